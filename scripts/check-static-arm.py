@@ -99,13 +99,13 @@ def edge_errors(depth, camera, world_from_camera):
                         found, plane = sample(depth, px), seen[:, 2]
                         if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < LEAST_JUMP_M:
                             continue  # Outside the image, something in front, or no jump.
-                        beyond = found - plane > 0.5 * (found[-1] - plane[-1])
-                        first = int(np.argmax(beyond))
+                        is_beyond_edge = found - plane > 0.5 * (found[-1] - plane[-1])
+                        first = int(np.argmax(is_beyond_edge))
                         errors.append(offsets[first] - STEP_M / 2)
     return errors
 
 
-def told(errors):
+def summarize(errors):
     size = np.abs(np.array(errors)) * 1e3
     if not len(size):
         return {"n": 0}
@@ -118,9 +118,9 @@ def main():
     fieldrig, model, folder = sys.argv[1:4]
     TARGET_XY, TABLE_Z = layout(pathlib.Path(__file__).resolve().parent.parent)
     folder = pathlib.Path(folder)
-    told_by = json.loads((folder / "transforms.json").read_text())
-    frames = [f for f in told_by["frames"] if f["file_path"] in set(told_by["test_filenames"])]
-    first = {**told_by, **frames[0]}  # What is the same for all frames stands at the top.
+    transforms = json.loads((folder / "transforms.json").read_text())
+    frames = [f for f in transforms["frames"] if f["file_path"] in set(transforms["test_filenames"])]
+    first = {**transforms, **frames[0]}  # What is the same for all frames stands at the top.
     height, width = int(first["h"]), int(first["w"])
     fov = 2 * np.degrees(np.arctan(height / 2 / first["fl_y"]))
     path = {"render_height": height, "render_width": width, "camera_path": [
@@ -148,7 +148,7 @@ def main():
             errors += edge_errors(np.load(depth).reshape(height, width), camera, pose)
             ideal += edge_errors(exact_depth(camera, pose, grid).reshape(height, width), camera, pose)
     print(json.dumps({"views": len(frames), "tags": {"in_truth": in_truth, "in_renders": in_render, "in_both": in_both, "missed": missed},
-                      "edges": told(errors), "ideal": told(ideal)}))
+                      "edges": summarize(errors), "ideal": summarize(ideal)}))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of 
 `surfaces` fuses, on the processor, the frames of a nerfstudio folder that MODEL/keyframes.txt says ours was fused from, with the
 same poses, lens, depth range, voxels and truncation (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
 - fusing: milliseconds a frame with color, the median after the first pass over all frames, images decoded before;
-- mesh (of all voxels seen; `mesh_as_usual`: of those seen more than three times, Open3D's default): triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
+- mesh (of all voxels seen; `mesh_default_threshold`: of those seen more than three times, Open3D's default): triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
   made one, as neither program promises that blocks share theirs;
 - against_depth: the depth images of test frames, which neither has fused, against the depth of the mesh there: share of measured
   pixels with a surface at all, and with one within two voxels (along z), and the median error;
@@ -76,8 +76,8 @@ class Grid:
                             1.0, self.depth_max_m, self.truncation_voxels)
         return 1e3 * (found - begin), 1e3 * (time.perf_counter() - found)
 
-    def mesh(self, least_weight):
-        mesh = self.grid.extract_triangle_mesh(weight_threshold=least_weight)
+    def mesh(self, min_weight):
+        mesh = self.grid.extract_triangle_mesh(weight_threshold=min_weight)
         colors = mesh.vertex.colors.numpy() if "colors" in mesh.vertex else np.zeros((len(mesh.vertex.positions), 3))
         return Mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), colors)
 
@@ -95,7 +95,7 @@ class Mesh:
         mesh = o3d.io.read_triangle_mesh(str(path))
         return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.asarray(mesh.vertex_colors))
 
-    def told(self):
+    def summary(self):
         _, first, one = np.unique(np.round(self.places / WELD_M).astype(np.int64), axis=0, return_index=True, return_inverse=True)
         places, triangles = self.places[first], one.reshape(-1)[self.triangles]
         degenerate = (triangles[:, 0] == triangles[:, 1]) | (triangles[:, 1] == triangles[:, 2]) | (triangles[:, 2] == triangles[:, 0])
@@ -180,15 +180,15 @@ def against_depth(mesh, frames, voxel_m, depth_max_m):
 
 def frames_of(data, keyframes):
     """Frames of a nerfstudio folder by split, as listed: photo n of the folder, in order of names, has the stamp n ms."""
-    told = json.loads((data / "transforms.json").read_text())
-    there = sorted((f for f in told["frames"] if (data / f["file_path"]).exists()), key=lambda f: f["file_path"])
+    summary = json.loads((data / "transforms.json").read_text())
+    existing = sorted((f for f in summary["frames"] if (data / f["file_path"]).exists()), key=lambda f: f["file_path"])
     by_split = {"train": [], "selection": [], "test": []}
     for line in keyframes.read_text().splitlines():
         if not line.strip() or line.startswith("#"):
             continue
         _, stamp, split = line.split()
-        frame = {**told, **there[int(stamp) // 1_000_000]}
-        unit = told.get("depth_unit_scale_factor", 0.001)
+        frame = {**summary, **existing[int(stamp) // 1_000_000]}
+        unit = summary.get("depth_unit_scale_factor", 0.001)
         depth_m = np.asarray(Image.open(data / frame["depth_file_path"])).astype(np.float32) * np.float32(unit)
         rgb = np.asarray(Image.open(data / frame["file_path"]).convert("RGB"))
         pose = np.array(frame["transform_matrix"]) @ OPENGL
@@ -208,26 +208,26 @@ def surfaces(args):
     voxel_m, depth_max_m = about["voxel_m"], about["max_depth_m"]
     truncation_voxels = about["truncation_m"] / voxel_m
     frames, test_frames = frames_of(args.data, args.model / "keyframes.txt")
-    told = {"open3d": {"version": o3d.__version__}}
+    summary = {"open3d": {"version": o3d.__version__}}
     for block in (8, 16):
         grid = Grid(voxel_m, truncation_voxels, depth_max_m, block)
         for frame in frames:
             grid.fuse(frame)
         theirs = grid.mesh(0.0)
-        told["open3d"]["mesh"], told["open3d"]["mesh_as_usual"] = theirs.told(), grid.mesh(3.0).told()
-        told["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
+        summary["open3d"]["mesh"], summary["open3d"]["mesh_default_threshold"] = theirs.summary(), grid.mesh(3.0).summary()
+        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
     ours = Mesh.read(args.model / "mesh.ply")
-    told["fieldrig"] = {"mesh": ours.told()}
-    told["voxel_mm"], told["truncation_voxels"], told["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)
+    summary["fieldrig"] = {"mesh": ours.summary()}
+    summary["voxel_mm"], summary["truncation_voxels"], summary["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)
     for name, mesh in (("open3d", theirs), ("fieldrig", ours)):
-        told[name]["against_depth"] = against_depth(mesh, test_frames, voxel_m, depth_max_m)
-    told["from_fieldrig_to_open3d"] = distances(ours, theirs, voxel_m)
-    told["from_open3d_to_fieldrig"] = distances(theirs, ours, voxel_m)
+        summary[name]["against_depth"] = against_depth(mesh, test_frames, voxel_m, depth_max_m)
+    summary["from_fieldrig_to_open3d"] = distances(ours, theirs, voxel_m)
+    summary["from_open3d_to_fieldrig"] = distances(theirs, ours, voxel_m)
     args.out.mkdir(parents=True, exist_ok=True)
     for frame in test_frames:
         row = [frame.rgb, ours.seen(frame)[1], theirs.seen(frame)[1]]
         Image.fromarray(np.concatenate(row, 1)).save(args.out / f"{pathlib.Path(frame.name).stem}.png")
-    return told
+    return summary
 
 
 def exact_frame(ix):
@@ -259,14 +259,14 @@ def exact_frame(ix):
 
 def frame(_args):
     frames = [exact_frame(ix) for ix in range(12)]
-    told = {"open3d": o3d.__version__, "voxel_mm": 10, "truncation_voxels": TRUNCATION_VOXELS}
+    summary = {"open3d": o3d.__version__, "voxel_mm": 10, "truncation_voxels": TRUNCATION_VOXELS}
     for block, numbers, name in ((16, o3c.float32, "blocks_of_16_f32"), (16, o3c.uint16, "blocks_of_16_u16"), (8, o3c.float32, "blocks_of_8_f32"), (8, o3c.uint16, "blocks_of_8_u16")):
         grid = Grid(0.01, TRUNCATION_VOXELS, 10.0, block, numbers)
         for each in frames[:8]:
             grid.fuse(each)
-        told[name] = {"new": timing([grid.fuse(each) for each in frames[8:]]), "again": timing([grid.fuse(each) for each in frames]),
+        summary[name] = {"new": timing([grid.fuse(each) for each in frames[8:]]), "again": timing([grid.fuse(each) for each in frames]),
                       "blocks": grid.grid.hashmap().size()}
-    return told
+    return summary
 
 
 def main():

@@ -11,9 +11,9 @@
 //! host memory twice.
 
 /// Blocks of at least this size get a separate mapping: an image of 640x480 has 1.2 MB.
-const MAP_FROM_BYTES: i32 = 1 << 20;
+const MMAP_THRESHOLD_BYTES: i32 = 1 << 20;
 /// Free memory at the end of a heap above which it returns to the system: twice the size above, as in glibc.
-const TRIM_BYTES: i32 = 2 * MAP_FROM_BYTES;
+const TRIM_THRESHOLD_BYTES: i32 = 2 * MMAP_THRESHOLD_BYTES;
 
 /// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -26,7 +26,10 @@ pub(crate) fn keep_images_out_of_heaps() {
     // SAFETY: `mallopt` takes the allocator's lock, and both values are within the range it documents. It changes how later
     // blocks are served and nothing about those handed out.
     let results = unsafe {
-        [libc::mallopt(libc::M_MMAP_THRESHOLD, MAP_FROM_BYTES), libc::mallopt(libc::M_TRIM_THRESHOLD, TRIM_BYTES)]
+        [
+            libc::mallopt(libc::M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES),
+            libc::mallopt(libc::M_TRIM_THRESHOLD, TRIM_THRESHOLD_BYTES),
+        ]
     };
     if results.contains(&0) {
         log::debug!("the allocator rejected its settings: a long run will take more memory");
@@ -53,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn images_have_mappings_of_their_own_after_others_were_freed() {
+    fn images_get_separate_mappings_after_frees() {
         keep_images_out_of_heaps();
         // Without the setting, freeing this block would put the images below into a heap.
         drop(vec![1u8; 24 << 20]);

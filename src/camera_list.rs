@@ -31,7 +31,7 @@ struct File {
 /// Writes the list, one camera per line.
 pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
     let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
-    run_folder::write_whole(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
+    run_folder::write_atomic(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
 }
 
 /// Reads the list; `None` if the folder has none.
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_are_read_as_they_were_written() {
+    fn camera_list_round_trips() {
         let folder = tempfile::tempdir().expect("a folder");
         assert!(read(folder.path()).expect("no file is no error").is_none());
         write(folder.path(), &[camera(), camera()]).expect("room on the disk");
@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_list_is_an_error_that_names_the_file() {
+    fn damaged_list_error_names_the_file() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut skewed = camera();
         skewed.world_from_camera[0] = 3.0;

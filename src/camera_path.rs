@@ -9,7 +9,7 @@ use std::path::Path;
 
 /// One place to draw from.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Stand {
+pub(crate) struct PathCamera {
     pub(crate) world_from_camera: Transform,
     /// Angle from the top to the bottom of the picture, radians, where the path says it.
     pub(crate) fov_y_rad: Option<f64>,
@@ -18,7 +18,7 @@ pub(crate) struct Stand {
 /// A camera path.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CameraPath {
-    pub(crate) stands: Vec<Stand>,
+    pub(crate) cameras: Vec<PathCamera>,
     /// Width and height of the pictures, where the path says it.
     pub(crate) size_px: Option<[u32; 2]>,
 }
@@ -32,11 +32,11 @@ struct PathFile {
     render_height: Option<u32>,
     render_width: Option<u32>,
     camera_type: Option<String>,
-    camera_path: Vec<PathStand>,
+    camera_path: Vec<PathFileCamera>,
 }
 
 #[derive(Debug, Deserialize)]
-struct PathStand {
+struct PathFileCamera {
     /// Row major; the camera looks along -z with y up.
     camera_to_world: Vec<f64>,
     /// From top to bottom, degrees.
@@ -53,7 +53,7 @@ impl CameraPath {
     /// One pose, 16 numbers row major, `world_from_camera` with the axes of [`kinematics::camera`].
     pub(crate) fn of_pose(numbers: &[f64]) -> Result<Self, BadArgument> {
         let world_from_camera = rigid(numbers).map_err(|error| BadArgument(format!("--pose: {error}")))?;
-        Ok(Self { stands: vec![Stand { world_from_camera, fov_y_rad: None }], size_px: None })
+        Ok(Self { cameras: vec![PathCamera { world_from_camera, fov_y_rad: None }], size_px: None })
     }
 
     fn parse(text: &str) -> anyhow::Result<Self> {
@@ -64,16 +64,16 @@ impl CameraPath {
             camera_type == PERSPECTIVE,
             "camera_type is {camera_type:?}, only {PERSPECTIVE:?} is drawn (and all directions, with --equirect)"
         );
-        let stand = |(ix, stand): (usize, &PathStand)| {
-            let world_from_opengl = rigid(&stand.camera_to_world).with_context(|| format!("camera {ix}"))?;
+        let camera = |(ix, camera): (usize, &PathFileCamera)| {
+            let world_from_opengl = rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
-            anyhow::Ok(Stand {
+            anyhow::Ok(PathCamera {
                 world_from_camera: world_from_opengl * opengl_from_camera,
-                fov_y_rad: stand.fov.map(f64::to_radians),
+                fov_y_rad: camera.fov.map(f64::to_radians),
             })
         };
         Ok(Self {
-            stands: file.camera_path.iter().enumerate().map(stand).collect::<Result<_, _>>()?,
+            cameras: file.camera_path.iter().enumerate().map(camera).collect::<Result<_, _>>()?,
             size_px: file.render_width.zip(file.render_height).map(|(width, height)| [width, height]),
         })
     }
@@ -82,15 +82,15 @@ impl CameraPath {
 /// The rigid motion of a 4x4 matrix, row major.
 pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
     /// Files round to six digits or so.
-    const ABS: f64 = 1e-3;
+    const TOLERANCE: f64 = 1e-3;
     ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
     ensure!(numbers.iter().all(|number| number.is_finite()), "a number of the pose is not finite");
     let matrix = Matrix4::from_row_slice(numbers);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
-    let off = (rotation * rotation.transpose() - Matrix3::identity()).amax();
-    ensure!(off < ABS && rotation.determinant() > 0.0, "its upper left 3x3 is no rotation");
+    let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
+    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "its upper left 3x3 is no rotation");
     ensure!(
-        (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < ABS,
+        (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < TOLERANCE,
         "its last row is not 0 0 0 1"
     );
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation));
@@ -105,23 +105,23 @@ mod tests {
     const IDENTITY: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 
     #[test]
-    fn a_nerfstudio_camera_looks_along_minus_z_with_y_up() {
+    fn nerfstudio_camera_axes_are_converted() {
         let text = serde_json::json!({
             "render_height": 480, "render_width": 640,
             "camera_path": [{ "camera_to_world": [1, 0, 0, 1, 0, 1, 0, 2, 0, 0, 1, 3, 0, 0, 0, 1], "fov": 90.0, "aspect": 1.33 }],
         });
         let path = CameraPath::parse(&text.to_string()).expect("a path");
         assert_eq!(path.size_px, Some([640, 480]));
-        let stand = path.stands[0];
-        assert_eq!(stand.fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
-        let ahead_in_world = stand.world_from_camera * Point3::new(0.0, 0.0, 1.0);
+        let camera = path.cameras[0];
+        assert_eq!(camera.fov_y_rad, Some(std::f64::consts::FRAC_PI_2));
+        let ahead_in_world = camera.world_from_camera * Point3::new(0.0, 0.0, 1.0);
         assert!((ahead_in_world - Point3::new(1.0, 2.0, 2.0)).norm() < 1e-12, "{ahead_in_world}");
-        let below_in_world = stand.world_from_camera * Point3::new(0.0, 1.0, 0.0);
+        let below_in_world = camera.world_from_camera * Point3::new(0.0, 1.0, 0.0);
         assert!((below_in_world - Point3::new(1.0, 1.0, 3.0)).norm() < 1e-12, "{below_in_world}");
     }
 
     #[test]
-    fn only_perspective_cameras_are_drawn() {
+    fn only_perspective_cameras_are_supported() {
         let of_type = |camera_type: &str| {
             let text =
                 serde_json::json!({ "camera_type": camera_type, "camera_path": [{ "camera_to_world": IDENTITY }] });
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_pose_is_told() {
+    fn invalid_poses_are_reported() {
         assert!(CameraPath::of_pose(&IDENTITY).is_ok());
         let mut stretched = IDENTITY;
         stretched[0] = 2.0;

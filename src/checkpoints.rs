@@ -1,8 +1,8 @@
 //! Checkpoints of a model in training: taken every so often, written on a thread of their own.
 
 use crate::exit::BadArgument;
-use crate::kept_keyframes::KeptKeyframes;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
+use crate::stored_keyframes::StoredKeyframes;
 use anyhow::Context;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -34,9 +34,9 @@ impl CheckpointArgs {
     }
 
     /// This flag, or if it is not given, that of the earlier run.
-    pub(crate) fn or_earlier(self, flags: &BTreeMap<String, String>) -> Self {
-        let earlier = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
-        Self { checkpoint_secs: self.checkpoint_secs.or_else(earlier) }
+    pub(crate) fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
+        let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
+        Self { checkpoint_secs: self.checkpoint_secs.or_else(previous) }
     }
 }
 
@@ -52,10 +52,14 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
 }
 
 /// Refuses a limit in seconds that has already passed when training continues.
-pub(crate) fn refuse_over(seconds: Option<f64>, checkpoint: &Checkpoint, whose: &str) -> Result<(), BadArgument> {
+pub(crate) fn check_limit_not_passed(
+    seconds: Option<f64>,
+    checkpoint: &Checkpoint,
+    subject: &str,
+) -> Result<(), BadArgument> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadArgument(format!(
-            "--seconds {seconds}: {whose} has been trained for {:.1} s, which count too; name more than that",
+            "--seconds {seconds}: {subject} has been trained for {:.1} s, which count too; name more than that",
             checkpoint.seconds
         ))),
         None => Ok(()),
@@ -75,20 +79,20 @@ pub(crate) struct RunFlags {
 pub(crate) struct Checkpoints {
     path: PathBuf,
     run_flags: RunFlags,
-    every: Duration,
+    period: Duration,
     /// Time after the last one at which the next is due.
     due_after: Duration,
     last: Instant,
     /// Keyframes that are on disk nowhere else.
-    kept_keyframes: Option<KeptKeyframes>,
+    stored_keyframes: Option<StoredKeyframes>,
     last_keyframes: Instant,
-    writing: Option<Writing>,
+    writer: Option<WriterThread>,
     /// Whether this run has written a checkpoint.
     has_any: bool,
 }
 
 /// A thread that writes.
-struct Writing {
+struct WriterThread {
     thread: JoinHandle<anyhow::Result<()>>,
     /// Whether it writes a checkpoint, not only keyframes.
     is_checkpoint: bool,
@@ -108,16 +112,16 @@ pub(crate) struct Snapshot<'a> {
 impl Checkpoints {
     /// None where they are not wanted. The first is due after the time between two.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
-        let (every, path) = (args.checkpoint_secs.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
-        (!every.is_zero()).then(|| Self {
+        let (period, path) = (args.checkpoint_secs.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
+        (!period.is_zero()).then(|| Self {
             path,
             run_flags: RunFlags::default(),
-            every,
-            due_after: every,
+            period,
+            due_after: period,
             last: Instant::now(),
-            kept_keyframes: None,
+            stored_keyframes: None,
             last_keyframes: Instant::now(),
-            writing: None,
+            writer: None,
             has_any: false,
         })
     }
@@ -130,30 +134,31 @@ impl Checkpoints {
     /// Stores the keyframes too: for a live run, whose images are nowhere else. The first checkpoint is written with the first keyframes,
     /// because resuming needs both.
     pub(crate) fn with_keyframes(self, run: &Path) -> Self {
-        let due_after = self.every.min(KEYFRAME_PERIOD);
-        Self { kept_keyframes: Some(KeptKeyframes::of_run(run)), due_after, ..self }
+        let due_after = self.period.min(KEYFRAME_PERIOD);
+        Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
     }
 
     /// Whether it keeps them.
     pub(crate) fn keeps_keyframes(&self) -> bool {
-        self.kept_keyframes.is_some()
+        self.stored_keyframes.is_some()
     }
 
     /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
-    pub(crate) fn when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
-        if self.writing.as_ref().is_some_and(|writing| !writing.thread.is_finished()) {
+    pub(crate) fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
+        if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
             return Ok(false);
         }
-        let is_resumable = self.kept_keyframes.is_none() || !now.keyframes.is_empty();
+        let is_resumable = self.stored_keyframes.is_none() || !now.keyframes.is_empty();
         if self.last.elapsed() >= self.due_after && is_resumable {
             self.begin(now)?;
             return Ok(true);
         }
-        if let Some(kept) = self.kept_keyframes.clone().filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD) {
+        if let Some(stored) = self.stored_keyframes.clone().filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD)
+        {
             self.wait_and_warn();
             let keyframes = now.keyframes.to_vec();
-            let thread = std::thread::spawn(move || kept.add(&keyframes));
-            self.writing = Some(Writing { thread, is_checkpoint: false });
+            let thread = std::thread::spawn(move || stored.add(&keyframes));
+            self.writer = Some(WriterThread { thread, is_checkpoint: false });
             self.last_keyframes = Instant::now();
         }
         Ok(false)
@@ -167,31 +172,31 @@ impl Checkpoints {
     }
 
     /// Copies the current state, to be written later.
-    pub(crate) fn take(&mut self, now: Snapshot<'_>) -> Result<Job, trainer::Error> {
+    pub(crate) fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
         self.wait_and_warn();
-        let asked = Instant::now();
+        let started = Instant::now();
         let pending = now.method.checkpoint()?;
-        log::debug!("a checkpoint paused training for {:?}", asked.elapsed());
-        Ok(Job {
+        log::debug!("a checkpoint paused training for {:?}", started.elapsed());
+        Ok(CheckpointWrite {
             pending,
             seconds: now.seconds,
             is_finished: now.is_finished,
             run_flags: self.run_flags.clone(),
             path: self.path.clone(),
-            keyframes: self.kept_keyframes.clone().map(|kept| (kept, now.keyframes.to_vec())),
+            keyframes: self.stored_keyframes.clone().map(|stored| (stored, now.keyframes.to_vec())),
         })
     }
 
     /// Writes a copy on a separate thread.
-    pub(crate) fn write(&mut self, job: Job) {
+    pub(crate) fn write(&mut self, job: CheckpointWrite) {
         let thread = std::thread::spawn(move || job.write());
-        self.writing = Some(Writing { thread, is_checkpoint: true });
+        self.writer = Some(WriterThread { thread, is_checkpoint: true });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
-        self.due_after = self.every;
+        self.due_after = self.period;
     }
 
     fn wait_and_warn(&mut self) {
-        let is_checkpoint = self.writing.as_ref().is_some_and(|writing| writing.is_checkpoint);
+        let is_checkpoint = self.writer.as_ref().is_some_and(|writer| writer.is_checkpoint);
         match self.wait() {
             Ok(()) => {}
             Err(error) if is_checkpoint => {
@@ -213,7 +218,7 @@ impl Checkpoints {
 
     /// Waits until the one under way is on the disk.
     pub(crate) fn wait(&mut self) -> anyhow::Result<()> {
-        let Some(Writing { thread, is_checkpoint }) = self.writing.take() else { return Ok(()) };
+        let Some(WriterThread { thread, is_checkpoint }) = self.writer.take() else { return Ok(()) };
         match thread.join() {
             Ok(written) => {
                 written?;
@@ -226,29 +231,29 @@ impl Checkpoints {
 }
 
 /// A checkpoint that is being written.
-pub(crate) struct Job {
+pub(crate) struct CheckpointWrite {
     pending: PendingCheckpoint,
     seconds: f64,
     is_finished: bool,
     run_flags: RunFlags,
     path: PathBuf,
-    keyframes: Option<(KeptKeyframes, Vec<Arc<Keyframe>>)>,
+    keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
 }
 
-impl Job {
+impl CheckpointWrite {
     /// Writes new keyframes, then the checkpoint, then removes the keyframes that only the previous checkpoint needed.
     fn write(self) -> anyhow::Result<()> {
-        let begun = Instant::now();
+        let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
-        if let Some((kept, keyframes)) = &self.keyframes {
-            kept.add(keyframes)?;
+        if let Some((stored, keyframes)) = &self.keyframes {
+            stored.add(keyframes)?;
         }
         let (seconds, is_finished) = (self.seconds, self.is_finished);
         Checkpoint { seconds, is_finished, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
-        if let Some((kept, keyframes)) = &self.keyframes {
-            kept.keep_only(keyframes)?;
+        if let Some((stored, keyframes)) = &self.keyframes {
+            stored.keep_only(keyframes)?;
         }
-        log::debug!("a checkpoint was written in {:?}", begun.elapsed());
+        log::debug!("a checkpoint was written in {:?}", started.elapsed());
         Ok(())
     }
 }
@@ -258,28 +263,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_time_between_two_is_a_number() {
+    fn checkpoint_period_must_be_a_number() {
         assert_eq!(secs("0"), Ok(Duration::ZERO));
         assert_eq!(secs("0.5"), Ok(Duration::from_millis(500)));
-        for wrong in ["-1", "nan", "inf", "minute", ""] {
-            assert!(secs(wrong).is_err(), "{wrong}");
+        for invalid in ["-1", "nan", "inf", "minute", ""] {
+            assert!(secs(invalid).is_err(), "{invalid}");
         }
     }
 
     #[test]
-    fn a_resumed_run_keeps_the_period_unless_another_is_given() {
+    fn resumed_run_keeps_the_checkpoint_period() {
         let [none, one, two] = [None, Some(1.0), Some(2.5)]
             .map(|secs| CheckpointArgs { checkpoint_secs: secs.map(Duration::from_secs_f64) });
         let flags = |args: CheckpointArgs| args.flag().into_iter().collect();
-        assert_eq!(none.or_earlier(&flags(two)).checkpoint_secs, two.checkpoint_secs);
-        assert_eq!(one.or_earlier(&flags(two)).checkpoint_secs, one.checkpoint_secs);
-        assert_eq!(none.or_earlier(&flags(none)).checkpoint_secs, None);
+        assert_eq!(none.or_previous(&flags(two)).checkpoint_secs, two.checkpoint_secs);
+        assert_eq!(one.or_previous(&flags(two)).checkpoint_secs, one.checkpoint_secs);
+        assert_eq!(none.or_previous(&flags(none)).checkpoint_secs, None);
     }
 
     #[test]
-    fn a_folder_without_a_checkpoint_is_named() {
+    fn missing_checkpoint_error_names_the_folder() {
         let folder = tempfile::tempdir().expect("a folder");
-        let told = format!("{:#}", read(folder.path()).expect_err("none"));
-        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains(CHECKPOINT), "{told}");
+        let message = format!("{:#}", read(folder.path()).expect_err("none"));
+        assert!(message.contains(folder.path().to_str().expect("plain")) && message.contains(CHECKPOINT), "{message}");
     }
 }

@@ -6,26 +6,26 @@ use std::time::{Duration, Instant};
 
 /// Seconds of training; evaluation does not count. Clones show the same time.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Clock(Rc<Cell<Times>>);
+pub(crate) struct Clock(Rc<Cell<ClockState>>);
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Times {
+struct ClockState {
     started: Option<Instant>,
     excluded: Duration,
     /// Of the runs that this one goes on from.
-    earlier_secs: f64,
+    previous_secs: f64,
 }
 
 impl Clock {
     /// A clock that goes on where earlier runs had trained for so long.
-    pub(crate) fn after(earlier_secs: f64) -> Self {
-        Self(Rc::new(Cell::new(Times { earlier_secs, ..Times::default() })))
+    pub(crate) fn with_elapsed(previous_secs: f64) -> Self {
+        Self(Rc::new(Cell::new(ClockState { previous_secs, ..ClockState::default() })))
     }
 
     /// Starts it, unless it runs.
     pub(crate) fn start(&self, at: Instant) {
-        let times = self.0.get();
-        self.0.set(Times { started: times.started.or(Some(at)), ..times });
+        let state = self.0.get();
+        self.0.set(ClockState { started: state.started.or(Some(at)), ..state });
     }
 
     /// When it started, once it runs.
@@ -35,15 +35,15 @@ impl Clock {
 
     /// Leaves out what was no training.
     pub(crate) fn exclude(&self, spent: Duration) {
-        let times = self.0.get();
-        self.0.set(Times { excluded: times.excluded + spent, ..times });
+        let state = self.0.get();
+        self.0.set(ClockState { excluded: state.excluded + spent, ..state });
     }
 
     /// Seconds so far.
     pub(crate) fn secs(&self) -> f64 {
-        let times = self.0.get();
-        let of_this_run = |started: Instant| started.elapsed().saturating_sub(times.excluded).as_secs_f64();
-        times.earlier_secs + times.started.map_or(0.0, of_this_run)
+        let state = self.0.get();
+        let of_this_run = |started: Instant| started.elapsed().saturating_sub(state.excluded).as_secs_f64();
+        state.previous_secs + state.started.map_or(0.0, of_this_run)
     }
 }
 
@@ -52,9 +52,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn clones_show_one_time_and_what_is_excluded_does_not_count() {
+    fn clones_share_time_and_exclusions() {
         const HOUR: Duration = Duration::from_secs(3600);
-        let clock = Clock::after(10.0);
+        let clock = Clock::with_elapsed(10.0);
         let other = clock.clone();
         assert_eq!(other.secs(), 10.0, "it stands still");
         let started = Instant::now().checked_sub(HOUR).expect("the machine has run for an hour");

@@ -1,13 +1,13 @@
 //! The rig file with what alignment found: the rig calibrates itself.
 
-use crate::config::{Camera, Measured, Rig};
+use crate::config::{Camera, Rig, TimeOffset};
 use crate::exit::BadArgument;
 use anyhow::Context;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
-use trainer::align::{Alignment, Found};
-use trainer::splat::CameraFix;
+use trainer::align::{Alignment, Estimate};
+use trainer::splat::CameraCorrection;
 
 /// What a corrected delay says about where it comes from.
 const SOURCE: &str = "train --write-rig";
@@ -16,23 +16,24 @@ const SOURCE: &str = "train --write-rig";
 pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig> {
     let mut rig = rig.clone();
     for camera in &mut rig.cameras {
-        if let Some(fix) = alignment.fixes.get(&*camera.name) {
-            correct(camera, fix, alignment);
+        if let Some(correction) = alignment.corrections.get(&*camera.name) {
+            correct(camera, correction, alignment);
         }
     }
-    let longest = alignment.fixes.values().map(|fix| &fix.joint_offsets).max_by_key(|offsets| offsets.len());
-    if let Some(by_chain) = longest.filter(|offsets| !offsets.is_empty()) {
+    let most_offsets =
+        alignment.corrections.values().map(|correction| &correction.joint_offsets).max_by_key(|offsets| offsets.len());
+    if let Some(by_chain) = most_offsets.filter(|offsets| !offsets.is_empty()) {
         let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)?;
         rig.arm.joint_offsets.resize(rig.arm.joints.len(), 0.0);
-        for (place, offset) in chain.order_in(&rig.arm.joints)?.into_iter().zip(by_chain) {
-            rig.arm.joint_offsets[place] += offset;
+        for (joint_ix, offset) in chain.order_in(&rig.arm.joints)?.into_iter().zip(by_chain) {
+            rig.arm.joint_offsets[joint_ix] += offset;
         }
     }
     Ok(rig)
 }
 
 /// Refuses a place where no file can be written.
-pub(crate) fn refuse_place(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
+pub(crate) fn check_target_file(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
         return Err(BadArgument(format!("--write-rig {}: must be a file in a folder that exists", file.display())));
@@ -50,47 +51,47 @@ pub(crate) fn refuse_place(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
 /// The robot's description beside a rig file, where it is of another robot.
 fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
-    let there = std::fs::read_to_string(&urdf).ok()?;
-    (there != rig.arm.urdf_text).then_some(urdf)
+    let existing = std::fs::read_to_string(&urdf).ok()?;
+    (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
 /// Writes a rig file, and the robot's description beside it, where no other one lies.
 pub(crate) fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
-    refuse_place(rig, file)?;
+    check_target_file(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let in_file = || format!("cannot write {}", file.display());
     std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
     std::fs::write(file, rig.to_toml()).with_context(in_file)
 }
 
-fn correct(camera: &mut Camera, fix: &CameraFix, alignment: &Alignment) {
-    let moved = |turn_rad: [f64; 3], shift_m: [f64; 3]| {
+fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Alignment) {
+    let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
         Transform::from_parts(
-            Translation3::from(Vector3::from(shift_m)),
-            UnitQuaternion::from_scaled_axis(Vector3::from(turn_rad)),
+            Translation3::from(Vector3::from(translation_m)),
+            UnitQuaternion::from_scaled_axis(Vector3::from(rotation_rad)),
         )
     };
-    camera.parent_from_camera *= moved(fix.turn_rad, fix.shift_m).inverse();
-    if fix.delay_secs != 0.0 {
-        let sigma = alignment.found.iter().find_map(|found| match found {
-            Found::Delay(delay) if *delay.camera == *camera.name => Some(delay.sigma),
+    camera.parent_from_camera *= moved(correction.rotation_rad, correction.translation_m).inverse();
+    if correction.time_offset_secs != 0.0 {
+        let sigma = alignment.estimates.iter().find_map(|estimate| match estimate {
+            Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => Some(time_offset.sigma),
             _ => None,
         });
-        camera.stamp_to_mid_exposure = Some(Measured {
+        camera.stamp_to_mid_exposure = Some(TimeOffset {
             value_millis: camera.stamp_to_mid_exposure.as_ref().map_or(0.0, |known| known.value_millis)
-                + 1e3 * fix.delay_secs,
+                + 1e3 * correction.time_offset_secs,
             sigma_millis: 1e3 * sigma.unwrap_or(0.0),
             source: SOURCE.to_owned(),
         });
     }
-    if fix.readout_secs != 0.0 {
-        let readout_micros = camera.readout_micros.unwrap_or(0.0) + 1e6 * fix.readout_secs;
+    if correction.readout_secs != 0.0 {
+        let readout_micros = camera.readout_micros.unwrap_or(0.0) + 1e6 * correction.readout_secs;
         camera.readout_micros = Some(readout_micros.clamp(0.0, 1e6 / camera.rate_hz));
     }
     let correct_lens = |intrinsics: &mut Intrinsics| {
         for axis in 0..2 {
-            intrinsics.principal_px[axis] += fix.principal_focals[axis] * intrinsics.focal_px[axis];
-            intrinsics.focal_px[axis] *= fix.log_focal[axis].exp();
+            intrinsics.principal_px[axis] += correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
+            intrinsics.focal_px[axis] *= correction.log_focal[axis].exp();
         }
     };
     if let Some(depth) = &mut camera.depth {
@@ -99,8 +100,9 @@ fn correct(camera: &mut Camera, fix: &CameraFix, alignment: &Alignment) {
         if shares_lens {
             correct_lens(&mut depth.intrinsics);
         }
-        depth.camera_from_depth = moved(fix.depth_turn_rad, fix.depth_shift_m) * depth.camera_from_depth;
-        depth.factor *= fix.log_depth_scale.exp();
+        depth.camera_from_depth =
+            moved(correction.depth_rotation_rad, correction.depth_translation_m) * depth.camera_from_depth;
+        depth.factor *= correction.log_depth_scale.exp();
     }
     correct_lens(&mut camera.intrinsics);
 }
@@ -109,66 +111,78 @@ fn correct(camera: &mut Camera, fix: &CameraFix, alignment: &Alignment) {
 mod tests {
     use super::*;
     use std::collections::BTreeMap;
-    use trainer::align::Number;
+    use trainer::align::ScalarEstimate;
 
-    const CLOSE: f64 = 1e-12; // Rounding of products of poses near 1.
+    const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
 
-    fn shipped() -> Rig {
+    fn bundled_rig() -> Rig {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         Rig::load(&file, &[]).unwrap()
     }
 
     #[test]
-    fn every_correction_finds_its_key() {
-        let mut rig = shipped();
+    fn every_correction_is_written_to_its_key() {
+        let mut rig = bundled_rig();
         rig.arm.joints.reverse(); // The device's order is not the chain's.
-        let fix = CameraFix {
-            turn_rad: [0.01, -0.02, 0.03],
-            shift_m: [0.001, 0.002, -0.003],
-            delay_secs: 0.004,
+        let correction = CameraCorrection {
+            rotation_rad: [0.01, -0.02, 0.03],
+            translation_m: [0.001, 0.002, -0.003],
+            time_offset_secs: 0.004,
             log_focal: [0.01, 0.02],
-            principal_focals: [0.001, -0.002],
+            principal_offset_focals: [0.001, -0.002],
             joint_offsets: (0..7).map(f64::from).map(|joint| 0.001 * joint).collect(),
-            depth_shift_m: [0.0, 0.0, 0.005],
+            depth_translation_m: [0.0, 0.0, 0.005],
             log_depth_scale: 0.01,
             readout_secs: -0.003,
-            ..CameraFix::default()
+            ..CameraCorrection::default()
         };
         let alignment = Alignment {
-            fixes: BTreeMap::from([("wrist".to_owned(), fix.clone())]),
-            found: vec![Found::Delay(Number { camera: "wrist".to_owned(), value: 0.004, sigma: 1e-4 })],
+            corrections: BTreeMap::from([("wrist".to_owned(), correction.clone())]),
+            estimates: vec![Estimate::TimeOffset(ScalarEstimate {
+                camera: "wrist".to_owned(),
+                value: 0.004,
+                sigma: 1e-4,
+            })],
             ..Alignment::default()
         };
-        let found = corrected(&rig, &alignment).unwrap();
-        let (before, after) = (&rig.cameras[0], &found.cameras[0]);
+        let calibrated_rig = corrected(&rig, &alignment).unwrap();
+        let (before, after) = (&rig.cameras[0], &calibrated_rig.cameras[0]);
         // A turn and a shift after camera_from_parent.
-        let moved = Transform::new(Vector3::from(fix.shift_m), Vector3::from(fix.turn_rad));
+        let moved = Transform::new(Vector3::from(correction.translation_m), Vector3::from(correction.rotation_rad));
         let expected = moved * before.parent_from_camera.inverse();
-        let off = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
-        assert!(off < CLOSE, "{off}");
-        let delay = after.stamp_to_mid_exposure.as_ref().unwrap();
-        assert!((delay.value_millis - 4.0).abs() < CLOSE && (delay.sigma_millis - 0.1).abs() < CLOSE);
-        assert_eq!(delay.source, SOURCE);
+        let max_error = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
+        assert!(max_error < TOLERANCE, "{max_error}");
+        let time_offset = after.stamp_to_mid_exposure.as_ref().unwrap();
+        assert!(
+            (time_offset.value_millis - 4.0).abs() < TOLERANCE && (time_offset.sigma_millis - 0.1).abs() < TOLERANCE
+        );
+        assert_eq!(time_offset.source, SOURCE);
         assert!((after.readout_micros.unwrap() - 12_000.0).abs() < 1e-6);
-        assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < CLOSE);
+        assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < TOLERANCE);
         let [fx, fy] = before.intrinsics.focal_px;
         let moved = [0, 1].map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
         assert!((moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9, "{moved:?}");
         let depth = after.depth.as_ref().unwrap();
         assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth comes through the same lens");
-        assert!((depth.factor - 0.01f64.exp()).abs() < CLOSE);
-        assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < CLOSE);
+        assert!((depth.factor - 0.01f64.exp()).abs() < TOLERANCE);
+        assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < TOLERANCE);
         let expected: Vec<f64> = (0..7).rev().map(|joint| 0.001 * f64::from(joint)).collect();
-        assert_eq!(found.arm.joint_offsets, expected);
+        assert_eq!(calibrated_rig.arm.joint_offsets, expected);
         // It is a rig file that can be read, and a second rig's description is not overwritten.
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("rig.toml");
-        write(&found, &file).unwrap();
-        assert_eq!(Rig::load(&file, &[]).unwrap(), found);
-        assert!(Rig::load(&file, &[]).unwrap().sees_like(&found) && !rig.sees_like(&found));
+        write(&calibrated_rig, &file).unwrap();
+        assert_eq!(Rig::load(&file, &[]).unwrap(), calibrated_rig);
+        assert!(
+            Rig::load(&file, &[]).unwrap().has_same_calibration(&calibrated_rig)
+                && !rig.has_same_calibration(&calibrated_rig)
+        );
         std::fs::write(folder.path().join(drivers::recording::URDF_FILE), "<robot/>").unwrap();
-        assert!(write(&found, &file).unwrap_err().to_string().contains("another robot"));
-        assert!(refuse_place(&found, &folder.path().join("none/rig.toml")).is_err());
-        assert!(refuse_place(&found, &file).unwrap_err().to_string().contains("another robot"), "before training, too");
+        assert!(write(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"));
+        assert!(check_target_file(&calibrated_rig, &folder.path().join("none/rig.toml")).is_err());
+        assert!(
+            check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
+            "before training, too"
+        );
     }
 }

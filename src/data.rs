@@ -2,14 +2,14 @@
 
 use crate::config::{Override, Rig};
 use crate::dataset;
-use crate::depth_from::{DepthSource, DrawnDepth};
-use crate::exit::{BadArgument, LackOfEvidence};
+use crate::depth_from::{DepthSource, RenderedDepth};
+use crate::exit::{BadArgument, InsufficientData};
 use crate::holdout::Holdout;
-use crate::join::{Join, JoinEvent, KeyframeList, Use};
-use crate::method::Kind;
+use crate::join::{Join, JoinEvent, KeyframeList, SampleUse};
+use crate::method::ModelKind;
 use crate::open::{self, Opened};
-use crate::stands::{StandReport, Stands};
-use crate::{print, shrink};
+use crate::stations::{StationReport, Stations};
+use crate::{downscale, print};
 use anyhow::ensure;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
 /// Ending of a recording.
-const RECORDING_ENDING: &str = "mcap";
+const RECORDING_EXTENSION: &str = "mcap";
 
 /// Which images of the data are taken, and what for.
 #[derive(Clone, Debug, clap::Args)]
@@ -34,7 +34,7 @@ pub(crate) struct DataArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) rig: Option<PathBuf>,
     /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
-    #[arg(long, value_name = "SHARE", value_parser = shrink::share)]
+    #[arg(long, value_name = "SHARE", value_parser = downscale::parse_scale)]
     pub(crate) scale: Option<f64>,
 }
 
@@ -46,12 +46,12 @@ impl DataArgs {
 
     /// What is given of the flags that keyframes are made by: values by names, files by their whole path.
     pub(crate) fn flags(&self) -> BTreeMap<String, String> {
-        let whole = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
-        let holdout = |text: &String| if is_number(text) { text.clone() } else { whole(Path::new(text)) };
+        let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
+        let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
         let given = [
             ("holdout", self.holdout.as_ref().map(holdout)),
-            ("keyframes", self.keyframes.as_deref().map(whole)),
-            ("rig", self.rig.as_deref().map(whole)),
+            ("keyframes", self.keyframes.as_deref().map(canonical)),
+            ("rig", self.rig.as_deref().map(canonical)),
             ("scale", self.scale.map(|scale| scale.to_string())),
         ];
         given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
@@ -67,34 +67,34 @@ impl DataArgs {
     /// These flags, and where they say nothing those that keyframes were made by `before`. A number that says otherwise is refused;
     /// a file may have moved: what it makes has to be the same, and is compared later.
     ///
-    /// `whose`: what was made before.
-    pub(crate) fn after(&self, whose: &str, before: &BTreeMap<String, String>) -> Result<Self, BadArgument> {
+    /// `subject`: what was made before.
+    pub(crate) fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, BadArgument> {
         let now = self.flags();
         for (name, value) in before {
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(BadArgument(format!("--{name} {now}: {whose} is of images with --{name} {value}")));
+                return Err(BadArgument(format!("--{name} {now}: {subject} is of images with --{name} {value}")));
             }
         }
-        let left = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
+        let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
         // Both say which images there are: one given stands for both.
-        let which = |name: &str| left(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
-        let scale = left("scale").map(|scale| scale.parse());
-        let scale = scale.transpose().map_err(|_| BadArgument(format!("{whose}: its scale is no number")))?;
+        let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
+        let scale = unset_flag("scale").map(|scale| scale.parse());
+        let scale = scale.transpose().map_err(|_| BadArgument(format!("{subject}: its scale is no number")))?;
         let restored = Self {
-            holdout: self.holdout.clone().or(which("holdout").cloned()),
-            keyframes: self.keyframes.clone().or(which("keyframes").map(PathBuf::from)),
-            rig: self.rig.clone().or(left("rig").map(PathBuf::from)),
+            holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
+            keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
+            rig: self.rig.clone().or(unset_flag("rig").map(PathBuf::from)),
             scale: self.scale.or(scale),
         };
-        let told: Vec<String> = restored
+        let restored_flags: Vec<String> = restored
             .flags()
             .iter()
             .filter(|(name, _)| !now.contains_key(*name))
             .map(|(name, value)| format!("--{name} {value}"))
             .collect();
-        if !told.is_empty() {
-            log::info!("{}, as {whose} was trained with", told.join(" "));
+        if !restored_flags.is_empty() {
+            log::info!("{}, as {subject} was trained with", restored_flags.join(" "));
         }
         Ok(restored)
     }
@@ -115,13 +115,13 @@ pub(crate) struct Data {
     /// Whether the stamps are times; else they only count the images.
     pub(crate) has_times: bool,
     /// What was lost on the way; anything here makes the exit code 3.
-    pub(crate) losses: Vec<String>,
+    pub(crate) dropped_messages: Vec<String>,
     /// What was found of the base's pose at each stand after the first.
-    pub(crate) stands: Vec<StandReport>,
+    pub(crate) stations: Vec<StationReport>,
     /// What was drawn from a model for images that lack depth.
-    pub(crate) drawn_depth: Option<DrawnDepth>,
+    pub(crate) rendered_depth: Option<RenderedDepth>,
     /// Time that finding the stands and drawing depth took: both come before learning, for the sake of it.
-    pub(crate) learning: Duration,
+    pub(crate) preparation_time: Duration,
 }
 
 /// What data are for.
@@ -134,14 +134,14 @@ pub(crate) enum Purpose {
 }
 
 /// Which images are taken.
-struct Selection {
+struct DataSelection {
     list: Option<KeyframeList>,
     holdout: Option<Holdout>,
     scale: Option<f64>,
     /// In place of the one in a recording.
     rig: Option<PathBuf>,
     /// Poses are those that the base's source tells, wherever its stands show them to be wrong.
-    as_told: bool,
+    use_reported_poses: bool,
 }
 
 impl Data {
@@ -155,9 +155,9 @@ impl Data {
     ) -> anyhow::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let holdout = args.holdout()?;
-        Self::selected(
+        Self::load_selected(
             path,
-            Selection { list, holdout, scale: args.scale, rig: args.rig.clone(), as_told: false },
+            DataSelection { list, holdout, scale: args.scale, rig: args.rig.clone(), use_reported_poses: false },
             purpose,
             overrides,
             quiet,
@@ -174,18 +174,19 @@ impl Data {
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let selection = Selection { list: Some(list), holdout: None, scale: Some(scale), rig, as_told: true };
-        Self::selected(path, selection, Purpose::Training, overrides, quiet)
+        let selection =
+            DataSelection { list: Some(list), holdout: None, scale: Some(scale), rig, use_reported_poses: true };
+        Self::load_selected(path, selection, Purpose::Training, overrides, quiet)
     }
 
-    fn selected(
+    fn load_selected(
         path: &Path,
-        selection: Selection,
+        selection: DataSelection,
         purpose: Purpose,
         overrides: &[Override],
         quiet: bool,
     ) -> anyhow::Result<Self> {
-        let Selection { list, holdout, scale, rig, as_told } = selection;
+        let DataSelection { list, holdout, scale, rig, use_reported_poses } = selection;
         expect(path)?;
         let is_recording = is_recording(path);
         let mut data = if is_recording {
@@ -201,16 +202,16 @@ impl Data {
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.hold_out(holdout)?;
         }
-        if !as_told {
+        if !use_reported_poses {
             data.realign();
         }
-        let (wanted, what) = match purpose {
+        let (required_split, message) = match purpose {
             Purpose::Training => (Split::Train, "no image is left to train on"),
             Purpose::Scoring => (Split::Test, "no test image"),
         };
-        if data.of_split(wanted).is_empty() {
+        if data.of_split(required_split).is_empty() {
             let n_images = print::counted(data.keyframes.len() as u64, "image");
-            return Err(LackOfEvidence(format!("{}: {what} among {n_images}", path.display())).into());
+            return Err(InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
         }
         Ok(data)
     }
@@ -222,9 +223,9 @@ impl Data {
     }
 
     /// The scene models that data are for where no flag says: a recording's rig file names them, before anything else is read.
-    pub(crate) fn usual_kinds(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<Kind>> {
+    pub(crate) fn default_methods(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
-        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![Kind::Splat] })
+        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![ModelKind::Splat] })
     }
 
     /// Keyframes of one split.
@@ -244,10 +245,10 @@ impl Data {
     }
 
     /// Gives images without depth that of a model.
-    pub(crate) fn draw_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, quiet: bool) -> anyhow::Result<()> {
-        let begun = Instant::now();
-        self.drawn_depth = Some(source.draw(gpu, &mut self.keyframes, quiet)?);
-        self.learning += begun.elapsed();
+    pub(crate) fn render_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, quiet: bool) -> anyhow::Result<()> {
+        let started = Instant::now();
+        self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, quiet)?);
+        self.preparation_time += started.elapsed();
         Ok(())
     }
 
@@ -271,10 +272,10 @@ impl Data {
             names: loaded.names,
             rig: None,
             has_times: folder.has_times(),
-            losses: loaded.losses,
-            stands: Vec::new(),
-            drawn_depth: None,
-            learning: Duration::ZERO,
+            dropped_messages: loaded.dropped_messages,
+            stations: Vec::new(),
+            rendered_depth: None,
+            preparation_time: Duration::ZERO,
         };
         if let Some(list) = list {
             data.take_only(&list)?;
@@ -303,7 +304,7 @@ impl Data {
                     JoinEvent::Evicted { camera, stamp } => {
                         keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                     }
-                    JoinEvent::Seen(_) | JoinEvent::Refused { .. } => {}
+                    JoinEvent::PosedImage(_) | JoinEvent::Refused { .. } => {}
                 }
             }
             bar.set_position(keyframes.len() as u64);
@@ -314,27 +315,27 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut losses = join.counts().losses(Use::Watched);
-        losses.extend(damage.get().cloned());
-        losses.extend(join.check_list()?);
+        let mut dropped_messages = join.counts().dropped_messages(SampleUse::Watched);
+        dropped_messages.extend(damage.get().cloned());
+        dropped_messages.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
         Ok(Self {
             keyframes,
             names,
             rig: Some(rig),
             has_times: true,
-            losses,
-            stands: Vec::new(),
-            drawn_depth: None,
-            learning: Duration::ZERO,
+            dropped_messages,
+            stations: Vec::new(),
+            rendered_depth: None,
+            preparation_time: Duration::ZERO,
         })
     }
 
     /// Corrects the keyframes of a base that walks, as a run does.
     fn realign(&mut self) {
-        let Some(mut stands) = self.rig.as_ref().and_then(Stands::new) else { return };
-        self.keyframes = stands.corrected(std::mem::take(&mut self.keyframes));
-        (self.stands, self.learning) = (stands.reports().to_vec(), stands.spent());
+        let Some(mut stations) = self.rig.as_ref().and_then(Stations::new) else { return };
+        self.keyframes = stations.corrected(std::mem::take(&mut self.keyframes));
+        (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
     }
 
     /// Splits anew, each camera on its own.
@@ -353,9 +354,9 @@ impl Data {
     }
 
     /// Keeps what a list names, as what it names it.
-    fn take_only(&mut self, list: &KeyframeList) -> Result<(), LackOfEvidence> {
+    fn take_only(&mut self, list: &KeyframeList) -> Result<(), InsufficientData> {
         let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        self.losses.extend(list.check_found(images(), images().next())?);
+        self.dropped_messages.extend(list.check_found(images(), images().next())?);
         let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
         for (mut keyframe, name) in all {
             if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {
@@ -376,7 +377,7 @@ pub(crate) fn expect(path: &Path) -> anyhow::Result<()> {
 
 /// Whether the name is that of a recording.
 pub(crate) fn is_recording(path: &Path) -> bool {
-    path.extension().is_some_and(|ending| ending == RECORDING_ENDING)
+    path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
 
 /// Name of a recorded image: camera and stamp.
@@ -389,10 +390,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_flags_leave_open_is_as_it_was() {
+    fn missing_flags_are_restored() {
         let none = DataArgs { holdout: None, keyframes: None, rig: None, scale: None };
         let first = DataArgs { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
-        let again = |args: &DataArgs| args.after("the checkpoint", &first.flags());
+        let again = |args: &DataArgs| args.completed_with("the checkpoint", &first.flags());
         assert_eq!(again(&none).expect("nothing is said").flags(), first.flags());
         let listed = DataArgs { keyframes: Some("other.txt".into()), ..none.clone() };
         let names: Vec<String> = again(&listed).expect("a list is compared later").flags().into_keys().collect();

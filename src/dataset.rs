@@ -1,8 +1,8 @@
 //! Photos of a dataset -> keyframes: decoded, undistorted, scaled, split.
 
+use crate::downscale;
 use crate::holdout::Holdout;
 use crate::print::counted;
-use crate::shrink;
 use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
 use kinematics::{Intrinsics, Undistortion};
@@ -16,7 +16,7 @@ const CAMERA: &str = "camera";
 
 /// The photos of a dataset as keyframes.
 #[derive(Debug)]
-pub(crate) struct Loaded {
+pub(crate) struct LoadedDataset {
     /// In the order of the dataset.
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
     /// Names of the photos, in the same order.
@@ -24,7 +24,7 @@ pub(crate) struct Loaded {
     /// What a user should know.
     pub(crate) notes: Vec<String>,
     /// What is there but did not decode.
-    pub(crate) losses: Vec<String>,
+    pub(crate) dropped_messages: Vec<String>,
 }
 
 /// Decodes all photos on all cores.
@@ -37,9 +37,9 @@ pub(crate) fn load(
     holdout: &Holdout,
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
-) -> anyhow::Result<Loaded> {
+) -> anyhow::Result<LoadedDataset> {
     for frame in &dataset.frames {
-        shrink::lens(&frame.intrinsics, scale_frac).with_context(|| frame.name.clone())?;
+        downscale::intrinsics(&frame.intrinsics, scale_frac).with_context(|| frame.name.clone())?;
     }
     let names: Vec<&str> = dataset.frames.iter().map(|frame| frame.name.as_str()).collect();
     let splits = holdout.splits(&names).with_context(|| dataset.path.display().to_string())?;
@@ -64,24 +64,29 @@ pub(crate) fn load(
         start += run.len();
     }
 
-    let (notes, losses) = (dataset.notes.clone(), dataset.losses.clone());
-    let mut loaded = Loaded { keyframes: Vec::new(), names: Vec::new(), notes, losses };
-    let (mut broken, mut broken_depth) = (Vec::new(), Vec::new());
+    let (notes, dropped_messages) = (dataset.notes.clone(), dataset.dropped_messages.clone());
+    let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, dropped_messages };
+    let (mut image_errors, mut depth_errors) = (Vec::new(), Vec::new());
     for (name, result) in results {
         match result {
             Ok((keyframe, depth_error)) => {
                 loaded.keyframes.push(Arc::new(keyframe));
                 loaded.names.push(name);
-                broken_depth.extend(depth_error);
+                depth_errors.extend(depth_error);
             }
-            Err(error) => broken.push(format!("{error:#}")),
+            Err(error) => image_errors.push(format!("{error:#}")),
         }
     }
-    ensure!(!loaded.keyframes.is_empty(), "{}: no photo can be used: {}", dataset.path.display(), broken.join("; "));
-    for (what, errors) in [("image", broken), ("depth image", broken_depth)] {
+    ensure!(
+        !loaded.keyframes.is_empty(),
+        "{}: no photo can be used: {}",
+        dataset.path.display(),
+        image_errors.join("; ")
+    );
+    for (what, errors) in [("image", image_errors), ("depth image", depth_errors)] {
         if !errors.is_empty() {
-            let n_lost = counted(errors.len() as u64, what);
-            loaded.losses.push(format!("{n_lost} cannot be used: {}", errors.join("; ")));
+            let n_unusable = counted(errors.len() as u64, what);
+            loaded.dropped_messages.push(format!("{n_unusable} cannot be used: {}", errors.join("; ")));
         }
     }
     Ok(loaded)
@@ -109,13 +114,13 @@ impl LensMaps {
 
     fn undistorted_depth(&self, depth: &DepthImage) -> Result<Vec<f32>, kinematics::Error> {
         let Some(color) = &self.color else { return Ok(depth.depth_m.clone()) };
-        let wanted_px = depth.intrinsics.size_px;
-        if color.size_px() == wanted_px {
+        let size_px = depth.intrinsics.size_px;
+        if color.size_px() == size_px {
             return color.apply_depth(&depth.depth_m);
         }
-        let kept = self.depth.get_or_init(|| Undistortion::new(&depth.intrinsics));
-        match kept.size_px() == wanted_px {
-            true => kept.apply_depth(&depth.depth_m),
+        let cached = self.depth.get_or_init(|| Undistortion::new(&depth.intrinsics));
+        match cached.size_px() == size_px {
+            true => cached.apply_depth(&depth.depth_m),
             false => Undistortion::new(&depth.intrinsics).apply_depth(&depth.depth_m),
         }
     }
@@ -137,7 +142,7 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::R
     let depth = depth.transpose()?;
     let rgba = lens.undistorted_color(images.rgba_srgb).with_context(in_frame)?;
     let scaled = frame.intrinsics.scaled(scale_frac);
-    let rgba = shrink::rgba(rgba, frame.intrinsics.size_px, scaled.size_px);
+    let rgba = downscale::rgba(rgba, frame.intrinsics.size_px, scaled.size_px);
     let keyframe = Keyframe {
         camera: CAMERA.into(),
         stamp: frame.stamp,

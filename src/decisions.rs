@@ -4,7 +4,7 @@
 
 use crate::exit::BadArgument;
 use crate::fingerprint;
-use crate::join::{split_name, split_named};
+use crate::join::{split_from_name, split_name};
 use anyhow::{Context, anyhow};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -18,7 +18,7 @@ use std::thread::JoinHandle;
 use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 
-const VERSION: u64 = 1;
+const VERSION: u64 = 2;
 /// Name of the log in the folder of a run.
 const FILE: &str = "decisions.jsonl";
 /// Decisions that may wait for the disk; when so many do, training waits too.
@@ -45,7 +45,7 @@ pub(crate) struct Settings {
 }
 
 /// What settles a training beside its data.
-pub(crate) struct About<'a> {
+pub(crate) struct RunDescription<'a> {
     pub(crate) method: &'a str,
     pub(crate) data: Option<&'a Path>,
     pub(crate) adapter: String,
@@ -56,24 +56,24 @@ pub(crate) struct About<'a> {
 }
 
 impl Settings {
-    pub(crate) fn new(about: About<'_>) -> Self {
+    pub(crate) fn new(description: RunDescription<'_>) -> Self {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         Self {
             version: VERSION,
-            method: about.method.to_owned(),
-            data: about.data.and_then(name),
-            adapter: about.adapter,
-            scale: about.scale,
-            depth_from: about.depth_from,
-            from_step: about.from_step,
-            options: about.options,
+            method: description.method.to_owned(),
+            data: description.data.and_then(name),
+            adapter: description.adapter,
+            scale: description.scale,
+            depth_from: description.depth_from,
+            from_step: description.from_step,
+            options: description.options,
         }
     }
 }
 
 impl Settings {
     /// The settings of a run that continues from a checkpoint after this many updates, or restarts.
-    pub(crate) fn after(&self, from_step: Option<u64>) -> Self {
+    pub(crate) fn continued_from(&self, from_step: Option<u64>) -> Self {
         Self { from_step, ..self.clone() }
     }
 }
@@ -92,7 +92,7 @@ pub(crate) struct Entry {
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Decision {
     /// The checkpoint that this went on from had learned from it.
-    Had(Pushed),
+    Restored(Pushed),
     /// A keyframe came.
     Push(Pushed),
     /// A keyframe went.
@@ -118,7 +118,7 @@ pub(crate) struct Pushed {
     /// What its poses were multiplied by from the left, where the base's stand was estimated anew: a translation in metres, then
     /// a quaternion with its real part last.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    world_from_told: Option<[f64; 7]>,
+    map_from_odom: Option<[f64; 7]>,
 }
 
 /// A keyframe that went.
@@ -154,25 +154,25 @@ impl Pushed {
             stamp_nanos: keyframe.stamp.0,
             split: split_name(keyframe.split).to_owned(),
             fingerprint: fingerprint_of(keyframe),
-            world_from_told: keyframe.base.as_ref().map(|base| base.world_from_told).filter(is_motion).map(numbers),
+            map_from_odom: keyframe.base.as_ref().map(|base| base.map_from_odom).filter(is_motion).map(numbers),
         }
     }
 
     /// The keyframe as it came, from the one that the base's source places.
-    pub(crate) fn placed(&self, told: &Arc<Keyframe>) -> Arc<Keyframe> {
-        match self.world_from_told {
-            Some(numbers) => Arc::new(told.carried(&motion(numbers))),
-            None => told.clone(),
+    pub(crate) fn corrected(&self, expected_error: &Arc<Keyframe>) -> Arc<Keyframe> {
+        match self.map_from_odom {
+            Some(numbers) => Arc::new(expected_error.with_base_correction(&motion(numbers))),
+            None => expected_error.clone(),
         }
     }
 
     /// What it was for; known from the moment the log is read.
     pub(crate) fn split(&self) -> Option<Split> {
-        split_named(&self.split)
+        split_from_name(&self.split)
     }
 
     /// Whether a keyframe has the same pixels, depth, lens, pose and velocity.
-    pub(crate) fn is_like(&self, keyframe: &Keyframe) -> bool {
+    pub(crate) fn matches(&self, keyframe: &Keyframe) -> bool {
         self.fingerprint == fingerprint_of(keyframe)
     }
 }
@@ -198,10 +198,10 @@ fn fingerprint_of(keyframe: &Keyframe) -> String {
 
 /// What training did since the last decision that was written, as far as it matters for the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Since {
+enum Activity {
     Nothing,
     Seeded,
-    Begun,
+    Training,
 }
 
 /// A log being written, on a thread of its own: neither a slow disk nor a large image holds training up.
@@ -209,14 +209,14 @@ pub(crate) struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
     last_step: Option<u64>,
-    since: Since,
+    activity: Activity,
 }
 
 enum Line {
     Settings(Box<Settings>),
     /// Its fingerprint takes a while.
     Push(u64, Arc<Keyframe>),
-    Had(u64, Arc<Keyframe>),
+    Restored(u64, Arc<Keyframe>),
     Entry(Entry),
 }
 
@@ -235,46 +235,46 @@ impl DecisionLog {
             lines.into_iter().try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
         });
         let thread = thread.context("cannot start a thread")?;
-        let mut log = Self { sender, thread, last_step: None, since: Since::Nothing };
+        let mut log = Self { sender, thread, last_step: None, activity: Activity::Nothing };
         log.write(Line::Settings(Box::new(settings)));
         Ok(log)
     }
 
-    pub(crate) fn had(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
-        self.write(Line::Had(step, keyframe.clone()));
+    pub(crate) fn restored(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
+        self.write(Line::Restored(step, keyframe.clone()));
     }
 
     pub(crate) fn pushed(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
-        self.come_to(step);
+        self.log_activity(step);
         self.write(Line::Push(step, keyframe.clone()));
     }
 
     pub(crate) fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
-        self.come_to(step);
-        let gone = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
-        self.write(Line::Entry(Entry { step, decision: Decision::Remove(gone) }));
+        self.log_activity(step);
+        let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
+        self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
     }
 
     /// Somebody looked at the model.
     pub(crate) fn seeded(&mut self) {
-        if self.since == Since::Nothing {
-            self.since = Since::Seeded;
+        if self.activity == Activity::Nothing {
+            self.activity = Activity::Seeded;
         }
     }
 
     /// Training was asked for steps.
-    pub(crate) fn begun(&mut self) {
-        self.since = Since::Begun;
+    pub(crate) fn step_requested(&mut self) {
+        self.activity = Activity::Training;
     }
 
     pub(crate) fn checkpoint(&mut self, step: u64) {
-        self.come_to(step);
+        self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
     }
 
     /// Ends the log; an error says why it is not whole.
     pub(crate) fn end(mut self, step: u64) -> anyhow::Result<()> {
-        self.come_to(step);
+        self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
         drop(self.sender);
         let written = self.thread.join().map_err(|_| anyhow!("the thread of the log panicked: this is a bug"))?;
@@ -282,19 +282,19 @@ impl DecisionLog {
     }
 
     /// Ends the log as that of a run that is killed; all that was decided so far is written when this returns.
-    pub(crate) fn break_off(self) {
+    pub(crate) fn close_unfinished(self) {
         drop(self.sender);
         let _ = self.thread.join(); // A log that is not whole is one that was cut off earlier.
     }
 
     /// Writes down what happened between two decisions where no update tells it.
-    fn come_to(&mut self, step: u64) {
-        let between = match std::mem::replace(&mut self.since, Since::Nothing) {
-            Since::Seeded => Some(Decision::Seed(True)),
-            Since::Begun => Some(Decision::Begin(True)),
-            Since::Nothing => None,
+    fn log_activity(&mut self, step: u64) {
+        let pending = match std::mem::replace(&mut self.activity, Activity::Nothing) {
+            Activity::Seeded => Some(Decision::Seed(True)),
+            Activity::Training => Some(Decision::Begin(True)),
+            Activity::Nothing => None,
         };
-        if let Some(decision) = between
+        if let Some(decision) = pending
             && self.last_step == Some(step)
         {
             self.write(Line::Entry(Entry { step, decision }));
@@ -315,8 +315,8 @@ impl Line {
             Self::Push(step, keyframe) => {
                 serde_json::to_string(&Entry { step, decision: Decision::Push(Pushed::of(&keyframe)) })
             }
-            Self::Had(step, keyframe) => {
-                serde_json::to_string(&Entry { step, decision: Decision::Had(Pushed::of(&keyframe)) })
+            Self::Restored(step, keyframe) => {
+                serde_json::to_string(&Entry { step, decision: Decision::Restored(Pushed::of(&keyframe)) })
             }
             Self::Entry(entry) => serde_json::to_string(&entry),
         }?;
@@ -340,46 +340,47 @@ impl Decisions {
     }
 
     /// Whether it tells how training ended; a run that was killed wrote no end.
-    pub(crate) fn is_whole(&self) -> bool {
+    pub(crate) fn is_complete(&self) -> bool {
         self.entries.last().is_some_and(|entry| entry.decision == Decision::End(True))
     }
 
     /// The keyframes it names, in order.
     pub(crate) fn pushed(&self) -> impl Iterator<Item = &Pushed> {
         self.entries.iter().filter_map(|entry| match &entry.decision {
-            Decision::Had(pushed) | Decision::Push(pushed) => Some(pushed),
+            Decision::Restored(pushed) | Decision::Push(pushed) => Some(pushed),
             _ => None,
         })
     }
 
     fn parse(text: &str) -> anyhow::Result<Self> {
-        let wrong = |reason: String| anyhow::Error::new(BadArgument(reason));
+        let invalid = |reason: String| anyhow::Error::new(BadArgument(reason));
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
-        let about: serde_json::Value = serde_json::from_str(first).map_err(|e| wrong(format!("line 1: {e}")))?;
-        match about["version"].as_u64() {
+        let description: serde_json::Value =
+            serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
+        match description["version"].as_u64() {
             Some(VERSION) => {}
-            Some(other) => return Err(wrong(format!("it is of version {other}, this program reads {VERSION}"))),
-            None => return Err(wrong("line 1 tells no version".to_owned())),
+            Some(other) => return Err(invalid(format!("it is of version {other}, this program reads {VERSION}"))),
+            None => return Err(invalid("line 1 tells no version".to_owned())),
         }
-        let settings = serde_json::from_value(about).map_err(|e| wrong(format!("line 1: {e}")))?;
+        let settings = serde_json::from_value(description).map_err(|e| invalid(format!("line 1: {e}")))?;
         let mut entries: Vec<Entry> = Vec::new();
         for (line, number) in lines {
             if !line.ends_with('\n') {
                 break; // A line that was being written when the run was killed.
             }
-            let entry: Entry = serde_json::from_str(line).map_err(|e| wrong(format!("line {number}: {e}")))?;
+            let entry: Entry = serde_json::from_str(line).map_err(|e| invalid(format!("line {number}: {e}")))?;
             let before = entries.last();
             if before.is_some_and(|before| before.decision == Decision::End(True)) {
-                return Err(wrong(format!("line {number} comes after the end")));
+                return Err(invalid(format!("line {number} comes after the end")));
             }
             if before.is_some_and(|before| before.step > entry.step) {
-                return Err(wrong(format!("line {number}: step {} comes after a later one", entry.step)));
+                return Err(invalid(format!("line {number}: step {} comes after a later one", entry.step)));
             }
-            if let Decision::Had(pushed) | Decision::Push(pushed) = &entry.decision
+            if let Decision::Restored(pushed) | Decision::Push(pushed) = &entry.decision
                 && pushed.split().is_none()
             {
-                return Err(wrong(format!("line {number}: {:?} is not train, selection or test", pushed.split)));
+                return Err(invalid(format!("line {number}: {:?} is not train, selection or test", pushed.split)));
             }
             entries.push(entry);
         }
@@ -393,7 +394,7 @@ mod tests {
     use kinematics::Transform;
 
     fn settings(from_step: Option<u64>) -> Settings {
-        Settings::new(About {
+        Settings::new(RunDescription {
             method: "splat",
             data: Some(Path::new("somewhere/scan.mcap")),
             adapter: "llvmpipe".to_owned(),
@@ -430,24 +431,24 @@ mod tests {
         log.pushed(0, &keyframe(17, Split::Test));
         log.seeded();
         log.pushed(0, &keyframe(18, Split::Train));
-        log.begun();
-        log.pushed(0, &keyframe(19, Split::Selection));
-        log.begun();
+        log.step_requested();
+        log.pushed(0, &keyframe(19, Split::Validation));
+        log.step_requested();
         log.seeded();
         log.removed(40, "wrist", Stamp(17));
         log.checkpoint(40);
-        log.begun();
+        log.step_requested();
         log.end(60).expect("room on the disk");
         std::fs::read_to_string(folder.join(FILE)).expect("the log")
     }
 
     #[test]
-    fn what_is_written_is_read_and_nothing_of_it_is_a_time_or_a_path() {
+    fn log_round_trips_without_times_or_paths() {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         let read = Decisions::load(&folder.path().join(FILE)).expect("a log");
         assert_eq!(read.settings, settings(None));
-        let told: Vec<(u64, String)> = text
+        let expected_error: Vec<(u64, String)> = text
             .lines()
             .skip(1)
             .zip(&read.entries)
@@ -468,24 +469,24 @@ mod tests {
             (40, "checkpoint"),
             (60, "end"),
         ];
-        assert_eq!(told, expected.map(|(step, what)| (step, what.to_owned())));
-        assert!(read.is_whole());
+        assert_eq!(expected_error, expected.map(|(step, what)| (step, what.to_owned())));
+        assert!(read.is_complete());
         let pushed: Vec<_> = read.pushed().map(|pushed| (pushed.stamp_nanos, pushed.split())).collect();
-        assert_eq!(pushed, [(17, Some(Split::Test)), (18, Some(Split::Train)), (19, Some(Split::Selection))]);
+        assert_eq!(pushed, [(17, Some(Split::Test)), (18, Some(Split::Train)), (19, Some(Split::Validation))]);
         let first = read.pushed().next().expect("one");
-        assert!(first.is_like(&keyframe(17, Split::Train)), "a split is no part of the image");
+        assert!(first.matches(&keyframe(17, Split::Train)), "a split is no part of the image");
         let mut other = keyframe(17, Split::Test).as_ref().clone();
         other.rgba_srgb = vec![1, 2, 4, 255].into();
-        assert!(!first.is_like(&other));
+        assert!(!first.matches(&other));
         assert!(text.contains("\"data\":\"scan.mcap\"") && !text.contains("somewhere") && !text.contains("secs\":"));
     }
 
     #[test]
-    fn a_log_from_a_checkpoint_spares_the_one_before() {
+    fn log_from_a_checkpoint_leaves_the_earlier_log_intact() {
         let folder = tempfile::tempdir().expect("a folder");
         let before = written(folder.path());
         let mut log = DecisionLog::create(folder.path(), settings(Some(130))).expect("a log");
-        log.had(130, &keyframe(18, Split::Train));
+        log.restored(130, &keyframe(18, Split::Train));
         log.end(260).expect("room on the disk");
         let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
         assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
@@ -493,25 +494,25 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_was_cut_off_holds_what_was_whole() {
+    fn truncated_log_keeps_complete_lines() {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         let lines = text.lines().count();
-        let cut = |n_bytes: usize| Decisions::parse(&text[..n_bytes]).expect("a log");
+        let parse_prefix = |n_bytes: usize| Decisions::parse(&text[..n_bytes]).expect("a log");
         let ended = text.trim_end().rfind('\n').expect("lines") + 1;
         for n_bytes in [ended, ended + 5, text.len() - 1] {
-            let read = cut(n_bytes);
-            assert!(!read.is_whole() && read.entries.len() == lines - 2, "{n_bytes}: {:?}", read.entries);
+            let read = parse_prefix(n_bytes);
+            assert!(!read.is_complete() && read.entries.len() == lines - 2, "{n_bytes}: {:?}", read.entries);
         }
-        assert!(cut(text.find('\n').expect("a line") + 1).entries.is_empty());
+        assert!(parse_prefix(text.find('\n').expect("a line") + 1).entries.is_empty());
         assert!(Decisions::parse(&text[..9]).is_err(), "without settings there is nothing");
     }
 
     #[test]
-    fn what_makes_no_sense_is_named_with_its_line() {
+    fn invalid_lines_are_reported_with_line_number() {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
-        for (was, is, told) in [
+        for (was, is, expected_error) in [
             ("\"version\":1", "\"version\":9", "version 9, this program reads 1"),
             ("\"version\"", "\"varsion\"", "line 1 tells no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
@@ -523,7 +524,7 @@ mod tests {
         ] {
             assert!(text.contains(was), "{was}");
             let error = format!("{:#}", Decisions::parse(&text.replace(was, is)).expect_err(is));
-            assert!(error.contains(told), "{error}");
+            assert!(error.contains(expected_error), "{error}");
         }
     }
 }

@@ -4,27 +4,27 @@ use crate::exit::BadArgument;
 use kinematics::Intrinsics;
 
 /// Images are shrunk at most to this many pixels along a side: below, nothing is left to learn from.
-const LEAST_SIDE_PX: u32 = 16;
+const MIN_SIDE_PX: u32 = 16;
 /// Shares of the width and height that are allowed.
-const SHARES: std::ops::RangeInclusive<f64> = 0.05..=1.0;
+const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
 
 /// The value of `--scale`.
-pub(crate) fn share(text: &str) -> Result<f64, String> {
-    let share = text.parse::<f64>().ok().filter(|share| SHARES.contains(share));
-    share.ok_or_else(|| format!("must be a number from {} to {}", SHARES.start(), SHARES.end()))
+pub(crate) fn parse_scale(text: &str) -> Result<f64, String> {
+    let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
+    share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
 }
 
 /// The lens of images shrunk to `share` of their width and height; refuses what would become too small.
-pub(crate) fn lens(full: &Intrinsics, share: f64) -> Result<Intrinsics, BadArgument> {
-    let shrunk = full.scaled(share);
-    if shrunk.size_px != full.size_px && shrunk.size_px.iter().any(|side| *side < LEAST_SIDE_PX) {
-        let [[from_width, from_height], [width, height]] = [full.size_px, shrunk.size_px];
+pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, BadArgument> {
+    let scaled = full.scaled(share);
+    if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
+        let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
         return Err(BadArgument(format!(
             "scale {share}: images of {from_width}x{from_height} pixels would have {width}x{height}, \
-             at least {LEAST_SIDE_PX} along each side are needed"
+             at least {MIN_SIDE_PX} along each side are needed"
         )));
     }
-    Ok(shrunk)
+    Ok(scaled)
 }
 
 /// An image at its new size, `[height, width, 4]`: nothing to do where the size stays.
@@ -67,9 +67,12 @@ fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
     let ratio = f64::from(from) / f64::from(to);
     let covered = |ix: u32| {
         let (start, end) = (f64::from(ix) * ratio, (f64::from(ix + 1) * ratio).min(f64::from(from)));
-        let overlap = |old: usize| ((old as f64 + 1.0).min(end) - (old as f64).max(start)) / ratio;
-        let olds = start as usize..(end.ceil() as usize).min(from as usize);
-        olds.map(|old| (old, overlap(old) as f32)).filter(|(_, share)| *share > 1e-6).collect()
+        let overlap = |source_ix: usize| ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio;
+        let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
+        source_pixels
+            .map(|source_ix| (source_ix, overlap(source_ix) as f32))
+            .filter(|(_, share)| *share > 1e-6)
+            .collect()
     };
     (0..to).map(covered).collect()
 }
@@ -80,17 +83,17 @@ mod tests {
     use kinematics::Lens;
 
     #[test]
-    fn fractions_of_pixels_count_by_their_area() {
+    fn partial_pixels_are_weighted_by_area() {
         let shares = coverage(5, 2);
         assert_eq!(shares[0], [(0, 0.4), (1, 0.4), (2, 0.2)]);
         assert_eq!(shares[1], [(2, 0.2), (3, 0.4), (4, 0.4)]);
     }
 
     #[test]
-    fn shares_have_bounds_and_images_a_least_size() {
-        assert_eq!(share("0.05"), Ok(0.05));
-        for wrong in ["0", "0.049", "1.01", "nan", "-1", "half"] {
-            assert!(share(wrong).is_err_and(|told| told.contains("0.05 to 1")), "{wrong}");
+    fn scale_and_image_size_are_bounded() {
+        assert_eq!(parse_scale("0.05"), Ok(0.05));
+        for invalid in ["0", "0.049", "1.01", "nan", "-1", "half"] {
+            assert!(parse_scale(invalid).is_err_and(|message| message.contains("0.05 to 1")), "{invalid}");
         }
         let full = Intrinsics {
             size_px: [160, 120],
@@ -99,11 +102,11 @@ mod tests {
             lens: Lens::Pinhole,
             rectified: true,
         };
-        let half = lens(&full, 0.5).expect("large enough");
+        let half = intrinsics(&full, 0.5).expect("large enough");
         assert_eq!((half.size_px, half.focal_px, half.principal_px), ([80, 60], [50.0; 2], [40.0, 30.5]));
-        let told = lens(&full, 0.1).expect_err("12 rows").to_string();
-        assert!(told.contains("160x120") && told.contains("16x12"), "{told}");
+        let message = intrinsics(&full, 0.1).expect_err("12 rows").to_string();
+        assert!(message.contains("160x120") && message.contains("16x12"), "{message}");
         let small = Intrinsics { size_px: [8, 6], ..full };
-        assert_eq!(lens(&small, 1.0).expect("as it is"), small);
+        assert_eq!(intrinsics(&small, 1.0).expect("as it is"), small);
     }
 }

@@ -10,7 +10,7 @@ use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
-use trainer::splat::PosedLens;
+use trainer::splat::CalibratedCamera;
 use trainer::{DepthMap, Keyframe, Method, Picture, Projection, RenderRequest};
 
 /// Names the weights of LPIPS where no flag does.
@@ -21,17 +21,17 @@ const NEAR_M: f64 = 0.01;
 const FAR_M: f64 = 1000.0;
 
 /// A pixel that a model covers by less shows nothing of it.
-pub(crate) const LEAST_ALPHA: u8 = 128;
+pub(crate) const MIN_ALPHA: u8 = 128;
 /// A model that covers less of what is looked at is hardly of that place.
-pub(crate) const LEAST_SEEN_FRAC: f64 = 0.05;
+pub(crate) const MIN_COVERED_FRAC: f64 = 0.05;
 /// What to ask then.
-pub(crate) const OTHER_PLACE: &str = "are both of one place, in one world frame?";
+pub(crate) const CHECK_SAME_SCENE: &str = "are both of one place, in one world frame?";
 
 /// Which scores are wanted.
 #[derive(Clone)]
 pub(crate) struct Evaluator {
     /// Everything there is; else PSNR only.
-    all: bool,
+    is_full: bool,
     /// Absent without weights.
     lpips: Option<Arc<Lpips>>,
 }
@@ -61,7 +61,7 @@ pub(crate) struct ImageScores {
     pub(crate) psnr_ceiling: Option<f64>,
     /// Share of its pixels that the model covers; `None` if the picture stayed on the GPU.
     #[serde(skip)]
-    pub(crate) seen_frac: Option<f64>,
+    pub(crate) covered_frac: Option<f64>,
 }
 
 /// Means over the test images. `None` is not known, never zero.
@@ -89,17 +89,17 @@ impl Evaluator {
     pub(crate) fn thorough(lpips_weights: Option<&Path>) -> anyhow::Result<Self> {
         let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
         let lpips = lpips_weights.or(named.as_deref()).map(Lpips::load).transpose()?;
-        Ok(Self { all: true, lpips: lpips.map(Arc::new) })
+        Ok(Self { is_full: true, lpips: lpips.map(Arc::new) })
     }
 
     /// PSNR and no more: one render an image.
     pub(crate) fn psnr_only() -> Self {
-        Self { all: false, lpips: None }
+        Self { is_full: false, lpips: None }
     }
 
     /// Scores one test keyframe.
     pub(crate) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
-        if !self.all
+        if !self.is_full
             && self.lpips.is_none()
             && let Some(psnr) = psnr_on_gpu(method, keyframe)?
         {
@@ -114,24 +114,24 @@ impl Evaluator {
                 surface_within_5_mm: None,
                 psnr_truth: None,
                 psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
-                seen_frac: None,
+                covered_frac: None,
             });
         }
         let drawn = draw(method, keyframe, false)?;
         let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
-        let depth = if self.all { depth_error(method, keyframe)? } else { DepthError::default() };
+        let depth = if self.is_full { depth_error(method, keyframe)? } else { DepthError::default() };
         Ok(ImageScores {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
             psnr: psnr(&pair)?,
-            ssim: self.all.then(|| ssim(&pair)).transpose()?,
+            ssim: self.is_full.then(|| ssim(&pair)).transpose()?,
             lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
             depth_rmse_m: depth.rmse_m,
             surface_error_m: depth.surface.and_then(|surface| surface.mean_m),
             surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
-            psnr_truth: if self.all { truth_score(method, keyframe)? } else { None },
+            psnr_truth: if self.is_full { truth_score(method, keyframe)? } else { None },
             psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
-            seen_frac: Some(seen_frac(&drawn)),
+            covered_frac: Some(covered_frac(&drawn)),
         })
     }
 
@@ -195,18 +195,18 @@ impl Display for Scores {
 }
 
 /// Share of a picture's pixels that the model covers.
-pub(crate) fn seen_frac(picture: &Picture) -> f64 {
+pub(crate) fn covered_frac(picture: &Picture) -> f64 {
     let pixels = picture.rgba_srgb.as_chunks::<4>().0;
-    let n_seen = pixels.iter().filter(|[.., alpha]| *alpha >= LEAST_ALPHA).count();
-    n_seen as f64 / pixels.len().max(1) as f64
+    let n_covered = pixels.iter().filter(|[.., alpha]| *alpha >= MIN_ALPHA).count();
+    n_covered as f64 / pixels.len().max(1) as f64
 }
 
 /// Says when a model covers next to nothing of pictures, from the share of each that it covers.
-pub(crate) fn warn_of_other_place(seen_fracs: &[f64]) {
-    let seen_frac = seen_fracs.iter().sum::<f64>() / seen_fracs.len().max(1) as f64;
-    if seen_frac < LEAST_SEEN_FRAC {
-        let views = print::counted(seen_fracs.len() as u64, "view");
-        log::warn!("the model covers {:.1} % of {views}; {OTHER_PLACE}", 100.0 * seen_frac);
+pub(crate) fn warn_if_hardly_covered(covered_fracs: &[f64]) {
+    let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
+    if covered_frac < MIN_COVERED_FRAC {
+        let views = print::counted(covered_fracs.len() as u64, "view");
+        log::warn!("the model covers {:.1} % of {views}; {CHECK_SAME_SCENE}", 100.0 * covered_frac);
     }
 }
 
@@ -222,10 +222,10 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 
 /// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
 pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
-    let lens = method.posed_lens(keyframe)?;
+    let lens = method.calibrated_camera(keyframe)?;
     let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
     if lens.gains != [1.0; 3] {
-        let by_byte = lens.gains.map(exposed);
+        let by_byte = lens.gains.map(gain_table);
         for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
             for (color, table) in [red, green, blue].into_iter().zip(&by_byte) {
                 *color = table[usize::from(*color)];
@@ -238,18 +238,18 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) ->
 /// PSNR of the picture that [`draw`] draws against the image of the keyframe, without reading the picture back: the same bits.
 /// `None` if the method cannot do that, or if the picture is brightened after it is drawn.
 fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
-    let lens = method.posed_lens(keyframe)?;
+    let lens = method.calibrated_camera(keyframe)?;
     if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
 }
 
 /// The picture a model shows where a keyframe's depth was taken, of the size and lens of `depth`: the keyframe's, or every so manieth
 /// reading of it. `None` for a keyframe without depth.
-pub(crate) fn draw_depth(
+pub(crate) fn render_depth(
     method: &mut dyn Method,
     keyframe: &Keyframe,
     depth: &DepthMap,
 ) -> Result<Option<Picture>, trainer::Error> {
-    let lens = method.posed_lens(keyframe)?;
+    let lens = method.calibrated_camera(keyframe)?;
     let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
     let drawn = method.render(&RenderRequest {
         world_from_camera: lens.world_from_camera * color_from_depth,
@@ -264,11 +264,11 @@ pub(crate) fn draw_depth(
 
 /// What each value of a color becomes when multiplied.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
-fn exposed(gain: f64) -> [u8; 256] {
+fn gain_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|value| (gain * value as f64).round().clamp(0.0, 255.0) as u8)
 }
 
-fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
+fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     RenderRequest {
         world_from_camera: lens.world_from_camera,
         size_px: keyframe.size_px,
@@ -278,7 +278,7 @@ fn request(keyframe: &Keyframe, lens: &PosedLens) -> RenderRequest {
         far_m: FAR_M,
         crop: None,
         background_srgb: [0.0; 3],
-        light_of: Some((keyframe.camera.clone(), keyframe.stamp)),
+        appearance_of: Some((keyframe.camera.clone(), keyframe.stamp)),
         depth: false,
     }
 }
@@ -291,11 +291,11 @@ struct DepthError {
 }
 
 fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
-    let Some(whole) = &keyframe.depth else { return Ok(DepthError::default()) };
+    let Some(full) = &keyframe.depth else { return Ok(DepthError::default()) };
     let stride = method.depth_stride();
-    let thin = (stride > 1).then(|| whole.every(stride));
-    let depth = thin.as_ref().unwrap_or(whole);
-    let Some(drawn) = draw_depth(method, keyframe, depth)? else { return Ok(DepthError::default()) };
+    let subsampled = (stride > 1).then(|| full.subsampled(stride));
+    let depth = subsampled.as_ref().unwrap_or(full);
+    let Some(drawn) = render_depth(method, keyframe, depth)? else { return Ok(DepthError::default()) };
     Ok(DepthError {
         rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
         surface: surface_error(&drawn.depth_m, depth)?,
@@ -305,7 +305,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<D
 /// The noise-free image has no shear, and is seen from the true pose.
 fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
-    let lens = PosedLens { world_from_camera: truth.world_from_camera, ..method.posed_lens(keyframe)? };
+    let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
     let at_truth = RenderRequest { shutter: None, ..request(keyframe, &lens) };
     let drawn = method.render(&at_truth)?;
     Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
@@ -327,18 +327,18 @@ mod tests {
             surface_within_5_mm: None,
             psnr_truth: None,
             psnr_ceiling: None,
-            seen_frac: Some(1.0),
+            covered_frac: Some(1.0),
         }
     }
 
     #[test]
-    fn pixels_are_seen_where_the_model_covers_them_by_half() {
-        let rgba_srgb = [0, LEAST_ALPHA - 1, LEAST_ALPHA, 255].into_iter().flat_map(|alpha| [9, 9, 9, alpha]).collect();
-        assert_eq!(seen_frac(&Picture { size_px: [2, 2], rgba_srgb, depth_m: vec![0.0; 4] }), 0.5);
+    fn pixels_count_as_covered_from_half_alpha() {
+        let rgba_srgb = [0, MIN_ALPHA - 1, MIN_ALPHA, 255].into_iter().flat_map(|alpha| [9, 9, 9, alpha]).collect();
+        assert_eq!(covered_frac(&Picture { size_px: [2, 2], rgba_srgb, depth_m: vec![0.0; 4] }), 0.5);
     }
 
     #[test]
-    fn means_leave_out_what_is_not_known() {
+    fn means_skip_unknown_scores() {
         let scores = Scores::mean(&[image("wrist", 20.0, Some(0.5)), image("wrist", 30.0, None)]);
         assert_eq!((scores.psnr, scores.lpips, scores.ssim), (Some(25.0), Some(0.5), None));
         assert!(scores.psnr_per_camera.is_empty(), "one camera has no share to tell");
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn several_cameras_are_told_apart() {
+    fn psnr_is_reported_per_camera() {
         let scores =
             Scores::mean(&[image("wrist", 20.0, None), image("front", 30.0, None), image("wrist", 22.0, None)]);
         assert_eq!(scores.psnr, Some(24.0));

@@ -2,22 +2,22 @@
 
 /// The next mark, and those after it.
 #[derive(Clone, Debug)]
-pub(crate) struct Marks {
+pub(crate) struct EvaluationSchedule {
     next_secs: f64,
 }
 
-impl Default for Marks {
+impl Default for EvaluationSchedule {
     fn default() -> Self {
         Self { next_secs: 0.25 }
     }
 }
 
-impl Marks {
+impl EvaluationSchedule {
     /// Whether a mark was reached at `secs`; several passed at once count as one.
     pub(crate) fn reached(&mut self, secs: f64) -> bool {
         let mut reached = false;
         while secs >= self.next_secs {
-            self.next_secs = after(self.next_secs);
+            self.next_secs = next_after(self.next_secs);
             reached = true;
         }
         reached
@@ -31,14 +31,14 @@ pub(crate) fn latest(secs: f64) -> Option<f64> {
 
 /// The marks up to `secs`.
 pub(crate) fn up_to(secs: f64) -> impl Iterator<Item = f64> {
-    let first = Marks::default().next_secs;
-    std::iter::successors(Some(first), |mark_secs| Some(after(*mark_secs)))
-        .take_while(move |mark_secs| *mark_secs <= secs)
+    let first = EvaluationSchedule::default().next_secs;
+    std::iter::successors(Some(first), |evaluation_secs| Some(next_after(*evaluation_secs)))
+        .take_while(move |evaluation_secs| *evaluation_secs <= secs)
 }
 
 /// Doubles, and turns from seconds to whole minutes between 32 s and 60 s.
-fn after(mark_secs: f64) -> f64 {
-    if mark_secs == 32.0 { 60.0 } else { 2.0 * mark_secs }
+fn next_after(evaluation_secs: f64) -> f64 {
+    if evaluation_secs == 32.0 { 60.0 } else { 2.0 * evaluation_secs }
 }
 
 #[cfg(test)]
@@ -46,23 +46,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_mark_comes_once() {
-        let mut marks = Marks::default();
-        let reached: Vec<f64> = (0..=4000).map(|n| f64::from(n) * 0.125).filter(|secs| marks.reached(*secs)).collect();
+    fn every_evaluation_time_is_reached_once() {
+        let mut schedule = EvaluationSchedule::default();
+        let reached: Vec<f64> =
+            (0..=4000).map(|n| f64::from(n) * 0.125).filter(|secs| schedule.reached(*secs)).collect();
         assert_eq!(reached, [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 120.0, 240.0, 480.0]);
     }
 
     #[test]
-    fn the_newest_mark_is_the_one_reached() {
+    fn latest_is_the_last_time_reached() {
         assert_eq!([0.2, 0.25, 0.3, 59.0, 61.0].map(latest), [None, Some(0.25), Some(0.25), Some(32.0), Some(60.0)]);
         assert_eq!(up_to(4.5).collect::<Vec<_>>(), [0.25, 0.5, 1.0, 2.0, 4.0]);
     }
 
     #[test]
-    fn marks_slept_through_count_once() {
-        let mut marks = Marks::default();
-        assert!(marks.reached(50.0));
-        assert!(!marks.reached(59.0));
-        assert!(marks.reached(60.0));
+    fn skipped_times_count_once() {
+        let mut schedule = EvaluationSchedule::default();
+        assert!(schedule.reached(50.0));
+        assert!(!schedule.reached(59.0));
+        assert!(schedule.reached(60.0));
     }
 }

@@ -23,8 +23,8 @@ pub(crate) enum Exit {
 
 impl Exit {
     /// A command that succeeded but could not print all of its output ends with a loss.
-    pub(crate) fn or_lost_output(self) -> Self {
-        if self == Self::Done && print::lost_output() { Self::Loss } else { self }
+    pub(crate) fn or_output_loss(self) -> Self {
+        if self == Self::Done && print::has_lost_output() { Self::Loss } else { self }
     }
 }
 
@@ -42,7 +42,7 @@ pub(crate) struct BadArgument(pub(crate) String);
 /// What came in does not suffice for a result.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct LackOfEvidence(pub(crate) String);
+pub(crate) struct InsufficientData(pub(crate) String);
 
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
@@ -51,7 +51,7 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
     };
     if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>() || is_small_budget(cause)) {
         Exit::BadArguments
-    } else if error.chain().any(|cause| cause.is::<LackOfEvidence>()) {
+    } else if error.chain().any(|cause| cause.is::<InsufficientData>()) {
         Exit::Refused
     } else {
         Exit::Failed
@@ -59,11 +59,11 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
 }
 
 /// The exit code of a command that did what it could: each loss of data that was to be kept is told on stderr.
-pub(crate) fn after(losses: &[String]) -> Exit {
-    for loss in losses {
+pub(crate) fn from_losses(dropped_messages: &[String]) -> Exit {
+    for loss in dropped_messages {
         log::warn!("lost: {loss}");
     }
-    if losses.is_empty() { Exit::Done } else { Exit::Loss }
+    if dropped_messages.is_empty() { Exit::Done } else { Exit::Loss }
 }
 
 /// Whether reading or writing a file failed, for example on a full disk.
@@ -83,22 +83,22 @@ mod tests {
     use anyhow::Context;
 
     #[test]
-    fn bad_arguments_stay_so_under_context() {
+    fn bad_argument_keeps_its_code_under_context() {
         let error = anyhow::Error::new(BadArgument("unknown key".into())).context("rig file");
         assert_eq!(of(&error), Exit::BadArguments);
         assert_eq!(of(&anyhow::anyhow!("disk full")), Exit::Failed);
-        let budget = trainer::Error::BudgetTooSmall { model: "neural field", max_bytes: 1, least_bytes: 2 };
+        let budget = trainer::Error::BudgetTooSmall { model: "neural field", max_bytes: 1, min_bytes: 2 };
         assert_eq!(of(&anyhow::Error::new(budget).context("run")), Exit::BadArguments);
     }
 
     #[test]
-    fn any_loss_is_told_by_the_exit_code() {
-        assert_eq!(after(&[]), Exit::Done);
-        assert_eq!(after(&["1 image did not decode".into()]), Exit::Loss);
+    fn loss_sets_the_exit_code() {
+        assert_eq!(from_losses(&[]), Exit::Done);
+        assert_eq!(from_losses(&["1 image did not decode".into()]), Exit::Loss);
     }
 
     #[test]
-    fn only_a_closed_stdout_is_no_error() {
+    fn only_closed_stdout_is_not_an_error() {
         let closed = || std::io::Error::from(ErrorKind::BrokenPipe);
         assert!(is_broken_pipe(&crate::print::StdoutError(closed()).into()));
         assert!(!is_broken_pipe(&crate::print::StdoutError(ErrorKind::StorageFull.into()).into()));

@@ -11,14 +11,14 @@ use std::sync::Arc;
 use trainer::{DepthMap, Keyframe, Split};
 
 /// What readers assume where a file does not say: millimetres.
-const METRES_PER_COUNT: f64 = 0.001;
+const METERS_PER_COUNT: f64 = 0.001;
 /// Depth may be written as that of a photo when their lenses differ by less than this, in pixels of the depth image.
-const SAME_LENS_PX: f64 = 0.5;
+const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
 /// The test photos, one a line, as `--holdout` takes them.
 const TEST_LIST: &str = "test.txt";
 /// The lists of nerfstudio; its validation photos are our selection.
 const LISTS: [(&str, Split); 3] =
-    [("train_filenames", Split::Train), ("val_filenames", Split::Selection), ("test_filenames", Split::Test)];
+    [("train_filenames", Split::Train), ("val_filenames", Split::Validation), ("test_filenames", Split::Test)];
 
 /// The entries of a dataset folder.
 const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
@@ -32,7 +32,7 @@ pub(crate) struct Written {
     pub(crate) n_images: usize,
     pub(crate) n_depth: usize,
     /// Depth images left out because their lens is not that of their photo, which the format cannot say.
-    pub(crate) n_depth_left_out: usize,
+    pub(crate) n_depth_skipped: usize,
 }
 
 /// Writes a folder that must not hold a dataset yet; `transforms.json` comes last, so a folder that has it is whole.
@@ -40,8 +40,8 @@ pub(crate) struct Written {
 /// Depth is rounded to millimetres and ends at 65 m. Velocities, readout times and the truth of simulators have no place in it.
 pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
     let transforms = out.join(nerfstudio::FILE_NAME);
-    if let Some(there) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
-        bail!("{} already exists: name another folder", there.display());
+    if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
+        bail!("{} already exists: name another folder", existing.display());
     }
     let partial = Partial::folder(out, &ENTRIES);
     let mut written = Written::default();
@@ -53,14 +53,14 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
     }
     ensure!(!frames.is_empty(), "there is no keyframe to export");
 
-    let names = |wanted: Split| {
-        let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted);
+    let names = |wanted_split: Split| {
+        let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted_split);
         of_split.filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned)).collect::<Vec<_>>()
     };
     write_text(&out.join(TEST_LIST), &(names(Split::Test).join("\n") + "\n"))?;
     let mut document = Map::new();
     document.insert("camera_model".to_owned(), json!("PINHOLE"));
-    document.insert("depth_unit_scale_factor".to_owned(), json!(METRES_PER_COUNT));
+    document.insert("depth_unit_scale_factor".to_owned(), json!(METERS_PER_COUNT));
     document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
     // One camera stands once, at the top, where every reader looks; several stand with their frames.
     if cameras.iter().all(|camera| *camera == cameras[0]) {
@@ -100,7 +100,7 @@ fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow
             }
             written.n_depth += 1;
         }
-        Some(_) => written.n_depth_left_out += 1,
+        Some(_) => written.n_depth_skipped += 1,
         None => {}
     }
     Ok(frame)
@@ -127,9 +127,9 @@ fn opengl_rows(world_from_camera: &Transform) -> Value {
 fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
     (0..2).all(|axis| {
         let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
-        let focal_off = depth.focal_px[axis] - ratio * keyframe.focal_px[axis];
-        let principal_off = depth.principal_px[axis] - ratio * keyframe.principal_px[axis];
-        focal_off.abs() < SAME_LENS_PX && principal_off.abs() < SAME_LENS_PX
+        let focal_difference = depth.focal_px[axis] - ratio * keyframe.focal_px[axis];
+        let principal_difference = depth.principal_px[axis] - ratio * keyframe.principal_px[axis];
+        focal_difference.abs() < MAX_LENS_DIFFERENCE_PX && principal_difference.abs() < MAX_LENS_DIFFERENCE_PX
     })
 }
 
@@ -137,7 +137,7 @@ fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked first")]
 fn depth_counts(depth: &DepthMap) -> Vec<u8> {
     let count = |depth_m: &f32| {
-        let count = (f64::from(*depth_m) / METRES_PER_COUNT).round();
+        let count = (f64::from(*depth_m) / METERS_PER_COUNT).round();
         if (0.0..=f64::from(u16::MAX)).contains(&count) { count as u16 } else { 0 }
     };
     depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
@@ -165,8 +165,8 @@ mod tests {
 
     /// A keyframe of 32 x 24 pixels with depth.
     fn keyframe(ix: usize) -> Keyframe {
-        let turn = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
-        let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), turn);
+        let rotation = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
+        let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), rotation);
         let pixels = (0..24).flat_map(|y: u8| (0..32).flat_map(move |x: u8| [3 * x, y, 9, 255]));
         let depth = DepthMap {
             size_px: [16, 12],
@@ -208,10 +208,10 @@ mod tests {
         let mut masked = keyframes[3].rgba_srgb.to_vec();
         masked[7] = 0;
         keyframes[3].rgba_srgb = masked.into();
-        let later = Transform::translation(0.001, 0.0, 0.0) * keyframes[5].world_from_camera;
-        keyframes[5].depth.as_mut().unwrap().world_from_camera = later;
+        let moved_pose = Transform::translation(0.001, 0.0, 0.0) * keyframes[5].world_from_camera;
+        keyframes[5].depth.as_mut().unwrap().world_from_camera = moved_pose;
         let written = write_nerfstudio(&out, keyframes.iter().cloned().map(Arc::new)).unwrap();
-        assert_eq!(written, Written { n_images: 10, n_depth: 10, n_depth_left_out: 0 });
+        assert_eq!(written, Written { n_images: 10, n_depth: 10, n_depth_skipped: 0 });
         for (got, expected) in read_back(&out).iter().zip(&keyframes) {
             assert_eq!(
                 (got.size_px, got.focal_px, got.principal_px),
@@ -228,21 +228,21 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_two_sizes_stand_with_their_frames() {
+    fn different_cameras_are_written_per_frame() {
         let folder = tempfile::tempdir().unwrap();
         let (first, mut second) = (keyframe(1), keyframe(2));
         second.camera = "overview".into();
         second.size_px = [24, 32];
         second.depth.as_mut().unwrap().focal_px = [40.0, 40.0];
         let written = write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
-        assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_left_out: 1 });
+        assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_skipped: 1 });
         let sizes: Vec<_> =
             drivers::dataset::read(folder.path()).unwrap().frames.iter().map(|f| f.intrinsics.size_px).collect();
         assert_eq!(sizes, [[24, 32], [32, 24]]);
     }
 
     #[test]
-    fn nothing_is_overwritten_and_nothing_is_refused() {
+    fn existing_dataset_is_not_overwritten_and_empty_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
         write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();

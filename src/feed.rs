@@ -1,7 +1,7 @@
 //! The input side of a run: source, recorder, join and the stands of the base on a thread of their own, keyframes out of a bounded queue.
 
-use crate::join::{Join, JoinEvent, Seen};
-use crate::stands::Stands;
+use crate::join::{Join, JoinEvent, PosedImage};
+use crate::stations::Stations;
 use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
@@ -41,7 +41,7 @@ pub(crate) enum Change {
 struct Shared {
     first_image: OnceLock<Instant>,
     refused: Mutex<BTreeMap<String, u64>>,
-    broke_off: AtomicBool,
+    source_failed: AtomicBool,
 }
 
 /// What goes in.
@@ -49,18 +49,18 @@ pub(crate) struct Input {
     pub(crate) source: Box<dyn Source>,
     pub(crate) join: Join,
     /// Where the base walks.
-    pub(crate) stands: Option<Stands>,
+    pub(crate) stations: Option<Stations>,
     pub(crate) recorder: Option<Recorder>,
     /// Whether devices are read in real time; the stamps of a recording are from another time.
     pub(crate) is_live: bool,
     /// Focal length and principal point of every camera, pixels.
-    pub(crate) lenses: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
+    pub(crate) camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
 
 /// What is left when the input ended.
-pub(crate) struct Leftover {
+pub(crate) struct InputResult {
     pub(crate) join: Join,
-    pub(crate) stands: Option<Stands>,
+    pub(crate) stations: Option<Stations>,
     /// Why the input broke off, if it did.
     pub(crate) input_error: Option<drivers::Error>,
     /// Why the recording broke off, if it did.
@@ -71,7 +71,7 @@ pub(crate) struct Leftover {
 pub(crate) struct Feed {
     changes: Receiver<Change>,
     shared: Arc<Shared>,
-    thread: JoinHandle<Leftover>,
+    thread: JoinHandle<InputResult>,
     ended: bool,
 }
 
@@ -99,7 +99,7 @@ impl Feed {
     /// The next change, waiting for at most `timeout`; `None` when there is none yet or none will come any more.
     pub(crate) fn next(&mut self, timeout: Duration) -> Option<Change> {
         match self.changes.recv_timeout(timeout) {
-            Ok(change) => Some(change),
+            Ok(apply) => Some(apply),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => {
                 self.ended = true;
@@ -114,12 +114,12 @@ impl Feed {
     }
 
     /// Whether the source failed.
-    pub(crate) fn broke_off(&self) -> bool {
-        self.shared.broke_off.load(Ordering::Relaxed)
+    pub(crate) fn source_failed(&self) -> bool {
+        self.shared.source_failed.load(Ordering::Relaxed)
     }
 
     /// Ends the input and waits for its thread, which closes the recording.
-    pub(crate) fn finish(self) -> anyhow::Result<Leftover> {
+    pub(crate) fn finish(self) -> anyhow::Result<InputResult> {
         // A pump that waits to send is woken by this.
         drop(self.changes);
         self.thread.join().map_err(|_| anyhow!("the input thread panicked: this is a bug"))
@@ -135,18 +135,18 @@ struct Pump {
 }
 
 /// The trainer takes no more.
-struct Hangup;
+struct TrainerGone;
 
 impl Pump {
-    fn run(mut self) -> Leftover {
+    fn run(mut self) -> InputResult {
         let mut recording_error = None;
         let mut input_error = None;
-        while !self.stop.asked() {
+        while !self.stop.requested() {
             let sample = match self.input.source.next_sample() {
                 Ok(Some(sample)) => sample,
                 Ok(None) => break,
                 Err(error) => {
-                    self.shared.broke_off.store(true, Ordering::Relaxed);
+                    self.shared.source_failed.store(true, Ordering::Relaxed);
                     input_error = Some(error);
                     break;
                 }
@@ -164,27 +164,27 @@ impl Pump {
             let newest = sample.stamp();
             let events = self.input.join.push(sample);
             let newest = self.input.join.shifted(newest);
-            if self.forward(events).and_then(|()| self.pass_time(newest)).is_err() {
+            if self.forward(events).and_then(|()| self.advance_to(newest)).is_err() {
                 break;
             }
         }
         let events = self.input.join.finish();
         // A trainer that hung up needs no more keyframes.
-        let _ = self.forward(events).and_then(|()| self.let_go());
+        let _ = self.forward(events).and_then(|()| self.release_held());
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
         {
             recording_error = Some(anyhow!(error));
         }
-        Leftover { join: self.input.join, stands: self.input.stands, input_error, recording_error }
+        InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
     }
 
-    fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), Hangup> {
+    fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), TrainerGone> {
         for event in events {
             match event {
-                JoinEvent::Accepted(keyframe) => self.change(Change::Accepted(keyframe))?,
-                JoinEvent::Evicted { camera, stamp } => self.change(Change::Evicted { camera, stamp })?,
-                JoinEvent::Seen(seen) => self.show(&seen),
+                JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,
+                JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
+                JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
                 JoinEvent::Refused { why, .. } => {
                     *lock(&self.shared.refused).entry(why.name().to_owned()).or_default() += 1;
                 }
@@ -193,35 +193,35 @@ impl Pump {
         Ok(())
     }
 
-    fn change(&mut self, change: Change) -> Result<(), Hangup> {
-        let passed = match &mut self.input.stands {
-            Some(stands) => stands.push(change),
-            None => vec![change],
+    fn apply(&mut self, apply: Change) -> Result<(), TrainerGone> {
+        let forwarded = match &mut self.input.stations {
+            Some(stations) => stations.push(apply),
+            None => vec![apply],
         };
-        self.send(passed)
+        self.send(forwarded)
     }
 
-    fn pass_time(&mut self, newest: Stamp) -> Result<(), Hangup> {
-        let passed = self.input.stands.as_mut().map(|stands| stands.pass_time(newest));
-        self.send(passed.unwrap_or_default())
+    fn advance_to(&mut self, newest: Stamp) -> Result<(), TrainerGone> {
+        let forwarded = self.input.stations.as_mut().map(|stations| stations.advance_to(newest));
+        self.send(forwarded.unwrap_or_default())
     }
 
     /// Nothing more comes: what was held back goes on.
-    fn let_go(&mut self) -> Result<(), Hangup> {
-        let passed = self.input.stands.as_mut().map(Stands::finish);
-        self.send(passed.unwrap_or_default())
+    fn release_held(&mut self) -> Result<(), TrainerGone> {
+        let forwarded = self.input.stations.as_mut().map(Stations::finish);
+        self.send(forwarded.unwrap_or_default())
     }
 
-    fn send(&self, changes: Vec<Change>) -> Result<(), Hangup> {
-        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| Hangup))
+    fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
+        changes.into_iter().try_for_each(|apply| self.sender.send(apply).map_err(|_| TrainerGone))
     }
 
     /// Shows what a camera sees to whoever looks.
-    fn show(&self, seen: &Seen) {
+    fn publish_image(&self, posed_image: &PosedImage) {
         if self.hub.n_clients() == 0 {
             return;
         }
-        let image = &seen.image;
+        let image = &posed_image.image;
         let pixels = match image.format {
             PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
             // Browsers show no JPEG that a camera sent without its tables.
@@ -238,15 +238,15 @@ impl Pump {
             }
             PixelFormat::DepthU16 { .. } => return,
         };
-        let Some(&(focal_px, principal_px)) = self.input.lenses.get(&image.camera) else { return };
-        let pose = |stands: &Stands| stands.pose_now(&image.camera, &seen.world_from_camera);
+        let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera) else { return };
+        let pose = |stations: &Stations| stations.corrected_pose(&image.camera, &posed_image.world_from_camera);
         self.hub.set_live_image(LiveImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
             captured_at: self.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
-            world_from_camera: Some(self.input.stands.as_ref().map_or(seen.world_from_camera, pose)),
+            world_from_camera: Some(self.input.stations.as_ref().map_or(posed_image.world_from_camera, pose)),
             focal_px,
             principal_px,
         });

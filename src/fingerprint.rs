@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_reaches_a_model_changes_it() {
+    fn fingerprint_covers_everything_a_model_uses() {
         let same = of(&keyframe());
         assert_eq!(of(&Keyframe { split: Split::Test, ..keyframe() }), same);
         let changes: [fn(&mut Keyframe); 10] = [

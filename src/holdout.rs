@@ -23,18 +23,18 @@ impl Default for Holdout {
 impl Holdout {
     /// From the value of `--holdout`: a number, or a file with one name a line.
     pub(crate) fn from_argument(argument: &str) -> Result<Self, BadArgument> {
-        let wrong = |reason: &str| BadArgument(format!("--holdout {argument}: {reason}"));
+        let invalid = |reason: &str| BadArgument(format!("--holdout {argument}: {reason}"));
         if let Ok(every) = argument.parse::<i64>() {
             return usize::try_from(every)
                 .ok()
                 .filter(|every| *every >= 1)
                 .map(Self::Every)
-                .ok_or_else(|| wrong("must be at least 1, or a file that names photos"));
+                .ok_or_else(|| invalid("must be at least 1, or a file that names photos"));
         }
         let text = std::fs::read_to_string(Path::new(argument))
-            .map_err(|error| wrong(&format!("neither a whole number nor a file that can be read ({error})")))?;
+            .map_err(|error| invalid(&format!("neither a whole number nor a file that can be read ({error})")))?;
         let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
-        if names.is_empty() { Err(wrong("the file names no photo")) } else { Ok(Self::Named(names)) }
+        if names.is_empty() { Err(invalid("the file names no photo")) } else { Ok(Self::Named(names)) }
     }
 
     /// What each photo is for, in the order of `names`.
@@ -44,7 +44,7 @@ impl Holdout {
     pub(crate) fn splits(&self, names: &[&str]) -> anyhow::Result<Vec<Split>> {
         match self {
             Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),
-            Self::Named(test_names) => named(test_names, names),
+            Self::Named(test_names) => splits_by_name(test_names, names),
         }
     }
 }
@@ -52,62 +52,63 @@ impl Holdout {
 fn every_nth(ix: usize, every: usize) -> Split {
     match ix % every {
         0 => Split::Test,
-        place if every >= 4 && place == every / 2 => Split::Selection,
+        offset if every >= 4 && offset == every / 2 => Split::Validation,
         _ => Split::Train,
     }
 }
 
-fn named(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<Split>> {
+fn splits_by_name(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<Split>> {
     for test_name in test_names {
-        ensure!(names.iter().any(|name| is_called(name, test_name)), "--holdout: no photo is called {test_name:?}");
+        ensure!(names.iter().any(|name| matches_name(name, test_name)), "--holdout: no photo is called {test_name:?}");
     }
-    let mut n_others = 0;
+    let mut n_remaining = 0;
     let split = |name: &&str| {
-        if test_names.iter().any(|test_name| is_called(name, test_name)) {
+        if test_names.iter().any(|test_name| matches_name(name, test_name)) {
             return Split::Test;
         }
-        n_others += 1;
-        if n_others % 8 == 5 { Split::Selection } else { Split::Train }
+        n_remaining += 1;
+        if n_remaining % 8 == 5 { Split::Validation } else { Split::Train }
     };
     Ok(names.iter().map(split).collect())
 }
 
 /// Whether a photo is meant: by its path in the folder, its file name, or its file name without extension.
-fn is_called(name: &str, wanted: &str) -> bool {
+fn matches_name(name: &str, requested: &str) -> bool {
     let path = Path::new(name);
     let parts = [path.file_name(), path.file_stem()];
-    name == wanted || parts.into_iter().flatten().any(|part| part == wanted)
+    name == requested || parts.into_iter().flatten().any(|part| part == requested)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use Split::{Selection, Test, Train};
+    use Split::{Test, Train, Validation};
 
     #[test]
-    fn every_eighth_is_the_rule_of_keyframes() {
+    fn default_holdout_matches_keyframe_splits() {
         let names = vec!["photo"; 20];
         let expected: Vec<_> = (0..20).map(Split::of).collect();
         assert_eq!(Holdout::default().splits(&names).unwrap(), expected);
         assert_eq!(Holdout::Every(2).splits(&names[..4]).unwrap(), [Test, Train, Test, Train]);
-        assert_eq!(Holdout::Every(4).splits(&names[..5]).unwrap(), [Test, Train, Selection, Train, Test]);
+        assert_eq!(Holdout::Every(4).splits(&names[..5]).unwrap(), [Test, Train, Validation, Train, Test]);
     }
 
     #[test]
-    fn photos_may_be_named_with_or_without_folder_and_extension() {
+    fn photos_match_with_or_without_folder_and_extension() {
         let names = ["images/a.jpg", "images/b.jpg", "images/c.jpg", "images/d.jpg"];
-        let named = |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
-        assert_eq!(named(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
-        assert!(named(&["e"]).unwrap_err().to_string().contains("no photo is called \"e\""));
-        assert_eq!(named(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all may be scored");
+        let splits_by_name =
+            |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
+        assert_eq!(splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
+        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("no photo is called \"e\""));
+        assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all may be scored");
     }
 
     #[test]
-    fn the_argument_is_a_number_or_a_file() {
+    fn argument_is_a_number_or_a_file() {
         assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
         assert_eq!(Holdout::from_argument("1").unwrap().splits(&["a", "b"]).unwrap(), [Test, Test]);
-        for wrong in ["0", "-3"] {
-            assert!(Holdout::from_argument(wrong).unwrap_err().to_string().contains("at least 1"), "{wrong}");
+        for invalid in ["0", "-3"] {
+            assert!(Holdout::from_argument(invalid).unwrap_err().to_string().contains("at least 1"), "{invalid}");
         }
         assert!(Holdout::from_argument("no/such/file").is_err());
         let folder = tempfile::tempdir().unwrap();

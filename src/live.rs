@@ -1,24 +1,24 @@
 //! Models growing while keyframes come in and people look.
 
-use crate::feed::{Change, Feed, Leftover};
+use crate::feed::{Change, Feed, InputResult};
 use crate::recovery::{self, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::scene_hint;
 use crate::session::Session;
-use crate::turns;
+use crate::time_slices;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Keyframe, Split};
 use viz::{Hub, KeyframePose, ModelStatus, Status};
 
 /// The status is told this often.
-const PUBLISH_EVERY: Duration = Duration::from_millis(250);
+const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
 /// Where there is nothing to do, this long is waited for something.
 const IDLE: Duration = Duration::from_millis(10);
 /// Share of the time that goes into scores between the marks.
 const SCORE_FRAC: f64 = 0.03;
 /// How often to check for keyframes while waiting for a keyframe or a picture request.
-const LOOK_EVERY: Duration = Duration::from_millis(2);
+const POLL_PERIOD: Duration = Duration::from_millis(2);
 /// Pictures are drawn for at most this long before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
@@ -50,7 +50,7 @@ pub(crate) struct Live {
     /// Session whose latest score is refreshed next.
     next_refreshed: usize,
     published: Option<Instant>,
-    scoring: Duration,
+    scoring_time: Duration,
     notes: Vec<String>,
     recoveries: Recoveries,
 }
@@ -70,23 +70,23 @@ impl Live {
             budget: RenderBudget::default(),
             next_refreshed: 0,
             published: None,
-            scoring: Duration::ZERO,
+            scoring_time: Duration::ZERO,
             notes: options.notes,
             recoveries: Recoveries::default(),
         }
     }
 
     /// Continues with the keyframes of an earlier run, which the sessions already hold.
-    pub(crate) fn after(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+    pub(crate) fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
         self.keyframes = keyframes;
-        self.show_keyframes();
+        self.publish_keyframes();
         if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
             self.hub.set_scene_hint(hint);
         }
         self
     }
 
-    fn show_keyframes(&self) {
+    fn publish_keyframes(&self) {
         self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
     }
 
@@ -98,13 +98,13 @@ impl Live {
         // Where one reached its limit, the others are waited for as long as they can reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
         let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
-        reached || self.is_through() || self.feed.broke_off() || (self.feed.ended() && !self.can_train())
+        reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
     }
 
     /// Whether the devices ended, and steps were asked for that no model can make without them. Where none were asked for
     /// there is no end: what is known is shown.
-    pub(crate) fn is_through(&self) -> bool {
-        self.is_finished() && self.sessions.iter().any(|session| session.steps_missing().is_some_and(|n| n > 0))
+    pub(crate) fn has_exhausted_input(&self) -> bool {
+        self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
     }
 
     /// The hub that clients are connected to.
@@ -143,8 +143,8 @@ impl Live {
     }
 
     /// What is saved on disk if the run fails now.
-    pub(crate) fn what_is_left(&mut self) -> String {
-        recovery::what_is_left(&mut self.sessions)
+    pub(crate) fn describe_recoverable(&mut self) -> String {
+        recovery::describe_recoverable(&mut self.sessions)
     }
 
     /// Pushes new keyframes to the model: all that wait in real time, the one that is due in lockstep. None during an evaluation.
@@ -180,7 +180,7 @@ impl Live {
             }
         }
         if self.keyframes.len() != n_before {
-            self.show_keyframes();
+            self.publish_keyframes();
             if self.keyframes.len() <= self.start_keyframes
                 && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
             {
@@ -196,16 +196,16 @@ impl Live {
         if self.hub.n_clients() == 0 {
             return self.feed.next(IDLE);
         }
-        let begun = Instant::now();
+        let started = Instant::now();
         loop {
             let before = Instant::now();
-            let patience = if self.budget.may_render() { Duration::ZERO } else { LOOK_EVERY };
-            if let Some(change) = self.feed.next(patience) {
+            let timeout = if self.budget.may_render() { Duration::ZERO } else { POLL_PERIOD };
+            if let Some(change) = self.feed.next(timeout) {
                 return Some(change);
             }
-            let is_asked = self.budget.may_render() && self.hub.wait_for_request(LOOK_EVERY);
+            let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
             self.budget.add_training(before.elapsed()); // Training had nothing to do in this time.
-            if begun.elapsed() >= IDLE || is_asked {
+            if started.elapsed() >= IDLE || is_requested {
                 return None;
             }
         }
@@ -228,50 +228,53 @@ impl Live {
             self.hub.wait_for_request(IDLE);
             return Ok(());
         }
-        if self.is_awaited() {
+        if self.is_render_pending() {
             return Ok(());
         }
         let is_watched = self.hub.n_clients() > 0;
         self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
         let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
         let due = &self.next_keyframe_at;
-        let n_most = |ix: usize, session: &Session| match is_paced {
+        let max_steps = |ix: usize, session: &Session| match is_paced {
             true => due[ix].saturating_sub(session.progress().step),
             false => u64::MAX,
         };
         let before = Instant::now();
         let (hub, budget) = (&self.hub, self.budget);
-        turns::take(&mut self.sessions, n_most, || budget.may_render() && hub.wait_for_request(Duration::ZERO))?;
+        time_slices::train_next(&mut self.sessions, max_steps, || {
+            budget.may_render() && hub.wait_for_request(Duration::ZERO)
+        })?;
         self.budget.add_training(before.elapsed());
         Ok(())
     }
 
     /// Whether a picture is requested and may be drawn now.
-    fn is_awaited(&self) -> bool {
+    fn is_render_pending(&self) -> bool {
         self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)
     }
 
     /// Draws requested pictures as long as training keeps its share of the time.
     fn render(&mut self) -> anyhow::Result<()> {
-        let begun = Instant::now();
+        let started = Instant::now();
         if !self.is_training() || self.is_idle() {
             self.budget = RenderBudget::default(); // Training does not need the time.
         }
-        while begun.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
+        while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
             if self.keyframes.is_empty() {
                 pending.fail("nothing was seen yet");
                 continue;
             }
-            let Some(session) = of_method(&mut self.sessions, pending.method()) else {
-                let there = self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
-                let asked = pending.method().unwrap_or_default().to_owned();
-                pending.fail(&format!("no model of the method {asked:?} learns here, but {there}"));
+            let Some(session) = session_for_method(&mut self.sessions, pending.method()) else {
+                let available_methods =
+                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
+                let requested = pending.method().unwrap_or_default().to_owned();
+                pending.fail(&format!("no model of the method {requested:?} learns here, but {available_methods}"));
                 continue;
             };
             // Work queued before the picture counts as training time.
             let before = Instant::now();
-            session.n_taken()?;
+            session.n_total_steps()?;
             self.budget.add_training(before.elapsed());
             let before = Instant::now();
             match session.render(&pending.request) {
@@ -285,21 +288,21 @@ impl Live {
 
     /// Tells whoever looks where the run stands, a few times a second.
     fn publish(&mut self) -> anyhow::Result<()> {
-        if self.published.is_some_and(|published| published.elapsed() < PUBLISH_EVERY) {
+        if self.published.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
             return Ok(());
         }
         self.published = Some(Instant::now());
         let clock_secs = self.sessions[0].secs();
-        if self.scoring.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
+        if self.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
             let before = Instant::now();
             // One image at a time, because viewers wait meanwhile.
             self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.next_refreshed];
             if session.progress().step > 0 {
-                session.n_taken()?;
+                session.n_total_steps()?;
                 session.refresh_psnr()?;
             }
-            self.scoring += before.elapsed();
+            self.scoring_time += before.elapsed();
             self.budget.add_training(before.elapsed());
         }
         let mut models = self.sessions.iter().map(model_status);
@@ -317,7 +320,7 @@ impl Live {
     }
 
     /// Ends the input; the sessions and what is left of the input come back.
-    pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<Leftover>) {
+    pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<InputResult>) {
         // The numbers stay, because viewers wait for the scores.
         self.hub.set_state("saving");
         (self.sessions, self.feed.finish())
@@ -338,13 +341,13 @@ impl Live {
 
     /// Whether no model can learn before a keyframe comes.
     fn is_idle(&self) -> bool {
-        self.sessions.iter().all(|session| session.is_idle() || session.has_all_steps())
+        self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
     }
 
     /// Whether each model came to the step at which the next keyframe is due, or can do nothing without it.
     fn is_keyframe_due(&self) -> bool {
         let is_due = |(session, at): (&Session, &u64)| {
-            session.progress().step >= *at || session.is_idle() || session.has_all_steps()
+            session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
         };
         self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
     }
@@ -372,7 +375,7 @@ impl Live {
                 // Nothing comes to a model that has made all its steps: it is as it would be alone.
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
-                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
                     // Every session holds the keyframe, even after a GPU failure, so that a restored model has it.
                     pushed = pushed.and(session.push(&keyframe));
                 }
@@ -382,7 +385,7 @@ impl Live {
                 self.n_evicted += 1;
                 self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                 let mut removed = Ok(());
-                for session in self.sessions.iter_mut().filter(|session| !session.has_all_steps()) {
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
                     removed = removed.and(session.remove(&camera, stamp));
                 }
                 removed
@@ -402,7 +405,7 @@ pub(crate) struct LiveOptions {
 }
 
 /// The session of a method; the first where none is named.
-fn of_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
+fn session_for_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
     sessions.iter_mut().find(|session| method.is_none_or(|name| session.kind().name() == name))
 }
 

@@ -15,22 +15,22 @@ mod data;
 mod dataset;
 mod decisions;
 mod depth_from;
+mod downscale;
 mod evaluate;
+mod evaluation_schedule;
 mod exit;
 mod export;
 mod feed;
 mod fingerprint;
 mod holdout;
 mod join;
-mod kept_keyframes;
 mod live;
-mod marks;
 mod method;
 mod model_bounds;
 mod next_commands;
 mod open;
-mod open_mark;
 mod partial;
+mod pending_evaluation;
 mod print;
 mod recovery;
 mod render_budget;
@@ -39,16 +39,16 @@ mod report;
 mod run_folder;
 mod scene_hint;
 mod session;
-mod shrink;
 mod splat_file;
-mod stands;
+mod stations;
 mod stop;
+mod stored_keyframes;
 #[cfg(test)]
 #[path = "../tests/common/test_data.rs"]
 mod test_data;
+mod time_slices;
 mod training;
 mod training_args;
-mod turns;
 mod viewer;
 
 use clap::Parser;
@@ -66,7 +66,7 @@ fn main() -> ExitCode {
     }
     print::flush();
     match ended {
-        Ok(exit) => exit.or_lost_output().into(),
+        Ok(exit) => exit.or_output_loss().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
         Err(error) => exit::of(&error).into(),
     }

@@ -1,8 +1,8 @@
 //! Bounds of most of a saved model, for the first view of a model without a list of cameras.
 
 use trainer::splat::arrays::SplatArrays;
-use trainer::tsdf::Lattice;
-use trainer::tsdf::block::{BLOCK_EDGE, Place};
+use trainer::tsdf::VoxelGrid;
+use trainer::tsdf::block::{BLOCK_EDGE, GridCoord};
 
 /// Share of the points inside the radius, so that stray points and far backgrounds stay outside.
 const INSIDE_FRAC: f64 = 0.8;
@@ -23,16 +23,16 @@ impl Bounds {
     /// Bounds around the median of the splats that are at least half opaque; `None` without splats.
     pub(crate) fn of_splats(splats: &SplatArrays) -> Option<Self> {
         let n_opaque = splats.opacity_logits.iter().filter(|logit| **logit > 0.0).count();
-        let takes_all = (n_opaque as f64) < MIN_OPAQUE_FRAC * splats.n_splats() as f64;
-        let kept = splats.means.iter().zip(&splats.opacity_logits).filter(|(_, logit)| takes_all || **logit > 0.0);
-        Self::of_points(&kept.map(|(mean, _)| mean.map(f64::from)).collect::<Vec<_>>())
+        let uses_all = (n_opaque as f64) < MIN_OPAQUE_FRAC * splats.n_splats() as f64;
+        let selected = splats.means.iter().zip(&splats.opacity_logits).filter(|(_, logit)| uses_all || **logit > 0.0);
+        Self::of_points(&selected.map(|(mean, _)| mean.map(f64::from)).collect::<Vec<_>>())
     }
 
     /// Bounds around the blocks of a distance field; `None` without blocks.
-    pub(crate) fn of_blocks<'a>(blocks: impl Iterator<Item = &'a Place>, lattice: &Lattice) -> Option<Self> {
-        let center = |place: &Place| {
-            let along = |axis: usize| (f64::from(place[axis]) + 0.5) * f64::from(BLOCK_EDGE) * lattice.voxel_m;
-            [0, 1, 2].map(|axis| lattice.anchor_m[axis] + along(axis))
+    pub(crate) fn of_blocks<'a>(blocks: impl Iterator<Item = &'a GridCoord>, voxel_grid: &VoxelGrid) -> Option<Self> {
+        let center = |block: &GridCoord| {
+            let coordinate = |axis: usize| (f64::from(block[axis]) + 0.5) * f64::from(BLOCK_EDGE) * voxel_grid.voxel_m;
+            [0, 1, 2].map(|axis| voxel_grid.anchor_m[axis] + coordinate(axis))
         };
         Self::of_points(&blocks.map(center).collect::<Vec<_>>())
     }
@@ -44,7 +44,7 @@ impl Bounds {
         }
         let center_m = [0, 1, 2].map(|axis| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5));
         let distance_m = |point: &[f64; 3]| {
-            let squared = point.iter().zip(center_m).map(|(along, center)| (along - center).powi(2));
+            let squared = point.iter().zip(center_m).map(|(coordinate, center)| (coordinate - center).powi(2));
             squared.sum::<f64>().sqrt()
         };
         let radius_m = quantile(points_m.iter().map(distance_m).collect(), INSIDE_FRAC);
@@ -76,7 +76,7 @@ mod tests {
     }
 
     #[test]
-    fn strays_and_transparent_splats_move_nothing() {
+    fn outliers_and_transparent_splats_do_not_affect_bounds() {
         let mut points: Vec<([f32; 3], f32)> = Vec::new();
         // A disk, evenly filled along a spiral of golden angles.
         for ix in 0u8..100 {
@@ -92,15 +92,15 @@ mod tests {
     }
 
     #[test]
-    fn few_or_no_splats_have_bounds_too() {
+    fn bounds_of_few_or_no_splats() {
         assert_eq!(Bounds::of_splats(&splats(&[])), None);
         let one = Bounds::of_splats(&splats(&[([1.0, 2.0, 3.0], -9.0)])).expect("a splat");
         assert_eq!(one, Bounds { center_m: [1.0, 2.0, 3.0], radius_m: MIN_RADIUS_M });
     }
 
     #[test]
-    fn blocks_lie_where_their_lattice_has_them() {
-        let lattice = Lattice {
+    fn block_bounds_follow_the_lattice() {
+        let voxel_grid = VoxelGrid {
             voxel_m: 0.125,
             truncation_m: 0.5,
             scale_m: 0.5,
@@ -109,7 +109,7 @@ mod tests {
             max_weight: 1,
             anchor_m: [10.0, 0.0, -1.0],
         };
-        let bounds = Bounds::of_blocks([[0, 0, 0], [1, 0, 0], [2, 0, 0]].iter(), &lattice).expect("blocks");
+        let bounds = Bounds::of_blocks([[0, 0, 0], [1, 0, 0], [2, 0, 0]].iter(), &voxel_grid).expect("blocks");
         assert_eq!(bounds.center_m, [11.5, 0.5, -0.5]);
         assert_eq!(bounds.radius_m, 1.0);
     }

@@ -1,6 +1,6 @@
 //! Commands to run after training; they work as printed, in the folder in which the training was started.
 
-use crate::method::Kind;
+use crate::method::ModelKind;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -26,7 +26,7 @@ impl DataSource {
 /// What the commands need to know about a saved model.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct SavedModel<'a> {
-    pub(crate) kind: Kind,
+    pub(crate) kind: ModelKind,
     pub(crate) folder: &'a Path,
     pub(crate) data: &'a DataSource,
     pub(crate) n_tests: usize,
@@ -61,11 +61,11 @@ pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             add("score it again", &words);
         }
         let (format, purpose) = match model.kind {
-            Kind::Splat => ("spz", "export the splats"),
-            Kind::Tsdf => ("glb", "export the mesh"),
-            Kind::Nerf => continue, // Other programs cannot read it.
+            ModelKind::Splat => ("spz", "export the splats"),
+            ModelKind::Tsdf => ("glb", "export the mesh"),
+            ModelKind::Nerf => continue, // Other programs cannot read it.
         };
-        let out = argument(&free_file(&model_name(model.folder), format));
+        let out = argument(&unused_file(&model_name(model.folder), format));
         add(purpose, &["export", &folder, "--to", format, "--out", &out]);
     }
     commands
@@ -98,9 +98,9 @@ fn model_name(folder: &Path) -> String {
 }
 
 /// A file name in the current folder that does not exist yet, because `export` does not overwrite files.
-fn free_file(name: &str, ending: &str) -> PathBuf {
+fn unused_file(name: &str, extension: &str) -> PathBuf {
     let numbered =
-        |n: u32| PathBuf::from(if n == 1 { format!("{name}.{ending}") } else { format!("{name}-{n}.{ending}") });
+        |n: u32| PathBuf::from(if n == 1 { format!("{name}.{extension}") } else { format!("{name}-{n}.{extension}") });
     (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
 }
 
@@ -124,7 +124,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_shell_reads_quoted_words_back() {
+    fn shell_reads_quoted_words_back() {
         for word in ["plain/path-1.spz", "two words", "it's", "$HOME `x` \"y\" \\ *", "", "naïve", "a\nb"] {
             let output = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
             assert_eq!(String::from_utf8_lossy(&output.expect("sh starts").stdout), word);
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn each_kind_of_model_has_the_commands_that_it_can_be_given() {
+    fn commands_depend_on_the_kind_of_model() {
         let data = DataSource {
             path: Some("my data".into()),
             flags: vec!["--scale".into(), "0.5".into()],
@@ -146,7 +146,7 @@ mod tests {
             for_models(models).into_iter().map(strip).collect()
         };
         assert_eq!(
-            commands(&[model(Kind::Splat, "runs/a b")]),
+            commands(&[model(ModelKind::Splat, "runs/a b")]),
             [
                 "view 'runs/a b'",
                 "eval 'runs/a b' 'my data' --keyframes 'runs/a b/keyframes.txt' --scale 0.5",
@@ -154,7 +154,7 @@ mod tests {
             ]
         );
         assert_eq!(
-            commands(&[model(Kind::Nerf, "both/nerf"), model(Kind::Tsdf, "both/tsdf")]),
+            commands(&[model(ModelKind::Nerf, "both/nerf"), model(ModelKind::Tsdf, "both/tsdf")]),
             [
                 "view both",
                 "eval both/nerf 'my data' --keyframes both/nerf/keyframes.txt --scale 0.5",
@@ -163,13 +163,13 @@ mod tests {
             ]
         );
         let live = DataSource::default();
-        let unscored = SavedModel { data: &live, ..model(Kind::Nerf, "-out") };
+        let unscored = SavedModel { data: &live, ..model(ModelKind::Nerf, "-out") };
         assert_eq!(commands(&[unscored]), ["view ./-out"]);
         assert_eq!(commands(&[]), Vec::<String>::new());
     }
 
     #[test]
-    fn images_without_a_name_are_named_by_camera_and_stamp() {
+    fn unnamed_images_use_camera_and_stamp() {
         let mut data = DataSource::default();
         data.image_names.insert(("camera".into(), 8), "images/0008.jpg".into());
         assert_eq!(data.image_name("camera", 8), "images/0008.jpg");

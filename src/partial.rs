@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The files and folders that this process is writing.
-static UNDER_WAY: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
 /// For a process ended by a signal, shells report this plus the signal number.
-const ENDED_BY_SIGNAL: i32 = 128;
+const SIGNAL_EXIT_BASE: i32 = 128;
 
 /// Files or folders being written; removed on drop unless they are kept.
 #[derive(Debug)]
@@ -22,37 +22,37 @@ pub(crate) struct Partial(Vec<PathBuf>);
 impl Partial {
     /// A file that will be written, under its own name or, until it is complete, with the suffix `.part`.
     pub(crate) fn file(path: &Path) -> Self {
-        Self::begin(vec![path.to_owned(), trainer::whole_file::partial_path(path)])
+        Self::register(vec![path.to_owned(), trainer::atomic_file::partial_path(path)])
     }
 
     /// A folder that will be filled with these entries; the folder itself, if it does not exist yet.
     pub(crate) fn folder(path: &Path, entries: &[&str]) -> Self {
         if path.exists() {
-            return Self::begin(entries.iter().map(|entry| path.join(entry)).collect());
+            return Self::register(entries.iter().map(|entry| path.join(entry)).collect());
         }
-        Self::begin(vec![path.to_owned()])
+        Self::register(vec![path.to_owned()])
     }
 
     /// Files that already exist belong to someone else and are not removed.
-    fn begin(paths: Vec<PathBuf>) -> Self {
+    fn register(paths: Vec<PathBuf>) -> Self {
         let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
-        under_way().extend(paths.iter().cloned());
+        in_progress().extend(paths.iter().cloned());
         Self(paths)
     }
 
     /// Keeps the files, because they are complete.
     pub(crate) fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
-        under_way().retain(|path| !paths.contains(path));
+        in_progress().retain(|path| !paths.contains(path));
     }
 }
 
 impl Drop for Partial {
     fn drop(&mut self) {
-        let mut under_way = under_way();
+        let mut in_progress = in_progress();
         for path in &self.0 {
             remove(path);
-            under_way.remove(path);
+            in_progress.remove(path);
         }
     }
 }
@@ -61,21 +61,21 @@ impl Drop for Partial {
 ///
 /// For commands that have nothing to save when they are cancelled; others use [`crate::stop::Stop`].
 pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
-    let mut signals = Signals::new(stop::ending_signals()).context("cannot install signal handlers")?;
+    let mut signals = Signals::new(stop::termination_signals()).context("cannot install signal handlers")?;
     let remove_all = move || {
         if let Some(signal) = signals.forever().next() {
             // Locked until the process exits, so that no new file is started.
-            let under_way = under_way();
-            under_way.iter().for_each(|path| remove(path));
-            std::process::exit(ENDED_BY_SIGNAL + signal);
+            let in_progress = in_progress();
+            in_progress.iter().for_each(|path| remove(path));
+            std::process::exit(SIGNAL_EXIT_BASE + signal);
         }
     };
     std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
     Ok(())
 }
 
-fn under_way() -> MutexGuard<'static, BTreeSet<PathBuf>> {
-    UNDER_WAY.lock().unwrap_or_else(PoisonError::into_inner)
+fn in_progress() -> MutexGuard<'static, BTreeSet<PathBuf>> {
+    IN_PROGRESS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn remove(path: &Path) {
@@ -93,21 +93,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_kept_is_removed_and_nothing_else() {
+    fn partial_files_are_removed_unless_kept() {
         let folder = tempfile::tempdir().expect("a folder");
         let at = |name: &str| folder.path().join(name);
         for keeps in [false, true] {
             let (file, new) = (Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["images"]));
-            let there = Partial::folder(folder.path(), &["images", "test.txt"]);
+            let existing = Partial::folder(folder.path(), &["images", "test.txt"]);
             for name in ["scene.ply", "scene.ply.part", "other", "test.txt"] {
                 std::fs::write(at(name), b"x").expect("room");
             }
             std::fs::create_dir_all(at("new/depth")).expect("room");
             std::fs::create_dir_all(at("images/a")).expect("room");
             if keeps {
-                [file, new, there].into_iter().for_each(Partial::keep);
+                [file, new, existing].into_iter().for_each(Partial::keep);
             } else {
-                drop([file, new, there]);
+                drop([file, new, existing]);
             }
             let exist = ["scene.ply", "new", "images", "test.txt"].map(|name| at(name).exists());
             assert_eq!(exist, [keeps; 4]);

@@ -10,16 +10,16 @@ use trainer::Keyframe;
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
 /// An evaluation in progress.
-pub(crate) struct OpenMark {
+pub(crate) struct PendingEvaluation {
     /// Seconds of training when it was due.
     pub(crate) seconds: f64,
     /// Ordered so that the images scored first are already spread evenly over all.
-    left: VecDeque<Arc<Keyframe>>,
+    remaining: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
     spent: Duration,
 }
 
-impl OpenMark {
+impl PendingEvaluation {
     /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
     pub(crate) fn new<'a>(
         seconds: f64,
@@ -27,15 +27,15 @@ impl OpenMark {
         max_images: usize,
     ) -> Self {
         let stride = tests.len().div_ceil(max_images).max(1);
-        let mut picked: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
-        picked.sort_by_key(|(ix, _)| ix.reverse_bits());
-        let left = picked.into_iter().map(|(_, keyframe)| keyframe.clone()).collect();
-        Self { seconds, left, images: Vec::new(), spent: Duration::ZERO }
+        let mut selected: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
+        selected.sort_by_key(|(ix, _)| ix.reverse_bits());
+        let remaining = selected.into_iter().map(|(_, keyframe)| keyframe.clone()).collect();
+        Self { seconds, remaining, images: Vec::new(), spent: Duration::ZERO }
     }
 
     /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
     pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
-        if self.spent < MAX_SCORING { self.left.pop_front() } else { None }
+        if self.spent < MAX_SCORING { self.remaining.pop_front() } else { None }
     }
 
     /// Adds the scores of the last keyframe and the time that scoring took.
@@ -46,7 +46,7 @@ impl OpenMark {
 
     /// Whether no image is left to score.
     pub(crate) fn is_complete(&self) -> bool {
-        self.left.is_empty() || self.spent >= MAX_SCORING
+        self.remaining.is_empty() || self.spent >= MAX_SCORING
     }
 
     /// The scores so far.

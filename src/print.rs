@@ -3,7 +3,7 @@
 //! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if stdout fails.
 //! A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and [`report_json`], which never fail: a
 //! closed terminal or a full disk loses lines, not the model. A separate thread writes the lines, so that a terminal that accepts
-//! no output does not block the program. [`lost_output`] returns afterwards whether any lines were lost.
+//! no output does not block the program. [`has_lost_output`] returns afterwards whether any lines were lost.
 
 use anyhow::Context;
 use console::Term;
@@ -33,7 +33,7 @@ const MAX_WAITING: usize = 4096;
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
 /// A piece of output for a stream.
-enum Piece {
+enum OutputChunk {
     Out(Vec<u8>),
     Err(Vec<u8>),
     /// Answered when everything before it has been written.
@@ -41,36 +41,36 @@ enum Piece {
 }
 
 /// Sends output to the thread that writes it.
-static WRITER: LazyLock<SyncSender<Piece>> = LazyLock::new(|| {
-    let (sender, pieces) = sync_channel(MAX_WAITING);
-    std::thread::spawn(move || pieces.into_iter().for_each(write));
+static WRITER: LazyLock<SyncSender<OutputChunk>> = LazyLock::new(|| {
+    let (sender, chunks) = sync_channel(MAX_WAITING);
+    std::thread::spawn(move || chunks.into_iter().for_each(write));
     sender
 });
 
-fn write(piece: Piece) {
-    match piece {
-        Piece::Out(bytes) => {
+fn write(chunk: OutputChunk) {
+    match chunk {
+        OutputChunk::Out(bytes) => {
             let mut stdout = std::io::stdout().lock();
             if let Err(error) = stdout.write_all(&bytes).and_then(|()| stdout.flush()) {
-                note_lost(&error.to_string());
+                log_lost(&error.to_string());
             }
         }
         // Lost if the terminal is closed or the disk is full.
-        Piece::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
-        Piece::Flush(done) => drop(done.send(())),
+        OutputChunk::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
+        OutputChunk::Flush(done) => drop(done.send(())),
     }
 }
 
-fn note_lost(why: &str) {
+fn log_lost(reason: &str) {
     if !LOST_OUTPUT.swap(true, Ordering::Relaxed) {
-        log::warn!("cannot write to stdout ({why}): output is lost, but the command continues");
+        log::warn!("cannot write to stdout ({reason}): output is lost, but the command continues");
     }
 }
 
 /// Waits until all output is written, but not for long if the stream accepts none.
 pub(crate) fn flush() {
     let (done, is_done) = sync_channel(1);
-    let is_written = WRITER.try_send(Piece::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
+    let is_written = WRITER.try_send(OutputChunk::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
     if !is_written {
         LOST_OUTPUT.store(true, Ordering::Relaxed);
     }
@@ -80,7 +80,7 @@ pub(crate) fn flush() {
 fn target() -> ProgressDrawTarget {
     let term = Term::stderr();
     if term.is_term() {
-        ProgressDrawTarget::term_like(Box::new(BarTerm { term, drawn: Mutex::default() }))
+        ProgressDrawTarget::term_like(Box::new(BarTerm { term, buffered: Mutex::default() }))
     } else {
         ProgressDrawTarget::hidden()
     }
@@ -94,12 +94,12 @@ fn target() -> ProgressDrawTarget {
 struct BarTerm {
     term: Term,
     /// Drawn since the last flush.
-    drawn: Mutex<String>,
+    buffered: Mutex<String>,
 }
 
 impl BarTerm {
     fn draw(&self, text: &str) -> std::io::Result<()> {
-        self.drawn.lock().unwrap_or_else(PoisonError::into_inner).push_str(text);
+        self.buffered.lock().unwrap_or_else(PoisonError::into_inner).push_str(text);
         Ok(())
     }
 
@@ -146,9 +146,9 @@ impl TermLike for BarTerm {
     }
 
     fn flush(&self) -> std::io::Result<()> {
-        let drawn = std::mem::take(&mut *self.drawn.lock().unwrap_or_else(PoisonError::into_inner));
-        if !drawn.is_empty() {
-            let _ = WRITER.try_send(Piece::Err(drawn.into_bytes())); // If the bar is lost, it is drawn again later.
+        let buffered = std::mem::take(&mut *self.buffered.lock().unwrap_or_else(PoisonError::into_inner));
+        if !buffered.is_empty() {
+            let _ = WRITER.try_send(OutputChunk::Err(buffered.into_bytes())); // If the bar is lost, it is drawn again later.
         }
         Ok(())
     }
@@ -165,29 +165,29 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
 
 /// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged once.
 pub(crate) fn report(text: impl Display) {
-    let sent = BARS.suspend(|| WRITER.try_send(Piece::Out(format!("{text}\n").into_bytes())));
+    let sent = BARS.suspend(|| WRITER.try_send(OutputChunk::Out(format!("{text}\n").into_bytes())));
     if sent.is_err() {
-        note_lost("it accepts no more output");
+        log_lost("it accepts no more output");
     }
 }
 
 /// Prints the error that ends the program to stderr, through the writer thread like the log: a terminal that takes no output cannot keep
 /// the program from ending, and the exit code remains.
 pub(crate) fn error(error: &anyhow::Error) {
-    let _ = BARS.suspend(|| WRITER.try_send(Piece::Err(format!("error: {error:#}\n").into_bytes())));
+    let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("error: {error:#}\n").into_bytes())));
 }
 
 /// Whether any line of [`report`] was lost.
-pub(crate) fn lost_output() -> bool {
+pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
 /// A count with its word: `1 image`, `2 images`.
-pub(crate) fn counted(n: u64, what: &str) -> String {
-    match what.strip_suffix('y') {
-        _ if n == 1 => format!("1 {what}"),
+pub(crate) fn counted(n: u64, noun: &str) -> String {
+    match noun.strip_suffix('y') {
+        _ if n == 1 => format!("1 {noun}"),
         Some(stem) => format!("{n} {stem}ies"),
-        None => format!("{n} {what}s"),
+        None => format!("{n} {noun}s"),
     }
 }
 
@@ -230,17 +230,17 @@ pub(crate) fn start_log(verbose: u8) {
         _ => "trace",
     };
     env_logger::Builder::from_env(env_logger::Env::default().default_filter_or(level))
-        .target(env_logger::Target::Pipe(Box::new(AboveBars)))
+        .target(env_logger::Target::Pipe(Box::new(LogTarget)))
         .format_target(false)
         .init();
 }
 
 /// Stderr, with the bars moved out of the way. Records that cannot be written are lost without an error to the caller.
-struct AboveBars;
+struct LogTarget;
 
-impl Write for AboveBars {
+impl Write for LogTarget {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let _ = BARS.suspend(|| WRITER.try_send(Piece::Err(bytes.to_vec())));
+        let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(bytes.to_vec())));
         Ok(bytes.len())
     }
 

@@ -2,7 +2,7 @@
 
 use crate::commands;
 use crate::decisions::Settings;
-use crate::method::Recipe;
+use crate::method::ModelSpec;
 use crate::run_folder::CHECKPOINT;
 use crate::session::Session;
 use anyhow::Context;
@@ -16,13 +16,13 @@ use trainer::gpu::Gpu;
 /// How many times a run tries to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
 /// After this time without a failure the count starts again: a run that lasts for days may fail now and then.
-const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
+const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
 /// Pause between attempts: a driver reset takes a moment.
-const BEFORE_RETRY: Duration = Duration::from_secs(1);
+const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// What a session needs to continue on another device.
 pub(crate) struct Recovery {
-    pub(crate) recipe: Recipe,
+    pub(crate) model_spec: ModelSpec,
     /// Folder of the run.
     pub(crate) folder: PathBuf,
     /// Folder of the checkpoint that the run was resumed from, if it was.
@@ -37,7 +37,7 @@ pub(crate) struct Recovery {
 
 impl Recovery {
     /// What can be continued if the model cannot be saved, as a sentence without a period.
-    pub(crate) fn what_is_left(&self, has_checkpoint: bool) -> String {
+    pub(crate) fn describe_recoverable(&self, has_checkpoint: bool) -> String {
         let Self { folder, resume_command, .. } = self;
         match (has_checkpoint, &self.resumed) {
             (true, _) => {
@@ -58,26 +58,26 @@ fn in_folder(folder: &Path) -> String {
 /// The GPU failed and the run could not continue on another device; the text names what is saved on disk.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct GpuGone(String);
+pub(crate) struct GpuUnrecoverable(String);
 
 /// Whether the GPU caused the error.
-pub(crate) fn is_of_gpu(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| cause.downcast_ref().is_some_and(trainer::Error::is_of_gpu))
+pub(crate) fn is_gpu_error(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| cause.downcast_ref().is_some_and(trainer::Error::is_gpu_error))
 }
 
 /// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
-pub(crate) fn what_is_left(sessions: &mut [Session]) -> String {
-    let left = sessions.iter_mut().filter_map(|session| {
+pub(crate) fn describe_recoverable(sessions: &mut [Session]) -> String {
+    let recoverable = sessions.iter_mut().filter_map(|session| {
         let has_checkpoint = session.has_checkpoint();
-        Some(session.recovery()?.what_is_left(has_checkpoint))
+        Some(session.recovery()?.describe_recoverable(has_checkpoint))
     });
-    left.collect::<Vec<_>>().join("; ")
+    recoverable.collect::<Vec<_>>().join("; ")
 }
 
 /// Adds what is saved on disk to an error of the GPU.
-pub(crate) fn with_what_is_left(error: anyhow::Error, left: &str) -> anyhow::Error {
-    if is_of_gpu(&error) && !left.is_empty() {
-        error.context(format!("the GPU failed at the end of the run; {left}"))
+pub(crate) fn with_recoverable(error: anyhow::Error, recoverable: &str) -> anyhow::Error {
+    if is_gpu_error(&error) && !recoverable.is_empty() {
+        error.context(format!("the GPU failed at the end of the run; {recoverable}"))
     } else {
         error
     }
@@ -94,17 +94,17 @@ impl Recoveries {
     /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail, returns the
     /// error.
     pub(crate) fn recover(&mut self, sessions: &mut [Session], error: anyhow::Error) -> anyhow::Result<()> {
-        if !is_of_gpu(&error) || sessions.iter().any(|session| session.recovery().is_none()) {
+        if !is_gpu_error(&error) || sessions.iter().any(|session| session.recovery().is_none()) {
             return Err(error);
         }
         let began = Instant::now();
-        if self.last.is_some_and(|last| last.elapsed() > FORGOTTEN_AFTER) {
+        if self.last.is_some_and(|last| last.elapsed() > RESET_COUNT_AFTER) {
             self.n = 0;
         }
         let mut error = error;
         while self.n < MAX_RECOVERIES {
             if self.n > 0 {
-                std::thread::sleep(BEFORE_RETRY);
+                std::thread::sleep(RETRY_DELAY);
             }
             self.n += 1;
             log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
@@ -118,8 +118,11 @@ impl Recoveries {
                 Err(again) => error = again,
             }
         }
-        let left = what_is_left(sessions);
-        Err(GpuGone(format!("{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {left}")).into())
+        let recoverable = describe_recoverable(sessions);
+        Err(GpuUnrecoverable(format!(
+            "{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}"
+        ))
+        .into())
     }
 }
 

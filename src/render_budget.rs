@@ -6,9 +6,9 @@
 use std::time::Duration;
 
 /// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this length.
-const MAX_SAVED_SECS: f64 = 0.1;
+const MAX_CREDIT_SECS: f64 = 0.1;
 /// Maximum debt, seconds: after a picture that takes longer, training catches up on this much only.
-const MAX_OWED_SECS: f64 = 1.0;
+const MAX_DEBT_SECS: f64 = 1.0;
 
 /// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,7 +19,7 @@ pub(crate) struct RenderBudget {
 
 impl Default for RenderBudget {
     fn default() -> Self {
-        Self { balance_secs: MAX_SAVED_SECS }
+        Self { balance_secs: MAX_CREDIT_SECS }
     }
 }
 
@@ -32,12 +32,12 @@ impl RenderBudget {
     /// Adds time spent on training.
     pub(crate) fn add_training(&mut self, spent: Duration) {
         let spent_secs = spent.as_secs_f64();
-        self.balance_secs = (self.balance_secs + spent_secs).min(MAX_SAVED_SECS.max(spent_secs));
+        self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
     }
 
     /// Subtracts time spent on a picture.
     pub(crate) fn add_render(&mut self, spent: Duration) {
-        self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_OWED_SECS);
+        self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_DEBT_SECS);
     }
 }
 
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn training_keeps_half_of_the_time_whatever_pictures_take() {
+    fn training_keeps_half_of_the_time() {
         for millis in [1, 3, 40, 400] {
             let frac = render_frac(Duration::from_millis(millis), STEP);
             assert!((0.49..0.51).contains(&frac), "{millis} ms per picture: {frac}");
@@ -72,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn all_stages_of_a_picture_are_drawn_at_once_and_a_burst_ends() {
+    fn bursts_of_pictures_are_bounded() {
         let mut budget = RenderBudget::default();
         let mut n_drawn = 0;
         while budget.may_render() {

@@ -4,9 +4,9 @@ use crate::config::Override;
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
 use crate::depth_from;
-use crate::exit::{BadArgument, LackOfEvidence};
+use crate::exit::{BadArgument, InsufficientData};
 use crate::join::KeyframeList;
-use crate::method::{Kind, Recipe};
+use crate::method::{ModelKind, ModelSpec};
 use crate::session::Session;
 use crate::stop::Stop;
 use kinematics::Stamp;
@@ -20,20 +20,20 @@ use trainer::Keyframe;
 pub(crate) struct Replay {
     path: PathBuf,
     pub(crate) decisions: Decisions,
-    kind: Kind,
+    kind: ModelKind,
 }
 
 impl Replay {
     /// Reads a log.
     pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let decisions = Decisions::load(path)?;
-        let kind = Kind::named(&decisions.settings.method).ok_or_else(|| {
+        let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
             BadArgument(format!("{}: there is no method {:?}", path.display(), decisions.settings.method))
         })?;
         let replay = Self { path: path.to_owned(), decisions, kind };
         if replay.decisions.pushed().next().is_none() {
             return Err(
-                LackOfEvidence(format!("{} names no keyframe: nothing is to be repeated", replay.name())).into()
+                InsufficientData(format!("{} names no keyframe: nothing is to be repeated", replay.name())).into()
             );
         }
         Ok(replay)
@@ -50,30 +50,31 @@ impl Replay {
             pushed().map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed)).collect();
         for keyframe in &mut data.keyframes {
             if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
-                *keyframe = pushed.placed(keyframe);
+                *keyframe = pushed.corrected(keyframe);
             }
         }
-        if !self.decisions.is_whole() {
+        if !self.decisions.is_complete() {
             let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
             let name = self.name();
-            data.losses.push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
+            data.dropped_messages
+                .push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
         }
         Ok(data)
     }
 
     /// Refuses data that lack a keyframe of the log, or have another one in its place.
-    pub(crate) fn check_data(&self, path: &Path, data: &Data) -> Result<(), LackOfEvidence> {
-        let there = by_name(&data.keyframes);
+    pub(crate) fn check_data(&self, path: &Path, data: &Data) -> Result<(), InsufficientData> {
+        let by_key = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
         for pushed in self.decisions.pushed() {
             let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
-            let Some(keyframe) = there.get(&(camera, stamp)) else {
-                return Err(LackOfEvidence(format!(
+            let Some(keyframe) = by_key.get(&(camera, stamp)) else {
+                return Err(InsufficientData(format!(
                     "{name} names image {stamp} of camera {camera:?}, which {shown} does not have"
                 )));
             };
-            if !pushed.is_like(keyframe) {
-                return Err(LackOfEvidence(format!(
+            if !pushed.matches(keyframe) {
+                return Err(InsufficientData(format!(
                     "image {stamp} of camera {camera:?} has other pixels, depth, lens or pose in {shown} than {name} was written with"
                 )));
             }
@@ -102,30 +103,30 @@ impl Replay {
     }
 
     /// The scene model that it is of.
-    pub(crate) fn recipe(&self) -> Recipe {
-        Recipe { kind: self.kind, options: self.decisions.settings.options.clone() }
+    pub(crate) fn model_spec(&self) -> ModelSpec {
+        ModelSpec { kind: self.kind, options: self.decisions.settings.options.clone() }
     }
 
     /// Says where the bits may differ.
     pub(crate) fn check_adapter(&self, adapter: &str) {
-        let then = &self.decisions.settings.adapter;
-        if then != adapter {
-            log::warn!("{} was written on {then:?}: another adapter rounds otherwise", self.name());
+        let logged_adapter = &self.decisions.settings.adapter;
+        if logged_adapter != adapter {
+            log::warn!("{} was written on {logged_adapter:?}: another adapter rounds otherwise", self.name());
         }
     }
 
     /// Repeats the decisions, each at its step.
     pub(crate) fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
-        let there = by_name(keyframes);
+        let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
-            while !stop.asked() {
-                let n_taken = session.n_taken()?;
-                if n_taken >= entry.step {
+            while !stop.requested() {
+                let n_total_steps = session.n_total_steps()?;
+                if n_total_steps >= entry.step {
                     break;
                 }
-                if session.step(entry.step - n_taken)? == 0 {
-                    return Err(LackOfEvidence(format!(
+                if session.step(entry.step - n_total_steps)? == 0 {
+                    return Err(InsufficientData(format!(
                         "{} asks for step {} where there is nothing to learn from",
                         self.name(),
                         entry.step
@@ -133,19 +134,19 @@ impl Replay {
                     .into());
                 }
             }
-            if stop.asked() {
+            if stop.requested() {
                 break;
             }
             match &entry.decision {
                 Decision::Push(pushed) => {
-                    if let Some(keyframe) = there.get(&(&*pushed.camera, pushed.stamp_nanos)) {
+                    if let Some(keyframe) = by_key.get(&(&*pushed.camera, pushed.stamp_nanos)) {
                         session.push(keyframe)?;
                     }
                 }
-                Decision::Remove(gone) => session.remove(&gone.camera, Stamp(gone.stamp_nanos))?,
+                Decision::Remove(removed) => session.remove(&removed.camera, Stamp(removed.stamp_nanos))?,
                 Decision::Seed(_) => session.seed()?,
                 Decision::Begin(_) => drop(session.step(0)?),
-                Decision::Had(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
+                Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
             }
         }
         Ok(())

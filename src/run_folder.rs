@@ -3,7 +3,7 @@
 use crate::config::Rig;
 use crate::data::is_recording;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::Kind;
+use crate::method::ModelKind;
 use crate::splat_file;
 use anyhow::{Context, bail, ensure};
 use serde::Serialize;
@@ -21,7 +21,7 @@ const SPLATS: &str = "splats.ply";
 /// Where the folders of runs lie unasked.
 const RUNS: &str = "runs";
 /// Where a model lies until it is whole.
-const UNFINISHED: &str = "model.part";
+const PARTIAL_MODEL: &str = "model.part";
 /// What training needs to go on, in the folder of a run.
 pub(crate) const CHECKPOINT: &str = "training.ckpt";
 /// Held while a run writes into a folder.
@@ -29,9 +29,9 @@ const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
 /// Refuses a folder that holds a model, or several: results of two runs never mix, and none is replaced.
-pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
-    let places = [PathBuf::new()].into_iter().chain(Kind::ALL.map(|kind| PathBuf::from(kind.name())));
-    let mut files = places.flat_map(|place| MODEL_FILES.map(|name| place.join(name)));
+pub(crate) fn check_no_model(folder: &Path) -> Result<(), BadArgument> {
+    let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.map(|kind| PathBuf::from(kind.name())));
+    let mut files = subfolders.flat_map(|path| MODEL_FILES.map(|name| path.join(name)));
     match files.find(|file| folder.join(file).exists()) {
         Some(file) => Err(BadArgument(format!(
             "--out {}: the folder holds a model already ({}), name another one",
@@ -43,8 +43,8 @@ pub(crate) fn refuse_model(folder: &Path) -> Result<(), BadArgument> {
 }
 
 /// Refuses the folder of a run that was cut off, or of several: another run would replace the checkpoint.
-pub(crate) fn refuse_unfinished(out: &Path) -> Result<(), BadArgument> {
-    let folders = std::iter::once(out.to_owned()).chain(Kind::ALL.into_iter().map(|kind| out.join(kind.name())));
+pub(crate) fn check_no_unfinished_run(out: &Path) -> Result<(), BadArgument> {
+    let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.into_iter().map(|kind| out.join(kind.name())));
     match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
         Some(folder) => Err(BadArgument(format!(
             "--out {}: {} holds a run that was cut off: --resume continues it, --out names another folder",
@@ -56,9 +56,9 @@ pub(crate) fn refuse_unfinished(out: &Path) -> Result<(), BadArgument> {
 }
 
 /// Refuses to write results into the folder of the data.
-pub(crate) fn refuse_data(out: &Path, data: &Path) -> Result<(), BadArgument> {
-    let whole = |path: &Path| path.canonicalize().ok();
-    match (whole(out), whole(data)) {
+pub(crate) fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), BadArgument> {
+    let canonical = |path: &Path| path.canonicalize().ok();
+    match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => {
             Err(BadArgument(format!("--out {}: this is the folder of the data, name another folder", out.display())))
         }
@@ -69,7 +69,7 @@ pub(crate) fn refuse_data(out: &Path, data: &Path) -> Result<(), BadArgument> {
 /// Refuses the folder of a run of several methods where one model is meant, and names theirs.
 pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
-    let inside: Vec<String> = Kind::ALL
+    let inside: Vec<String> = ModelKind::ALL
         .into_iter()
         .map(|kind| folder.join(kind.name()))
         .filter(|folder| holds_one(folder))
@@ -91,13 +91,14 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
             return Ok(());
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
-        let instead = if has_checkpoint { " but a checkpoint: train --resume goes on from it to one" } else { "" };
-        bail!("{shown} holds no model{instead}");
+        let hint = if has_checkpoint { " but a checkpoint: train --resume goes on from it to one" } else { "" };
+        bail!("{shown} holds no model{hint}");
     }
-    let is_part = model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
-    if is_part || splat_file::Format::of(model).is_none() {
-        let told = format!("{shown} is no file of splats (.ply, .spz); of a saved model name its folder");
-        return Err(BadArgument(told).into());
+    let is_model_part =
+        model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
+    if is_model_part || splat_file::Format::of(model).is_none() {
+        let message = format!("{shown} is no file of splats (.ply, .spz); of a saved model name its folder");
+        return Err(BadArgument(message).into());
     }
     Ok(())
 }
@@ -106,7 +107,7 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
 /// [`expect_model`]. Methods without a model are left out, unless none has one.
 pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
-    let inside = Kind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
+    let inside = ModelKind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
     let inside: Vec<PathBuf> = inside.collect();
     if path.is_dir() && !holds_model(path) && !inside.is_empty() {
         return Ok(inside);
@@ -117,26 +118,26 @@ pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
 
 /// Folders that this run made; a refused run takes them back.
 #[derive(Debug, Default)]
-pub(crate) struct MadeFolders {
+pub(crate) struct CreatedFolders {
     /// Each before the one it lies in.
     leaves: Vec<PathBuf>,
     /// What leads to them, each before the one it lies in.
-    above: Vec<PathBuf>,
+    parents: Vec<PathBuf>,
 }
 
-impl MadeFolders {
+impl CreatedFolders {
     /// Makes the folder of each model of a run: the one asked for where there is one model, else one inside it by the name of its
     /// method. The settled rig file, where there is one, is written into each: beside a model the one that makes it alone.
     pub(crate) fn make_each(
         &mut self,
-        asked: Option<&Path>,
-        kinds: &[Kind],
+        requested: Option<&Path>,
+        kinds: &[ModelKind],
         rig: Option<&Rig>,
     ) -> anyhow::Result<Vec<PathBuf>> {
         let write = |rig: &Rig, folder: &Path| {
-            rig.write_settled(folder).with_context(|| format!("cannot write into {}", folder.display()))
+            rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))
         };
-        let out = self.make(asked)?;
+        let out = self.make(requested)?;
         let folders: Vec<PathBuf> = match kinds {
             [_] => vec![out.clone()],
             several => {
@@ -153,63 +154,63 @@ impl MadeFolders {
     }
 
     /// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
-    pub(crate) fn make(&mut self, asked: Option<&Path>) -> anyhow::Result<PathBuf> {
-        let is_absent = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-        let absent = |folder: &Path| folder.ancestors().take_while(is_absent).map(Path::to_owned).collect::<Vec<_>>();
-        let runs = absent(Path::new(RUNS));
-        let asked_for = asked.map_or(Vec::new(), absent);
-        let made = make(asked)?;
-        match (asked, asked_for.split_first()) {
+    pub(crate) fn make(&mut self, requested: Option<&Path>) -> anyhow::Result<PathBuf> {
+        let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+        let missing = |folder: &Path| folder.ancestors().take_while(is_missing).map(Path::to_owned).collect::<Vec<_>>();
+        let runs = missing(Path::new(RUNS));
+        let missing_parents = requested.map_or(Vec::new(), missing);
+        let created = make(requested)?;
+        match (requested, missing_parents.split_first()) {
             (None, _) => {
-                self.leaves.insert(0, made.clone());
-                self.above.splice(0..0, runs);
+                self.leaves.insert(0, created.clone());
+                self.parents.splice(0..0, runs);
             }
-            (Some(_), Some((leaf, above))) => {
+            (Some(_), Some((leaf, parents))) => {
                 self.leaves.insert(0, leaf.clone());
-                self.above.splice(0..0, above.iter().cloned());
+                self.parents.splice(0..0, parents.iter().cloned());
             }
             (Some(_), None) => {} // Somebody else's.
         }
-        Ok(made)
+        Ok(created)
     }
 
     /// Removes what was made and all in it, but not where a model, a checkpoint or a recording is: somebody will want that.
-    pub(crate) fn take_back(self) {
+    pub(crate) fn remove_created(self) {
         let holds_recording = |folder: &PathBuf| {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
             entries.map(|entry| entry.path()).any(|path| is_recording(&path))
         };
-        let is_wanted = |folder: &PathBuf| {
+        let must_keep = |folder: &PathBuf| {
             holds_recording(folder) || MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists())
         };
-        if self.leaves.iter().any(is_wanted) {
+        if self.leaves.iter().any(must_keep) {
             return;
         }
         let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
         // What others put something into meanwhile is not empty, and stays.
-        let removed = removed.and_then(|()| self.above.iter().try_for_each(std::fs::remove_dir));
+        let removed = removed.and_then(|()| self.parents.iter().try_for_each(std::fs::remove_dir));
         if let Err(error) = removed {
             log::debug!("what a refused run leaves behind: {error}");
         }
     }
 
     /// Takes back what was made where a command was refused: bad arguments, or nothing to work on.
-    pub(crate) fn after<T>(self, ended: anyhow::Result<T>) -> anyhow::Result<T> {
+    pub(crate) fn keep_or_remove<T>(self, ended: anyhow::Result<T>) -> anyhow::Result<T> {
         if ended.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::Refused)) {
-            self.take_back();
+            self.remove_created();
         }
         ended
     }
 }
 
-fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
-    if let Some(folder) = asked {
+fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
+    if let Some(folder) = requested {
         if folder.to_str().is_none() {
             return Err(
                 BadArgument(format!("--out {}: the name must be UTF-8, reports hold it", folder.display())).into()
             );
         }
-        refuse_model(folder)?;
+        check_no_model(folder)?;
         std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
         lock(folder)?;
         return Ok(folder.to_owned());
@@ -218,7 +219,7 @@ fn make(asked: Option<&Path>) -> anyhow::Result<PathBuf> {
 }
 
 /// Makes a folder in the system's folder for temporary files, for a model that cannot be saved in the folder of its run.
-pub(crate) fn make_rescue() -> anyhow::Result<PathBuf> {
+pub(crate) fn make_fallback_folder() -> anyhow::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
@@ -247,54 +248,56 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
 
 /// Keeps other runs out of a folder as long as this process lives.
 fn lock(folder: &Path) -> anyhow::Result<()> {
-    let place = folder.join(LOCK);
-    let file = std::fs::File::create(&place).with_context(|| format!("cannot write {}", place.display()))?;
+    let path = folder.join(LOCK);
+    let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
     match file.try_lock() {
         Ok(()) => std::mem::forget(file), // The system lets go of it when the process ends, however it ends.
         Err(std::fs::TryLockError::WouldBlock) => {
-            let told = format!("--out {}: another run writes into this folder, name another one", folder.display());
-            return Err(BadArgument(told).into());
+            let message = format!("--out {}: another run writes into this folder, name another one", folder.display());
+            return Err(BadArgument(message).into());
         }
-        Err(std::fs::TryLockError::Error(error)) => log::debug!("{}: no lock: {error}", place.display()),
+        Err(std::fs::TryLockError::Error(error)) => log::debug!("{}: no lock: {error}", path.display()),
     }
     Ok(())
 }
 
 /// Saves a model beside its place first and moves it there when it is whole.
 pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
-    let unfinished = folder.join(UNFINISHED);
-    if unfinished.exists() {
+    let partial_folder = folder.join(PARTIAL_MODEL);
+    if partial_folder.exists() {
         // Of a run that was killed while it saved.
-        std::fs::remove_dir_all(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))?;
+        std::fs::remove_dir_all(&partial_folder)
+            .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
     }
-    if let Err(error) = method.save(&unfinished) {
-        let _ = std::fs::remove_dir_all(&unfinished); // Incomplete, and it takes space.
+    if let Err(error) = method.save(&partial_folder) {
+        let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and it takes space.
         return Err(error.into());
     }
     // Splats and blocks come last: a folder that holds them holds the whole model.
-    for name in MODEL_FILES.iter().filter(|name| unfinished.join(name).exists()) {
-        let place = folder.join(name);
-        std::fs::rename(unfinished.join(name), &place).with_context(|| format!("cannot write {}", place.display()))?;
+    for name in MODEL_FILES.iter().filter(|name| partial_folder.join(name).exists()) {
+        let path = folder.join(name);
+        std::fs::rename(partial_folder.join(name), &path)
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
     // A file that is not listed above would be lost: the folder has to be empty now.
-    std::fs::remove_dir(&unfinished).with_context(|| format!("cannot remove {}", unfinished.display()))
+    std::fs::remove_dir(&partial_folder).with_context(|| format!("cannot remove {}", partial_folder.display()))
 }
 
 /// Writes a report as readable JSON.
 pub(crate) fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
-    write_whole(path, &text)
+    write_atomic(path, &text)
 }
 
 /// Writes a file that is either complete or absent.
-pub(crate) fn write_whole(path: &Path, text: &str) -> anyhow::Result<()> {
-    Ok(trainer::whole_file::write(path, |file| file.write_all(text.as_bytes()))?)
+pub(crate) fn write_atomic(path: &Path, text: &str) -> anyhow::Result<()> {
+    Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
 }
 
 /// Writes which keyframes were used, and what for, for `--keyframes`.
 pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
-    write_whole(path, &crate::join::keyframe_list(keyframes.iter()))
+    write_atomic(path, &crate::join::keyframe_list(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.
@@ -324,8 +327,8 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
 fn name_from_time(since_epoch: Duration) -> String {
     let secs = since_epoch.as_secs();
     let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
-    let of_day = secs % SECS_PER_DAY;
-    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", of_day / 3600, of_day / 60 % 60, of_day % 60)
+    let secs_of_day = secs % SECS_PER_DAY;
+    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", secs_of_day / 3600, secs_of_day / 60 % 60, secs_of_day % 60)
 }
 
 /// Year, month and day of a day counted from 1 January 1970.
@@ -358,84 +361,87 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_with_a_model_is_refused_and_named() {
+    fn folder_with_a_model_is_rejected() {
         let folder = tempfile::tempdir().expect("folder");
         assert_eq!(make(Some(folder.path())).expect("an empty folder"), folder.path());
         std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
-        let told = make(Some(folder.path())).expect_err("a model").to_string();
-        assert!(told.contains(folder.path().to_str().expect("plain")) && told.contains("model.json"), "{told}");
+        let message = make(Some(folder.path())).expect_err("a model").to_string();
+        assert!(
+            message.contains(folder.path().to_str().expect("plain")) && message.contains("model.json"),
+            "{message}"
+        );
     }
 
     #[test]
-    fn several_models_lie_in_folders_of_their_own_and_are_found() {
+    fn models_of_several_methods_are_found_in_subfolders() {
         let folder = tempfile::tempdir().expect("folder");
-        let asked = folder.path().join("out");
-        let kinds = [Kind::Tsdf, Kind::Splat];
-        let made = MadeFolders::default().make_each(Some(&asked), &kinds, None).expect("it is free");
-        assert_eq!(made, [asked.join("tsdf"), asked.join("splat")]);
-        expect_one_model(&asked).expect("there is none yet");
-        std::fs::write(made[0].join(CHECKPOINT), b"{}").expect("file");
-        assert!(models_at(&asked).is_err(), "a checkpoint is not a model");
-        std::fs::write(made[1].join("splats.ply"), b"{}").expect("file");
-        assert_eq!(models_at(&asked).expect("one of them"), [asked.join("splat")]);
-        std::fs::write(made[0].join("model.json"), b"{}").expect("file");
-        assert_eq!(models_at(&asked).expect("both"), [asked.join("splat"), asked.join("tsdf")]);
-        assert_eq!(models_at(&made[0]).expect("itself"), [asked.join("tsdf")]);
-        std::fs::remove_file(made[0].join("model.json")).expect("file");
-        let told = expect_one_model(&asked).expect_err("two").0;
-        assert!(told.contains("out/splat or ") && told.ends_with("out/tsdf"), "{told}");
-        expect_one_model(&made[1]).expect("one");
-        let told = refuse_model(&asked).expect_err("one inside").0;
-        assert!(told.contains("splat/splats.ply"), "{told}");
+        let requested = folder.path().join("out");
+        let kinds = [ModelKind::Tsdf, ModelKind::Splat];
+        let created = CreatedFolders::default().make_each(Some(&requested), &kinds, None).expect("it is free");
+        assert_eq!(created, [requested.join("tsdf"), requested.join("splat")]);
+        expect_one_model(&requested).expect("there is none yet");
+        std::fs::write(created[0].join(CHECKPOINT), b"{}").expect("file");
+        assert!(models_at(&requested).is_err(), "a checkpoint is not a model");
+        std::fs::write(created[1].join("splats.ply"), b"{}").expect("file");
+        assert_eq!(models_at(&requested).expect("one of them"), [requested.join("splat")]);
+        std::fs::write(created[0].join("model.json"), b"{}").expect("file");
+        assert_eq!(models_at(&requested).expect("both"), [requested.join("splat"), requested.join("tsdf")]);
+        assert_eq!(models_at(&created[0]).expect("itself"), [requested.join("tsdf")]);
+        std::fs::remove_file(created[0].join("model.json")).expect("file");
+        let message = expect_one_model(&requested).expect_err("two").0;
+        assert!(message.contains("out/splat or ") && message.ends_with("out/tsdf"), "{message}");
+        expect_one_model(&created[1]).expect("one");
+        let message = check_no_model(&requested).expect_err("one inside").0;
+        assert!(message.contains("splat/splats.ply"), "{message}");
     }
 
     #[test]
-    fn a_run_that_was_cut_off_is_not_overwritten() {
+    fn unfinished_run_is_not_overwritten() {
         let out = tempfile::tempdir().expect("a folder");
-        refuse_unfinished(&out.path().join("new")).expect("nothing is there");
-        let run = out.path().join(Kind::Splat.name());
+        check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
+        let run = out.path().join(ModelKind::Splat.name());
         std::fs::create_dir(&run).expect("room");
-        refuse_unfinished(out.path()).expect("without a checkpoint there is nothing to continue from");
+        check_no_unfinished_run(out.path()).expect("without a checkpoint there is nothing to continue from");
         std::fs::write(run.join(CHECKPOINT), b"x").expect("room");
-        assert!(refuse_unfinished(out.path()).is_err_and(|error| error.0.contains("splat holds a run")));
-        assert!(refuse_unfinished(&run).is_err());
+        assert!(check_no_unfinished_run(out.path()).is_err_and(|error| error.0.contains("splat holds a run")));
+        assert!(check_no_unfinished_run(&run).is_err());
     }
 
     #[test]
-    fn a_refused_run_takes_back_what_it_made_and_nothing_else() {
+    fn rejected_run_removes_only_its_own_folders() {
         let folder = tempfile::tempdir().expect("folder");
-        let (ours, theirs) = (folder.path().join("a/b"), folder.path().join("theirs"));
-        std::fs::create_dir(&theirs).expect("room on the disk");
+        let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
+        std::fs::create_dir(&foreign_folder).expect("room on the disk");
         let refused = || Err::<(), _>(anyhow::Error::new(BadArgument("too small".into())));
-        for (asked, is_left) in [(&ours, false), (&theirs, true)] {
-            let mut made = MadeFolders::default();
-            made.make_each(Some(asked), &[Kind::Tsdf, Kind::Splat], None).expect("it is free");
-            assert!(made.after(refused()).is_err());
-            assert_eq!((asked.exists(), asked.join("tsdf").exists()), (is_left, false), "{asked:?}");
+        for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
+            let mut created = CreatedFolders::default();
+            created.make_each(Some(requested), &[ModelKind::Tsdf, ModelKind::Splat], None).expect("it is free");
+            assert!(created.keep_or_remove(refused()).is_err());
+            assert_eq!((requested.exists(), requested.join("tsdf").exists()), (is_left, false), "{requested:?}");
         }
         assert!(!folder.path().join("a").exists());
         let failed = Err(anyhow::anyhow!("the disk is full"));
         for (ended, file) in [(refused(), CHECKPOINT), (refused(), "scan.mcap"), (failed, "keyframes.txt")] {
-            let mut made = MadeFolders::default();
+            let mut created = CreatedFolders::default();
             let out = folder.path().join(file);
-            made.make(Some(&out)).expect("it is free");
+            created.make(Some(&out)).expect("it is free");
             std::fs::write(out.join(file), b"x").expect("file");
-            assert!(made.after(ended).is_err() && out.exists(), "{file}");
+            assert!(created.keep_or_remove(ended).is_err() && out.exists(), "{file}");
         }
     }
 
     #[test]
-    fn what_holds_no_model_says_what_to_name() {
+    fn missing_model_error_suggests_a_path() {
         let folder = tempfile::tempdir().expect("folder");
         let at = |name: &str| folder.path().join(name);
-        let told = |name: &str| expect_model(&at(name)).expect_err("no model").to_string();
-        assert!(told("absent").ends_with("absent does not exist"));
-        assert!(told("").ends_with("holds no model"));
+        let message = |name: &str| expect_model(&at(name)).expect_err("no model").to_string();
+        assert!(message("absent").ends_with("absent does not exist"));
+        assert!(message("").ends_with("holds no model"));
         for name in [CHECKPOINT, "report.json", "scan.mcap", "mesh.ply"] {
             std::fs::write(at(name), b"x").expect("file");
-            assert!(told(name).contains("name its folder"), "{name}");
+            assert!(message(name).contains("name its folder"), "{name}");
             if name == CHECKPOINT {
-                assert!(told("").contains("--resume"));
+                assert!(message("").contains("--resume"));
             }
         }
         std::fs::write(at(SPLATS), b"x").expect("file");
@@ -444,15 +450,15 @@ mod tests {
     }
 
     #[test]
-    fn two_runs_do_not_write_into_one_folder() {
+    fn folder_is_locked_by_one_run() {
         let folder = tempfile::tempdir().expect("folder");
         make(Some(folder.path())).expect("the first");
-        let told = make(Some(folder.path())).expect_err("the second").to_string();
-        assert!(told.contains("another run writes into this folder"), "{told}");
+        let message = make(Some(folder.path())).expect_err("the second").to_string();
+        assert!(message.contains("another run writes into this folder"), "{message}");
     }
 
     #[test]
-    fn the_checksum_sees_every_byte_and_every_name() {
+    fn checksum_covers_contents_and_names() {
         let folder = tempfile::tempdir().expect("folder");
         assert!(checkpoint_sha256(folder.path()).is_err(), "no model, no checksum");
         std::fs::write(folder.path().join("splats.ply"), b"abc").expect("file");

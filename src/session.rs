@@ -5,14 +5,14 @@ use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
+use crate::evaluation_schedule::EvaluationSchedule;
 use crate::join::split_name;
-use crate::marks::Marks;
-use crate::method::{self, Absent, Kind};
+use crate::method::{self, FailedModel, ModelKind};
 use crate::next_commands::{self, DataSource, SavedModel};
-use crate::open_mark::OpenMark;
+use crate::pending_evaluation::PendingEvaluation;
 use crate::recovery::{self, Recovery};
 use crate::stop::Stop;
-use crate::turns::TURN;
+use crate::time_slices::TIME_SLICE;
 use crate::{camera_list, checkpoints, exit, print, report, run_folder};
 use anyhow::Context;
 use indicatif::ProgressBar;
@@ -24,13 +24,13 @@ use std::time::{Duration, Instant};
 use trainer::align::Alignment;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::splat::PosedLens;
-use trainer::{DepthMap, Keyframe, Method, Part, Picture, Progress, RenderRequest, Split};
+use trainer::splat::CalibratedCamera;
+use trainer::{DepthMap, Keyframe, Method, Picture, Progress, RenderRequest, Split, TrialReport};
 
 /// Steps that a profile is the median of.
 const N_PROFILED: usize = 21;
 /// After large buffers were let go of, drivers are slow for a while.
-const BEFORE_PROFILE: Duration = Duration::from_millis(700);
+const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
 /// Points of the PSNR curve that are kept; past them every second one goes.
 const MAX_HISTORY: usize = 512;
 
@@ -45,7 +45,7 @@ pub(crate) struct Limits {
 
 impl Limits {
     /// How long that is, for people: `8 s`, `500 steps`.
-    pub(crate) fn in_words(self) -> String {
+    pub(crate) fn describe(self) -> String {
         let parts =
             [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" or ")
@@ -56,16 +56,16 @@ impl Limits {
 #[derive(Clone)]
 pub(crate) struct Evaluators {
     /// At the marks: thorough where nobody waits, quick in a live run.
-    pub(crate) at_marks: Evaluator,
+    pub(crate) during_training: Evaluator,
     /// Test keyframes scored at a mark, spread evenly over all; the others are scored at the end only.
-    pub(crate) most_at_marks: usize,
+    pub(crate) max_images_during_training: usize,
     /// At the end.
     pub(crate) at_end: Evaluator,
 }
 
 /// What a session prints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Tell {
+pub(crate) enum OutputMode {
     /// A line a mark, and a bar where stderr is a terminal.
     Lines,
     /// One JSON object a mark.
@@ -76,7 +76,7 @@ pub(crate) enum Tell {
     Nothing,
 }
 
-impl Tell {
+impl OutputMode {
     /// What a command prints of its one session.
     pub(crate) fn of_command(json: bool) -> Self {
         if json { Self::Json } else { Self::Lines }
@@ -85,7 +85,7 @@ impl Tell {
 
 /// A model in training.
 pub(crate) struct Session {
-    kind: Kind,
+    kind: ModelKind,
     method: Box<dyn Method>,
     checkpoints: Option<Checkpoints>,
     decisions: Option<DecisionLog>,
@@ -97,28 +97,28 @@ pub(crate) struct Session {
     gpu: Arc<Gpu>,
     /// At the marks.
     evaluator: Evaluator,
-    most_at_marks: usize,
+    max_images_during_training: usize,
     /// At the end.
-    last_evaluator: Evaluator,
+    final_evaluator: Evaluator,
     /// Held, in the order they came.
     keyframes: Vec<Arc<Keyframe>>,
     tests: VecDeque<Arc<Keyframe>>,
     limits: Limits,
     clock: Clock,
     /// Time it had on a device that it shares.
-    had: Duration,
+    device_time: Duration,
     /// When it was done though others were not, seconds.
-    rested_secs: Option<f64>,
-    marks: Marks,
+    finished_secs: Option<f64>,
+    schedule: EvaluationSchedule,
     /// Due and not completely scored yet.
-    open_mark: Option<OpenMark>,
+    pending_evaluation: Option<PendingEvaluation>,
     /// Whether the caller scores an open evaluation image by image.
     scores_stepwise: bool,
-    told: Vec<Eval>,
+    reported: Vec<Evaluation>,
     history: Vec<(f64, f64)>,
     /// Newest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
-    tell: Tell,
+    output: OutputMode,
     /// Whether somebody wants an end: a mark is not worth waiting for then.
     stop: Stop,
     profiles: bool,
@@ -127,7 +127,7 @@ pub(crate) struct Session {
 
 /// What is told at a mark.
 #[derive(Clone, Debug, Serialize)]
-pub(crate) struct Eval {
+pub(crate) struct Evaluation {
     event: &'static str,
     method: &'static str,
     pub(crate) seconds: f64,
@@ -142,20 +142,20 @@ pub(crate) struct Eval {
 }
 
 /// What came of a training.
-pub(crate) struct Outcome {
+pub(crate) struct TrainingOutcome {
     pub(crate) seconds: f64,
     pub(crate) steps: u64,
     pub(crate) scores: Scores,
     pub(crate) primitives: u64,
     pub(crate) bytes: u64,
     /// What was told at the marks.
-    pub(crate) marks: Vec<Eval>,
+    pub(crate) evaluations: Vec<Evaluation>,
     per_image: Vec<ImageScores>,
 }
 
 /// What is told at the end.
 #[derive(Clone, Debug, Serialize)]
-struct Done<'a> {
+struct DoneEvent<'a> {
     event: &'static str,
     method: &'static str,
     seconds: f64,
@@ -170,7 +170,7 @@ struct Done<'a> {
 
 /// GPU time of each kernel in a step, milliseconds.
 #[derive(Debug, Serialize)]
-struct Profile<'a> {
+struct ProfileEvent<'a> {
     event: &'static str,
     method: &'static str,
     passes: &'a [(&'static str, f64)],
@@ -179,15 +179,15 @@ struct Profile<'a> {
 /// What `report.json` holds.
 #[derive(Debug, Serialize)]
 struct Report<'a, T: Serialize> {
-    done: &'a Done<'a>,
+    done: &'a DoneEvent<'a>,
     adapter: String,
     #[serde(flatten)]
-    particulars: &'a T,
+    details: &'a T,
     /// What the parts of the model that were tried bought.
-    parts: Vec<Part>,
+    parts: Vec<TrialReport>,
     /// GPU time of each pass of a step, milliseconds, where it was asked for.
     passes: Vec<(&'static str, f64)>,
-    marks: &'a [Eval],
+    evaluations: &'a [Evaluation],
     per_image: Vec<NamedScores<'a>>,
 }
 
@@ -200,8 +200,8 @@ struct NamedScores<'a> {
 }
 
 /// A trained model that is saved and scored, still in GPU memory.
-pub(crate) struct Finished {
-    pub(crate) kind: Kind,
+pub(crate) struct FinishedModel {
+    pub(crate) kind: ModelKind,
     pub(crate) method: Box<dyn Method>,
     pub(crate) folder: PathBuf,
     /// Seconds of training.
@@ -210,30 +210,31 @@ pub(crate) struct Finished {
     pub(crate) scores: Scores,
     data: DataSource,
     n_tests: usize,
-    tell: Tell,
+    output: OutputMode,
 }
 
-impl Finished {
+impl FinishedModel {
     fn saved(&self) -> SavedModel<'_> {
         SavedModel { kind: self.kind, folder: &self.folder, data: &self.data, n_tests: self.n_tests }
     }
 }
 
 /// One of the sessions that end together: where its results go, and what only its kind of run knows of it.
-pub(crate) struct Ending<P> {
+pub(crate) struct EndingSession<P> {
     pub(crate) session: Session,
     pub(crate) out: PathBuf,
-    pub(crate) particulars: P,
+    pub(crate) details: P,
 }
 
 /// Saves the models, then scores each a last time, writes its report, and reports the end. Returns the models so that they can be shown.
-pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result<Vec<Finished>> {
+pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow::Result<Vec<FinishedModel>> {
     // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
-    let ended_secs: Vec<f64> = endings.iter_mut().map(|ending| ending.session.halt()).collect::<anyhow::Result<_>>()?;
+    let ended_secs: Vec<f64> =
+        endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<anyhow::Result<_>>()?;
     let mut saved = Vec::new();
     // The first error ends the command, the others are logged.
     let mut failed = Ok(());
-    let mut note = |error: anyhow::Error| match failed {
+    let mut record_error = |error: anyhow::Error| match failed {
         Ok(()) => failed = Err(error),
         Err(_) => log::error!("{error:#}"),
     };
@@ -243,31 +244,31 @@ pub(crate) fn finish(mut endings: Vec<Ending<impl Serialize>>) -> anyhow::Result
             Ok(Saved { folder, sha256, failed: error }) => {
                 ending.out = folder;
                 ending.session.write_cameras(&ending.out);
-                error.into_iter().for_each(&mut note);
+                error.into_iter().for_each(&mut record_error);
                 saved.push((ending, seconds, sha256));
             }
-            Err(error) => note(error),
+            Err(error) => record_error(error),
         }
     }
     for (ending, ..) in &mut saved {
         if let Some(Err(error)) = ending.session.checkpoints.as_mut().map(Checkpoints::wait) {
-            note(
+            record_error(
                 error.context(format!("the model was saved in {}, but not its last checkpoint", ending.out.display())),
             );
         }
     }
-    if saved.iter().any(|(ending, ..)| ending.session.stop.asked()) {
+    if saved.iter().any(|(ending, ..)| ending.session.stop.requested()) {
         log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
     }
     let mut finished = Vec::new();
-    for (Ending { session, out, particulars }, seconds, sha256) in saved {
-        match session.tell_end(&out, seconds, &sha256, &particulars) {
+    for (EndingSession { session, out, details }, seconds, sha256) in saved {
+        match session.report_end(&out, seconds, &sha256, &details) {
             Ok(model) => finished.push(model),
-            Err(error) => note(error),
+            Err(error) => record_error(error),
         }
     }
-    if finished.iter().any(|model| model.tell == Tell::Lines) {
-        let models: Vec<SavedModel<'_>> = finished.iter().map(Finished::saved).collect();
+    if finished.iter().any(|model| model.output == OutputMode::Lines) {
+        let models: Vec<SavedModel<'_>> = finished.iter().map(FinishedModel::saved).collect();
         for line in next_commands::lines(&next_commands::for_models(&models)) {
             print::report(line);
         }
@@ -287,10 +288,10 @@ impl Session {
     /// A session around a fresh model; its clock stands still until [`Self::start_clock`].
     pub(crate) fn new(
         gpu: Arc<Gpu>,
-        (kind, method): (Kind, Box<dyn Method>),
+        (kind, method): (ModelKind, Box<dyn Method>),
         evaluators: Evaluators,
         limits: Limits,
-        tell: Tell,
+        output: OutputMode,
     ) -> Self {
         let length = limits.steps.or(limits.seconds.map(whole_secs));
         let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
@@ -304,25 +305,25 @@ impl Session {
             evicted: Vec::new(),
             n_evicted_before_last: 0,
             gpu,
-            evaluator: evaluators.at_marks,
-            most_at_marks: evaluators.most_at_marks,
-            last_evaluator: evaluators.at_end,
+            evaluator: evaluators.during_training,
+            max_images_during_training: evaluators.max_images_during_training,
+            final_evaluator: evaluators.at_end,
             keyframes: Vec::new(),
             tests: VecDeque::new(),
             limits,
             clock: Clock::default(),
-            had: Duration::ZERO,
-            rested_secs: None,
-            marks: Marks::default(),
-            open_mark: None,
+            device_time: Duration::ZERO,
+            finished_secs: None,
+            schedule: EvaluationSchedule::default(),
+            pending_evaluation: None,
             scores_stepwise: false,
-            told: Vec::new(),
+            reported: Vec::new(),
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
-            tell,
+            output,
             stop: Stop::default(),
             profiles: false,
-            bar: print::bar(length, template, matches!(tell, Tell::Json | Tell::Nothing)),
+            bar: print::bar(length, template, matches!(output, OutputMode::Json | OutputMode::Nothing)),
         }
     }
 
@@ -363,19 +364,19 @@ impl Session {
     }
 
     /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
-    pub(crate) fn going_on_after(mut self, earlier_secs: f64) -> Self {
-        self.clock = Clock::after(earlier_secs);
-        self.marks.reached(earlier_secs);
+    pub(crate) fn with_elapsed_secs(mut self, previous_secs: f64) -> Self {
+        self.clock = Clock::with_elapsed(previous_secs);
+        self.schedule.reached(previous_secs);
         self
     }
 
     /// Makes it one of several that learn by one clock; it shows no bar, for those would stand in each other's way.
-    pub(crate) fn among_others(self, clock: Clock) -> Self {
+    pub(crate) fn with_shared_clock(self, clock: Clock) -> Self {
         Self { clock, bar: ProgressBar::hidden(), ..self }
     }
 
     /// The scene model's kind.
-    pub(crate) fn kind(&self) -> Kind {
+    pub(crate) fn kind(&self) -> ModelKind {
         self.kind
     }
 
@@ -404,7 +405,7 @@ impl Session {
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
         if let Some(decisions) = &mut self.decisions {
-            decisions.pushed(self.method.n_taken()?, keyframe);
+            decisions.pushed(self.method.n_total_steps()?, keyframe);
         }
         Ok(())
     }
@@ -434,40 +435,40 @@ impl Session {
         self.newest_psnr.retain(|(of, nanos), _| of != camera || *nanos != stamp.0);
         self.method.remove(camera, stamp)?;
         if let Some(decisions) = &mut self.decisions {
-            decisions.removed(self.method.n_taken()?, camera, stamp);
+            decisions.removed(self.method.n_total_steps()?, camera, stamp);
         }
         Ok(())
     }
 
     /// Gives the keyframes so far their splats.
     pub(crate) fn seed(&mut self) -> anyhow::Result<()> {
-        self.note_look();
+        self.note_render();
         Ok(self.method.seed()?)
     }
 
     /// Draws a picture.
     pub(crate) fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
-        self.note_look();
+        self.note_render();
         self.method.render(request)
     }
 
     /// Waits for what is queued, and says how many updates were made in all, those of trials included.
-    pub(crate) fn n_taken(&mut self) -> anyhow::Result<u64> {
-        Ok(self.method.n_taken()?)
+    pub(crate) fn n_total_steps(&mut self) -> anyhow::Result<u64> {
+        Ok(self.method.n_total_steps()?)
     }
 
     /// Whether a limit was reached.
     pub(crate) fn is_over(&self) -> bool {
-        self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_all_steps()
+        self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps()
     }
 
     /// Steps asked for that it has not made; `None` where no number was asked for.
-    pub(crate) fn steps_missing(&self) -> Option<u64> {
+    pub(crate) fn n_steps_remaining(&self) -> Option<u64> {
         Some(self.limits.steps?.saturating_sub(self.method.progress().step))
     }
 
     /// Whether it made all the steps that were asked for: nothing changes it any more.
-    pub(crate) fn has_all_steps(&self) -> bool {
+    pub(crate) fn has_finished_steps(&self) -> bool {
         self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
     }
 
@@ -476,20 +477,20 @@ impl Session {
         self.method.is_idle()
     }
 
-    /// Trains a slice of at most `n_most` steps, and evaluates when a mark was reached.
-    pub(crate) fn step(&mut self, n_most: u64) -> anyhow::Result<u64> {
-        let n = self.learn(n_most)?;
-        self.tell_due()?;
+    /// Trains a slice of at most `max_steps` steps, and evaluates when a mark was reached.
+    pub(crate) fn step(&mut self, max_steps: u64) -> anyhow::Result<u64> {
+        let n = self.train_steps(max_steps)?;
+        self.evaluate_when_due()?;
         Ok(n)
     }
 
-    /// Trains a slice of at most `n_most` steps.
-    pub(crate) fn learn(&mut self, n_most: u64) -> anyhow::Result<u64> {
+    /// Trains a slice of at most `max_steps` steps.
+    pub(crate) fn train_steps(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
         if let Some(decisions) = &mut self.decisions {
-            decisions.begun();
+            decisions.step_requested();
         }
-        let n = self.method.step(n_most.min(left))?;
+        let n = self.method.step(max_steps.min(left))?;
         recovery::lose_for_tests(&self.gpu, self.method.progress().step);
         Ok(n)
     }
@@ -528,7 +529,7 @@ impl Session {
 
     /// Drops the model on a failed device; [`Self::restart_on`] makes a new one.
     pub(crate) fn drop_model(&mut self) {
-        self.method = Box::new(Absent);
+        self.method = Box::new(FailedModel);
     }
 
     /// Restores the model on another device, from the newest checkpoint or, without one, from the start.
@@ -544,34 +545,37 @@ impl Session {
         let all = [&held[..], &self.evicted[..]].concat();
         let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint?, &all)).transpose();
         let resumed = resumed.or_else(|error| {
-            if recovery::is_of_gpu(&error) {
+            if recovery::is_gpu_error(&error) {
                 return Err(error);
             }
             log::warn!("cannot resume from the newest checkpoint: {error:#}");
             Ok(None)
         })?;
         let is_resumed = resumed.is_some();
-        let (mut method, rest) = match resumed {
-            Some(resumed) => (resumed.method, resumed.rest),
-            None => (recovery.recipe.clone().start(gpu.clone())?, held.clone()),
+        let (mut method, untrained) = match resumed {
+            Some(resumed) => (resumed.method, resumed.untrained),
+            None => (recovery.model_spec.clone().start(gpu.clone())?, held.clone()),
         };
         method.prepare()?;
-        let is_in =
-            |keyframes: &[Arc<Keyframe>], it: &Arc<Keyframe>| keyframes.iter().any(|other| Arc::ptr_eq(other, it));
-        for keyframe in self.evicted.iter().filter(|keyframe| !is_in(&rest, keyframe)) {
+        let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
+            keyframes.iter().any(|other| Arc::ptr_eq(other, keyframe_ref))
+        };
+        for keyframe in self.evicted.iter().filter(|keyframe| !is_in(&untrained, keyframe)) {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
-        let from_step = method.n_taken()?;
+        let from_step = method.n_total_steps()?;
         // The log so far is that of a run that ended here; a new log begins, perhaps in the same file.
         if let Some(decisions) = self.decisions.take() {
-            decisions.break_off();
+            decisions.close_unfinished();
         }
-        let settings = recovery.settings.after(is_resumed.then_some(from_step));
+        let settings = recovery.settings.continued_from(is_resumed.then_some(from_step));
         let mut decisions = DecisionLog::create(&recovery.folder, settings)?;
-        held.iter().filter(|keyframe| !is_in(&rest, keyframe)).for_each(|keyframe| decisions.had(from_step, keyframe));
-        for keyframe in rest.iter().filter(|keyframe| is_in(&held, keyframe)) {
+        held.iter()
+            .filter(|keyframe| !is_in(&untrained, keyframe))
+            .for_each(|keyframe| decisions.restored(from_step, keyframe));
+        for keyframe in untrained.iter().filter(|keyframe| is_in(&held, keyframe)) {
             method.push(keyframe.clone())?;
-            decisions.pushed(method.n_taken()?, keyframe);
+            decisions.pushed(method.n_total_steps()?, keyframe);
         }
         log::info!(
             "reopened the GPU: training continues from {}",
@@ -579,61 +583,61 @@ impl Session {
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
         // All images of a mark are scored on one state of the model, and that one is gone.
-        (self.rested_secs, self.open_mark) = (None, None);
+        (self.finished_secs, self.pending_evaluation) = (None, None);
         Ok(())
     }
 
-    /// Trains for a turn on a device that others use too, at most `n_most` steps; what was queued is done at its end.
+    /// Trains for a turn on a device that others use too, at most `max_steps` steps; what was queued is done at its end.
     ///
-    /// `is_awaited`: whether a picture waits for the end of the turn; asked after each submit.
-    pub(crate) fn take_turn(
+    /// `is_render_pending`: whether a picture waits for the end of the turn; asked after each submit.
+    pub(crate) fn run_time_slice(
         &mut self,
-        n_most: impl Fn(&Self) -> u64,
-        is_awaited: impl Fn() -> bool,
+        max_steps: impl Fn(&Self) -> u64,
+        is_render_pending: impl Fn() -> bool,
     ) -> anyhow::Result<()> {
-        let begun = Instant::now();
+        let started = Instant::now();
         let mut n_steps = 0;
         loop {
-            let n = self.learn(n_most(self))?;
+            let n = self.train_steps(max_steps(self))?;
             n_steps += n;
-            let is_at_end = self.is_over() || self.is_idle() || n_most(self) == 0;
-            if n == 0 || is_at_end || begun.elapsed() >= TURN || is_awaited() {
+            let is_at_end = self.is_over() || self.is_idle() || max_steps(self) == 0;
+            if n == 0 || is_at_end || started.elapsed() >= TIME_SLICE || is_render_pending() {
                 break;
             }
         }
-        self.method.n_taken()?;
+        self.method.n_total_steps()?;
         // Who can do nothing does not take each turn because of that.
-        self.had += if n_steps == 0 { TURN } else { begun.elapsed() };
-        if self.has_all_steps() {
-            self.rest();
+        self.device_time += if n_steps == 0 { TIME_SLICE } else { started.elapsed() };
+        if self.has_finished_steps() {
+            self.mark_finished();
         }
         Ok(())
     }
 
     /// Time it had on a device that it shares.
-    pub(crate) fn had(&self) -> Duration {
-        self.had
+    pub(crate) fn device_time(&self) -> Duration {
+        self.device_time
     }
 
     /// Lets it catch up on no more than what it lacks of this.
-    pub(crate) fn had_at_least(&mut self, had: Duration) {
-        self.had = self.had.max(had);
+    pub(crate) fn raise_device_time(&mut self, device_time: Duration) {
+        self.device_time = self.device_time.max(device_time);
     }
 
     /// Takes it for done, at this time of the clock.
-    pub(crate) fn rest(&mut self) {
+    pub(crate) fn mark_finished(&mut self) {
         let secs = self.secs();
-        self.rested_secs.get_or_insert(secs);
+        self.finished_secs.get_or_insert(secs);
     }
 
     /// Writes the checkpoint that is due, and evaluates when a mark was reached; one that rests has told all.
-    pub(crate) fn tell_due(&mut self) -> anyhow::Result<()> {
-        if self.rested_secs.is_some() {
+    pub(crate) fn evaluate_when_due(&mut self) -> anyhow::Result<()> {
+        if self.finished_secs.is_some() {
             return Ok(());
         }
         let seconds = self.secs();
         if let Some(checkpoints) = &mut self.checkpoints
-            && checkpoints.when_due(Snapshot {
+            && checkpoints.write_when_due(Snapshot {
                 method: self.method.as_mut(),
                 keyframes: &self.keyframes,
                 seconds,
@@ -641,43 +645,43 @@ impl Session {
             })?
         {
             if let Some(decisions) = &mut self.decisions {
-                decisions.checkpoint(self.method.n_taken()?);
+                decisions.checkpoint(self.method.n_total_steps()?);
             }
             // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe evicted before it.
             self.evicted.drain(..self.n_evicted_before_last);
             self.n_evicted_before_last = self.evicted.len();
         }
-        if self.open_mark.is_none() && self.marks.reached(self.secs()) {
-            self.open_mark()?;
+        if self.pending_evaluation.is_none() && self.schedule.reached(self.secs()) {
+            self.begin_evaluation()?;
             while !self.scores_stepwise && self.is_scoring() {
                 self.score_next()?;
             }
         }
-        self.show();
+        self.update_bar();
         Ok(())
     }
 
     /// Whether an evaluation is in progress.
     pub(crate) fn is_scoring(&self) -> bool {
-        self.open_mark.is_some()
+        self.pending_evaluation.is_some()
     }
 
     /// Scores one more test image of the open evaluation, and reports the evaluation after its last image.
     pub(crate) fn score_next(&mut self) -> anyhow::Result<()> {
-        let Some(mut mark) = self.open_mark.take() else { return Ok(()) };
-        if self.stop.asked() {
+        let Some(mut evaluation) = self.pending_evaluation.take() else { return Ok(()) };
+        if self.stop.requested() {
             return Ok(());
         }
-        if let Some(keyframe) = mark.take_next() {
+        if let Some(keyframe) = evaluation.take_next() {
             let before = Instant::now();
             let score = |session: &mut Self| session.evaluator.score_named(session.method.as_mut(), &keyframe);
-            let scores = self.off_the_clock(score)?;
-            mark.add(scores, before.elapsed());
+            let scores = self.without_clock(score)?;
+            evaluation.add(scores, before.elapsed());
         }
-        if mark.is_complete() {
-            return self.tell_mark(mark);
+        if evaluation.is_complete() {
+            return self.report_evaluation(evaluation);
         }
-        self.open_mark = Some(mark);
+        self.pending_evaluation = Some(evaluation);
         Ok(())
     }
 
@@ -690,7 +694,7 @@ impl Session {
     pub(crate) fn refresh_psnr(&mut self) -> anyhow::Result<()> {
         let Some(oldest) = self.tests.pop_front() else { return Ok(()) };
         self.tests.push_back(oldest.clone());
-        self.note_look();
+        self.note_render();
         let quick = Evaluator::psnr_only();
         let scores = quick.score(self.method.as_mut(), &oldest)?;
         self.newest_psnr.insert((scores.camera, scores.stamp_nanos), scores.psnr);
@@ -722,7 +726,7 @@ impl Session {
     /// Saves the model after this many seconds of training; if its folder cannot be written, in a folder for temporary files.
     fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
         if let Some(decisions) = self.decisions.take()
-            && let Err(error) = decisions.end(self.method.n_taken()?)
+            && let Err(error) = decisions.end(self.method.n_total_steps()?)
         {
             log::warn!("{error:#}");
         }
@@ -755,9 +759,9 @@ impl Session {
     }
 
     /// Saves the model in a folder for temporary files, because that of its run could not be written.
-    fn save_elsewhere(&mut self, out: &Path, refused: anyhow::Error) -> anyhow::Result<Saved> {
+    fn save_elsewhere(&mut self, out: &Path, save_error: anyhow::Error) -> anyhow::Result<Saved> {
         let save = |method: &mut dyn Method| {
-            let folder = run_folder::make_rescue()?;
+            let folder = run_folder::make_fallback_folder()?;
             run_folder::save_model(method, &folder)?;
             let sha256 = run_folder::checkpoint_sha256(&folder)?;
             Ok((folder, sha256))
@@ -766,34 +770,38 @@ impl Session {
             Ok((folder, sha256)) => {
                 let context =
                     format!("cannot save the model in {}, it was saved in {}", out.display(), folder.display());
-                Ok(Saved { folder, sha256, failed: Some(refused.context(context)) })
+                Ok(Saved { folder, sha256, failed: Some(save_error.context(context)) })
             }
             Err(error) => {
                 let error: anyhow::Error = error;
                 log::error!("cannot save the model among the temporary files either: {error:#}");
-                Err(refused.context(format!("cannot save the model in {}; {}", out.display(), self.what_is_left())))
+                Err(save_error.context(format!(
+                    "cannot save the model in {}; {}",
+                    out.display(),
+                    self.describe_recoverable()
+                )))
             }
         }
     }
 
     /// What to continue from if the model could not be saved, as part of a sentence.
-    fn what_is_left(&mut self) -> String {
+    fn describe_recoverable(&mut self) -> String {
         let has_checkpoint = self.has_checkpoint();
         let Some(recovery) = &self.recovery else { return "there is no checkpoint either".to_owned() };
-        let left = recovery.what_is_left(has_checkpoint);
+        let left = recovery.describe_recoverable(has_checkpoint);
         if has_checkpoint { format!("{left}; use --out to save the model in another folder") } else { left }
     }
 
     /// Scores the saved model a last time, writes the report, and tells the end.
-    fn tell_end(
+    fn report_end(
         mut self,
         out: &Path,
         seconds: f64,
         checkpoint_sha256: &str,
-        particulars: &impl Serialize,
-    ) -> anyhow::Result<Finished> {
+        details: &impl Serialize,
+    ) -> anyhow::Result<FinishedModel> {
         let outcome = self.score_at_end(seconds)?;
-        let done = Done {
+        let done = DoneEvent {
             event: "done",
             method: self.kind.name(),
             seconds,
@@ -810,10 +818,10 @@ impl Session {
         let report = Report {
             done: &done,
             adapter: self.gpu.describe(),
-            particulars,
+            details,
             parts: self.method.report(),
             passes,
-            marks: &outcome.marks,
+            evaluations: &outcome.evaluations,
             per_image: self.named(&outcome.per_image),
         };
         let written = run_folder::write_json(&out.join("report.json"), &report);
@@ -821,15 +829,15 @@ impl Session {
         if let Err(error) = &page {
             log::warn!("no {}: {error:#}", report::FILE);
         }
-        match self.tell {
-            Tell::Json => {
+        match self.output {
+            OutputMode::Json => {
                 if self.profiles {
                     let passes = &report.passes;
-                    print::report_json(&Profile { event: "profile", method: self.kind.name(), passes })?;
+                    print::report_json(&ProfileEvent { event: "profile", method: self.kind.name(), passes })?;
                 }
                 print::report_json(&done)?;
             }
-            Tell::Lines => {
+            OutputMode::Lines => {
                 for (name, millis) in &report.passes {
                     print::report(format_args!("{millis:9.3} ms  {name}"));
                 }
@@ -843,15 +851,15 @@ impl Session {
                 let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
                 print::report(format_args!("saved in {}{with_page}", out.display()));
             }
-            Tell::Bar | Tell::Nothing => {}
+            OutputMode::Bar | OutputMode::Nothing => {}
         }
         written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))?;
         Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
     }
 
-    fn finished(self, out: &Path, (seconds, scores): (f64, Scores), n_tests: usize) -> Finished {
-        let Self { kind, method, data, tell, .. } = self;
-        Finished { kind, method, folder: out.to_owned(), seconds, scores, data, n_tests, tell }
+    fn finished(self, out: &Path, (seconds, scores): (f64, Scores), n_tests: usize) -> FinishedModel {
+        let Self { kind, method, data, output, .. } = self;
+        FinishedModel { kind, method, folder: out.to_owned(), seconds, scores, data, n_tests, output }
     }
 
     fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {
@@ -896,9 +904,9 @@ impl Session {
     fn write_cameras(&mut self, out: &Path) {
         let mut cameras = Vec::new();
         for keyframe in &self.keyframes {
-            let lens = self.method.posed_lens(keyframe).unwrap_or_else(|error| {
+            let lens = self.method.calibrated_camera(keyframe).unwrap_or_else(|error| {
                 log::debug!("a camera is listed without the learned correction: {error}");
-                PosedLens::of(keyframe)
+                CalibratedCamera::of(keyframe)
             });
             cameras.push(camera_list::PosedCamera {
                 camera: keyframe.camera.to_string(),
@@ -920,7 +928,7 @@ impl Session {
         let mut names: Vec<&'static str> = Vec::new();
         let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
         let began = Instant::now();
-        while began.elapsed() < BEFORE_PROFILE {
+        while began.elapsed() < PROFILE_WARM_UP {
             self.method.profile_step()?;
         }
         for _ in 0..N_PROFILED {
@@ -937,30 +945,30 @@ impl Session {
     }
 
     /// Scores the model a last time, and saves nothing.
-    pub(crate) fn conclude(mut self) -> anyhow::Result<Outcome> {
-        let seconds = self.halt()?;
+    pub(crate) fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
+        let seconds = self.stop_training()?;
         self.score_at_end(seconds)
     }
 
     /// Waits for what is queued; the seconds of training come back.
-    fn halt(&mut self) -> anyhow::Result<f64> {
+    fn stop_training(&mut self) -> anyhow::Result<f64> {
         self.gpu.wait()?;
-        let seconds = self.rested_secs.unwrap_or_else(|| self.secs());
+        let seconds = self.finished_secs.unwrap_or_else(|| self.secs());
         self.bar.finish_and_clear();
         Ok(seconds)
     }
 
-    fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<Outcome> {
-        std::mem::swap(&mut self.evaluator, &mut self.last_evaluator);
-        let per_image = self.off_the_clock(Self::score_all)?;
+    fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<TrainingOutcome> {
+        std::mem::swap(&mut self.evaluator, &mut self.final_evaluator);
+        let per_image = self.without_clock(Self::score_all)?;
         let progress = self.method.progress();
-        Ok(Outcome {
+        Ok(TrainingOutcome {
             seconds,
             steps: progress.step,
             scores: Scores::mean(&per_image),
             primitives: progress.primitives,
             bytes: progress.bytes,
-            marks: std::mem::take(&mut self.told),
+            evaluations: std::mem::take(&mut self.reported),
             per_image,
         })
     }
@@ -972,9 +980,9 @@ impl Session {
     }
 
     /// Does what is not training: time stands still meanwhile.
-    fn off_the_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
+    fn without_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
         self.gpu.wait()?;
-        self.note_look();
+        self.note_render();
         let before = Instant::now();
         let done = work(self)?;
         self.gpu.wait()?;
@@ -983,22 +991,23 @@ impl Session {
     }
 
     /// Opens the evaluation that is due; it scores the model after all steps queued so far.
-    fn open_mark(&mut self) -> anyhow::Result<()> {
-        self.method.n_taken()?;
-        self.open_mark = Some(OpenMark::new(self.secs(), self.tests.iter(), self.most_at_marks));
+    fn begin_evaluation(&mut self) -> anyhow::Result<()> {
+        self.method.n_total_steps()?;
+        self.pending_evaluation =
+            Some(PendingEvaluation::new(self.secs(), self.tests.iter(), self.max_images_during_training));
         Ok(())
     }
 
     /// Reports a completed evaluation.
-    fn tell_mark(&mut self, mark: OpenMark) -> anyhow::Result<()> {
-        let seconds = mark.seconds;
-        let images = mark.into_images();
+    fn report_evaluation(&mut self, evaluation: PendingEvaluation) -> anyhow::Result<()> {
+        let seconds = evaluation.seconds;
+        let images = evaluation.into_images();
         for image in &images {
             self.newest_psnr.insert((image.camera.clone(), image.stamp_nanos), image.psnr);
         }
         self.note_psnr();
         let progress = self.method.progress();
-        let eval = Eval {
+        let eval = Evaluation {
             event: "eval",
             method: self.kind.name(),
             seconds,
@@ -1009,23 +1018,23 @@ impl Session {
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),
         };
-        match self.tell {
-            Tell::Json => print::report_json(&eval)?,
-            Tell::Lines => print::report(format_args!(
+        match self.output {
+            OutputMode::Json => print::report_json(&eval)?,
+            OutputMode::Lines => print::report(format_args!(
                 "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms a step  {}",
                 eval.step,
                 print::counted(eval.primitives, self.method.primitive()),
                 progress.step_millis,
                 eval.scores
             )),
-            Tell::Bar | Tell::Nothing => {}
+            OutputMode::Bar | OutputMode::Nothing => {}
         }
-        self.told.push(eval);
+        self.reported.push(eval);
         Ok(())
     }
 
     /// What is drawn makes splats of keyframes that wait for theirs.
-    fn note_look(&mut self) {
+    fn note_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {
             decisions.seeded();
         }
@@ -1043,7 +1052,7 @@ impl Session {
         }
     }
 
-    fn show(&self) {
+    fn update_bar(&self) {
         let progress = self.method.progress();
         let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
         self.bar.set_position(position);

@@ -20,8 +20,8 @@ pub(crate) enum Format {
 impl Format {
     /// The format that the ending of a name stands for.
     pub(crate) fn of(path: &Path) -> Option<Self> {
-        let ending = path.extension()?.to_str()?.to_ascii_lowercase();
-        match ending.as_str() {
+        let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+        match extension.as_str() {
             "ply" => Some(Self::Ply),
             "spz" => Some(Self::Spz),
             _ => None,
@@ -30,7 +30,7 @@ impl Format {
 }
 
 /// Whether this is a folder that holds splats, or a file whose name ends as one of splats.
-pub(crate) fn is_one(path: &Path) -> bool {
+pub(crate) fn is_splat_file(path: &Path) -> bool {
     path.join(IN_FOLDER).is_file() || (path.is_file() && Format::of(path).is_some())
 }
 
@@ -42,8 +42,8 @@ pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
         Some(Format::Spz) => spz::read(&path),
         Some(Format::Ply) | None => ply::read(&path),
     };
-    let instead = if is_file { "; of a saved model name its folder" } else { "" };
-    splats.with_context(|| format!("no splats in {}{instead}", model.display()))
+    let hint = if is_file { "; of a saved model name its folder" } else { "" };
+    splats.with_context(|| format!("no splats in {}{hint}", model.display()))
 }
 
 /// Writes splats to a file.

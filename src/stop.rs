@@ -17,7 +17,7 @@ const INTERRUPTED: i32 = 130;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Stop {
     /// By the program itself.
-    asked: Arc<AtomicBool>,
+    requested: Arc<AtomicBool>,
     /// By a signal.
     signaled: Arc<AtomicBool>,
     /// Whether the signal was logged.
@@ -40,20 +40,20 @@ impl Stop {
             // A signal's actions run in the order of registration: the first Ctrl-C only sets the flags.
             flag::register_conditional_shutdown(SIGINT, INTERRUPTED, interrupted.clone())?;
             flag::register(SIGINT, interrupted)?;
-            ending_signals().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
+            termination_signals().try_for_each(|signal| flag::register(signal, stop.signaled.clone()).map(drop))
         };
         register().context("cannot install signal handlers")?;
         Ok(stop)
     }
 
     /// Requests a stop.
-    pub(crate) fn ask(&self) {
-        self.asked.store(true, Ordering::Relaxed);
+    pub(crate) fn request(&self) {
+        self.requested.store(true, Ordering::Relaxed);
     }
 
     /// Whether the end was asked for.
-    pub(crate) fn asked(&self) -> bool {
-        self.asked.load(Ordering::Relaxed) || self.signaled()
+    pub(crate) fn requested(&self) -> bool {
+        self.requested.load(Ordering::Relaxed) || self.signaled()
     }
 
     /// Whether a signal requested a stop.
@@ -67,18 +67,18 @@ impl Stop {
 }
 
 /// The signals that ask for an end; without SIGHUP where it is ignored.
-pub(crate) fn ending_signals() -> impl Iterator<Item = i32> {
+pub(crate) fn termination_signals() -> impl Iterator<Item = i32> {
     [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
 }
 
 /// Whether this process was started with the signal ignored, which Linux reports in `/proc`.
 fn is_ignored(signal: i32) -> bool {
     let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return false };
-    ignores(&status, signal)
+    is_in_ignore_mask(&status, signal)
 }
 
 /// Reads the mask `SigIgn` of `/proc/self/status`: bit n - 1 stands for signal n.
-fn ignores(status: &str, signal: i32) -> bool {
+fn is_in_ignore_mask(status: &str, signal: i32) -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
     mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
@@ -89,11 +89,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ignored_signals_are_read_from_the_mask() {
+    fn ignored_signals_are_parsed_from_the_mask() {
         let status = |mask: &str| format!("Name:\tfieldrig\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\nSigCgt:\tff\n");
-        assert!(ignores(&status("0000000000001001"), SIGHUP));
-        assert!(!ignores(&status("0000000000001000"), SIGHUP));
-        assert!(ignores(&status("0000000000001000"), 13));
-        assert!(!ignores("Name:\tfieldrig\n", SIGHUP));
+        assert!(is_in_ignore_mask(&status("0000000000001001"), SIGHUP));
+        assert!(!is_in_ignore_mask(&status("0000000000001000"), SIGHUP));
+        assert!(is_in_ignore_mask(&status("0000000000001000"), 13));
+        assert!(!is_in_ignore_mask("Name:\tfieldrig\n", SIGHUP));
     }
 }

@@ -3,7 +3,7 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth as PNG.
 //! Ground truth from a simulator is left out.
 
-use crate::join::{split_name, split_named};
+use crate::join::{split_from_name, split_name};
 use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -14,18 +14,18 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
-use trainer::{BasePlace, DepthMap, Keyframe};
+use trainer::{BaseState, DepthMap, Keyframe};
 
 /// Name of the folder in the folder of a run.
 pub(crate) const FOLDER: &str = "keyframes";
-const ENDING: &str = "keyframe";
+const EXTENSION: &str = "keyframe";
 const METHOD: &str = "keyframe";
 const COLOR: &str = "rgba_srgb.png";
 const DEPTH: &str = "depth_m.png";
 
 /// A folder of keyframes.
 #[derive(Clone, Debug)]
-pub(crate) struct KeptKeyframes {
+pub(crate) struct StoredKeyframes {
     folder: PathBuf,
 }
 
@@ -59,12 +59,12 @@ struct DepthDescription {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct BaseDescription {
-    stand: Option<usize>,
+    station: Option<usize>,
     world_from_base: [f64; 7],
-    world_from_told: [f64; 7],
+    map_from_odom: [f64; 7],
 }
 
-impl KeptKeyframes {
+impl StoredKeyframes {
     /// The stored keyframes of the run in this folder; nothing is read or written yet.
     pub(crate) fn of_run(run: &Path) -> Self {
         Self { folder: run.join(FOLDER) }
@@ -73,11 +73,11 @@ impl KeptKeyframes {
     /// Writes the keyframes that are not stored yet.
     pub(crate) fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
         std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot make {}", self.folder.display()))?;
-        let there = self.names()?;
+        let existing = self.names()?;
         for keyframe in keyframes {
             let name = name_of(keyframe);
-            if !there.contains(&name) {
-                container(keyframe)?.write(&self.folder.join(name))?;
+            if !existing.contains(&name) {
+                to_checkpoint(keyframe)?.write(&self.folder.join(name))?;
             }
         }
         Ok(())
@@ -85,8 +85,8 @@ impl KeptKeyframes {
 
     /// Removes all files except those of these keyframes.
     pub(crate) fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
-        let kept: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
-        for name in self.names()?.difference(&kept) {
+        let stored: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
+        for name in self.names()?.difference(&stored) {
             let path = self.folder.join(name);
             std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
         }
@@ -112,15 +112,15 @@ impl KeptKeyframes {
         };
         let names = list().with_context(|| format!("cannot list {}", self.folder.display()))?;
         let names = names.into_iter().filter_map(|name| name.into_string().ok());
-        Ok(names.filter(|name| Path::new(name).extension().is_some_and(|ending| ending == ENDING)).collect())
+        Ok(names.filter(|name| Path::new(name).extension().is_some_and(|extension| extension == EXTENSION)).collect())
     }
 }
 
 fn name_of(keyframe: &Keyframe) -> String {
-    format!("{}_{:020}.{ENDING}", keyframe.camera, keyframe.stamp.0)
+    format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
 }
 
-fn container(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
+fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     let description = Description {
         camera: keyframe.camera.to_string(),
         stamp_nanos: keyframe.stamp.0,
@@ -139,9 +139,9 @@ fn container(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
             world_from_camera: numbers(&depth.world_from_camera),
         }),
         base: keyframe.base.as_ref().map(|base| BaseDescription {
-            stand: base.stand,
+            station: base.station,
             world_from_base: numbers(&base.world_from_base),
-            world_from_told: numbers(&base.world_from_told),
+            map_from_odom: numbers(&base.map_from_odom),
         }),
     };
     let mut arrays = vec![Array { name: COLOR.to_owned(), bytes: png(keyframe.size_px, &keyframe.rgba_srgb)? }];
@@ -160,17 +160,17 @@ fn container(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     })
 }
 
-fn keyframe_of(container: &Checkpoint) -> anyhow::Result<Keyframe> {
-    ensure!(container.method == METHOD, "it holds a {}, expected a {METHOD}", container.method);
-    let about: Description = serde_json::from_value(container.state.clone())?;
+fn keyframe_of(to_checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
+    ensure!(to_checkpoint.method == METHOD, "it holds a {}, expected a {METHOD}", to_checkpoint.method);
+    let metadata: Description = serde_json::from_value(to_checkpoint.state.clone())?;
     let pixels = |name: &str, size_px: [u32; 2]| {
-        let array = container.arrays.iter().find(|array| array.name == name);
+        let array = to_checkpoint.arrays.iter().find(|array| array.name == name);
         let png = &array.with_context(|| format!("array {name:?} is missing"))?.bytes;
         let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
         ensure!([image.width(), image.height()] == size_px, "array {name:?} has another size than {size_px:?}");
         Ok(image.into_rgba8().into_raw())
     };
-    let depth = about.depth.map(|depth| {
+    let depth = metadata.depth.map(|depth| {
         let bytes = pixels(DEPTH, depth.size_px)?;
         let depth_m = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
         Ok::<_, anyhow::Error>(DepthMap {
@@ -182,24 +182,24 @@ fn keyframe_of(container: &Checkpoint) -> anyhow::Result<Keyframe> {
         })
     });
     Ok(Keyframe {
-        camera: about.camera.into(),
-        stamp: Stamp(about.stamp_nanos),
-        size_px: about.size_px,
-        focal_px: about.focal_px,
-        principal_px: about.principal_px,
-        rgba_srgb: pixels(COLOR, about.size_px)?.into(),
+        camera: metadata.camera.into(),
+        stamp: Stamp(metadata.stamp_nanos),
+        size_px: metadata.size_px,
+        focal_px: metadata.focal_px,
+        principal_px: metadata.principal_px,
+        rgba_srgb: pixels(COLOR, metadata.size_px)?.into(),
         depth: depth.transpose()?,
-        world_from_camera: transform(about.world_from_camera),
-        twist: about.twist.map(twist),
-        readout_secs: about.readout_secs,
-        joint_twists: about.joint_twists.into_iter().map(twist).collect(),
-        base: about.base.map(|base| BasePlace {
-            stand: base.stand,
+        world_from_camera: transform(metadata.world_from_camera),
+        twist: metadata.twist.map(twist),
+        readout_secs: metadata.readout_secs,
+        joint_twists: metadata.joint_twists.into_iter().map(twist).collect(),
+        base: metadata.base.map(|base| BaseState {
+            station: base.station,
             world_from_base: transform(base.world_from_base),
-            world_from_told: transform(base.world_from_told),
+            map_from_odom: transform(base.map_from_odom),
             truth: None,
         }),
-        split: split_named(&about.split).with_context(|| format!("unknown split {:?}", about.split))?,
+        split: split_from_name(&metadata.split).with_context(|| format!("unknown split {:?}", metadata.split))?,
         truth: None,
     })
 }
@@ -259,25 +259,25 @@ mod tests {
             twist: depth.then(|| twist([0.1, 0.2, 0.3, 0.4, 0.5, 0.7])),
             readout_secs: 0.015,
             joint_twists: vec![twist([1.0, 2.0, 3.0, 4.0, 5.0, 1.0 / 7.0])].into(),
-            base: depth.then(|| BasePlace {
-                stand: Some(3),
+            base: depth.then(|| BaseState {
+                station: Some(3),
                 world_from_base: pose,
-                world_from_told: pose * pose,
+                map_from_odom: pose * pose,
                 truth: None,
             }),
-            split: Split::Selection,
+            split: Split::Validation,
             truth: None,
         })
     }
 
     #[test]
-    fn keyframes_come_back_bit_for_bit_and_in_order() {
+    fn keyframes_round_trip_bit_for_bit_in_order() {
         let run = tempfile::tempdir().expect("a folder");
-        let kept = KeptKeyframes::of_run(run.path());
+        let stored = StoredKeyframes::of_run(run.path());
         let all = [keyframe(9_000_000_000, true), keyframe(20, false), keyframe(10_000_000_000, true)];
-        kept.add(&all[..2]).expect("room");
-        kept.add(&all).expect("room");
-        let read = kept.read().expect("whole");
+        stored.add(&all[..2]).expect("room");
+        stored.add(&all).expect("room");
+        let read = stored.read().expect("whole");
         let in_order = [&all[1], &all[0], &all[2]];
         assert_eq!(read.len(), 3);
         for (read, expected) in read.iter().zip(in_order) {
@@ -285,22 +285,22 @@ mod tests {
             assert_eq!(fingerprint::of(read), fingerprint::of(expected));
             assert_eq!(read.base, expected.base);
         }
-        kept.keep_only(&all[1..]).expect("they are there");
-        assert_eq!(kept.read().expect("whole").len(), 2);
+        stored.keep_only(&all[1..]).expect("they are there");
+        assert_eq!(stored.read().expect("whole").len(), 2);
     }
 
     #[test]
-    fn a_damaged_file_is_named() {
+    fn damaged_file_is_named_in_the_error() {
         let run = tempfile::tempdir().expect("a folder");
-        let kept = KeptKeyframes::of_run(run.path());
-        assert!(kept.read().is_err(), "there is no folder");
-        kept.add(&[keyframe(1, true)]).expect("room");
+        let stored = StoredKeyframes::of_run(run.path());
+        assert!(stored.read().is_err(), "there is no folder");
+        stored.add(&[keyframe(1, true)]).expect("room");
         let path = run.path().join(FOLDER).join("wrist_00000000000000000001.keyframe");
         let mut bytes = std::fs::read(&path).expect("a file");
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
         std::fs::write(&path, bytes).expect("room");
-        let told = format!("{:#}", kept.read().expect_err("damaged"));
-        assert!(told.contains("wrist_00000000000000000001.keyframe") && told.contains("damaged"), "{told}");
+        let message = format!("{:#}", stored.read().expect_err("damaged"));
+        assert!(message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"), "{message}");
     }
 }

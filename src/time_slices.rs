@@ -7,35 +7,43 @@ use crate::session::Session;
 use std::time::Duration;
 
 /// A turn among several lasts about this long: at its end the device has nothing to do for a moment.
-pub(crate) const TURN: Duration = Duration::from_millis(40);
+pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
 
 /// Lets the model learn that had the least time of those that can, then tells what is due of all.
 ///
-/// `n_most`: maximum number of steps of a session in this turn, by its index. `is_awaited`: whether a picture waits for the end
+/// `max_steps`: maximum number of steps of a session in this turn, by its index. `is_render_pending`: whether a picture waits for the end
 /// of the turn, which then comes after the current submit.
-pub(crate) fn take(
+pub(crate) fn train_next(
     sessions: &mut [Session],
-    n_most: impl Fn(usize, &Session) -> u64,
-    is_awaited: impl Fn() -> bool,
+    max_steps: impl Fn(usize, &Session) -> u64,
+    is_render_pending: impl Fn() -> bool,
 ) -> anyhow::Result<()> {
-    let learns = |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && n_most(ix, session) > 0;
-    let had: Vec<Option<Duration>> =
-        sessions.iter().enumerate().map(|(ix, session)| learns(ix, session).then(|| session.had())).collect();
-    if let Some((ix, least)) = next(&had) {
+    let can_train =
+        |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0;
+    let device_time: Vec<Option<Duration>> = sessions
+        .iter()
+        .enumerate()
+        .map(|(ix, session)| can_train(ix, session).then(|| session.device_time()))
+        .collect();
+    if let Some((ix, min_time)) = next(&device_time) {
         if sessions.len() == 1 {
-            sessions[ix].learn(n_most(ix, &sessions[ix]))?;
+            sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
         } else {
             // Who had nothing to learn for a while does not catch up on that.
-            sessions.iter_mut().for_each(|session| session.had_at_least(least));
-            sessions[ix].take_turn(|session| n_most(ix, session), is_awaited)?;
+            sessions.iter_mut().for_each(|session| session.raise_device_time(min_time));
+            sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
         }
     }
-    sessions.iter_mut().try_for_each(Session::tell_due)
+    sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 
 /// Place and time of the one that had the least, the first of several; `None` where nobody can learn.
-fn next(had: &[Option<Duration>]) -> Option<(usize, Duration)> {
-    had.iter().enumerate().filter_map(|(ix, had)| Some((ix, (*had)?))).min_by_key(|(_, had)| *had)
+fn next(device_time: &[Option<Duration>]) -> Option<(usize, Duration)> {
+    device_time
+        .iter()
+        .enumerate()
+        .filter_map(|(ix, device_time)| Some((ix, (*device_time)?)))
+        .min_by_key(|(_, device_time)| *device_time)
 }
 
 #[cfg(test)]
@@ -43,16 +51,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turns_share_the_time_however_long_each_lasts() {
+    fn time_slices_share_the_time_evenly() {
         const MILLIS: [u64; 3] = [40, 90, 55];
-        let mut had = [Duration::ZERO; 3];
+        let mut device_time = [Duration::ZERO; 3];
         for _ in 0..1000 {
-            let (ix, _) = next(&had.map(Some)).expect("all can learn");
-            had[ix] += Duration::from_millis(MILLIS[ix]);
+            let (ix, _) = next(&device_time.map(Some)).expect("all can learn");
+            device_time[ix] += Duration::from_millis(MILLIS[ix]);
         }
-        let (most, least) = (had.iter().max().expect("three"), had.iter().min().expect("three"));
-        assert!(*most - *least <= Duration::from_millis(90), "{had:?}");
-        assert_eq!(next(&[None, Some(had[1]), None]), Some((1, had[1])));
+        let (max_time, min_time) = (device_time.iter().max().expect("three"), device_time.iter().min().expect("three"));
+        assert!(*max_time - *min_time <= Duration::from_millis(90), "{device_time:?}");
+        assert_eq!(next(&[None, Some(device_time[1]), None]), Some((1, device_time[1])));
         assert_eq!(next(&[None, None]), None);
     }
 }

@@ -1,6 +1,6 @@
 //! Draws saved or finished models for the page: the loop of a run without devices and training.
 
-use crate::method::Kind;
+use crate::method::ModelKind;
 use crate::stop::Stop;
 use kinematics::Transform;
 use std::time::Duration;
@@ -8,26 +8,26 @@ use trainer::{Aabb, Method, RenderRequest};
 use viz::{Hub, PendingRender};
 
 /// Longest time until Ctrl-C is noticed while no client requests a picture.
-const WAIT: Duration = Duration::from_millis(100);
+const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
-pub(crate) struct ShownModel {
-    pub(crate) kind: Kind,
+pub(crate) struct ServedModel {
+    pub(crate) kind: ModelKind,
     pub(crate) method: Box<dyn Method>,
 }
 
 /// Models that no longer change, and the hub of the clients that view them.
-pub(crate) struct Viewer {
+pub(crate) struct ModelViewer {
     /// The first is drawn for clients that name no method.
-    models: Vec<ShownModel>,
+    models: Vec<ServedModel>,
     hub: Hub,
     /// The page is z up; a model may not be.
     model_from_page: Transform,
 }
 
-impl Viewer {
+impl ModelViewer {
     /// A viewer of models that are z up.
-    pub(crate) fn new(models: Vec<ShownModel>, hub: Hub) -> Self {
+    pub(crate) fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
         Self { models, hub, model_from_page: Transform::identity() }
     }
 
@@ -39,7 +39,7 @@ impl Viewer {
     /// Draws requested pictures until a signal requests a stop.
     pub(crate) fn serve(&mut self, stop: &Stop) {
         while !stop.signaled() {
-            if self.hub.wait_for_request(WAIT)
+            if self.hub.wait_for_request(POLL_PERIOD)
                 && let Some(pending) = self.hub.next_request()
             {
                 self.answer(pending);
@@ -49,12 +49,13 @@ impl Viewer {
 
     fn answer(&mut self, pending: PendingRender) {
         let request = in_model(&pending.request, &self.model_from_page);
-        let wanted = pending.method().map(str::to_owned);
-        let is_wanted = |model: &&mut ShownModel| wanted.as_deref().is_none_or(|name| model.kind.name() == name);
-        let Some(model) = self.models.iter_mut().find(is_wanted) else {
+        let requested_method = pending.method().map(str::to_owned);
+        let is_requested =
+            |model: &&mut ServedModel| requested_method.as_deref().is_none_or(|name| model.kind.name() == name);
+        let Some(model) = self.models.iter_mut().find(is_requested) else {
             let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
-            let wanted = wanted.unwrap_or_default();
-            return pending.fail(&format!("no model with the method {wanted:?}, only {}", names.join(", ")));
+            let requested_method = requested_method.unwrap_or_default();
+            return pending.fail(&format!("no model with the method {requested_method:?}, only {}", names.join(", ")));
         };
         match model.method.render(&request) {
             Ok(picture) => pending.deliver(picture),

@@ -14,7 +14,7 @@ const ALLOWED: [(&str, &[&str]); 6] = [
 ];
 
 /// Crates that only `fieldrig` itself may use: printing and command lines are its business.
-const ONLY_AT_THE_TOP: [&str; 5] = ["anyhow", "clap", "ctrlc", "env_logger", "indicatif"];
+const BINARY_ONLY: [&str; 5] = ["anyhow", "clap", "ctrlc", "env_logger", "indicatif"];
 
 /// Direct dependencies by package, dev-dependencies left out.
 type Dependencies = BTreeMap<String, BTreeSet<String>>;
@@ -41,39 +41,39 @@ fn dependencies() -> Dependencies {
 }
 
 /// Every arrow that should not be there, and every crate that has no rule.
-fn wrong_arrows(dependencies: &Dependencies) -> Vec<String> {
-    let mut wrong = Vec::new();
-    let ours: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();
+fn violations(dependencies: &Dependencies) -> Vec<String> {
+    let mut violations_found = Vec::new();
+    let workspace_crates: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();
     for (package, direct) in dependencies {
         let Some((_, allowed)) = ALLOWED.iter().find(|(name, _)| name == package) else {
-            wrong.push(format!("{package} has no rule in this test"));
+            violations_found.push(format!("{package} has no rule in this test"));
             continue;
         };
         for dependency in direct {
-            if ours.contains(dependency.as_str()) && !allowed.contains(&dependency.as_str()) {
-                wrong.push(format!("{package} -> {dependency}"));
+            if workspace_crates.contains(dependency.as_str()) && !allowed.contains(&dependency.as_str()) {
+                violations_found.push(format!("{package} -> {dependency}"));
             }
-            if package != "fieldrig" && ONLY_AT_THE_TOP.contains(&dependency.as_str()) {
-                wrong.push(format!("{package} -> {dependency}, which only fieldrig may use"));
+            if package != "fieldrig" && BINARY_ONLY.contains(&dependency.as_str()) {
+                violations_found.push(format!("{package} -> {dependency}, which only fieldrig may use"));
             }
         }
     }
-    wrong
+    violations_found
 }
 
 #[test]
-fn dependencies_follow_the_arrows() {
+fn dependencies_follow_architecture() {
     let dependencies = dependencies();
     assert_eq!(dependencies.len(), ALLOWED.len(), "crates: {:?}", dependencies.keys());
-    assert_eq!(wrong_arrows(&dependencies), Vec::<String>::new());
+    assert_eq!(violations(&dependencies), Vec::<String>::new());
 }
 
 #[test]
-fn a_wrong_arrow_is_seen() {
+fn forbidden_dependency_is_detected() {
     let mut dependencies = dependencies();
     dependencies.get_mut("trainer").expect("trainer").extend(["drivers".to_owned(), "anyhow".to_owned()]);
     dependencies.insert("shortcut".to_owned(), BTreeSet::new());
     let expected =
         ["shortcut has no rule in this test", "trainer -> anyhow, which only fieldrig may use", "trainer -> drivers"];
-    assert_eq!(wrong_arrows(&dependencies), expected);
+    assert_eq!(violations(&dependencies), expected);
 }

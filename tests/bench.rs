@@ -46,12 +46,12 @@ fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
 }
 
 /// Asserts that a bench refused, and that its one sentence holds `words`.
-fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
+fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = bench(folder, args);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {told}");
-    assert!(words.iter().all(|word| told.contains(word)), "{args:?}: {told}");
-    assert_eq!(told.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
+    assert!(words.iter().all(|word| printed.contains(word)), "{args:?}: {printed}");
+    assert_eq!(printed.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{printed}");
 }
 
 fn assert_chart(folder: &Path, name: &str) {
@@ -64,7 +64,7 @@ fn assert_chart(folder: &Path, name: &str) {
 }
 
 #[test]
-fn kernels_tell_what_order_and_untouched_splats_cost() {
+fn kernel_bench_reports_every_variant() {
     let folder = tempfile::tempdir().expect("a folder");
     let args = ["kernels", "--size", "64x48", "--splats", "2000", "--repeats", "1", "--inside", "--json"];
     let row = &events(folder.path(), &args)[0];
@@ -82,7 +82,7 @@ fn kernels_tell_what_order_and_untouched_splats_cost() {
 }
 
 #[test]
-fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
+fn curve_bench_draws_peers_and_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
@@ -91,9 +91,9 @@ fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
     std::fs::write(folder.join("other.json"), peer.to_string()).expect("room on the disk");
     let args =
         ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "500", "--peer", "other.json", "--out", "c"];
-    let told = events(folder, &[&args[..], &["--json"]].concat());
-    assert_eq!(told.iter().filter(|event| event["event"] == "run").count(), 2);
-    let lines = told[2]["findings"]["lines"].as_array().expect("lines").clone();
+    let printed = events(folder, &[&args[..], &["--json"]].concat());
+    assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
+    let lines = printed[2]["findings"]["lines"].as_array().expect("lines").clone();
     assert_eq!((lines.len(), &lines[1]["label"]), (2, &json!("other")));
     assert!(lines[0]["points"].as_array().is_some_and(|points| !points.is_empty()), "{}", lines[0]);
     assert_eq!(lines[0]["summary"]["n_runs"], 2);
@@ -109,9 +109,9 @@ fn a_curve_is_drawn_with_a_peer_and_goes_on_where_it_stopped() {
     std::fs::remove_file(first).expect("removed");
     let again = events(folder, &[&args[..], &["--json"]].concat());
     assert_eq!([&again[0]["kept"], &again[1]["kept"]], [&json!(false), &json!(true)]);
-    assert_eq!(again[1]["end"], told[1]["end"]);
+    assert_eq!(again[1]["end"], printed[1]["end"]);
     let changed = ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "400", "--out", "c"];
-    assert_refused(folder, &changed, 2, &["max_splats", "--out c"]);
+    assert_fails_with(folder, &changed, 2, &["max_splats", "--out c"]);
 }
 
 /// Depth images, a metre everywhere: what the wall of [`scene`] is away.
@@ -129,7 +129,7 @@ fn add_depth(folder: &Path) {
 }
 
 #[test]
-fn a_curve_of_several_methods_has_a_line_for_each_that_the_data_suffice_for() {
+fn curve_bench_skips_methods_without_sufficient_data() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for data in ["deep", "flat"] {
@@ -138,13 +138,13 @@ fn a_curve_of_several_methods_has_a_line_for_each_that_the_data_suffice_for() {
     }
     add_depth(&folder.join("deep"));
     let one = ["curve", "deep", "flat", "--seconds", "0.4", "--seeds", "1", "--max-splats", "300", "--out", "c"];
-    let told = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
-    assert_eq!(told.iter().filter(|event| event["event"] == "run").count(), 2);
+    let printed = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
+    assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
     // More methods join in the same folder, and what is done is not repeated.
-    let told = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
-    let kept: Vec<bool> = told.iter().filter_map(|event| event["kept"].as_bool()).collect();
-    assert_eq!(kept, [true, false, false, true, false]);
-    let findings = &told.last().expect("events")["findings"];
+    let printed = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
+    let cached: Vec<bool> = printed.iter().filter_map(|event| event["kept"].as_bool()).collect();
+    assert_eq!(cached, [true, false, false, true, false]);
+    let findings = &printed.last().expect("events")["findings"];
     let lines = findings["lines"].as_array().expect("lines");
     let labels: Vec<&str> = lines.iter().filter_map(|line| line["label"].as_str()).collect();
     assert_eq!(labels, ["deep, splat", "deep, tsdf", "deep, nerf", "flat, splat", "flat, nerf"]);
@@ -162,19 +162,19 @@ fn a_curve_of_several_methods_has_a_line_for_each_that_the_data_suffice_for() {
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("deep, nerf") && page.contains("flat has no depth"), "{page}");
 
-    assert_refused(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
-    assert_refused(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);
-    assert_refused(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["one method"]);
+    assert_fails_with(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
+    assert_fails_with(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);
+    assert_fails_with(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["one method"]);
 }
 
 #[test]
-fn a_budget_tells_the_trainers_own_choice() {
+fn budget_bench_reports_the_automatic_count() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
-    let told = events(folder, &["budget", ".", "--steps", "20", "--splats", "200,50", "--out", "b", "--json"]);
-    let findings = &told.last().expect("events")["findings"];
-    assert!(findings["own_choice"]["psnr"].as_f64().is_some_and(f64::is_finite), "{findings}");
+    let printed = events(folder, &["budget", ".", "--steps", "20", "--splats", "200,50", "--out", "b", "--json"]);
+    let findings = &printed.last().expect("events")["findings"];
+    assert!(findings["automatic"]["psnr"].as_f64().is_some_and(f64::is_finite), "{findings}");
     let caps: Vec<u64> = findings["caps"]
         .as_array()
         .expect("caps")
@@ -187,17 +187,17 @@ fn a_budget_tells_the_trainers_own_choice() {
     }
     assert_chart(&folder.join("b"), "budget");
     assert_chart(&folder.join("b"), "budget-gain");
-    assert_refused(folder, &["budget", ".", "--max-splats", "9"], 2, &["--max-splats", "--splats"]);
+    assert_fails_with(folder, &["budget", ".", "--max-splats", "9"], 2, &["--max-splats", "--splats"]);
 }
 
 #[test]
-fn an_ablation_tells_what_each_part_brings() {
+fn ablation_bench_reports_gains() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
     let args = ["ablation", ".", "--steps", "30", "--seeds", "1", "--only", "structure,black", "--out", "a"];
-    let told = events(folder, &[&args[..], &["--json"]].concat());
-    let changes = told.last().expect("events")["findings"]["changes"].as_array().expect("changes").clone();
+    let printed = events(folder, &[&args[..], &["--json"]].concat());
+    let changes = printed.last().expect("events")["findings"]["changes"].as_array().expect("changes").clone();
     let names: Vec<&str> = changes.iter().filter_map(|change| change["name"].as_str()).collect();
     assert_eq!(names, ["as it is", "no structure loss", "black background"]);
     let psnrs: Vec<f64> = changes.iter().filter_map(|change| change["psnr"].as_f64()).collect();
@@ -205,22 +205,22 @@ fn an_ablation_tells_what_each_part_brings() {
         psnrs.len() == 3 && psnrs[1] != psnrs[0] && psnrs[2] != psnrs[0],
         "the changes reach the trainer: {psnrs:?}"
     );
-    assert_eq!(changes[1]["bought_db"].as_f64(), Some(psnrs[0] - psnrs[1]));
+    assert_eq!(changes[1]["gain_db"].as_f64(), Some(psnrs[0] - psnrs[1]));
     let page = std::fs::read_to_string(folder.join("a/ablation.html")).expect("a page");
     assert!(page.contains("black background"), "{page}");
-    assert_refused(folder, &["ablation", ".", "--only", "nothing", "--out", "b"], 2, &["--only", "no growth"]);
+    assert_fails_with(folder, &["ablation", ".", "--only", "nothing", "--out", "b"], 2, &["--only", "no growth"]);
 }
 
 #[test]
-fn stability_is_the_same_again_and_clock_offsets_need_times() {
+fn stability_bench_is_repeatable_and_needs_times() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     scene(folder);
     let small = ["--steps", "20", "--max-splats", "300", "--json"];
     let poses = ["stability", ".", "--disturb", "pose-noise", "--levels", "0,50", "--out"];
     let measured = |out: &str| {
-        let told = events(folder, &[&poses[..], &[out], &small].concat());
-        told.last().expect("events")["findings"]["disturbances"].clone()
+        let printed = events(folder, &[&poses[..], &[out], &small].concat());
+        printed.last().expect("events")["findings"]["disturbances"].clone()
     };
     let (first, second) = (measured("s"), measured("again"));
     let psnrs = |of: &Value| -> Vec<f64> {
@@ -233,7 +233,7 @@ fn stability_is_the_same_again_and_clock_offsets_need_times() {
     assert_chart(&folder.join("s"), "stability-pose-noise");
 
     let clock = ["stability", ".", "--disturb", "clock-offset", "--levels", "100", "--out", "t"];
-    assert_refused(folder, &clock, 2, &["clock-offset", "--rate-hz"]);
+    assert_fails_with(folder, &clock, 2, &["clock-offset", "--rate-hz"]);
     let n_runs = |refine: &str, out: &str| {
         let clock = [&clock[..7], &[out, "--rate-hz", "10", "--refine", refine], &small].concat();
         events(folder, &clock).iter().filter(|event| event["event"] == "run").count()
@@ -241,5 +241,5 @@ fn stability_is_the_same_again_and_clock_offsets_need_times() {
     assert_eq!(n_runs("none", "t"), 2, "undisturbed, and 100 ms");
     assert_eq!(n_runs("image-gains", "u"), 4, "each with and without what is settled about cameras");
     let few = ["stability", ".", "--disturb", "keyframes,exposure", "--levels", "1"];
-    assert_refused(folder, &few, 2, &["--levels", "one disturbance"]);
+    assert_fails_with(folder, &few, 2, &["--levels", "one disturbance"]);
 }

@@ -9,9 +9,9 @@ use wall::fieldrig;
 
 const N_STEPS: &str = "24";
 /// What depth is worth after these few steps, dB.
-const LEAST_GAIN_DB: f64 = 2.0;
+const MIN_GAIN_DB: f64 = 2.0;
 /// Measured 0.2 mm: splats keep the depth that they were seeded by.
-const MOST_DEPTH_ERROR_M: f64 = 2e-3;
+const MAX_DEPTH_ERROR_M: f64 = 2e-3;
 
 fn train(folder: &Path, args: &[&str]) -> Output {
     fieldrig(folder, &[&["train", "--json"], args].concat())
@@ -21,20 +21,20 @@ fn train(folder: &Path, args: &[&str]) -> Output {
 fn done(folder: &Path, args: &[&str]) -> Value {
     let output = train(folder, args);
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    let told = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-    serde_json::from_str(told.lines().last().expect("an end")).expect("a JSON object")
+    let printed = String::from_utf8(output.stdout).expect("stdout is UTF-8");
+    serde_json::from_str(printed.lines().last().expect("an end")).expect("a JSON object")
 }
 
-fn refused(folder: &Path, args: &[&str], code: i32, words: &str) {
+fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &str) {
     let output = train(folder, &[args, &["--out", "x"]].concat());
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{args:?}: {told}");
-    assert!(told.lines().any(|line| line.starts_with("error: ") && line.contains(words)), "{args:?}: {told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
+    assert!(printed.lines().any(|line| line.starts_with("error: ") && line.contains(words)), "{args:?}: {printed}");
     assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
 }
 
 #[test]
-fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike() {
+fn rendered_depth_improves_training_and_is_repeatable() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("measured"), true, 0.0);
@@ -49,54 +49,54 @@ fn images_without_depth_are_learned_with_that_of_a_model_again_and_again_alike()
     let from_field = ["--depth-from", "field"];
     let with = |more: &[&'static str]| [&from_field[..], more].concat();
     let bare = splats("seen", N_STEPS, &["--out", "bare"]);
-    let drawn = splats("seen", N_STEPS, &with(&["--out", "drawn"]));
+    let rendered = splats("seen", N_STEPS, &with(&["--out", "drawn"]));
     let psnr = |done: &Value| done["psnr"].as_f64().expect("a score");
-    assert!(psnr(&drawn) > psnr(&bare) + LEAST_GAIN_DB, "{bare} {drawn}");
+    assert!(psnr(&rendered) > psnr(&bare) + MIN_GAIN_DB, "{bare} {rendered}");
     let report = std::fs::read(folder.join("drawn/report.json")).expect("a report");
     let report: Value = serde_json::from_slice(&report).expect("JSON");
-    assert_eq!(report["drawn_depth"]["n_images"], 8, "test images get none");
-    assert!(report["drawn_depth"]["drawn_frac"].as_f64() > Some(0.9), "{}", report["drawn_depth"]);
+    assert_eq!(report["rendered_depth"]["n_images"], 8, "test images get none");
+    assert!(report["rendered_depth"]["rendered_frac"].as_f64() > Some(0.9), "{}", report["rendered_depth"]);
 
     // What was measured stays as it is, and there is nothing else to draw here.
     let measured = splats("measured", N_STEPS, &["--out", "measured splats"]);
     let both = splats("measured", N_STEPS, &with(&["--out", "both"]));
     assert_eq!(both["checkpoint_sha256"], measured["checkpoint_sha256"]);
 
-    let sum = &drawn["checkpoint_sha256"];
-    assert_eq!(splats("seen", N_STEPS, &with(&["--out", "twice"]))["checkpoint_sha256"], *sum);
+    let sha256 = &rendered["checkpoint_sha256"];
+    assert_eq!(splats("seen", N_STEPS, &with(&["--out", "twice"]))["checkpoint_sha256"], *sha256);
     splats("seen", "12", &with(&["--out", "half"]));
     let resume = ["seen", "--resume", "half", "--steps", N_STEPS];
     let whole = done(folder, &[&resume[..], &with(&["--out", "whole"])].concat());
-    assert_eq!(whole["checkpoint_sha256"], *sum, "two halves give another model");
+    assert_eq!(whole["checkpoint_sha256"], *sha256, "two halves give another model");
     let replay = ["seen", "--replay-decisions", "drawn/decisions.jsonl"];
     let repeated = done(folder, &[&replay[..], &with(&["--out", "repeated"])].concat());
-    assert_eq!(repeated["checkpoint_sha256"], *sum, "the log gives another model");
+    assert_eq!(repeated["checkpoint_sha256"], *sha256, "the log gives another model");
 
     // A checkpoint names the model, and a resumed run finds it without a flag; a decision log has only its hash.
     let found = done(folder, &[&resume[..], &["--out", "found"]].concat());
-    assert_eq!(found["checkpoint_sha256"], *sum, "resumed without --depth-from");
-    refused(folder, &replay, 2, "name it with --depth-from");
+    assert_eq!(found["checkpoint_sha256"], *sha256, "resumed without --depth-from");
+    assert_fails_with(folder, &replay, 2, "name it with --depth-from");
     for again in [&resume[..], &replay] {
-        refused(folder, &[again, &["--depth-from", "drawn"]].concat(), 2, "--depth-from names one with");
+        assert_fails_with(folder, &[again, &["--depth-from", "drawn"]].concat(), 2, "--depth-from names one with");
     }
     let bare = ["seen", "--resume", "bare", "--depth-from", "field"];
-    refused(folder, &bare, 2, "leave out --depth-from");
-    refused(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
-    refused(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
-    refused(
+    assert_fails_with(folder, &bare, 2, "leave out --depth-from");
+    assert_fails_with(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
+    assert_fails_with(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
+    assert_fails_with(
         folder,
         &["seen", "--depth-from", "field/mesh.ply"],
         2,
         "--depth-from: field/mesh.ply is no file of splats",
     );
-    refused(folder, &["seen", "--method", "tsdf"], 4, "no image to learn from has depth");
+    assert_fails_with(folder, &["seen", "--method", "tsdf"], 4, "no image to learn from has depth");
 
     // Depth from splats makes a mesh of images that have none.
     done(folder, &["seen", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
-    let judged = fieldrig(folder, &["eval", "mesh", "measured", "--json"]).stdout;
-    let judged: Value = serde_json::from_slice(&judged).expect("a JSON object");
+    let evaluated = fieldrig(folder, &["eval", "mesh", "measured", "--json"]).stdout;
+    let evaluated: Value = serde_json::from_slice(&evaluated).expect("a JSON object");
     let elsewhere = fieldrig(folder, &["eval", "mesh", "elsewhere"]).stderr;
     let elsewhere = String::from_utf8(elsewhere).expect("stderr is UTF-8");
     assert!(elsewhere.contains("the model covers 0.0 % of 2 views; are both of one place"), "{elsewhere}");
-    assert!(judged["depth_rmse_m"].as_f64().is_some_and(|error_m| error_m < MOST_DEPTH_ERROR_M), "{judged}");
+    assert!(evaluated["depth_rmse_m"].as_f64().is_some_and(|error_m| error_m < MAX_DEPTH_ERROR_M), "{evaluated}");
 }

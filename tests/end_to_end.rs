@@ -14,9 +14,9 @@ const N_IMAGES: i64 = 40;
 /// Steps of every run here.
 const N_STEPS: &str = "300";
 /// Measured 22.1 dB after these few steps, most of them coarse ones; the first keyframe's seeds alone score 16.4 dB.
-const LEAST_PSNR: f64 = 21.0;
+const MIN_PSNR: f64 = 21.0;
 /// Forward kinematics, interpolation and the camera's mounting together.
-const MOST_POSITION_ERROR_M: f64 = 1e-4;
+const MAX_POSITION_ERROR_M: f64 = 1e-4;
 
 /// `rigs/static-arm.toml` at a quarter of its size, without flaws, in lockstep.
 fn rig_file(folder: &Path) {
@@ -47,7 +47,7 @@ fn number(value: &Value, key: &str) -> f64 {
 }
 
 #[test]
-fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
+fn simulated_run_and_its_replay_are_identical() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
@@ -55,18 +55,18 @@ fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
     let replay = ["run", "rig.toml", "--from", "scan.mcap", "--steps", N_STEPS, "--out", "replay"];
     let common = ["--steps-per-keyframe", "2", "--listen", "127.0.0.1:0", "--json"];
 
-    let told = events(folder, &[&live[..], &common[..]].concat());
-    assert_eq!(told[0]["event"], "serving", "the address comes first");
-    let done = told.last().expect("events");
+    let printed = events(folder, &[&live[..], &common[..]].concat());
+    assert_eq!(printed[0]["event"], "serving", "the address comes first");
+    let done = printed.last().expect("events");
     assert_eq!(done["event"], "done");
     assert_eq!(done["steps"].as_u64(), N_STEPS.parse().ok());
     let psnr = number(done, "psnr");
-    assert!(psnr >= LEAST_PSNR, "test PSNR {psnr:.2} dB");
+    assert!(psnr >= MIN_PSNR, "test PSNR {psnr:.2} dB");
 
     let report = std::fs::read_to_string(folder.join("live/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");
-    let error_m = number(&report, "worst_position_error_m");
-    assert!(error_m < MOST_POSITION_ERROR_M, "a camera is {error_m} m off");
+    let error_m = number(&report, "max_position_error_m");
+    assert!(error_m < MAX_POSITION_ERROR_M, "a camera is {error_m} m off");
     assert!(number(&report, "keyframes") >= 12.0, "{report}");
 
     let replayed = events(folder, &[&replay[..], &common[..]].concat());
@@ -77,26 +77,26 @@ fn a_simulated_run_learns_and_its_recording_gives_the_same_bits() {
         assert!(first == second, "{list} differs");
     }
 
-    scores_a_saved_model_alike(folder, psnr);
-    draws_a_saved_model(folder);
-    tells_what_a_cut_off_recording_lost(folder);
+    check_saved_model_scores(folder, psnr);
+    check_saved_model_renders(folder);
+    check_truncated_recording_is_a_loss(folder);
 }
 
 #[test]
-fn memory_of_a_run_is_measured_with_a_viewer() {
+fn memory_bench_measures_a_run_with_a_viewer() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     let small = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file") + "\n[join]\nmax_keyframes = 8\n";
     std::fs::write(folder.join("rig.toml"), small).expect("room on the disk");
     let bench = ["bench", "memory", "rig.toml", "--sim", "--seconds", "20", "--every-secs", "0.2", "--json"];
-    let told = events(
+    let printed = events(
         folder,
         &[&bench[..], &["--out", "memory", "--", "--max-splats", "2000", "--steps-per-keyframe", "1"]].concat(),
     );
-    assert_eq!(told[0]["event"], "serving");
+    assert_eq!(printed[0]["event"], "serving");
     let samples: Vec<&Value> =
-        told.iter().filter(|event| event["event"] == "sample").map(|event| &event["sample"]).collect();
+        printed.iter().filter(|event| event["event"] == "sample").map(|event| &event["sample"]).collect();
     assert!(samples.len() >= 3, "{}", samples.len());
     let (first, last) = (samples[0], samples[samples.len() - 1]);
     assert!(number(last, "pictures") >= 1.0 && number(last, "viewers") == 1.0, "{last}");
@@ -116,20 +116,20 @@ fn memory_of_a_run_is_measured_with_a_viewer() {
 /// Keyframes that are fused.
 const N_FUSED: &str = "10";
 /// Measured 18 dB: what was not seen yet has no surface.
-const LEAST_PSNR_OF_MESH: f64 = 15.0;
+const MIN_PSNR_OF_MESH: f64 = 15.0;
 
 #[test]
-fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
+fn tsdf_runs_live_replays_and_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     let common = ["--method", "tsdf", "--json", "--steps", N_FUSED];
     let run = [&["--steps-per-keyframe", "1", "--listen", "127.0.0.1:0"], &common[..]].concat();
     let live = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "live"];
-    let told = events(folder, &[&live[..], &run].concat());
-    let done = told.last().expect("events");
+    let printed = events(folder, &[&live[..], &run].concat());
+    let done = printed.last().expect("events");
     let psnr = number(done, "psnr");
-    assert!(psnr >= LEAST_PSNR_OF_MESH, "test PSNR {psnr:.2} dB");
+    assert!(psnr >= MIN_PSNR_OF_MESH, "test PSNR {psnr:.2} dB");
     assert!(number(done, "depth_rmse_m") < 0.05, "{done}");
     assert!(number(done, "surface_error_m") < 0.004, "{done}");
 
@@ -146,15 +146,15 @@ fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
 
     assert!(mesh.starts_with(b"glTF") && mesh.len() > 50_000, "{} bytes", mesh.len());
 
-    scores_a_saved_model_alike(folder, psnr);
-    draws_a_saved_model(folder);
+    check_saved_model_scores(folder, psnr);
+    check_saved_model_renders(folder);
 
     let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt"];
     let half = ["--method", "tsdf", "--json", "--steps", "4", "--out", "half"];
     let half = events(folder, &[&train[..], &half].concat());
     let rest = ["--resume", "half", "--json", "--steps", N_FUSED, "--out", "whole"];
     let whole = events(folder, &[&train[..], &rest].concat());
-    let [half, whole] = [half, whole].map(|told| told.last().cloned().expect("events"));
+    let [half, whole] = [half, whole].map(|printed| printed.last().cloned().expect("events"));
     assert_eq!(half["steps"], 4);
     assert!(number(&half, "psnr") < psnr);
     assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "two halves give another model");
@@ -163,56 +163,57 @@ fn a_distance_field_is_built_live_replayed_scored_drawn_and_gone_on_with() {
 /// Steps of a neural field: few, since software takes its time over each.
 const N_RAY_STEPS: &str = "120";
 /// Measured 16.5 dB: keyframes come in while it learns.
-const LEAST_PSNR_OF_RAYS: f64 = 14.0;
+const MIN_PSNR_OF_RAYS: f64 = 14.0;
 
 #[test]
-fn a_neural_field_is_learned_live_replayed_scored_drawn_and_gone_on_with() {
+fn nerf_runs_live_replays_and_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     let common = ["--method", "nerf", "--json", "--steps", N_RAY_STEPS];
     let run = [&["--steps-per-keyframe", "8", "--listen", "127.0.0.1:0"], &common[..]].concat();
     let live = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "live"];
-    let told = events(folder, &[&live[..], &run].concat());
-    let done = told.last().expect("events");
+    let printed = events(folder, &[&live[..], &run].concat());
+    let done = printed.last().expect("events");
     let psnr = number(done, "psnr");
-    assert!(psnr >= LEAST_PSNR_OF_RAYS, "test PSNR {psnr:.2} dB");
+    assert!(psnr >= MIN_PSNR_OF_RAYS, "test PSNR {psnr:.2} dB");
     assert_eq!(done["steps"].as_u64(), N_RAY_STEPS.parse().ok());
 
     let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
     let replayed = events(folder, &[&replay[..], &run].concat());
     assert_eq!(replayed.last().expect("events")["checkpoint_sha256"], done["checkpoint_sha256"]);
-    scores_a_saved_model_alike(folder, psnr);
-    draws_a_saved_model(folder);
+    check_saved_model_scores(folder, psnr);
+    check_saved_model_renders(folder);
 
     let train = ["train", "scan.mcap", "--keyframes", "live/keyframes.txt", "--json"];
-    let taken = |args: &[&str]| events(folder, &[&train[..], args].concat()).last().cloned().expect("events");
+    let train_and_get_done =
+        |args: &[&str]| events(folder, &[&train[..], args].concat()).last().cloned().expect("events");
     let begin = ["--method", "nerf", "--plan-steps", "30"];
-    taken(&[&begin[..], &["--steps", "15", "--out", "half"]].concat());
-    let whole = taken(&[&begin[..], &["--steps", "30", "--out", "whole"]].concat());
-    let resumed = taken(&["--resume", "half", "--steps", "30", "--out", "resumed"]);
+    train_and_get_done(&[&begin[..], &["--steps", "15", "--out", "half"]].concat());
+    let whole = train_and_get_done(&[&begin[..], &["--steps", "30", "--out", "whole"]].concat());
+    let resumed = train_and_get_done(&["--resume", "half", "--steps", "30", "--out", "resumed"]);
     assert_eq!(resumed["checkpoint_sha256"], whole["checkpoint_sha256"], "two halves give another model");
 
     let exported = fieldrig(folder, &["export", "live", "--to", "ply", "--out", "splats.ply"]);
-    let told = String::from_utf8_lossy(&exported.stderr);
+    let printed = String::from_utf8_lossy(&exported.stderr);
     assert!(
-        !exported.status.success() && told.contains("a neural field, which has neither splats nor a mesh"),
-        "{told}"
+        !exported.status.success() && printed.contains("a neural field, which has neither splats nor a mesh"),
+        "{printed}"
     );
 }
 
 #[test]
-fn several_methods_grow_live_as_each_does_alone_and_a_viewer_chooses() {
+fn several_live_methods_equal_single_runs() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     events(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"]);
     let replay = |method: &str, out: &str| {
         let run = ["run", "rig.toml", "--from", "scan.mcap", "--method", method, "--steps", N_FUSED, "--out", out];
-        let told =
+        let printed =
             events(folder, &[&run[..], &["--steps-per-keyframe", "1", "--listen", "127.0.0.1:0", "--json"]].concat());
         let hash = |done: &Value| done["checkpoint_sha256"].as_str().expect("a hash").to_owned();
-        told.iter().filter(|event| event["event"] == "done").map(hash).collect::<Vec<_>>()
+        printed.iter().filter(|event| event["event"] == "done").map(hash).collect::<Vec<_>>()
     };
     let together = replay("tsdf,splat", "both");
     assert_eq!(together, [replay("tsdf", "tsdf"), replay("splat", "splat")].concat());
@@ -224,10 +225,10 @@ fn several_methods_grow_live_as_each_does_alone_and_a_viewer_chooses() {
 
     let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
     let common = ["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"];
-    let told = interrupted(folder, &[&args[..], &common].concat(), |serving| {
-        looks_at_each(serving["url"].as_str().expect("an address"));
+    let printed = interrupted(folder, &[&args[..], &common].concat(), |serving| {
+        request_picture_of_each_method(serving["url"].as_str().expect("an address"));
     });
-    assert_eq!(told.iter().filter(|event| event["event"] == "done").count(), 2);
+    assert_eq!(printed.iter().filter(|event| event["event"] == "done").count(), 2);
 }
 
 /// Runs a command that serves, and asks for its end, as Ctrl-C does, once it told a score; what it told from there on comes
@@ -241,20 +242,21 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     while event().expect("an event before the end")["event"] != "eval" {}
     meanwhile(&serving);
     // The shell's own `kill`: a bare system has no other.
-    let asked = Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
-    assert!(asked.success());
-    let told = std::iter::from_fn(event).collect();
+    let interrupt_status =
+        Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
+    assert!(interrupt_status.success());
+    let printed = std::iter::from_fn(event).collect();
     assert_eq!(run.wait().expect("it ends").code(), Some(0));
-    told
+    printed
 }
 
 /// Asks for a picture of each model there is, and of one that is not there.
-fn looks_at_each(url: &str) {
+fn request_picture_of_each_method(url: &str) {
     let address = url.trim_start_matches("http://").trim_end_matches('/');
     let stream = std::net::TcpStream::connect(address).expect("the server listens");
     stream.set_read_timeout(Some(std::time::Duration::from_secs(60))).expect("a timeout");
     let (mut socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-    let mut ask = |id: u64, method: Option<&str>| -> Value {
+    let mut request_picture = |id: u64, method: Option<&str>| -> Value {
         let mut message = serde_json::json!({
             "type": "render", "id": id, "size_px": [64, 48], "stages": [1.0],
             "world_from_camera": [1, 0, 0, 0.5, 0, -1, 0, 0, 0, 0, -1, 0.6, 0, 0, 0, 1],
@@ -286,64 +288,64 @@ fn looks_at_each(url: &str) {
     let mut ids = 1..200;
     let tsdf = loop {
         let mut next = || ids.next().expect("the first is never the usual one");
-        let (usual, tsdf) = (ask(next(), None), ask(next(), Some("tsdf")));
-        if usual == tsdf {
+        let (default_picture, tsdf) = (request_picture(next(), None), request_picture(next(), Some("tsdf")));
+        if default_picture == tsdf {
             break tsdf;
         }
         std::thread::sleep(std::time::Duration::from_millis(300));
     };
-    let splat = ask(201, Some("splat"));
+    let splat = request_picture(201, Some("splat"));
     assert!(tsdf.is_array() && splat.is_array() && splat != tsdf, "the models look different");
-    let told = ask(202, Some("nerf"))["message"].as_str().expect("an error").to_owned();
-    assert!(told.contains("\"nerf\"") && told.contains("tsdf, splat"), "{told}");
+    let printed = request_picture(202, Some("nerf"))["message"].as_str().expect("an error").to_owned();
+    assert!(printed.contains("\"nerf\"") && printed.contains("tsdf, splat"), "{printed}");
 }
 
 /// What `run` said of its model, `eval` says of the saved one.
-fn scores_a_saved_model_alike(folder: &Path, psnr: f64) {
+fn check_saved_model_scores(folder: &Path, psnr: f64) {
     /// The file keeps the parameters' bits; scores are sums in the same order.
-    const ABS_DB: f64 = 1e-6;
+    const TOLERANCE_DB: f64 = 1e-6;
     let list = ["--keyframes", "live/keyframes.txt", "--json"];
-    let judged = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
-    let again = number(&judged[0], "psnr");
-    assert!((again - psnr).abs() < ABS_DB, "eval says {again} dB, run said {psnr} dB");
-    let n_tests = judged[0]["per_image"].as_array().expect("scores").len();
-    assert!(n_tests >= 2, "{}", judged[0]);
+    let evaluated = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
+    let again = number(&evaluated[0], "psnr");
+    assert!((again - psnr).abs() < TOLERANCE_DB, "eval says {again} dB, run said {psnr} dB");
+    let n_tests = evaluated[0]["per_image"].as_array().expect("scores").len();
+    assert!(n_tests >= 2, "{}", evaluated[0]);
 
     let all = fieldrig(folder, &["eval", "live", "scan.mcap", "--holdout", "1", "--json"]);
-    let told = String::from_utf8_lossy(&all.stderr);
-    assert_eq!(all.status.code(), Some(0), "{told}");
-    assert!(told.contains("the model was trained on"), "{told}");
+    let printed = String::from_utf8_lossy(&all.stderr);
+    assert_eq!(all.status.code(), Some(0), "{printed}");
+    assert!(printed.contains("the model was trained on"), "{printed}");
     let scored: Value = serde_json::from_slice(&all.stdout).expect("JSON");
     assert!(scored["per_image"].as_array().is_some_and(|images| images.len() > 4 * n_tests), "all are scored");
 }
 
-fn draws_a_saved_model(folder: &Path) {
+fn check_saved_model_renders(folder: &Path) {
     let pose = "1 0 0 0.5  0 -1 0 0  0 0 -1 0.6  0 0 0 1"; // Above the table, looking down.
-    let drawn = events(
+    let rendered = events(
         folder,
         &["render", "live", "--pose", pose, "--size", "64x48", "--depth", "--out", "pictures", "--json"],
     );
-    let picture = drawn[0]["picture"].as_str().expect("a picture");
+    let picture = rendered[0]["picture"].as_str().expect("a picture");
     let pixels = image::open(folder.join(picture)).expect("a PNG file").into_rgb8();
     assert_eq!(pixels.dimensions(), (64, 48));
     let brightest = pixels.pixels().map(|pixel| pixel.0.iter().copied().max()).max();
     assert!(brightest > Some(Some(40)), "the picture is black");
-    assert!(folder.join(drawn[0]["depth"].as_str().expect("a depth file")).is_file());
+    assert!(folder.join(rendered[0]["depth"].as_str().expect("a depth file")).is_file());
 }
 
 /// Half a recording trains; the exit code and one sentence say that something is missing.
-fn tells_what_a_cut_off_recording_lost(folder: &Path) {
+fn check_truncated_recording_is_a_loss(folder: &Path) {
     let whole = std::fs::read(folder.join("scan.mcap")).expect("the recording");
     std::fs::write(folder.join("half.mcap"), &whole[..whole.len() / 2]).expect("room on the disk");
     let output = fieldrig(folder, &["train", "half.mcap", "--steps", "1", "--out", "half", "--json"]);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(3), "{told}");
-    assert!(told.contains("half.mcap") || told.contains("recording"), "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{printed}");
+    assert!(printed.contains("half.mcap") || printed.contains("recording"), "{printed}");
     assert!(folder.join("half/splats.ply").is_file(), "what was there is used");
 }
 
 #[test]
-fn record_names_its_losses_and_spares_what_is_there() {
+fn record_reports_losses_and_does_not_overwrite() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
@@ -352,38 +354,38 @@ fn record_names_its_losses_and_spares_what_is_there() {
     let sim = rig["sim"].as_table_mut().expect("a simulation");
     sim.insert("ideal".into(), false.into());
     let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
-    let flaws = wrist.entry("sim").or_insert_with(|| toml::Table::new().into());
-    flaws.as_table_mut().expect("a table").insert("dropped_frac".into(), 0.4.into());
+    let sensor_noise = wrist.entry("sim").or_insert_with(|| toml::Table::new().into());
+    sensor_noise.as_table_mut().expect("a table").insert("dropped_frac".into(), 0.4.into());
     std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
 
     let record = ["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"];
     let output = fieldrig(folder, &record);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(3), "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{printed}");
     let done: Value = serde_json::from_slice(&output.stdout).expect("a JSON object");
     assert_eq!((done["images"].as_i64(), done["depth_images"].as_i64()), (Some(N_IMAGES), Some(N_IMAGES)));
-    let n_lost = done["lost"]["wrist"]["images"].as_u64().expect("a number");
-    assert!(n_lost > 0 && told.contains(&format!("camera \"wrist\" lost {n_lost} color")), "{told}");
+    let n_dropped = done["dropped"]["wrist"]["images"].as_u64().expect("a number");
+    assert!(n_dropped > 0 && printed.contains(&format!("camera \"wrist\" lost {n_dropped} color")), "{printed}");
 
     let before = std::fs::read(folder.join("scan.mcap")).expect("a recording");
     let itself = ["run", "rig.toml", "--from", "scan.mcap", "--record", "scan.mcap", "--listen", "127.0.0.1:0"];
     for again in [&record[..], &itself[..]] {
         let refused = fieldrig(folder, again);
-        let told = String::from_utf8_lossy(&refused.stderr);
-        assert_eq!(refused.status.code(), Some(1), "{told}");
-        assert!(told.contains("\"scan.mcap\" exists already"), "{told}");
+        let printed = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(1), "{printed}");
+        assert!(printed.contains("\"scan.mcap\" exists already"), "{printed}");
     }
     assert!(std::fs::read(folder.join("scan.mcap")).expect("a recording") == before);
 }
 
 #[test]
-fn an_interrupted_run_saves_model_and_recording() {
+fn interrupted_run_saves_model_and_recording() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
     let run = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "cut"];
-    let told = interrupted(folder, &[&run[..], &["--listen", "127.0.0.1:0", "--json"]].concat(), |_| {});
-    assert_eq!(told.last().expect("events")["event"], "done");
+    let printed = interrupted(folder, &[&run[..], &["--listen", "127.0.0.1:0", "--json"]].concat(), |_| {});
+    assert_eq!(printed.last().expect("events")["event"], "done");
     assert!(folder.join("cut/splats.ply").is_file());
     let replayed = fieldrig(folder, &["train", "scan.mcap", "--steps", "1", "--out", "again"]);
     assert!(replayed.status.success(), "{}", String::from_utf8_lossy(&replayed.stderr));
@@ -391,7 +393,7 @@ fn an_interrupted_run_saves_model_and_recording() {
 
 /// In real time the machine's speed decides what is learned when; the log of that gives the same model again.
 #[test]
-fn a_run_in_real_time_is_repeated_by_its_log() {
+fn decision_log_reproduces_a_real_time_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
@@ -403,8 +405,8 @@ fn a_run_in_real_time_is_repeated_by_its_log() {
     // Images that the machine is too slow for are a loss (3).
     let done = |args: &[&str], codes: &[i32]| -> Value {
         let output = fieldrig(folder, args);
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code().is_some_and(|code| codes.contains(&code)), "{args:?}: {told}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code().is_some_and(|code| codes.contains(&code)), "{args:?}: {printed}");
         let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
         serde_json::from_str(stdout.lines().last().expect("events")).expect("a JSON object a line")
     };
@@ -414,9 +416,10 @@ fn a_run_in_real_time_is_repeated_by_its_log() {
 
     let log = std::fs::read_to_string(folder.join("live/decisions.jsonl")).expect("a log");
     let entries: Vec<Value> = log.lines().skip(1).map(|line| serde_json::from_str(line).expect("JSON")).collect();
-    let late = entries.iter().filter(|entry| entry.get("push").is_some() && number(entry, "step") > 0.0).count();
-    let gone = entries.iter().filter(|entry| entry.get("remove").is_some()).count();
-    assert!(late > 3 && gone > 0, "{late} came while it learned, {gone} went: {log}");
+    let n_pushed_late =
+        entries.iter().filter(|entry| entry.get("push").is_some() && number(entry, "step") > 0.0).count();
+    let n_evicted = entries.iter().filter(|entry| entry.get("remove").is_some()).count();
+    assert!(n_pushed_late > 3 && n_evicted > 0, "{n_pushed_late} came while it learned, {n_evicted} went: {log}");
 
     let replay = |log: &str, out: &str, codes: &[i32]| {
         done(&["train", "scan.mcap", "--replay-decisions", log, "--out", out, "--json"], codes)
@@ -437,8 +440,8 @@ fn a_run_in_real_time_is_repeated_by_its_log() {
     let refused = |log: String, words: &str| {
         std::fs::write(folder.join("changed.jsonl"), log).expect("room on the disk");
         let output = fieldrig(folder, &["train", "scan.mcap", "--replay-decisions", "changed.jsonl", "--out", "no"]);
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.code() == Some(4) && told.contains(words), "{told}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(4) && printed.contains(words), "{printed}");
         assert!(!folder.join("no").exists(), "what is refused leaves nothing behind");
     };
     let pushed = &entries[1]["push"];
@@ -450,7 +453,7 @@ fn a_run_in_real_time_is_repeated_by_its_log() {
 
 /// A replay that leaves nothing to train on ends by itself, and says what was amiss.
 #[test]
-fn a_replay_without_training_keyframes_ends_with_a_reason() {
+fn replay_without_training_keyframes_reports_the_reason() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
@@ -465,16 +468,16 @@ fn a_replay_without_training_keyframes_ends_with_a_reason() {
             folder,
             &["run", rig, "--from", "one.mcap", "--out", &format!("out-{rig}"), "--listen", "127.0.0.1:0"],
         );
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(4), "{told}");
-        assert!(told.contains(reason), "{told}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(4), "{printed}");
+        assert!(printed.contains(reason), "{printed}");
         assert!(!folder.join(format!("out-{rig}")).exists(), "what is refused leaves nothing behind");
     }
 }
 
 /// A disk that fills up is a loss, told with its cause; what was written before can be read.
 #[test]
-fn a_recording_that_finds_no_room_is_a_loss() {
+fn full_disk_during_recording_is_a_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
@@ -484,21 +487,21 @@ fn a_recording_that_finds_no_room_is_a_loss() {
         .current_dir(folder)
         .output()
         .expect("sh starts");
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(3), "{told}");
-    assert!(told.contains("cut.mcap\", which keeps the first") && told.contains("too large"), "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{printed}");
+    assert!(printed.contains("cut.mcap\", which keeps the first") && printed.contains("too large"), "{printed}");
 }
 
 #[test]
-fn a_port_in_use_is_one_clear_sentence() {
+fn port_in_use_is_one_clear_error() {
     let folder = tempfile::tempdir().expect("a folder");
     rig_file(folder.path());
-    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
-    let address = taken.local_addr().expect("bound").to_string();
+    let train_and_get_done = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = train_and_get_done.local_addr().expect("bound").to_string();
     let output = fieldrig(folder.path(), &["run", "rig.toml", "--sim", "--listen", &address]);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{told}");
-    assert!(told.starts_with("error: ") && told.contains(&address), "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert!(printed.starts_with("error: ") && printed.contains(&address), "{printed}");
 }
 
 /// The hand-eye calibration of a rig file: metres, and a quaternion as x, y, z, w.
@@ -512,11 +515,11 @@ fn hand_eye(file: &Path) -> (Vec<f64>, Vec<f64>) {
 }
 
 #[test]
-fn a_rig_with_a_wrong_hand_eye_calibration_calibrates_itself() {
+fn wrong_hand_eye_calibration_is_corrected() {
     /// Half the scan; measured 0.003 degrees and 0.04 mm.
     const N_IMAGES: i64 = 90;
-    const LEFT_DEGREES: f64 = 0.1;
-    const LEFT_MM: f64 = 0.5;
+    const MAX_REMAINING_DEGREES: f64 = 0.1;
+    const MAX_REMAINING_MM: f64 = 0.5;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file_for(folder, N_IMAGES);
@@ -544,28 +547,28 @@ fn a_rig_with_a_wrong_hand_eye_calibration_calibrates_itself() {
 
     std::fs::create_dir(folder.join("found")).expect("room on the disk");
     let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--refine", "auto", "--steps", "8", "--out", "out"];
-    let told = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
-    assert_eq!(told.last().expect("events")["event"], "done");
+    let printed = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
+    assert_eq!(printed.last().expect("events")["event"], "done");
     let (found_m, found) = hand_eye(&folder.join("found/rig.toml"));
     let dot: f64 = found.iter().zip(&right).map(|(found, right)| found * right).sum();
     let degrees = 2.0 * dot.abs().min(1.0).acos().to_degrees();
     let mm = 1e3 * found_m.iter().zip(&right_m).map(|(found, right)| (found - right).powi(2)).sum::<f64>().sqrt();
-    assert!(degrees < LEFT_DEGREES && mm < LEFT_MM, "{degrees:.4} degrees, {mm:.3} mm left");
+    assert!(degrees < MAX_REMAINING_DEGREES && mm < MAX_REMAINING_MM, "{degrees:.4} degrees, {mm:.3} mm left");
 
     let report = std::fs::read_to_string(folder.join("out/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");
-    let found = report["alignment"]["found"].as_array().expect("what was found");
+    let found = report["alignment"]["estimates"].as_array().expect("what was found");
     assert_eq!(found.len(), 1, "only the hand-eye: {found:?}");
-    assert_eq!(found[0]["what"], "hand-eye");
-    assert!((number(&found[0], "turn_rad").to_degrees() - 1.0).abs() < LEFT_DEGREES);
-    assert!(number(&found[0], "shift_sigma_m") < 5e-4);
+    assert_eq!(found[0]["parameter"], "hand-eye");
+    assert!((number(&found[0], "rotation_rad").to_degrees() - 1.0).abs() < MAX_REMAINING_DEGREES);
+    assert!(number(&found[0], "translation_sigma_m") < 5e-4);
 
     // With the corrected rig nothing is wrong any more.
     let args = ["train", "scan.mcap", "--rig", "found/rig.toml", "--refine", "auto", "--steps", "8", "--out", "again"];
     events(folder, &[&args[..], &["--json"]].concat());
     let report = std::fs::read_to_string(folder.join("again/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");
-    assert_eq!(report["alignment"]["found"].as_array().map(Vec::len), Some(0));
+    assert_eq!(report["alignment"]["estimates"].as_array().map(Vec::len), Some(0));
 
     let refused = fieldrig(folder, &["train", "scan.mcap", "--steps", "8", "--write-rig", "nowhere/rig.toml"]);
     assert_eq!(refused.status.code(), Some(2), "{}", String::from_utf8_lossy(&refused.stderr));

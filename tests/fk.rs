@@ -7,7 +7,7 @@ use std::process::Command;
 
 const PANDA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/kinematics/tests/data/panda.urdf");
 /// Metres, and rotation matrix elements: rounding of a dozen products of numbers near 1.
-const CLOSE: f64 = 1e-12;
+const TOLERANCE: f64 = 1e-12;
 
 /// Exit code, stdout and stderr of `fieldrig fk` with these joints.
 fn fk(urdf: &Path, flags: &[&str], joints: &str) -> (i32, String, String) {
@@ -36,7 +36,7 @@ fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
 }
 
 #[test]
-fn joints_are_found_by_name_and_the_stretched_panda_is_where_it_is_published() {
+fn stretched_panda_matches_published_pose() {
     // All joints zero: 0.333 + 0.316 + 0.384 - 0.107 up, 0.088 out, the flange looking down.
     let stretched = [1.0, 0.0, 0.0, 0.088, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.926, 0.0, 0.0, 0.0, 1.0];
     let names = ["joint7", "joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "finger_joint_left"];
@@ -46,9 +46,9 @@ fn joints_are_found_by_name_and_the_stretched_panda_is_where_it_is_published() {
     let joints = json!({"joint_names": names, "configurations": [stretch, first_turned]});
     let got = poses(Path::new(PANDA), &["--tip", "link8"], &joints);
     assert_eq!(got.len(), 2);
-    assert!(largest_difference(&got[0], &stretched) < CLOSE, "{:?}", got[0]);
+    assert!(largest_difference(&got[0], &stretched) < TOLERANCE, "{:?}", got[0]);
     // A quarter turn of the first joint turns x into y.
-    assert!((got[1][3] - 0.0).abs() < CLOSE && (got[1][7] - 0.088).abs() < CLOSE, "{:?}", got[1]);
+    assert!((got[1][3] - 0.0).abs() < TOLERANCE && (got[1][7] - 0.088).abs() < TOLERANCE, "{:?}", got[1]);
     let from_hand = json!({"joint_names": ["finger_joint_left"], "configurations": [[0.04]]});
     let finger = poses(Path::new(PANDA), &["--tip", "finger_right", "--base", "hand"], &from_hand);
     assert_eq!(finger[0][7], -0.04, "a mimic joint follows");
@@ -57,7 +57,7 @@ fn joints_are_found_by_name_and_the_stretched_panda_is_where_it_is_published() {
 }
 
 #[test]
-fn poses_agree_with_an_independent_library() {
+fn poses_match_an_independent_library() {
     let data = std::env::var("FIELDRIG_TEST_DATA")
         .map_or_else(|_| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared/data")), PathBuf::from);
     let robots = data.join("robots");
@@ -77,8 +77,8 @@ fn poses_agree_with_an_independent_library() {
             for (pose, sample) in poses(&urdf, &["--tip", frame], &joints).iter().zip(samples) {
                 let rows = sample["T"][frame].as_array().unwrap().iter().flat_map(|row| row.as_array().unwrap());
                 let rows: Vec<f64> = rows.map(|number| number.as_f64().unwrap()).collect();
-                let off = largest_difference(pose, &rows);
-                assert!(off < CLOSE, "{name} {frame}: {off:e} from the library");
+                let difference = largest_difference(pose, &rows);
+                assert!(difference < TOLERANCE, "{name} {frame}: {difference:e} from the library");
             }
         }
     }
@@ -88,7 +88,7 @@ fn poses_agree_with_an_independent_library() {
 }
 
 #[test]
-fn wrong_input_gets_one_sentence_and_no_output() {
+fn invalid_input_gives_one_error_and_no_output() {
     let fine = r#"{"joint_names":["joint1"],"configurations":[[0.5]]}"#;
     let cases = [
         (&["--tip", "wrist"][..], fine, r#"link "wrist" is not in the URDF"#),

@@ -30,7 +30,7 @@ fn done(output: &Output) -> Value {
 }
 
 #[test]
-fn a_training_that_loses_its_gpu_ends_with_the_bits_of_one_that_does_not() {
+fn training_after_gpu_loss_is_identical() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -53,7 +53,7 @@ fn a_training_that_loses_its_gpu_ends_with_the_bits_of_one_that_does_not() {
 }
 
 #[test]
-fn where_the_gpu_does_not_come_back_the_checkpoint_and_the_command_that_continues_are_named() {
+fn permanent_gpu_loss_error_names_checkpoint_and_command() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -78,7 +78,7 @@ fn where_the_gpu_does_not_come_back_the_checkpoint_and_the_command_that_continue
 }
 
 #[test]
-fn a_gpu_without_memory_for_more_splats_keeps_those_it_has() {
+fn out_of_gpu_memory_stops_growth() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -102,7 +102,7 @@ fn a_gpu_without_memory_for_more_splats_keeps_those_it_has() {
 
 #[cfg(feature = "sim")]
 #[test]
-fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recording() {
+fn live_run_survives_gpu_loss_or_keeps_its_recording() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
@@ -118,9 +118,9 @@ fn a_live_run_that_loses_its_gpu_continues_and_one_that_cannot_keeps_its_recordi
     assert!(text.contains("reopened the GPU: training continues from"), "{text}");
     assert_eq!(done(&lost)["steps"], 200);
 
-    let gone = run("gone", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")]);
-    let text = stderr(&gone);
-    assert_eq!(gone.status.code(), Some(1), "{text}");
+    let unrecovered = run("gone", &[("FIELDRIG_TEST_LOSE_GPU_AT_STEP", "120"), ("FIELDRIG_TEST_OPEN_GPU_ONCE", "1")]);
+    let text = stderr(&unrecovered);
+    assert_eq!(unrecovered.status.code(), Some(1), "{text}");
     assert!(
         (text.contains("`fieldrig run ") && text.contains("--resume gone`"))
             || text.contains("no checkpoint was written yet"),

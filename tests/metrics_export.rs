@@ -24,10 +24,10 @@ fn json_of(output: &Output) -> Value {
 }
 
 /// What a command that failed with `code` said.
-fn complaint(output: &Output, code: i32) -> String {
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!((output.status.code(), output.stdout.len()), (Some(code), 0), "{said}");
-    said
+fn error_message(output: &Output, code: i32) -> String {
+    let stderr_text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!((output.status.code(), output.stdout.len()), (Some(code), 0), "{stderr_text}");
+    stderr_text
 }
 
 fn picture(folder: &Path, name: &str, side: u32, level: u8) -> PathBuf {
@@ -38,7 +38,7 @@ fn picture(folder: &Path, name: &str, side: u32, level: u8) -> PathBuf {
 }
 
 #[test]
-fn metrics_of_pictures_are_one_json_object() {
+fn metrics_are_one_json_object() {
     let folder = tempfile::tempdir().unwrap();
     let (a, b) = (picture(folder.path(), "a.png", 20, 6), picture(folder.path(), "b.png", 20, 0));
     let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--json"]));
@@ -47,14 +47,14 @@ fn metrics_of_pictures_are_one_json_object() {
     assert!((scores["psnr"].as_f64().unwrap() - expected_db).abs() < 1e-9, "{scores}");
     assert!((0.5..1.0).contains(&scores["ssim"].as_f64().unwrap()), "{scores}");
     assert!(scores["lpips"].is_null() && scores["depth_rmse_m"].is_null(), "{scores}");
-    let for_people = fieldrig(&["metrics", text(&a), text(&b)]);
-    assert!(String::from_utf8_lossy(&for_people.stdout).starts_with("PSNR 37.339 dB  SSIM 0."), "{for_people:?}");
+    let text_output = fieldrig(&["metrics", text(&a), text(&b)]);
+    assert!(String::from_utf8_lossy(&text_output.stdout).starts_with("PSNR 37.339 dB  SSIM 0."), "{text_output:?}");
 }
 
 #[test]
-fn metrics_agree_with_the_oracle_through_the_binary() {
-    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(beside, PathBuf::from).join("metrics");
+fn metrics_match_the_reference_values() {
+    let default_folder = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    let folder = std::env::var_os("FIELDRIG_TEST_DATA").map_or_else(default_folder, PathBuf::from).join("metrics");
     if !folder.is_dir() {
         eprintln!("skipped: no test data at {}", folder.display());
         return;
@@ -70,7 +70,7 @@ fn metrics_agree_with_the_oracle_through_the_binary() {
 }
 
 #[test]
-fn metrics_of_depth_images_are_metres() {
+fn metrics_of_depth_images_are_in_meters() {
     let folder = tempfile::tempdir().unwrap();
     let save = |name: &str, counts: [u16; 4]| {
         let bytes: Vec<u8> = counts.iter().flat_map(|count| count.to_ne_bytes()).collect();
@@ -84,20 +84,23 @@ fn metrics_of_depth_images_are_metres() {
 }
 
 #[test]
-fn pictures_that_cannot_be_compared_are_told_in_one_sentence() {
+fn incomparable_pictures_give_one_error() {
     let folder = tempfile::tempdir().unwrap();
     let (a, b) = (picture(folder.path(), "a.png", 20, 0), picture(folder.path(), "b.png", 30, 0));
-    let said = complaint(&fieldrig(&["metrics", text(&a), text(&b)]), 1);
-    assert!(said.contains("a.png is 20x20 pixels") && said.contains("pictures must have one size"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["metrics", text(&a), text(&b)]), 1);
+    assert!(
+        stderr_text.contains("a.png is 20x20 pixels") && stderr_text.contains("pictures must have one size"),
+        "{stderr_text}"
+    );
     std::fs::write(&b, b"not a picture").unwrap();
-    assert!(complaint(&fieldrig(&["metrics", text(&a), text(&b)]), 1).contains("b.png"));
+    assert!(error_message(&fieldrig(&["metrics", text(&a), text(&b)]), 1).contains("b.png"));
     let small = picture(folder.path(), "small.png", 10, 0);
-    let said = complaint(&fieldrig(&["metrics", text(&small), text(&small)]), 1);
-    assert!(said.contains("SSIM needs pictures of at least 11x11 pixels"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["metrics", text(&small), text(&small)]), 1);
+    assert!(stderr_text.contains("SSIM needs pictures of at least 11x11 pixels"), "{stderr_text}");
 }
 
 #[test]
-fn a_model_is_exported_as_ply() {
+fn model_is_exported_as_ply() {
     let folder = tempfile::tempdir().unwrap();
     let (model, out) = (folder.path().join("model"), folder.path().join("scene.ply"));
     std::fs::create_dir(&model).unwrap();
@@ -108,32 +111,36 @@ fn a_model_is_exported_as_ply() {
     assert!(output.status.success(), "{output:?}");
     assert_eq!(ply::read(&out).unwrap(), splats);
 
-    let said = complaint(&fieldrig(&export), 2);
-    assert!(said.contains("scene.ply: it is there already"), "{said}");
+    let stderr_text = error_message(&fieldrig(&export), 2);
+    assert!(stderr_text.contains("scene.ply: it is there already"), "{stderr_text}");
     let out = folder.path().join("other.ply");
-    let said = complaint(&fieldrig(&["export", text(&model), "--to", "spz", "--out", text(&out)]), 2);
-    assert!(said.contains("ends in .spz"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "spz", "--out", text(&out)]), 2);
+    assert!(stderr_text.contains("ends in .spz"), "{stderr_text}");
     let glb = folder.path().join("mesh.glb");
-    let said = complaint(&fieldrig(&["export", text(&model), "--to", "glb", "--out", text(&glb)]), 2);
-    assert!(said.contains("which have no mesh"), "{said}");
-    let said =
-        complaint(&fieldrig(&["export", text(&model), "--to", "ply", "--cell-m", "0.1", "--out", text(&out)]), 2);
-    assert!(said.contains("--cell-m") && said.contains("has no mesh"), "{said}");
-    let said = complaint(&fieldrig(&["export", text(&model), "--to", "nerfstudio", "--out", text(&out)]), 2);
-    assert!(said.contains("nerfstudio is written of a recording"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "glb", "--out", text(&glb)]), 2);
+    assert!(stderr_text.contains("which have no mesh"), "{stderr_text}");
+    let stderr_text =
+        error_message(&fieldrig(&["export", text(&model), "--to", "ply", "--cell-m", "0.1", "--out", text(&out)]), 2);
+    assert!(stderr_text.contains("--cell-m") && stderr_text.contains("has no mesh"), "{stderr_text}");
+    let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "nerfstudio", "--out", text(&out)]), 2);
+    assert!(stderr_text.contains("nerfstudio is written of a recording"), "{stderr_text}");
     let nothing = folder.path().join("nothing");
-    let said = complaint(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
-    assert!(said.contains("nothing does not exist"), "{said}");
-    let said = complaint(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
-    assert!(said.contains("neither a folder with a model, nor a file of splats, nor a recording"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
+    assert!(stderr_text.contains("nothing does not exist"), "{stderr_text}");
+    let stderr_text = error_message(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
+    assert!(
+        stderr_text.contains("neither a folder with a model, nor a file of splats, nor a recording"),
+        "{stderr_text}"
+    );
     let other = folder.path().join("other.bin");
     std::fs::write(&other, b"neither").unwrap();
-    let said = complaint(&fieldrig(&["export", text(&other), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
-    assert!(said.contains("is not a recording"), "{said}");
+    let stderr_text =
+        error_message(&fieldrig(&["export", text(&other), "--to", "nerfstudio", "--out", text(&nothing)]), 1);
+    assert!(stderr_text.contains("is not a recording"), "{stderr_text}");
 }
 
 #[test]
-fn a_model_is_exported_as_spz_and_back() {
+fn model_round_trips_through_spz() {
     let folder = tempfile::tempdir().unwrap();
     let [ply_file, spz_file, again] = ["scene.ply", "scene.spz", "again.ply"].map(|name| folder.path().join(name));
     ply::write(&ply_file, &synthetic_cloud(200, 1)).unwrap();
@@ -148,6 +155,6 @@ fn a_model_is_exported_as_spz_and_back() {
     let whole = std::fs::read(&spz_file).unwrap();
     std::fs::write(&spz_file, &whole[..whole.len() / 2]).unwrap();
     let again = folder.path().join("cut.ply");
-    let said = complaint(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
-    assert!(said.contains("scene.spz") && said.contains("cut off"), "{said}");
+    let stderr_text = error_message(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
+    assert!(stderr_text.contains("scene.spz") && stderr_text.contains("cut off"), "{stderr_text}");
 }

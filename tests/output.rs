@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
 /// Longer than any of these commands takes on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(240);
+const TIMEOUT: Duration = Duration::from_secs(240);
 /// Exit code of a loss, which includes lost lines of output.
 const LOSS: i32 = 3;
 
@@ -24,7 +24,7 @@ const LOSS: i32 = 3;
 struct OnTerminal {
     child: Child,
     terminal: File,
-    said: Vec<u8>,
+    printed: Vec<u8>,
 }
 
 impl OnTerminal {
@@ -40,33 +40,33 @@ impl OnTerminal {
             command.args(["--ctty", EXE]);
         }
         let child = command.args(args).current_dir(folder).stdin(open()).stdout(open()).stderr(open()).spawn().unwrap();
-        Self { child, terminal: File::from(master), said: Vec::new() }
+        Self { child, terminal: File::from(master), printed: Vec::new() }
     }
 
     /// Reads until the program has printed this text.
     fn wait_for(&mut self, text: &str) {
         let mut bytes = [0; 4096];
-        while !self.said.windows(text.len()).any(|window| window == text.as_bytes()) {
+        while !self.printed.windows(text.len()).any(|window| window == text.as_bytes()) {
             let n = self.terminal.read(&mut bytes).unwrap_or(0);
-            assert!(n > 0, "no {text:?} in {}", String::from_utf8_lossy(&self.said));
-            self.said.extend(&bytes[..n]);
+            assert!(n > 0, "no {text:?} in {}", String::from_utf8_lossy(&self.printed));
+            self.printed.extend(&bytes[..n]);
         }
     }
 
     /// Closes the terminal; returns the program's exit status.
     fn close(self) -> ExitStatus {
         drop(self.terminal);
-        end_of(self.child)
+        wait_for_exit(self.child)
     }
 }
 
-fn end_of(mut child: Child) -> ExitStatus {
-    let asked = Instant::now();
+fn wait_for_exit(mut child: Child) -> ExitStatus {
+    let started = Instant::now();
     loop {
         if let Some(status) = child.try_wait().unwrap() {
             return status;
         }
-        if asked.elapsed() > PATIENCE {
+        if started.elapsed() > TIMEOUT {
             child.kill().unwrap();
             panic!("it did not end");
         }
@@ -90,7 +90,7 @@ fn expect_recording(folder: &Path, recording: &str) {
 }
 
 #[test]
-fn a_training_survives_its_terminal() {
+fn training_survives_a_closed_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
@@ -106,7 +106,7 @@ fn a_training_survives_its_terminal() {
 }
 
 #[test]
-fn a_training_goes_on_where_no_signal_comes_with_the_end_of_its_terminal() {
+fn training_survives_a_closed_terminal_without_sighup() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
@@ -120,7 +120,7 @@ fn a_training_goes_on_where_no_signal_comes_with_the_end_of_its_terminal() {
 }
 
 #[test]
-fn a_training_does_not_wait_for_a_terminal_that_takes_no_output() {
+fn training_is_not_blocked_by_a_full_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
@@ -129,13 +129,13 @@ fn a_training_does_not_wait_for_a_terminal_that_takes_no_output() {
     let mut run = OnTerminal::start(folder, &args, true);
     run.wait_for("step");
     let OnTerminal { child, terminal, .. } = run;
-    assert_eq!(end_of(child).code(), Some(LOSS));
+    assert_eq!(wait_for_exit(child).code(), Some(LOSS));
     drop(terminal);
     expect_model(folder, "out");
 }
 
 #[test]
-fn a_training_survives_a_closed_pipe_and_a_full_disk_behind_stdout() {
+fn training_survives_a_closed_pipe_and_full_stdout() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
@@ -150,14 +150,14 @@ fn a_training_survives_a_closed_pipe_and_a_full_disk_behind_stdout() {
     let mut line = String::new();
     BufReader::new(head.stdout.take().unwrap()).read_line(&mut line).unwrap();
     assert!(line.starts_with('{'), "{line}");
-    assert_eq!(end_of(head).code(), Some(LOSS));
+    assert_eq!(wait_for_exit(head).code(), Some(LOSS));
     expect_model(folder, "head");
 
     let full = || OpenOptions::new().write(true).open("/dev/full").unwrap();
     let output = train("full").stdout(full()).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(LOSS), "{said}");
-    assert!(said.contains("cannot write to stdout") && said.contains("No space left"), "{said}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(LOSS), "{printed}");
+    assert!(printed.contains("cannot write to stdout") && printed.contains("No space left"), "{printed}");
     expect_model(folder, "full");
     // Without stderr as well.
     assert_eq!(train("mute").stdout(full()).stderr(full()).status().unwrap().code(), Some(LOSS));
@@ -171,7 +171,7 @@ fn a_training_survives_a_closed_pipe_and_a_full_disk_behind_stdout() {
 
 #[cfg(feature = "sim")]
 #[test]
-fn runs_and_recordings_survive_their_terminal() {
+fn runs_and_recordings_survive_a_closed_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     small_rig::write(folder, small_rig::Pace::RealTime);
@@ -221,7 +221,7 @@ impl Drop for SmallDisk<'_> {
 
 #[cfg(feature = "sim")]
 #[test]
-fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere() {
+fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     small_rig::write(folder, small_rig::Pace::Lockstep);
@@ -229,16 +229,16 @@ fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere
     let Some(_disk) = SmallDisk::mount(&disk, "1m") else { return };
     let record = ["record", "rig.toml", "--sim", "--seconds", "30", "--json", "--out", "disk/run.mcap"];
     let output = wall::fieldrig(folder, &record);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(LOSS), "{said}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(LOSS), "{printed}");
     let reported: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let count = |key: &str| reported[key].as_u64().unwrap();
     let n_samples = ["images", "depth_images", "joint_states", "truths"].map(count).iter().sum::<u64>();
-    assert!(said.contains(&format!("({n_samples} samples)")), "{n_samples}: {said}");
+    assert!(printed.contains(&format!("({n_samples} samples)")), "{n_samples}: {printed}");
     // The same number everywhere: a reader counts as many samples.
     let read = wall::fieldrig(folder, &["export", "disk/run.mcap", "--to", "nerfstudio", "--out", "read"]);
-    let read_said = String::from_utf8_lossy(&read.stderr);
-    assert!(read_said.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {read_said}");
+    let export_stderr = String::from_utf8_lossy(&read.stderr);
+    assert!(export_stderr.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {export_stderr}");
 
     // Enough space for the lists, but not for the model.
     std::fs::remove_file(disk.join("run.mcap")).unwrap();
@@ -253,16 +253,16 @@ fn on_a_full_disk_a_recording_is_read_as_reported_and_a_model_is_saved_elsewhere
         train.output().unwrap()
     };
     let output = train(&temporary);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("cannot save the model in disk/out, it was saved in "), "{said}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert!(printed.contains("cannot save the model in disk/out, it was saved in "), "{printed}");
     let saved = std::fs::read_dir(&temporary).unwrap().next().unwrap().unwrap().path();
     expect_model(folder, saved.strip_prefix(folder).unwrap().to_str().unwrap());
     assert!(!disk.join("out/model.part").exists(), "the incomplete file is removed");
 
     std::fs::remove_dir_all(disk.join("out")).unwrap();
     let output = train(&disk);
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("cannot save the model in disk/out; no checkpoint was written yet"), "{said}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{printed}");
+    assert!(printed.contains("cannot save the model in disk/out; no checkpoint was written yet"), "{printed}");
 }

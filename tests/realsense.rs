@@ -1,6 +1,6 @@
 //! A rig whose camera is a file that librealsense2 recorded: the binary reads lens and depth pose from it and records its images.
 
-use drivers::realsense::played::{BagWriter, PlayedCamera, PlayedDepth};
+use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::recording::{RIG_FILE, Recording};
 use drivers::{Image, PixelFormat, Sample, Source};
 use kinematics::{Intrinsics, Lens, Stamp, Transform};
@@ -33,12 +33,12 @@ fn write_bag(path: &Path) {
         lens: Lens::Pinhole,
         rectified: false,
     };
-    let depth = PlayedDepth {
+    let depth = EmulatedDepth {
         intrinsics: lens(192.5),
         camera_from_depth: Transform::translation(0.015, 0.0, 0.0),
-        metres_per_count: 0.001,
+        meters_per_count: 0.001,
     };
-    let camera = PlayedCamera {
+    let camera = EmulatedCamera {
         name: "Intel RealSense D435I".into(),
         serial: "1".into(),
         rate_hz: 30,
@@ -58,36 +58,36 @@ fn write_bag(path: &Path) {
             n_skipped: 0,
         };
         writer.write(&color).expect("room on the disk");
-        let format = PixelFormat::DepthU16 { metres_per_count: 0.001 };
+        let format = PixelFormat::DepthU16 { meters_per_count: 0.001 };
         writer.write(&Image { format, data: [232, 3].repeat(320 * 240).into(), ..color }).expect("room on the disk");
     }
     writer.finish().expect("room on the disk");
 }
 
 #[test]
-fn a_rig_with_a_recorded_camera_is_recorded_with_what_the_camera_knows() {
+fn recording_stores_calibration_read_from_the_bag() {
     let folder = tempfile::tempdir().unwrap();
     let [rig, out] = ["rig.toml", "out.mcap"].map(|name| folder.path().join(name));
     write_bag(&folder.path().join("front.bag"));
     std::fs::write(&rig, RIG).unwrap();
     let output = Command::new(env!("CARGO_BIN_EXE_fieldrig")).arg("record").arg(&rig).arg("--out").arg(&out).output();
     let output = output.unwrap();
-    let told = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(0), "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(0), "{printed}");
     let mut recording = Recording::open(&out).unwrap();
-    let settled = String::from_utf8(recording.attachment(RIG_FILE).unwrap().to_vec()).unwrap();
+    let resolved = String::from_utf8(recording.attachment(RIG_FILE).unwrap().to_vec()).unwrap();
     // 15 mm in single precision.
-    let places = ["0.01499999", "0.015"];
-    assert!(places.iter().any(|place| settled.contains(place)), "{settled}");
-    assert!(settled.contains("303.25") && settled.contains("192.5"), "{settled}");
+    let depth_translations = ["0.01499999", "0.015"];
+    assert!(depth_translations.iter().any(|translation| resolved.contains(translation)), "{resolved}");
+    assert!(resolved.contains("303.25") && resolved.contains("192.5"), "{resolved}");
     let mut n_images = [0; 2];
     while let Some(sample) = recording.next_sample().unwrap() {
         let Sample::Image(image) = sample else { panic!("a camera gives images") };
         match image.is_depth() {
-            true => assert!(image.decode_depth_m().unwrap().iter().all(|metres| (metres - 1.0).abs() < 1e-6)),
+            true => assert!(image.decode_depth_m().unwrap().iter().all(|meters| (meters - 1.0).abs() < 1e-6)),
             false => assert!(image.data.iter().all(|byte| *byte == image.data[0])),
         }
         n_images[usize::from(image.is_depth())] += 1;
     }
-    assert_eq!(n_images, [N_IMAGES; 2], "{told}");
+    assert_eq!(n_images, [N_IMAGES; 2], "{printed}");
 }

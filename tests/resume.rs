@@ -25,21 +25,21 @@ fn train(folder: &Path, args: &[&str]) -> Command {
 fn done(folder: &Path, args: &[&str]) -> Value {
     let output = train(folder, args).output().unwrap();
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    let told = String::from_utf8(output.stdout).unwrap();
-    let last: Value = serde_json::from_str(told.lines().last().unwrap()).unwrap();
+    let printed = String::from_utf8(output.stdout).unwrap();
+    let last: Value = serde_json::from_str(printed.lines().last().unwrap()).unwrap();
     assert_eq!(last["event"], "done");
     last
 }
 
-fn refused(output: &Output, code: i32) -> String {
-    let told = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(code), "{told}");
-    assert!(!told.contains("panicked"), "{told}");
-    told
+fn assert_fails(output: &Output, code: i32) -> String {
+    let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(code), "{printed}");
+    assert!(!printed.contains("panicked"), "{printed}");
+    printed
 }
 
 #[test]
-fn two_halves_give_the_bits_of_the_whole() {
+fn resumed_training_equals_uninterrupted_training() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -68,40 +68,42 @@ fn two_halves_give_the_bits_of_the_whole() {
     let out = folder.join(again["out"].as_str().unwrap());
     assert!(out.starts_with(folder.join("runs")) && !out.join("training.ckpt").exists());
 
-    tells_what_it_cannot_go_on_from(folder);
+    check_invalid_checkpoints_are_reported(folder);
 }
 
-fn tells_what_it_cannot_go_on_from(folder: &Path) {
+fn check_invalid_checkpoints_are_reported(folder: &Path) {
     let file = folder.join("half/training.ckpt");
     let whole = std::fs::read(&file).unwrap();
-    let told = |bytes: &[u8]| {
+    let printed = |bytes: &[u8]| {
         std::fs::write(&file, bytes).unwrap();
-        refused(&train(folder, &["--resume", "half", "--out", "x"]).output().unwrap(), 1)
+        assert_fails(&train(folder, &["--resume", "half", "--out", "x"]).output().unwrap(), 1)
     };
-    assert!(told(&whole[..whole.len() / 2]).contains("cut off"));
-    assert!(told(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 2"));
+    assert!(printed(&whole[..whole.len() / 2]).contains("cut off"));
+    assert!(
+        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 2")
+    );
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
-    assert!(told(&damaged).contains("damaged"));
+    assert!(printed(&damaged).contains("damaged"));
     std::fs::write(&file, &whole).unwrap();
     let other_data = |args: &[&str]| {
         let output = train(folder, &[&["--resume", "half", "--out", "x"], args].concat()).output().unwrap();
-        let told = refused(&output, 1);
-        assert!(told.contains("error: the checkpoint is of other data: image"), "{told}");
-        told
+        let printed = assert_fails(&output, 1);
+        assert!(printed.contains("error: the checkpoint is of other data: image"), "{printed}");
+        printed
     };
     assert!(other_data(&["--scale", "0.5"]).contains("has 32x24 pixels, had 64x48"));
     assert!(other_data(&["--holdout", "2"]).contains("is not there to be learned from"));
     for flag in ["--seed", "--max-splats", "--plan-steps"] {
-        assert!(refused(&train(folder, &["--resume", "half", flag, "5"]).output().unwrap(), 2).contains(flag));
+        assert!(assert_fails(&train(folder, &["--resume", "half", flag, "5"]).output().unwrap(), 2).contains(flag));
     }
-    let told = refused(&train(folder, &["--resume", "data"]).output().unwrap(), 1);
-    assert!(told.contains("nothing to go on from in data") && told.contains("training.ckpt"), "{told}");
+    let printed = assert_fails(&train(folder, &["--resume", "data"]).output().unwrap(), 1);
+    assert!(printed.contains("nothing to go on from in data") && printed.contains("training.ckpt"), "{printed}");
     assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
 }
 
 #[test]
-fn what_the_clock_ended_is_repeated_by_its_log() {
+fn decision_log_reproduces_a_timed_training() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -120,28 +122,30 @@ fn what_the_clock_ended_is_repeated_by_its_log() {
     let replay = ["--replay-decisions", &log, "--out", "both again"];
     let both_again = done(folder, &[&["--resume", "timed"], &replay[..]].concat());
     assert_eq!(both_again["checkpoint_sha256"], both["checkpoint_sha256"]);
-    let told = |args: &[&str]| refused(&train(folder, &[args, &["--out", "x"]].concat()).output().unwrap(), 2);
-    assert!(told(&["--replay-decisions", &log]).contains("with --resume"));
+    let printed = |args: &[&str]| assert_fails(&train(folder, &[args, &["--out", "x"]].concat()).output().unwrap(), 2);
+    assert!(printed(&["--replay-decisions", &log]).contains("with --resume"));
     assert!(
-        told(&["--resume", "timed", "--scale", "1"])
+        printed(&["--resume", "timed", "--scale", "1"])
             .contains("--scale 1: the checkpoint in timed is of images with --scale 0.5")
     );
-    assert!(told(&["--resume", "timed", "--holdout", "8"]).contains("with --holdout 5"));
+    assert!(printed(&["--resume", "timed", "--holdout", "8"]).contains("with --holdout 5"));
     assert!(
-        told(&["--resume", "timed", "--seconds", "0.5"])
+        printed(&["--resume", "timed", "--seconds", "0.5"])
             .contains("--seconds 0.5: the checkpoint in timed has been trained for 1.")
     );
-    assert!(told(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is of step"));
-    assert!(told(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("leave out --resume"));
+    assert!(printed(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is of step"));
+    assert!(
+        printed(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("leave out --resume")
+    );
     for flag in ["--seed", "--seconds", "--steps", "--holdout", "--scale", "--max-splats"] {
-        let told = told(&["--replay-decisions", "timed/decisions.jsonl", flag, "1"]);
-        assert!(told.contains(flag), "{told}");
+        let printed = printed(&["--replay-decisions", "timed/decisions.jsonl", flag, "1"]);
+        assert!(printed.contains(flag), "{printed}");
     }
     assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
 }
 
 #[test]
-fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
+fn repeatedly_killed_training_is_identical() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     dataset(&folder.join("data"));
@@ -149,7 +153,7 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
     let whole = done(folder, &["--steps", N_STEPS, "--max-splats", "600", "--out", "whole"]);
 
     let file = folder.join("killed/training.ckpt");
-    let changed = || std::fs::metadata(&file).and_then(|about| about.modified()).ok();
+    let changed = || std::fs::metadata(&file).and_then(|metadata| metadata.modified()).ok();
     let resumed = ["--resume", "killed"]; // No other flag: the limit and the time between checkpoints are in the checkpoint.
     let mut steps = Vec::new();
     for kill in 0..N_KILLS {
@@ -181,7 +185,7 @@ fn a_run_that_is_killed_again_and_again_ends_with_the_same_bits() {
 /// Kills a live run, continues it, and checks that the result is that of one run: with its time, its keyframes and more steps.
 #[cfg(feature = "sim")]
 #[test]
-fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
+fn killed_live_run_resumes_keyframes_and_clock() {
     const SECONDS: &str = "14";
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
@@ -204,23 +208,23 @@ fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
     killed.kill().unwrap();
     killed.wait().unwrap();
     let checkpoint = Checkpoint::read(&file).unwrap();
-    let kept = || std::fs::read_dir(folder.join("out/keyframes")).unwrap().count();
-    let n_kept = kept();
-    assert!(n_kept > 4 && !checkpoint.is_finished, "{n_kept} keyframes");
+    let n_stored = || std::fs::read_dir(folder.join("out/keyframes")).unwrap().count();
+    let n_stored_at_kill = n_stored();
+    assert!(n_stored_at_kill > 4 && !checkpoint.is_finished, "{n_stored_at_kill} keyframes");
 
     let output = run(&["--resume", "out"]).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
-    assert!(said.contains("recorded in first.mcap; this part is not"), "{said}");
-    let told = String::from_utf8(output.stdout).unwrap();
-    let done: Value = serde_json::from_str(told.lines().last().unwrap()).unwrap();
+    let stderr_text = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{stderr_text}");
+    assert!(stderr_text.contains("recorded in first.mcap; this part is not"), "{stderr_text}");
+    let printed = String::from_utf8(output.stdout).unwrap();
+    let done: Value = serde_json::from_str(printed.lines().last().unwrap()).unwrap();
     assert_eq!((&done["event"], &done["out"]), (&json!("done"), &json!("out")));
     assert!(done["steps"].as_u64() > checkpoint.state["step"].as_u64(), "{done}");
     let seconds = done["seconds"].as_f64().unwrap();
     assert!((14.0..16.0).contains(&seconds), "its clock continued: {seconds} s");
     let list = std::fs::read_to_string(folder.join("out/keyframes.txt")).unwrap();
     let stamps = list.lines().filter_map(|line| line.split(' ').nth(1)?.parse::<i64>().ok());
-    assert!(stamps.clone().count() >= n_kept && stamps.is_sorted(), "{list}");
+    assert!(stamps.clone().count() >= n_stored_at_kill && stamps.is_sorted(), "{list}");
 
     // It is finished now; a longer time limit continues it in a new folder.
     let finished = run(&["--resume", "out"]).output().unwrap();
@@ -229,12 +233,12 @@ fn a_live_run_that_is_killed_continues_with_its_keyframes_and_its_clock() {
     let more = run(&["--resume", "out", "--seconds", "16", "--out", "more"]).output().unwrap();
     assert!(more.status.success(), "{}", String::from_utf8_lossy(&more.stderr));
     assert!(folder.join("more/splats.ply").exists());
-    let refused = |args: &[&str], words: &str| {
+    let assert_fails = |args: &[&str], words: &str| {
         let output = run(args).output().unwrap();
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(!output.status.success() && said.contains(words), "{args:?}: {said}");
+        let stderr_text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && stderr_text.contains(words), "{args:?}: {stderr_text}");
     };
-    refused(&["--resume", "out", "--seed", "5"], "--seed");
+    assert_fails(&["--resume", "out", "--seed", "5"], "--seed");
     std::fs::remove_dir_all(folder.join("out/keyframes")).unwrap();
-    refused(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes that can be used");
+    assert_fails(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes that can be used");
 }

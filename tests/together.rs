@@ -18,34 +18,34 @@ fn trained(folder: &Path, args: &[&str]) -> Vec<Value> {
     stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
 }
 
-fn ends(told: &[Value]) -> Vec<&Value> {
-    told.iter().filter(|event| event["event"] == "done").collect()
+fn done_events(printed: &[Value]) -> Vec<&Value> {
+    printed.iter().filter(|event| event["event"] == "done").collect()
 }
 
-fn refused(folder: &Path, args: &[&str], words: &[&str]) {
+fn assert_fails_with(folder: &Path, args: &[&str], words: &[&str]) {
     let output = fieldrig(folder, args);
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(2), "{args:?}: {told}");
-    assert!(words.iter().all(|word| told.contains(word)), "{args:?}: {told}");
-    assert_eq!(told.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{told}");
+    let printed = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {printed}");
+    assert!(words.iter().all(|word| printed.contains(word)), "{args:?}: {printed}");
+    assert_eq!(printed.lines().filter(|line| line.starts_with("error: ")).count(), 1, "{printed}");
 }
 
 #[test]
-fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
+fn several_methods_equal_single_trainings() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
     let common = ["--steps", N_STEPS, "--seed", "3", "--refine", "image-poses"];
     let all = ["--method", "tsdf,splat,nerf", "--max-splats", "500", "--out", "all"];
     let together = trained(folder, &[&common[..], &all].concat());
-    let together = ends(&together);
+    let together = done_events(&together);
     let methods: Vec<&str> = together.iter().filter_map(|done| done["method"].as_str()).collect();
     assert_eq!(methods, ["tsdf", "splat", "nerf"]);
     for done in &together {
         let method = done["method"].as_str().expect("a method");
         let caps: &[&str] = if method == "splat" { &["--max-splats", "500"] } else { &[] };
         let alone = trained(folder, &[&common[..], caps, &["--method", method, "--out", method]].concat());
-        let alone = ends(&alone)[0];
+        let alone = done_events(&alone)[0];
         for key in ["checkpoint_sha256", "steps", "psnr", "primitives", "bytes"] {
             assert_eq!(done[key], alone[key], "{method}: {key}");
         }
@@ -59,29 +59,29 @@ fn each_of_several_methods_ends_with_the_bits_that_it_has_alone() {
     }
     assert_eq!(together[0]["steps"], json!(8), "the distance field has seen all");
 
-    goes_on_method_by_method(folder, together[1]);
-    exports_meshes(folder);
+    check_resume_of_one_method(folder, together[1]);
+    check_mesh_export(folder);
     let small = ["train", "data", "--method", "tsdf,splat", "--max-bytes", "1000000", "--out", "small"];
-    refused(folder, &small, &["the smallest distance field takes 2629632 bytes"]);
+    assert_fails_with(folder, &small, &["the smallest distance field takes 2629632 bytes"]);
     assert!(!folder.join("small").exists(), "what is refused leaves nothing behind");
-    refused(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
-    refused(folder, &["train", "data", "--out", "all"], &["holds a model already", "splat/model.json"]);
+    assert_fails_with(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
+    assert_fails_with(folder, &["train", "data", "--out", "all"], &["holds a model already", "splat/model.json"]);
 }
 
 /// The folder of each method is that of a run of its own.
-fn goes_on_method_by_method(folder: &Path, splat: &Value) {
+fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     let again = trained(folder, &["--replay-decisions", "all/splat/decisions.jsonl", "--out", "again"]);
-    assert_eq!(ends(&again)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
+    assert_eq!(done_events(&again)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
     let on = trained(folder, &["--resume", "all/splat", "--steps", N_STEPS, "--out", "on"]);
-    assert_eq!(ends(&on)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
-    refused(folder, &["train", "data", "--resume", "all"], &["all/splat or all/tsdf or all/nerf"]);
-    let judged = fieldrig(folder, &["eval", "all/splat", "data", "--json"]);
-    let judged: Value = serde_json::from_slice(&judged.stdout).expect("a JSON object");
-    assert_eq!(judged["psnr"], splat["psnr"]);
+    assert_eq!(done_events(&on)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
+    assert_fails_with(folder, &["train", "data", "--resume", "all"], &["all/splat or all/tsdf or all/nerf"]);
+    let evaluated = fieldrig(folder, &["eval", "all/splat", "data", "--json"]);
+    let evaluated: Value = serde_json::from_slice(&evaluated.stdout).expect("a JSON object");
+    assert_eq!(evaluated["psnr"], splat["psnr"]);
 }
 
 /// Meshes come from distance fields alone, and can be made coarser.
-fn exports_meshes(folder: &Path) {
+fn check_mesh_export(folder: &Path) {
     let export = |to: &str, more: &[&str], out: &str| {
         let output = fieldrig(folder, &[&["export", "all/tsdf", "--to", to, "--out", out], more].concat());
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -93,49 +93,56 @@ fn exports_meshes(folder: &Path) {
         let coarse = export(to, &["--cell-m", "0.1"], &format!("coarse.{to}"));
         assert!(coarse.len() < saved.len() / 4, "{to}: {} of {} bytes", coarse.len(), saved.len());
     }
-    refused(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["which has no splats"]);
-    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["it is there already"]);
-    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["ends in .glb"]);
-    refused(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
-    refused(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
-    refused(folder, &["export", "all", "--to", "glb", "--out", "a.glb"], &["all/splat or all/tsdf or all/nerf"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["which has no splats"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["it is there already"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["ends in .glb"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
+    assert_fails_with(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
+    assert_fails_with(
+        folder,
+        &["export", "all", "--to", "glb", "--out", "a.glb"],
+        &["all/splat or all/tsdf or all/nerf"],
+    );
 }
 
 #[test]
-fn several_methods_share_the_time_and_tell_their_scores_by_one_clock() {
+fn several_methods_share_time_and_one_clock() {
     /// Turns are dealt by time; steps of splats grow longer, and the last turn of a slow machine is a large part.
-    const MOST_UNEVEN: f64 = 3.0;
+    const MAX_TIME_RATIO: f64 = 3.0;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
     let args = ["--seconds", "2.1", "--max-splats", "500", "--method", "splat,nerf", "--out", "both"];
-    let told = trained(folder, &args);
+    let printed = trained(folder, &args);
     let evals = |method: &str| -> Vec<&Value> {
-        told.iter().filter(|event| event["event"] == "eval" && event["method"] == method).collect()
+        printed.iter().filter(|event| event["event"] == "eval" && event["method"] == method).collect()
     };
     let number = |event: &Value, key: &str| event[key].as_f64().unwrap_or_else(|| panic!("no {key} in {event}"));
     let (splat, nerf) = (evals("splat"), evals("nerf"));
-    assert!(splat.len() >= 3 && splat.len() == nerf.len(), "{told:?}");
+    assert!(splat.len() >= 3 && splat.len() == nerf.len(), "{printed:?}");
     for (one, other) in splat.iter().zip(&nerf) {
         assert!((number(one, "seconds") - number(other, "seconds")).abs() < 0.02, "at the same mark: {one}, {other}");
     }
     let millis = |evals: &[&Value]| {
-        let last = evals.last().expect("marks");
+        let last = evals.last().expect("evaluations");
         number(last, "step") * number(last, "step_millis")
     };
-    let uneven = millis(&splat) / millis(&nerf);
-    assert!((1.0 / MOST_UNEVEN..MOST_UNEVEN).contains(&uneven), "splats had {uneven:.2} times as long: {told:?}");
+    let time_ratio = millis(&splat) / millis(&nerf);
+    assert!(
+        (1.0 / MAX_TIME_RATIO..MAX_TIME_RATIO).contains(&time_ratio),
+        "splats had {time_ratio:.2} times as long: {printed:?}"
+    );
 }
 
 #[test]
-fn methods_that_make_no_sense_are_refused_in_one_sentence() {
+fn invalid_methods_give_one_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for (methods, word) in
         [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf stands there twice"), ("", "splat, tsdf and nerf")]
     {
-        refused(folder, &["train", "data", "--method", methods], &["--method", word]);
-        refused(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);
+        assert_fails_with(folder, &["train", "data", "--method", methods], &["--method", word]);
+        assert_fails_with(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);
     }
-    refused(folder, &["train", "data", "--resume", "a", "--method", "splat,tsdf"], &["--method", "--resume"]);
+    assert_fails_with(folder, &["train", "data", "--resume", "a", "--method", "splat,tsdf"], &["--method", "--resume"]);
 }

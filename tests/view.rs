@@ -12,7 +12,7 @@ use tungstenite::{Message, WebSocket};
 use wall::fieldrig;
 
 /// Far longer than two busy cores need for a small picture.
-const PATIENCE: Duration = Duration::from_secs(120);
+const TIMEOUT: Duration = Duration::from_secs(120);
 const SIZE_PX: [u32; 2] = [96, 72];
 /// Angle from the top to the bottom of a picture, degrees.
 const FOV_DEGREES: f64 = 50.0;
@@ -66,16 +66,16 @@ impl Drop for View {
 /// A connected page.
 struct Client {
     socket: WebSocket<TcpStream>,
-    n_asked: u64,
+    n_requested: u64,
 }
 
 impl Client {
     fn connect(view: &View) -> Self {
         let address = view.address();
         let stream = TcpStream::connect(address).expect("the server listens");
-        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
-        Self { socket, n_asked: 0 }
+        Self { socket, n_requested: 0 }
     }
 
     /// The next message: JSON, and the payload of a binary one.
@@ -107,10 +107,10 @@ impl Client {
     }
 
     /// The decoded picture from a pose, or the reason why there is none.
-    fn ask(&mut self, pose: &[f64], method: Option<&str>) -> Result<image::RgbImage, String> {
-        self.n_asked += 1;
+    fn request_picture(&mut self, pose: &[f64], method: Option<&str>) -> Result<image::RgbImage, String> {
+        self.n_requested += 1;
         let mut message = json!({
-            "type": "render", "id": self.n_asked, "size_px": SIZE_PX, "stages": [1.0], "world_from_camera": pose,
+            "type": "render", "id": self.n_requested, "size_px": SIZE_PX, "stages": [1.0], "world_from_camera": pose,
             "projection": { "kind": "pinhole", "vertical_fov_rad": FOV_DEGREES.to_radians() }, "far_m": 1000.0,
         });
         if let Some(method) = method {
@@ -119,7 +119,7 @@ impl Client {
         self.socket.send(Message::text(message.to_string())).expect("sent");
         loop {
             let (answer, payload) = self.receive();
-            if answer["id"] != json!(self.n_asked) {
+            if answer["id"] != json!(self.n_requested) {
                 continue;
             }
             if answer["type"] == "error" {
@@ -158,10 +158,10 @@ fn brightness(picture: &image::RgbImage) -> f64 {
 }
 
 /// Bound on the change by JPEG compression at quality 92 in these pictures: measured 1.0.
-const MOST_FROM_JPEG: f64 = 3.0;
+const MAX_JPEG_DIFFERENCE: f64 = 3.0;
 
 #[test]
-fn saved_models_are_shown_as_render_draws_them() {
+fn view_matches_render() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
@@ -188,22 +188,22 @@ fn saved_models_are_shown_as_render_draws_them() {
         assert!((number - of_camera).abs() < 1e-9, "{scene} {}", cameras[0]);
     }
     for method in ["splat", "tsdf", "nerf"] {
-        let seen = client.ask(&start, Some(method)).expect("a picture");
+        let received = client.request_picture(&start, Some(method)).expect("a picture");
         let expected = rendered(folder, &format!("all/{method}"), &start, &format!("picture-{method}"));
-        let difference = difference(&seen, &expected);
-        assert!(difference < MOST_FROM_JPEG, "{method}: {difference}");
-        assert!(brightness(&seen) > 30.0, "{method}: the picture is dark");
+        let difference = difference(&received, &expected);
+        assert!(difference < MAX_JPEG_DIFFERENCE, "{method}: {difference}");
+        assert!(brightness(&received) > 30.0, "{method}: the picture is dark");
     }
-    assert_eq!(client.ask(&start, None), client.ask(&start, Some("splat")));
-    let refused = client.ask(&start, Some("mesh")).expect_err("no such model");
+    assert_eq!(client.request_picture(&start, None), client.request_picture(&start, Some("splat")));
+    let refused = client.request_picture(&start, Some("mesh")).expect_err("no such model");
     assert!(refused.contains("\"mesh\"") && refused.contains("splat, tsdf, nerf"), "{refused}");
     assert_eq!(view.interrupt().code(), Some(0));
 
-    without_cameras(folder);
+    check_view_without_cameras(folder);
 }
 
 /// A model without a list of cameras is first seen from outside, whichever axis is up.
-fn without_cameras(folder: &Path) {
+fn check_view_without_cameras(folder: &Path) {
     let model = folder.join("all/splat/splats.ply");
     std::fs::copy(&model, folder.join("lone.ply")).expect("room on the disk");
     std::fs::remove_file(folder.join("all/tsdf/cameras.json")).expect("a list of cameras");
@@ -217,8 +217,8 @@ fn without_cameras(folder: &Path) {
         let start = pose_of(&scene);
         // Upright: the camera's x axis is level, its y axis points down.
         assert!(start[8].abs() < 1e-9 && start[9] < -0.1, "{start:?}");
-        let seen = client.ask(&start, None).expect("a picture");
-        assert!(brightness(&seen) > 2.0, "{model}, {up} up: nothing is seen from {start:?}");
+        let received = client.request_picture(&start, None).expect("a picture");
+        assert!(brightness(&received) > 2.0, "{model}, {up} up: nothing is seen from {start:?}");
         if up == "-y" {
             // Up on the page is -y in the model: the page's world rotated by a quarter turn about x.
             let [x, y, z] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]];
@@ -227,15 +227,15 @@ fn without_cameras(folder: &Path) {
                 |(row, column): ([f64; 4], usize)| (0..4).map(|k| row[k] * start[4 * k + column]).sum::<f64>();
             let in_model: Vec<f64> = [x, y, z, [0.0, 0.0, 0.0, 1.0]].into_iter().flat_map(row).map(product).collect();
             let expected = rendered(folder, model, &in_model, "picture-turned");
-            let difference = difference(&seen, &expected);
-            assert!(difference < MOST_FROM_JPEG, "{difference}");
+            let difference = difference(&received, &expected);
+            assert!(difference < MAX_JPEG_DIFFERENCE, "{difference}");
         }
         assert_eq!(view.interrupt().code(), Some(0));
     }
 }
 
 /// Asserts the exit code and one sentence on stderr that contains all `words`.
-fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
+fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = fieldrig(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
@@ -244,7 +244,7 @@ fn assert_refused(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
 }
 
 #[test]
-fn what_is_not_a_model_is_refused_in_one_sentence() {
+fn non_model_paths_give_one_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);
@@ -254,7 +254,7 @@ fn what_is_not_a_model_is_refused_in_one_sentence() {
     write("scan.mcap", b"\x89MCAP0\r\n");
     write("new.spz", b"NGSP\x04\0\0\0and so on");
     write("torn.ply", b"ply\n");
-    let refused = |model: &str, code: i32, words: &[&str]| assert_refused(folder, &["view", model], code, words);
+    let refused = |model: &str, code: i32, words: &[&str]| assert_fails_with(folder, &["view", model], code, words);
     refused("absent", 1, &["absent does not exist"]);
     refused("cut", 1, &["cut holds no model", "train --resume"]);
     refused("scan.mcap", 2, &["scan.mcap is a recording, not a model", "run RIG.toml --from scan.mcap"]);
@@ -263,21 +263,21 @@ fn what_is_not_a_model_is_refused_in_one_sentence() {
     refused("torn.ply", 1, &["torn.ply"]);
     refused("data/00.png", 2, &["00.png is no file of splats"]);
     refused("http://127.0.0.1:7007/", 2, &["open it in a browser"]);
-    assert_refused(folder, &["view", "absent", "--up", "north"], 2, &["--up", "-z"]);
-    assert_refused(folder, &["view", "absent", "--listen", "7007"], 2, &["127.0.0.1:7007"]);
+    assert_fails_with(folder, &["view", "absent", "--up", "north"], 2, &["--up", "-z"]);
+    assert_fails_with(folder, &["view", "absent", "--listen", "7007"], 2, &["127.0.0.1:7007"]);
 }
 
 #[test]
-fn a_port_that_was_named_and_is_in_use_is_refused_and_the_usual_one_is_replaced() {
+fn explicit_port_in_use_is_an_error_default_falls_back() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);
     train(folder, &["data", "--steps", "1", "--max-splats", "500", "--out", "model"]);
-    let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
-    let address = taken.local_addr().expect("bound").to_string();
-    assert_refused(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
+    let occupied = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let address = occupied.local_addr().expect("bound").to_string();
+    assert_fails_with(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
     // Taken by this test, or already in use.
-    let _usual = TcpListener::bind("127.0.0.1:7007");
+    let _default_port = TcpListener::bind("127.0.0.1:7007");
     let view = View::start(folder, &["model"]);
     assert_ne!(view.address().port(), 7007);
     TcpStream::connect(view.address()).expect("the server listens");
@@ -285,7 +285,7 @@ fn a_port_that_was_named_and_is_in_use_is_refused_and_the_usual_one_is_replaced(
 }
 
 #[test]
-fn a_training_prints_commands_that_work_as_printed_and_writes_a_page() {
+fn printed_commands_work_and_report_page_is_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("my data"), true, 0.0);
@@ -343,14 +343,17 @@ fn a_training_prints_commands_that_work_as_printed_and_writes_a_page() {
     assert_eq!(pictures.len(), 8);
     assert!(pictures.iter().all(|picture| picture.dimensions() == (36, 27)), "photos of 48x36, shrunk");
     // Each render is of its own test image rather than of the other one.
-    let [to_own, to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
-    assert!(to_own < 0.7 * to_other && brightness(&pictures[1]) > 30.0, "{to_own} {to_other}");
+    let [difference_to_own, difference_to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
+    assert!(
+        difference_to_own < 0.7 * difference_to_other && brightness(&pictures[1]) > 30.0,
+        "{difference_to_own} {difference_to_other}"
+    );
     let others = page.replace("http://www.w3.org/2000/svg", "");
     assert!(!others.contains("http") && !others.contains("<script"), "the page needs no network");
 }
 
 #[test]
-fn without_test_images_the_page_says_so_and_nothing_is_scored_again() {
+fn report_without_test_images_says_so() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);
@@ -365,7 +368,7 @@ fn without_test_images_the_page_says_so_and_nothing_is_scored_again() {
 }
 
 #[test]
-fn a_page_that_cannot_be_written_costs_no_model() {
+fn unwritable_report_page_keeps_the_model() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);

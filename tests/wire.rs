@@ -13,13 +13,13 @@ use std::process::{Child, ChildStdout, Command, Stdio};
 const START_IN: &str = "5";
 
 /// A `fieldrig sim` that is ready; ended when dropped.
-struct Playing {
+struct EmulatedRig {
     child: Child,
     /// It ends where nobody reads what it prints.
     _stdout: BufReader<ChildStdout>,
 }
 
-impl Playing {
+impl EmulatedRig {
     fn start(folder: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
             .args(["sim", "static-arm", "--seconds", "3", "--start-in", START_IN, "--json", "--out"])
@@ -35,7 +35,7 @@ impl Playing {
     }
 }
 
-impl Drop for Playing {
+impl Drop for EmulatedRig {
     fn drop(&mut self) {
         let _ = self.child.kill(); // Gone already.
         let _ = self.child.wait(); // Its exit code is of no interest.
@@ -45,31 +45,31 @@ impl Drop for Playing {
 fn fieldrig(words: &[&str], rig: &Path) -> (Option<i32>, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_fieldrig")).arg(words[0]).arg(rig).args(&words[1..]).output();
     let output = output.expect("it is built");
-    let told = [output.stdout, output.stderr].concat();
-    (output.status.code(), String::from_utf8_lossy(&told).into_owned())
+    let printed = [output.stdout, output.stderr].concat();
+    (output.status.code(), String::from_utf8_lossy(&printed).into_owned())
 }
 
 #[test]
-fn a_simulated_franka_rig_comes_through_its_drivers_and_is_moved() {
+fn emulated_franka_rig_is_recorded_and_moved() {
     let folder = tempfile::tempdir().expect("a folder");
-    let playing = Playing::start(folder.path());
+    let emulated_rig = EmulatedRig::start(folder.path());
     let (rig, script, wire) =
         (folder.path().join("rig.toml"), folder.path().join("script.mcap"), folder.path().join("wire.mcap"));
     // A file's end ends the recording, and is none of a loss; a busy machine may lose images, which is one.
-    let (code, told) = fieldrig(&["record", "--out", &wire.to_string_lossy(), "--json"], &rig);
-    assert!(matches!(code, Some(0 | 3)), "{told}");
+    let (code, printed) = fieldrig(&["record", "--out", &wire.to_string_lossy(), "--json"], &rig);
+    assert!(matches!(code, Some(0 | 3)), "{printed}");
     let difference = compare::difference(&script, &wire);
     assert!(difference.n_images >= 60, "{difference:?}");
     // A joint turns by half a radian a second at most here: a millisecond is half a milliradian.
     assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
     assert_eq!(difference.base_m, 0.0, "it stands still");
 
-    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
-    assert_eq!(code, Some(0), "{told}");
-    assert!(compare::error_of_move(&told) < 1e-3, "{told}");
-    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=9", "--enable-motion", "--json"], &rig);
-    assert_eq!(code, Some(2), "a slip of the pen does not swing it to the end of its range: {told}");
-    let (code, told) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
-    assert_eq!(code, Some(2), "without a word that it may move it does not: {told}");
-    drop(playing);
+    let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
+    assert_eq!(code, Some(0), "{printed}");
+    assert!(compare::error_of_move(&printed) < 1e-3, "{printed}");
+    let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=9", "--enable-motion", "--json"], &rig);
+    assert_eq!(code, Some(2), "a slip of the pen does not swing it to the end of its range: {printed}");
+    let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
+    assert_eq!(code, Some(2), "without a word that it may move it does not: {printed}");
+    drop(emulated_rig);
 }

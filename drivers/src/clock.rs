@@ -11,7 +11,7 @@ pub fn now() -> Stamp {
 
 /// Now, on a clock that also counts while the computer sleeps: for what must be noticed after that, and nothing else.
 #[cfg(target_os = "linux")]
-pub(crate) fn now_with_sleep() -> Stamp {
+pub(crate) fn now_including_suspend() -> Stamp {
     read(rustix::time::ClockId::Boottime)
 }
 
@@ -24,7 +24,7 @@ fn read(clock: rustix::time::ClockId) -> Stamp {
 
 /// How long processors have worked for this process so far; `None` where the system is not asked.
 #[cfg(unix)]
-pub fn processor() -> Option<Duration> {
+pub fn process_cpu_time() -> Option<Duration> {
     let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
     let [secs, nanos] = [spent.tv_sec, spent.tv_nsec].map(|part| u64::try_from(part).unwrap_or(0));
     Some(Duration::from_secs(secs) + Duration::from_nanos(nanos))
@@ -32,7 +32,7 @@ pub fn processor() -> Option<Duration> {
 
 /// How long processors have worked for this process so far; `None` where the system is not asked.
 #[cfg(not(unix))]
-pub fn processor() -> Option<Duration> {
+pub fn process_cpu_time() -> Option<Duration> {
     None
 }
 

@@ -47,18 +47,18 @@ impl Image {
     /// Decodes a depth image to `[height, width]`, metres along the camera's z axis; 0 where the sensor saw nothing. The
     /// largest count says that the reading was larger still: nothing is known there either.
     pub fn decode_depth_m(&self) -> Result<Vec<f32>, Error> {
-        let PixelFormat::DepthU16 { metres_per_count } = self.format else {
+        let PixelFormat::DepthU16 { meters_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
         };
         #[expect(
             clippy::cast_possible_truncation,
             reason = "16-bit counts keep more digits in f32 than the sensor has"
         )]
-        let metres_from_count = |count: &[u8]| match u16::from_le_bytes([count[0], count[1]]) {
+        let meters_from_count = |count: &[u8]| match u16::from_le_bytes([count[0], count[1]]) {
             u16::MAX => 0.0,
-            count => (f64::from(count) * metres_per_count) as f32,
+            count => (f64::from(count) * meters_per_count) as f32,
         };
-        Ok(self.raw_bytes()?.chunks_exact(2).map(metres_from_count).collect())
+        Ok(self.raw_bytes()?.chunks_exact(2).map(meters_from_count).collect())
     }
 
     /// Takes the padding away that a device leaves behind each row and behind the last one.
@@ -103,7 +103,7 @@ impl Image {
     fn decompress(&self, format: ImageFormat) -> Result<Vec<u8>, Error> {
         let (camera, stamp) = (self.camera.to_string(), self.stamp);
         let decode = |expected_px: [u32; 2]| {
-            let file = first_whole(&self.data, format)?;
+            let file = first_complete(&self.data, format)?;
             // Looked at before: a few bytes can say that a picture is large, and take seconds.
             let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format).into_dimensions()?.into();
             let is_expected = got_px == expected_px;
@@ -117,19 +117,19 @@ impl Image {
         }
     }
 
-    pub(crate) fn wrong_kind(&self, wanted: &'static str) -> Error {
-        Error::WrongKind { camera: self.camera.to_string(), stamp: self.stamp, wanted }
+    pub(crate) fn wrong_kind(&self, expected: &'static str) -> Error {
+        Error::WrongKind { camera: self.camera.to_string(), stamp: self.stamp, expected }
     }
 }
 
 /// Decodes an image of a format that is given or guessed. Of a JPEG the first whole image in the bytes is taken: one that is
 /// cut off is an error, where decoders fill up with grey.
-pub(crate) fn decode_whole(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
+pub(crate) fn decode_complete(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
     let format = format.map_or_else(|| image::guess_format(bytes), Ok)?;
-    image::load_from_memory_with_format(&first_whole(bytes, format)?, format)
+    image::load_from_memory_with_format(&first_complete(bytes, format)?, format)
 }
 
-fn first_whole(bytes: &[u8], format: ImageFormat) -> Result<Cow<'_, [u8]>, ImageError> {
+fn first_complete(bytes: &[u8], format: ImageFormat) -> Result<Cow<'_, [u8]>, ImageError> {
     if format != ImageFormat::Jpeg {
         return Ok(bytes.into());
     }
@@ -167,20 +167,20 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_that_is_cut_off_is_refused_wherever_it_is_cut() {
+    fn truncated_jpeg_is_rejected_at_any_length() {
         let rgb: Vec<u8> = (0..3 * 64 * 64).map(|ix: u32| (ix * ix % 251) as u8).collect();
-        let whole = file_of(ImageFormat::Jpeg, [64, 64], &rgb);
+        let complete = file_of(ImageFormat::Jpeg, [64, 64], &rgb);
         let decode = |data: &[u8]| image(PixelFormat::Jpeg, [64, 64], data).decode_rgb();
-        assert_eq!(decode(&whole).expect("whole").len(), rgb.len());
-        assert!(decode(&[&whole[..], b"what a camera appends"].concat()).is_ok());
-        for n_bytes in [whole.len() - 2, whole.len() * 9 / 10, whole.len() / 2, 20, 3, 0] {
-            let error = decode(&whole[..n_bytes]).expect_err("cut off");
+        assert_eq!(decode(&complete).expect("whole").len(), rgb.len());
+        assert!(decode(&[&complete[..], b"what a camera appends"].concat()).is_ok());
+        for n_bytes in [complete.len() - 2, complete.len() * 9 / 10, complete.len() / 2, 20, 3, 0] {
+            let error = decode(&complete[..n_bytes]).expect_err("cut off");
             assert!(matches!(error, Error::Undecodable { .. }), "{n_bytes}: {error}");
         }
         // A thumbnail among the first segments ends, the image does not.
-        let mut with_thumbnail = [&whole[..2], &[0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9], &whole[2..]].concat();
+        let mut with_thumbnail = [&complete[..2], &[0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9], &complete[2..]].concat();
         assert!(decode(&with_thumbnail).is_ok());
-        with_thumbnail.truncate(whole.len() - 100);
+        with_thumbnail.truncate(complete.len() - 100);
         assert!(decode(&with_thumbnail).is_err());
     }
 
@@ -200,8 +200,8 @@ mod tests {
     }
 
     #[test]
-    fn padding_of_rows_goes_and_short_buffers_are_refused() {
-        let depth = PixelFormat::DepthU16 { metres_per_count: 1e-3 };
+    fn row_padding_is_removed_and_short_buffers_rejected() {
+        let depth = PixelFormat::DepthU16 { meters_per_count: 1e-3 };
         let [yuyv, uyvy, nv12] = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12].map(yuv);
         for format in [PixelFormat::Rgb8, PixelFormat::Bgr8, PixelFormat::Gray8, depth, yuyv, uyvy, nv12] {
             for size_px in [[5, 3], [4, 2], [1, 1]] {
@@ -222,17 +222,17 @@ mod tests {
                     assert!(matches!(narrow, Err(Error::ImageLength { .. })));
                 }
                 let short = image(format, size_px, &tight[1..]);
-                let refused = if short.is_depth() { short.decode_depth_m().err() } else { short.decode_rgb().err() };
-                assert!(matches!(refused, Some(Error::ImageLength { .. })), "{format:?} {size_px:?}");
+                let rejected = if short.is_depth() { short.decode_depth_m().err() } else { short.decode_rgb().err() };
+                assert!(matches!(rejected, Some(Error::ImageLength { .. })), "{format:?} {size_px:?}");
             }
         }
         assert_eq!(image(nv12, [5, 3], &[0; 30]).decode_rgb().expect("three rows and two of differences").len(), 45);
     }
 
     #[test]
-    fn depth_counts_become_metres_and_what_is_not_known_is_zero() {
+    fn depth_counts_convert_to_meters_and_unknown_is_zero() {
         let depth = image(
-            PixelFormat::DepthU16 { metres_per_count: 1e-4 },
+            PixelFormat::DepthU16 { meters_per_count: 1e-4 },
             [4, 1],
             &[0, 0, 0x10, 0x27, 0xfe, 0xff, 0xff, 0xff],
         );
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn broken_images_are_named() {
+    fn broken_images_report_camera_and_cause() {
         let cut = image(PixelFormat::Jpeg, [2, 1], &[0xff, 0xd8, 0xff]).decode_rgb().expect_err("cut off").to_string();
         assert!(cut.contains("wrist") && cut.contains("does not decode"), "{cut}");
         let short = image(PixelFormat::Rgb8, [2, 1], &[1, 2, 3]).decode_rgb();
@@ -255,7 +255,7 @@ mod tests {
         assert!(matches!(huge, Err(Error::ImageSize { got_px: [16_383, 16_383], .. })), "{huge:?}");
         assert!(matches!(
             image(PixelFormat::Rgb8, [1, 1], &[0; 3]).decode_depth_m(),
-            Err(Error::WrongKind { wanted: "depth", .. })
+            Err(Error::WrongKind { expected: "depth", .. })
         ));
     }
 
@@ -266,8 +266,8 @@ mod tests {
         // Edges, slopes and noise: as many bytes as a webcam sends of a room.
         let pixel = |x: u32, y: u32| {
             let noise = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).to_le_bytes()[1] % 12;
-            let slope = ((x / 60 + y / 40) * 11 + x / 16).to_le_bytes()[0] / 2;
-            [slope + noise, slope / 2 + 40 + noise, 200 - slope + noise]
+            let gradient = ((x / 60 + y / 40) * 11 + x / 16).to_le_bytes()[0] / 2;
+            [gradient + noise, gradient / 2 + 40 + noise, 200 - gradient + noise]
         };
         let rgb: Vec<u8> = (0..size_px[1]).flat_map(|y| (0..size_px[0]).flat_map(move |x| pixel(x, y))).collect();
         let mut file = Vec::new();

@@ -7,14 +7,14 @@ use std::time::Duration;
 
 /// How much of a recording has reached the file.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Kept {
+pub struct RecordedSpan {
     /// Samples that can be read.
     pub n_samples: u64,
     /// From the first of their stamps to the last, seconds.
     pub seconds: f64,
 }
 
-impl std::fmt::Display for Kept {
+impl std::fmt::Display for RecordedSpan {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.n_samples {
             0 => f.write_str("nothing of it is kept"),
@@ -59,12 +59,12 @@ pub enum Error {
         camera: String,
     },
     /// The next image of a file that a camera is played from is due later; asking again then gives it.
-    #[error("camera {camera:?}: the next image of its file is due in {left:?}")]
+    #[error("camera {camera:?}: the next image of its file is due in {remaining:?}")]
     NotDue {
         /// Name in the rig file.
         camera: String,
         /// From now on.
-        left: Duration,
+        remaining: Duration,
     },
     /// A camera read by nokhwa cannot be opened, or was lost for good.
     #[cfg(feature = "nokhwa")]
@@ -228,14 +228,14 @@ pub enum Error {
         ycbcr_enc: u32,
     },
     /// Colour was asked of a depth image or depth of a colour image.
-    #[error("camera {camera:?}: the image at {} ns holds no {wanted}", stamp.0)]
+    #[error("camera {camera:?}: the image at {} ns holds no {expected}", stamp.0)]
     WrongKind {
         /// Name in the rig file.
         camera: String,
         /// Stamp of the image.
         stamp: Stamp,
         /// "color" or "depth".
-        wanted: &'static str,
+        expected: &'static str,
     },
     /// A file that is no recording.
     #[error("{path:?} is not a recording: it does not begin like an MCAP file")]
@@ -256,12 +256,12 @@ pub enum Error {
         path: PathBuf,
     },
     /// A recording cannot be written further, for instance because the disk is full.
-    #[error("cannot write the recording {path:?}, {kept}")]
+    #[error("cannot write the recording {path:?}, {recorded}")]
     Record {
         /// The file.
         path: PathBuf,
         /// What of it can be read.
-        kept: Kept,
+        recorded: RecordedSpan,
         /// Why.
         source: std::io::Error,
     },
@@ -313,7 +313,7 @@ pub enum Error {
     #[error(
         "{path:?}: no lens parameters: put fx fy cx cy [k1 k2 p1 p2 k3] into calibration.txt, or keep freiburg1, 2 or 3 in the name"
     )]
-    NoCamera {
+    NoIntrinsics {
         /// The folder.
         path: PathBuf,
     },

@@ -11,10 +11,10 @@ mod recording;
 mod tests;
 
 #[cfg(target_os = "linux")]
-pub use crate::can::hostile::frames;
+pub use crate::can::fuzz::frames;
 #[cfg(target_os = "linux")]
-pub use crate::franka::{hostile::states, played::hostile::client};
-pub use crate::udp::hostile::datagrams;
+pub use crate::franka::{emulated::fuzz::client, fuzz::states};
+pub use crate::udp::fuzz::datagrams;
 pub use dataset::{nerfstudio, tum};
 pub use messages::messages;
 pub use pixels::pixels;
@@ -63,9 +63,9 @@ pub(crate) struct Random(pub(crate) u64);
 #[cfg(test)]
 impl Random {
     /// A number below another one.
-    pub(crate) fn below(&mut self, most: usize) -> usize {
+    pub(crate) fn below(&mut self, bound: usize) -> usize {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        usize::try_from(self.0 >> 32).expect("32 bits") % most
+        usize::try_from(self.0 >> 32).expect("32 bits") % bound
     }
 
     /// Any byte.

@@ -7,16 +7,16 @@ use std::borrow::Cow;
 /// Why a buffer holds no JPEG image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
-pub enum NoJpeg {
+pub enum JpegError {
     /// No image begins in it.
     #[error("no JPEG begins in it")]
-    NoStart,
+    NoStartMarker,
     /// An image begins, and the buffer or another image comes before its end.
     #[error("the JPEG is cut off")]
-    CutOff,
+    Truncated,
     /// An image begins and ends without a picture.
     #[error("the JPEG ends before its picture begins")]
-    NoPicture,
+    NoScanData,
 }
 
 const START_OF_IMAGE: u8 = 0xd8;
@@ -30,20 +30,20 @@ const SEQUENTIAL_FRAMES: [u8; 2] = [0xc0, 0xc1];
 ///
 /// What comes before and behind it is left out, as is an image that another one cuts off. A thumbnail inside a segment is
 /// part of the image around it. The picture itself is not decoded here.
-pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, NoJpeg> {
-    let mut reason = NoJpeg::NoStart;
+pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
+    let mut reason = JpegError::NoStartMarker;
     let mut start = 0;
     while let Some(offset) = buffer[start..].windows(2).position(|pair| pair == [0xff, START_OF_IMAGE]) {
         start += offset;
-        match walk(buffer, start) {
-            Ok(Whole { end, first_scan, needs_tables: true }) => {
+        match scan_markers(buffer, start) {
+            Ok(ImageExtent { end, first_scan, needs_tables: true }) => {
                 return Ok([&buffer[start..first_scan], &STANDARD_TABLES, &buffer[first_scan..end]].concat().into());
             }
-            Ok(Whole { end, .. }) => return Ok(buffer[start..end].into()),
-            Err((why, resume)) => {
+            Ok(ImageExtent { end, .. }) => return Ok(buffer[start..end].into()),
+            Err((error, resume)) => {
                 // The first failure says most: what follows it are often only its remains.
-                if reason == NoJpeg::NoStart {
-                    reason = why;
+                if reason == JpegError::NoStartMarker {
+                    reason = error;
                 }
                 start = resume;
             }
@@ -54,13 +54,13 @@ pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, NoJpeg> {
 
 /// Just behind the first whole image in a buffer; `None` where there is none.
 #[cfg(feature = "nokhwa")]
-pub(crate) fn end_of_first(buffer: &[u8]) -> Option<usize> {
+pub(crate) fn first_image_end(buffer: &[u8]) -> Option<usize> {
     let starts = buffer.windows(2).enumerate().filter(|(_, pair)| *pair == [0xff, START_OF_IMAGE]);
-    starts.map(|(start, _)| start).find_map(|start| walk(buffer, start).ok()).map(|whole| whole.end)
+    starts.map(|(start, _)| start).find_map(|start| scan_markers(buffer, start).ok()).map(|complete| complete.end)
 }
 
 /// Where an image lies in its buffer.
-struct Whole {
+struct ImageExtent {
     /// Just behind its last marker.
     end: usize,
     /// The marker of its first scan.
@@ -70,20 +70,20 @@ struct Whole {
 }
 
 /// Goes from marker to marker of the image that begins at `start`; failing says why and where the next image may begin.
-fn walk(buffer: &[u8], start: usize) -> Result<Whole, (NoJpeg, usize)> {
-    let mut at = start + 2;
+fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, usize)> {
+    let mut position = start + 2;
     let mut first_scan = None;
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
         // Also steps over coded data, where a 0xff is followed by 0, and over bytes that belong to nothing.
-        let (marker_at, marker) = next_marker(buffer, at).ok_or((NoJpeg::CutOff, buffer.len()))?;
-        at = marker_at + 2;
+        let (marker_at, marker) = next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
+        position = marker_at + 2;
         match (marker, first_scan) {
-            (START_OF_IMAGE, _) => return Err((NoJpeg::CutOff, marker_at)),
-            (END_OF_IMAGE, None) => return Err((NoJpeg::NoPicture, at)),
+            (START_OF_IMAGE, _) => return Err((JpegError::Truncated, marker_at)),
+            (END_OF_IMAGE, None) => return Err((JpegError::NoScanData, position)),
             (END_OF_IMAGE, Some(first_scan)) => {
-                return Ok(Whole { end: at, first_scan, needs_tables: is_sequential && !has_tables });
+                return Ok(ImageExtent { end: position, first_scan, needs_tables: is_sequential && !has_tables });
             }
             (HUFFMAN_TABLES, None) => has_tables = true,
             (START_OF_SCAN, None) => first_scan = Some(marker_at),
@@ -91,18 +91,18 @@ fn walk(buffer: &[u8], start: usize) -> Result<Whole, (NoJpeg, usize)> {
             _ => {}
         }
         // The length counts its own two bytes.
-        let &[high, low, ..] = &buffer[at..] else { return Err((NoJpeg::CutOff, buffer.len())) };
-        at += usize::from(u16::from_be_bytes([high, low])).max(2);
-        if at > buffer.len() {
-            return Err((NoJpeg::CutOff, buffer.len()));
+        let &[high, low, ..] = &buffer[position..] else { return Err((JpegError::Truncated, buffer.len())) };
+        position += usize::from(u16::from_be_bytes([high, low])).max(2);
+        if position > buffer.len() {
+            return Err((JpegError::Truncated, buffer.len()));
         }
     }
 }
 
 /// Place and code of the next marker other than those without meaning here: restarts and the private 0x01.
 fn next_marker(buffer: &[u8], from: usize) -> Option<(usize, u8)> {
-    let means = |code: u8| !matches!(code, 0x00 | 0x01 | 0xd0..=0xd7 | 0xff);
-    let offset = buffer[from..].windows(2).position(|pair| pair[0] == 0xff && means(pair[1]))?;
+    let is_marker = |code: u8| !matches!(code, 0x00 | 0x01 | 0xd0..=0xd7 | 0xff);
+    let offset = buffer[from..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1]))?;
     Some((from + offset, buffer[from + offset + 1]))
 }
 
@@ -158,18 +158,18 @@ mod tests {
     }
 
     /// The file without its segments of one marker.
-    fn without(jpeg: &[u8], unwanted: u8) -> Vec<u8> {
-        let mut kept = jpeg[..2].to_vec();
-        let mut at = 2;
-        while jpeg[at + 1] != START_OF_SCAN {
-            let end = at + 2 + usize::from(u16::from_be_bytes([jpeg[at + 2], jpeg[at + 3]]));
-            if jpeg[at + 1] != unwanted {
-                kept.extend(&jpeg[at..end]);
+    fn without_segments(jpeg: &[u8], marker: u8) -> Vec<u8> {
+        let mut remaining = jpeg[..2].to_vec();
+        let mut position = 2;
+        while jpeg[position + 1] != START_OF_SCAN {
+            let end = position + 2 + usize::from(u16::from_be_bytes([jpeg[position + 2], jpeg[position + 3]]));
+            if jpeg[position + 1] != marker {
+                remaining.extend(&jpeg[position..end]);
             }
-            at = end;
+            position = end;
         }
-        kept.extend(&jpeg[at..]);
-        kept
+        remaining.extend(&jpeg[position..]);
+        remaining
     }
 
     fn pixels(jpeg: &[u8]) -> Vec<u8> {
@@ -178,32 +178,35 @@ mod tests {
     }
 
     #[test]
-    fn an_image_without_huffman_tables_gets_the_standard_ones() {
-        let whole = jpeg();
-        let bare = without(&whole, HUFFMAN_TABLES);
-        assert!(whole.len() - bare.len() >= STANDARD_TABLES.len());
-        assert!(image::load_from_memory_with_format(&bare, ImageFormat::Jpeg).is_err(), "the tables are not missed");
-        let repaired = first_image(&bare).expect("whole but for its tables");
-        assert_eq!(pixels(&repaired), pixels(&whole));
+    fn missing_huffman_tables_are_inserted() {
+        let complete = jpeg();
+        let without_tables = without_segments(&complete, HUFFMAN_TABLES);
+        assert!(complete.len() - without_tables.len() >= STANDARD_TABLES.len());
+        assert!(
+            image::load_from_memory_with_format(&without_tables, ImageFormat::Jpeg).is_err(),
+            "the tables are not missed"
+        );
+        let repaired = first_image(&without_tables).expect("whole but for its tables");
+        assert_eq!(pixels(&repaired), pixels(&complete));
     }
 
     #[test]
-    fn a_whole_image_is_not_copied_and_what_is_around_it_is_left_out() {
-        let whole = jpeg();
-        for (before, behind) in [(&b""[..], &b""[..]), (b"\xff\xffabc", b""), (b"", b"\0\0\0"), (b"\xff\xd9", b"\xff")]
+    fn complete_image_is_borrowed_without_surrounding_bytes() {
+        let complete = jpeg();
+        for (prefix, suffix) in [(&b""[..], &b""[..]), (b"\xff\xffabc", b""), (b"", b"\0\0\0"), (b"\xff\xd9", b"\xff")]
         {
-            let buffer = [before, &whole, behind].concat();
-            assert!(matches!(first_image(&buffer), Ok(Cow::Borrowed(found)) if found == whole));
+            let buffer = [prefix, &complete, suffix].concat();
+            assert!(matches!(first_image(&buffer), Ok(Cow::Borrowed(slice)) if slice == complete));
         }
         // A restart marker and a stuffed 0xff among the coded data do not end it.
-        let mut coded = whole.clone();
-        coded.splice(whole.len() - 2..whole.len() - 2, [0xff, 0xd3, 0xff, 0x00, 0xff, 0xff]);
+        let mut coded = complete.clone();
+        coded.splice(complete.len() - 2..complete.len() - 2, [0xff, 0xd3, 0xff, 0x00, 0xff, 0xff]);
         assert_eq!(first_image(&coded).as_deref(), Ok(&coded[..]));
     }
 
     #[test]
-    fn of_two_images_the_first_whole_one_is_found() {
-        let (first, second) = (jpeg(), without(&jpeg(), 0xe0));
+    fn first_complete_image_of_two_is_found() {
+        let (first, second) = (jpeg(), without_segments(&jpeg(), 0xe0));
         assert_ne!(first, second);
         assert_eq!(first_image(&[&first[..], &second].concat()).as_deref(), Ok(&first[..]));
         // Not inside a segment: its length would reach into the second image.
@@ -214,25 +217,26 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_image_is_refused_wherever_it_is_cut() {
-        let whole = jpeg();
-        for n_bytes in (0..whole.len()).step_by(97).chain(0..40).chain(whole.len() - 40..whole.len()) {
-            let why = if n_bytes < 2 { NoJpeg::NoStart } else { NoJpeg::CutOff };
-            assert_eq!(first_image(&whole[..n_bytes]), Err(why), "{n_bytes} of {} bytes", whole.len());
+    fn truncated_image_is_rejected_at_any_length() {
+        let complete = jpeg();
+        for n_bytes in (0..complete.len()).step_by(97).chain(0..40).chain(complete.len() - 40..complete.len()) {
+            let error = if n_bytes < 2 { JpegError::NoStartMarker } else { JpegError::Truncated };
+            assert_eq!(first_image(&complete[..n_bytes]), Err(error), "{n_bytes} of {} bytes", complete.len());
         }
         // Bytes lost at any place never panic, whatever is found.
-        for lost in (0..whole.len()).step_by(97) {
-            let _ = first_image(&[&whole[..lost], &whole[(lost + 61).min(whole.len())..]].concat());
+        for dropped_at in (0..complete.len()).step_by(97) {
+            let _ =
+                first_image(&[&complete[..dropped_at], &complete[(dropped_at + 61).min(complete.len())..]].concat());
         }
     }
 
     #[test]
-    fn a_thumbnail_is_part_of_the_image_around_it() {
-        let whole = jpeg();
+    fn embedded_thumbnail_is_part_of_the_image() {
+        let complete = jpeg();
         let segment = [&[0xff, 0xe1, 0, 6][..], &[0xff, START_OF_IMAGE, 0xff, END_OF_IMAGE]].concat();
-        let with_thumbnail = [&whole[..2], &segment, &whole[2..]].concat();
+        let with_thumbnail = [&complete[..2], &segment, &complete[2..]].concat();
         assert_eq!(first_image(&with_thumbnail).as_deref(), Ok(&with_thumbnail[..]));
-        assert_eq!(first_image(&with_thumbnail[..with_thumbnail.len() - 100]), Err(NoJpeg::CutOff));
-        assert_eq!(first_image(&segment[4..]), Err(NoJpeg::NoPicture));
+        assert_eq!(first_image(&with_thumbnail[..with_thumbnail.len() - 100]), Err(JpegError::Truncated));
+        assert_eq!(first_image(&segment[4..]), Err(JpegError::NoScanData));
     }
 }

@@ -9,7 +9,7 @@ mod error;
 #[cfg(target_os = "linux")]
 pub mod franka;
 #[cfg(any(test, fuzzing))]
-pub mod hostile;
+pub mod fuzz;
 pub mod jpeg;
 mod live;
 pub mod motion;
@@ -29,7 +29,7 @@ pub mod v4l2;
 pub mod wire;
 mod yuv;
 
-pub use error::{Error, Kept};
+pub use error::{Error, RecordedSpan};
 pub use live::{Devices, Live};
 pub use motion::MovableArm;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
@@ -85,7 +85,7 @@ pub trait Source: Send {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error>;
 
     /// Joint states, base poses and range scans that came and gave way to newer ones, so far, because the caller was slow.
-    fn n_others_dropped(&self) -> u64 {
+    fn n_other_samples_dropped(&self) -> u64 {
         0
     }
 }

@@ -33,7 +33,7 @@ pub struct Devices {
 /// All devices of a rig, read by a thread each.
 ///
 /// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
-/// same kind, everything else in [`Source::n_others_dropped`]; a camera that waits for its caller is made to wait. The first error of
+/// same kind, everything else in [`Source::n_other_samples_dropped`]; a camera that waits for its caller is made to wait. The first error of
 /// a device is returned once by [`Source::next_sample`] and ends the source. So does the end of the last camera, where cameras are
 /// played from files: what was read until then still comes. Dropping it stops the threads.
 #[derive(Debug)]
@@ -56,7 +56,7 @@ struct State {
     queues: Vec<VecDeque<Sample>>,
     /// Images dropped and not yet told, by device: colour and depth.
     dropped: Vec<[u64; 2]>,
-    n_others_dropped: u64,
+    n_other_samples_dropped: u64,
     error: Option<Error>,
     failed: bool,
     n_running: usize,
@@ -84,36 +84,44 @@ impl Live {
         };
         for mut camera in cameras {
             let name = camera.name().to_owned();
-            let silent = move |waited| Error::NoImage { camera: name.clone(), waited };
-            let room = Room { max_waiting: MAX_IMAGES, is_waited_for: camera.waits_for_caller() };
-            live.read(format!("camera {:?}", camera.name()), room, silent, move || match camera.next_image(POLL) {
-                Err(Error::Ended { .. }) => Ok(Heard::End),
-                Err(Error::NoImage { .. }) => Ok(Heard::Nothing),
-                Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(Heard::Mending),
-                image => image.map(Sample::Image).map(Heard::Sample),
+            let timeout_error = move |waited| Error::NoImage { camera: name.clone(), waited };
+            let policy = QueuePolicy { capacity: MAX_IMAGES, blocks_device: camera.waits_for_caller() };
+            live.read(format!("camera {:?}", camera.name()), policy, timeout_error, move || {
+                match camera.next_image(POLL) {
+                    Err(Error::Ended { .. }) => Ok(ReadOutcome::End),
+                    Err(Error::NoImage { .. }) => Ok(ReadOutcome::NoSample),
+                    Err(Error::Reconnecting { .. } | Error::NotDue { .. }) => Ok(ReadOutcome::Pending),
+                    image => image.map(Sample::Image).map(ReadOutcome::Sample),
+                }
             })?;
         }
         if let Some(mut arm) = arm {
-            let silent = |waited| Error::NoJoints { waited };
-            live.read("arm".to_owned(), Room::losing(MAX_JOINTS), silent, move || match arm.read(POLL) {
-                Err(Error::NoJoints { .. }) => Ok(Heard::Nothing),
-                state => state.map(Sample::Joints).map(Heard::Sample),
+            let timeout_error = |waited| Error::NoJoints { waited };
+            live.read("arm".to_owned(), QueuePolicy::drop_oldest(MAX_JOINTS), timeout_error, move || {
+                match arm.read(POLL) {
+                    Err(Error::NoJoints { .. }) => Ok(ReadOutcome::NoSample),
+                    state => state.map(Sample::Joints).map(ReadOutcome::Sample),
+                }
             })?;
         }
         if let Some(mut base) = base {
-            let silent = |waited| Error::NoBasePose { waited };
-            live.read("base".to_owned(), Room::losing(MAX_JOINTS), silent, move || match base.next_pose(POLL) {
-                Err(Error::NoBasePose { .. }) => Ok(Heard::Nothing),
-                pose => pose.map(Sample::Base).map(Heard::Sample),
+            let timeout_error = |waited| Error::NoBasePose { waited };
+            live.read("base".to_owned(), QueuePolicy::drop_oldest(MAX_JOINTS), timeout_error, move || {
+                match base.next_pose(POLL) {
+                    Err(Error::NoBasePose { .. }) => Ok(ReadOutcome::NoSample),
+                    pose => pose.map(Sample::Base).map(ReadOutcome::Sample),
+                }
             })?;
         }
         for mut scanner in scanners {
             let name = scanner.name().to_owned();
-            let silent = move |waited| Error::NoScan { scanner: name.clone(), waited };
+            let timeout_error = move |waited| Error::NoScan { scanner: name.clone(), waited };
             let device = format!("range scanner {:?}", scanner.name());
-            live.read(device, Room::losing(MAX_SCANS), silent, move || match scanner.next_scan(POLL) {
-                Err(Error::NoScan { .. }) => Ok(Heard::Nothing),
-                scan => scan.map(Sample::Range).map(Heard::Sample),
+            live.read(device, QueuePolicy::drop_oldest(MAX_SCANS), timeout_error, move || {
+                match scanner.next_scan(POLL) {
+                    Err(Error::NoScan { .. }) => Ok(ReadOutcome::NoSample),
+                    scan => scan.map(Sample::Range).map(ReadOutcome::Sample),
+                }
             })?;
         }
         Ok(live)
@@ -123,12 +131,12 @@ impl Live {
     fn read(
         &mut self,
         device: String,
-        room: Room,
-        silent: impl Fn(Duration) -> Error + Send + 'static,
-        read: impl FnMut() -> Result<Heard, Error> + Send + 'static,
+        policy: QueuePolicy,
+        timeout_error: impl Fn(Duration) -> Error + Send + 'static,
+        read: impl FnMut() -> Result<ReadOutcome, Error> + Send + 'static,
     ) -> Result<(), Error> {
         let device_ix = self.threads.len();
-        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, room, read, silent))
+        self.spawn(device, move |shared| read_until_stopped(shared, device_ix, policy, read, timeout_error))
     }
 
     fn spawn(&mut self, device: String, read: impl FnOnce(&Shared) + Send + 'static) -> Result<(), Error> {
@@ -145,25 +153,25 @@ impl Live {
 
 /// What lies between a device and a slow caller.
 #[derive(Clone, Copy)]
-struct Room {
-    max_waiting: usize,
+struct QueuePolicy {
+    capacity: usize,
     /// The device waits where there is none; else its oldest sample goes.
-    is_waited_for: bool,
+    blocks_device: bool,
 }
 
-impl Room {
-    fn losing(max_waiting: usize) -> Self {
-        Self { max_waiting, is_waited_for: false }
+impl QueuePolicy {
+    fn drop_oldest(capacity: usize) -> Self {
+        Self { capacity, blocks_device: false }
     }
 }
 
 /// What one wait on a device led to.
-enum Heard {
+enum ReadOutcome {
     Sample(Sample),
     /// It is there and said nothing.
-    Nothing,
+    NoSample,
     /// It is lost, and its driver looks for it: how long, the driver bounds. Or it is a file, and its next image is not due.
-    Mending,
+    Pending,
     /// It is a file, and that is at its end.
     End,
 }
@@ -172,9 +180,9 @@ enum Heard {
 fn read_until_stopped(
     shared: &Shared,
     device_ix: usize,
-    room: Room,
-    mut read: impl FnMut() -> Result<Heard, Error>,
-    silent: impl Fn(Duration) -> Error,
+    policy: QueuePolicy,
+    mut read: impl FnMut() -> Result<ReadOutcome, Error>,
+    timeout_error: impl Fn(Duration) -> Error,
 ) {
     let mut waited = Duration::ZERO;
     loop {
@@ -184,29 +192,29 @@ fn read_until_stopped(
             return;
         }
         let error = match sample {
-            Ok(Heard::Sample(sample)) => {
+            Ok(ReadOutcome::Sample(sample)) => {
                 waited = Duration::ZERO;
-                while room.is_waited_for && state.queues[device_ix].len() >= room.max_waiting && !state.stop {
+                while policy.blocks_device && state.queues[device_ix].len() >= policy.capacity && !state.stop {
                     state = shared.taken.wait(state).unwrap_or_else(PoisonError::into_inner);
                 }
-                state.put(device_ix, room.max_waiting, sample);
+                state.put(device_ix, policy.capacity, sample);
                 shared.arrived.notify_all();
                 continue;
             }
-            Ok(Heard::End) => {
+            Ok(ReadOutcome::End) => {
                 state.n_cameras -= 1;
                 state.stop |= state.n_cameras == 0;
                 return;
             }
-            Ok(Heard::Mending) => {
+            Ok(ReadOutcome::Pending) => {
                 waited = Duration::ZERO;
                 continue;
             }
-            Ok(Heard::Nothing) if waited + POLL < MAX_SILENCE => {
+            Ok(ReadOutcome::NoSample) if waited + POLL < MAX_SILENCE => {
                 waited += POLL;
                 continue;
             }
-            Ok(Heard::Nothing) => silent(waited + POLL),
+            Ok(ReadOutcome::NoSample) => timeout_error(waited + POLL),
             Err(error) => error,
         };
         if !state.failed {
@@ -226,11 +234,11 @@ impl Shared {
 
 impl State {
     /// Queues a sample; where there is no room the oldest of this device goes and is counted.
-    fn put(&mut self, device_ix: usize, max_waiting: usize, mut sample: Sample) {
-        if self.queues[device_ix].len() >= max_waiting {
+    fn put(&mut self, device_ix: usize, capacity: usize, mut sample: Sample) {
+        if self.queues[device_ix].len() >= capacity {
             match self.queues[device_ix].pop_front() {
-                Some(Sample::Image(lost)) => self.tell_loss(device_ix, &lost, &mut sample),
-                Some(_) => self.n_others_dropped += 1,
+                Some(Sample::Image(dropped_image)) => self.report_dropped(device_ix, &dropped_image, &mut sample),
+                Some(_) => self.n_other_samples_dropped += 1,
                 None => {}
             }
         }
@@ -238,11 +246,10 @@ impl State {
     }
 
     /// Adds a lost image and what was lost before it to the next image of its kind.
-    fn tell_loss(&mut self, device_ix: usize, lost: &Image, newest: &mut Sample) {
-        let same_kind =
-            |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == lost.is_depth());
-        let pending = &mut self.dropped[device_ix][usize::from(lost.is_depth())];
-        *pending += lost.n_skipped + 1;
+    fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
+        let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
+        let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
+        *pending += dropped_image.n_skipped + 1;
         if let Some(Sample::Image(next)) =
             self.queues[device_ix].iter_mut().chain(std::iter::once(newest)).find(same_kind)
         {
@@ -276,8 +283,8 @@ impl Source for Live {
         }
     }
 
-    fn n_others_dropped(&self) -> u64 {
-        self.shared.lock().n_others_dropped
+    fn n_other_samples_dropped(&self) -> u64 {
+        self.shared.lock().n_other_samples_dropped
     }
 }
 
@@ -299,13 +306,13 @@ mod tests {
     use kinematics::{Intrinsics, JointState, Lens, Stamp};
 
     /// A camera that delivers numbered images as fast as it is asked, then fails.
-    struct Fast {
+    struct FastCamera {
         intrinsics: Intrinsics,
         n_images: i64,
         next: i64,
     }
 
-    impl Camera for Fast {
+    impl Camera for FastCamera {
         fn name(&self) -> &str {
             "fast"
         }
@@ -322,7 +329,7 @@ mod tests {
     }
 
     fn image(stamp: i64, depth: bool) -> Image {
-        let format = if depth { PixelFormat::DepthU16 { metres_per_count: 1e-3 } } else { PixelFormat::Gray8 };
+        let format = if depth { PixelFormat::DepthU16 { meters_per_count: 1e-3 } } else { PixelFormat::Gray8 };
         Image {
             camera: "fast".into(),
             stamp: Stamp(stamp),
@@ -342,15 +349,15 @@ mod tests {
         rectified: true,
     };
 
-    fn fast(n_images: i64) -> Box<dyn Camera> {
-        Box::new(Fast { intrinsics: LENS, n_images, next: 0 })
+    fn fast_camera(n_images: i64) -> Box<dyn Camera> {
+        Box::new(FastCamera { intrinsics: LENS, n_images, next: 0 })
     }
 
-    struct Still {
+    struct SlowArm {
         next: i64,
     }
 
-    impl Arm for Still {
+    impl Arm for SlowArm {
         fn joint_names(&self) -> &[String] {
             &[]
         }
@@ -365,8 +372,9 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_caller_gets_the_newest_images_and_the_count_of_the_lost_ones() {
-        let mut live = Live::new(Devices { cameras: vec![fast(101)], ..Devices::default() }).expect("threads start");
+    fn slow_caller_gets_newest_images_and_drop_counts() {
+        let mut live =
+            Live::new(Devices { cameras: vec![fast_camera(101)], ..Devices::default() }).expect("threads start");
         while live.shared.lock().n_running > 0 {
             std::thread::yield_now();
         }
@@ -383,12 +391,12 @@ mod tests {
     }
 
     /// A camera whose cable is out for longer than a silent one is waited for; it waits for nothing itself.
-    struct Unplugged {
-        camera: Fast,
+    struct ReconnectingCamera {
+        camera: FastCamera,
         n_tries: u32,
     }
 
-    impl Camera for Unplugged {
+    impl Camera for ReconnectingCamera {
         fn name(&self) -> &str {
             self.camera.name()
         }
@@ -405,8 +413,8 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_is_looked_for_is_not_silent() {
-        let camera = Unplugged { camera: Fast { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
+    fn reconnecting_camera_does_not_time_out() {
+        let camera = ReconnectingCamera { camera: FastCamera { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
         let devices = Devices { cameras: vec![Box::new(camera)], ..Devices::default() };
         let mut live = Live::new(devices).expect("threads start");
         while live.shared.lock().n_running > 0 {
@@ -418,9 +426,9 @@ mod tests {
     }
 
     /// A camera that is played from a file as fast as it is taken.
-    struct Recorded(Fast);
+    struct FileCamera(FastCamera);
 
-    impl Camera for Recorded {
+    impl Camera for FileCamera {
         fn name(&self) -> &str {
             "recorded"
         }
@@ -439,11 +447,11 @@ mod tests {
     }
 
     #[test]
-    fn a_file_waits_for_a_slow_caller_and_its_end_ends_the_source() {
+    fn file_camera_blocks_for_slow_caller_and_ends_source() {
         let n_images = 5 * i64::try_from(MAX_IMAGES).expect("a small number");
-        let camera = Recorded(Fast { intrinsics: LENS, n_images, next: 0 });
+        let camera = FileCamera(FastCamera { intrinsics: LENS, n_images, next: 0 });
         // The arm would go on for ever.
-        let arm: Box<dyn Arm> = Box::new(Still { next: 0 });
+        let arm: Box<dyn Arm> = Box::new(SlowArm { next: 0 });
         let devices = Devices { cameras: vec![Box::new(camera)], arm: Some(arm), ..Devices::default() };
         let mut live = Live::new(devices).expect("threads start");
         let mut stamps = Vec::new();
@@ -457,9 +465,9 @@ mod tests {
     }
 
     #[test]
-    fn joints_and_images_come_in_stamp_order_and_dropping_stops_the_threads() {
-        let mut live =
-            Live::new(Devices { arm: Some(Box::new(Still { next: 0 })), ..Devices::default() }).expect("threads start");
+    fn joints_arrive_in_stamp_order_and_drop_stops_threads() {
+        let mut live = Live::new(Devices { arm: Some(Box::new(SlowArm { next: 0 })), ..Devices::default() })
+            .expect("threads start");
         let stamps: Vec<_> =
             (0..3).map(|_| live.next_sample().expect("alive").expect("three readings").stamp()).collect();
         assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);
@@ -469,7 +477,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_of_several_devices_are_merged_by_stamp() {
+    fn samples_of_multiple_devices_are_merged_by_stamp() {
         let mut state = State { queues: vec![VecDeque::new(); 2], dropped: vec![[0; 2]; 2], ..State::default() };
         for stamp in [2, 5] {
             state.put(0, 8, Sample::Image(image(stamp, false)));

@@ -23,7 +23,7 @@ impl Outage {
 
     /// Waits for the next try, which is due a pause after the last one, and counts it. False where it is not due before the deadline,
     /// which is waited for.
-    pub(crate) fn try_again(&mut self, pause: Duration, deadline: Instant) -> bool {
+    pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
         if next_try > deadline {
@@ -50,7 +50,7 @@ mod tests {
 
     #[cfg(any(target_os = "linux", feature = "realsense"))]
     #[test]
-    fn an_outage_is_counted_in_images() {
+    fn outage_duration_converts_to_missed_images() {
         let millis = |millis: i64| Stamp(millis * 1_000_000);
         assert_eq!(n_between(millis(0), millis(33), 30.0), 0);
         assert_eq!(n_between(millis(0), millis(100), 30.0), 2);
@@ -59,14 +59,14 @@ mod tests {
     }
 
     #[test]
-    fn a_try_waits_for_its_pause_and_never_past_the_deadline() {
+    fn retry_waits_for_pause_but_not_past_deadline() {
         let mut lost = None;
         let mut outage = Outage::of(&mut lost);
-        assert!(outage.try_again(Duration::ZERO, Instant::now()), "the first may be due at once");
+        assert!(outage.wait_for_retry(Duration::ZERO, Instant::now()), "the first may be due at once");
         let began = Instant::now();
-        assert!(!outage.try_again(Duration::from_secs(60), began + Duration::from_millis(10)));
+        assert!(!outage.wait_for_retry(Duration::from_secs(60), began + Duration::from_millis(10)));
         assert!(began.elapsed() >= Duration::from_millis(10) && began.elapsed() < Duration::from_secs(30));
-        assert!(outage.try_again(Duration::from_millis(20), began + Duration::from_secs(60)));
+        assert!(outage.wait_for_retry(Duration::from_millis(20), began + Duration::from_secs(60)));
         assert!(began.elapsed() >= Duration::from_millis(15));
         assert_eq!(outage.n_tries, 2);
         assert_eq!(Outage::of(&mut lost).since, outage.since, "it goes on");

@@ -27,7 +27,7 @@ pub enum PixelFormat {
     /// Depth along the camera's z axis as little-endian 16-bit counts; 0 where the sensor saw nothing.
     DepthU16 {
         /// Metres per count; of a RealSense D4xx 0.001 unless set otherwise, of a D405 0.0001, of an L515 0.00025.
-        metres_per_count: f64,
+        meters_per_count: f64,
     },
 }
 

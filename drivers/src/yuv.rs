@@ -59,24 +59,24 @@ pub struct V4l2Colors {
 impl YuvColors {
     /// Settles what a V4L2 device leaves open as `V4L2_MAP_COLORSPACE_DEFAULT`, `V4L2_MAP_YCBCR_ENC_DEFAULT` and
     /// `V4L2_MAP_QUANTIZATION_DEFAULT` do; fails for BT.2020 and SMPTE 240M.
-    pub fn from_v4l2(told: V4l2Colors) -> Result<Self, Error> {
+    pub fn from_v4l2(reported: V4l2Colors) -> Result<Self, Error> {
         const REC709: u32 = 3;
         const JPEG: u32 = 7;
         const SRGB: u32 = 8;
         const DCI_P3: u32 = 12;
-        let colorspace = match (told.colorspace, told.is_hdtv) {
+        let colorspace = match (reported.colorspace, reported.is_hdtv) {
             (0, true) => REC709,
             (0, false) => SRGB, // Standard definition (SMPTE 170M) has the same matrix and range.
             (colorspace, _) => colorspace,
         };
-        let matrix = match (told.ycbcr_enc, colorspace) {
+        let matrix = match (reported.ycbcr_enc, colorspace) {
             // 601, xvYCC 601, sYCC; 709, xvYCC 709.
             (1 | 3 | 5, _) => YuvMatrix::Bt601,
             (2 | 4, _) | (0, REC709 | DCI_P3) => YuvMatrix::Bt709,
             (0, 1 | 4..=9 | 11) => YuvMatrix::Bt601,
-            _ => return Err(Error::YuvColors { colorspace, ycbcr_enc: told.ycbcr_enc }),
+            _ => return Err(Error::YuvColors { colorspace, ycbcr_enc: reported.ycbcr_enc }),
         };
-        let range = match (told.quantization, colorspace) {
+        let range = match (reported.quantization, colorspace) {
             (1, _) | (0, JPEG) => YuvRange::Full,
             _ => YuvRange::Limited,
         };
@@ -95,12 +95,12 @@ impl YuvColors {
     fn coefficients(self) -> (f64, [f64; 5]) {
         let [red, blue] = self.luma_weights();
         let green = 1.0 - red - blue;
-        let (black, luma, difference) = match self.range {
+        let (black, luma, chroma) = match self.range {
             YuvRange::Limited => (16.0, 255.0 / 219.0, 255.0 / 224.0),
             YuvRange::Full => (0.0, 1.0, 1.0),
         };
-        let v_in_red = 2.0 * (1.0 - red) * difference;
-        let u_in_blue = 2.0 * (1.0 - blue) * difference;
+        let v_in_red = 2.0 * (1.0 - red) * chroma;
+        let u_in_blue = 2.0 * (1.0 - blue) * chroma;
         (black, [luma, v_in_red, -u_in_blue * blue / green, -v_in_red * red / green, u_in_blue])
     }
 }
@@ -138,9 +138,9 @@ pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data:
             YuvLayout::Yuyv => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[y0, u, y1, v]| [y0, y1, u, v])),
             YuvLayout::Uyvy => fixed.row(out, row.as_chunks::<4>().0.iter().map(|&[u, y0, v, y1]| [y0, y1, u, v])),
             YuvLayout::Nv12 => {
-                let differences = chroma[row_ix / 2 * row_bytes..][..row_bytes].as_chunks::<2>().0;
+                let chroma_row = chroma[row_ix / 2 * row_bytes..][..row_bytes].as_chunks::<2>().0;
                 let lumas = row.as_chunks::<2>().0.iter();
-                fixed.row(out, lumas.zip(differences).map(|(&[y0, y1], &[u, v])| [y0, y1, u, v]));
+                fixed.row(out, lumas.zip(chroma_row).map(|(&[y0, y1], &[u, v])| [y0, y1, u, v]));
             }
         }
     }
@@ -164,17 +164,17 @@ impl Fixed {
     fn new(colors: YuvColors) -> Self {
         let (black, coefficients) = colors.coefficients();
         #[expect(clippy::cast_possible_truncation, reason = "coefficients are below 3, black is 0 or 16")]
-        let whole = |number: f64| number.round() as i32;
+        let to_integer = |number: f64| number.round() as i32;
         let [luma, v_in_red, u_in_green, v_in_green, u_in_blue] =
-            coefficients.map(|coefficient| whole(coefficient * f64::from(1 << SHIFT)));
-        Self { black: whole(black), luma, v_in_red, u_in_green, v_in_green, u_in_blue }
+            coefficients.map(|coefficient| to_integer(coefficient * f64::from(1 << SHIFT)));
+        Self { black: to_integer(black), luma, v_in_red, u_in_green, v_in_green, u_in_blue }
     }
 
     /// One row from its pairs `[y0, y1, u, v]`; of the last pair an odd width takes the first pixel.
     #[inline(always)]
     fn row(self, out: &mut [u8], mut pairs: impl Iterator<Item = [u8; 4]>) {
-        let (whole, rest) = out.as_chunks_mut::<6>();
-        for (out, pair) in whole.iter_mut().zip(&mut pairs) {
+        let (to_integer, rest) = out.as_chunks_mut::<6>();
+        for (out, pair) in to_integer.iter_mut().zip(&mut pairs) {
             *out = self.pair(pair);
         }
         if let (false, Some(pair)) = (rest.is_empty(), pairs.next()) {
@@ -215,31 +215,31 @@ mod tests {
     fn twin(colors: YuvColors, y: u8, u: u8, v: u8) -> [f64; 3] {
         let [red_weight, blue_weight] = colors.luma_weights();
         let [y, u, v] = [y, u, v].map(f64::from);
-        let (luma, blue_difference, red_difference) = match colors.range {
+        let (luma, cb, cr) = match colors.range {
             YuvRange::Limited => ((y - 16.0) / 219.0, (u - 128.0) / 224.0, (v - 128.0) / 224.0),
             YuvRange::Full => (y / 255.0, (u - 128.0) / 255.0, (v - 128.0) / 255.0),
         };
-        let red = luma + 2.0 * (1.0 - red_weight) * red_difference;
-        let blue = luma + 2.0 * (1.0 - blue_weight) * blue_difference;
+        let red = luma + 2.0 * (1.0 - red_weight) * cr;
+        let blue = luma + 2.0 * (1.0 - blue_weight) * cb;
         let green = (luma - red_weight * red - blue_weight * blue) / (1.0 - red_weight - blue_weight);
         [red, green, blue].map(|color| (color * 255.0).clamp(0.0, 255.0))
     }
 
     #[test]
-    fn every_count_is_within_one_of_the_twin() {
-        const OFF: f64 = 0.54; // Half a count of rounding and what `Fixed` says.
+    fn every_value_is_within_one_count_of_twin() {
+        const MAX_ERROR: f64 = 0.54; // Half a count of rounding and what `Fixed` says.
         for colors in all_colors() {
             let fixed = Fixed::new(colors);
             for y in 0..=255 {
                 for u in (0..=255).step_by(5) {
                     for v in (0..=255).step_by(3) {
                         let got = fixed.pair([y, 255 - y, u, v]);
-                        for (got, wanted) in
+                        for (got, expected) in
                             got.iter().zip(twin(colors, y, u, v).into_iter().chain(twin(colors, 255 - y, u, v)))
                         {
                             assert!(
-                                (f64::from(*got) - wanted).abs() <= OFF,
-                                "{colors:?} {y} {u} {v}: {got}, wanted {wanted}"
+                                (f64::from(*got) - expected).abs() <= MAX_ERROR,
+                                "{colors:?} {y} {u} {v}: {got}, wanted {expected}"
                             );
                         }
                     }
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn published_colors_come_out() {
+    fn published_colors_convert_correctly() {
         let limited = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
         let of = |colors: YuvColors, y, u, v| rgb(YuvLayout::Yuyv, colors, [1, 1], &[y, u, 0, v]);
         assert_eq!(of(limited, 16, 128, 128), [0, 0, 0]);
@@ -263,35 +263,33 @@ mod tests {
     }
 
     #[test]
-    fn all_layouts_of_one_picture_give_the_same_pixels_at_odd_sizes() {
+    fn all_layouts_convert_identically_at_odd_sizes() {
         let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full };
         let luma = |x: usize, y: usize| (20 + 31 * x + 47 * y).to_le_bytes()[0];
-        let difference = |x: usize, y: usize, plus: usize| (90 + plus + 13 * (x / 2) + 7 * (y / 2)).to_le_bytes()[0];
+        let chroma = |x: usize, y: usize, plus: usize| (90 + plus + 13 * (x / 2) + 7 * (y / 2)).to_le_bytes()[0];
         for size_px in [[1, 1], [2, 2], [5, 3], [4, 3], [7, 2]] {
             let [width, height] = size_px.map(|side| side as usize);
             let pairs = width.div_ceil(2);
             let packed = |order: fn(u8, u8, u8, u8) -> [u8; 4]| -> Vec<u8> {
-                let pair =
-                    |x: usize, y: usize| order(luma(x, y), luma(x + 1, y), difference(x, y, 0), difference(x, y, 40));
+                let pair = |x: usize, y: usize| order(luma(x, y), luma(x + 1, y), chroma(x, y, 0), chroma(x, y, 40));
                 (0..height).flat_map(|y| (0..pairs).flat_map(move |pair_ix| pair(2 * pair_ix, y))).collect()
             };
             let lumas = (0..height).flat_map(|y| (0..2 * pairs).map(move |x| luma(x, y)));
-            let differences = (0..height.div_ceil(2)).flat_map(|row| {
-                (0..pairs).flat_map(move |pair| [0, 40].map(|plus| difference(2 * pair, 2 * row, plus)))
-            });
+            let chroma_row = (0..height.div_ceil(2))
+                .flat_map(|row| (0..pairs).flat_map(move |pair| [0, 40].map(|plus| chroma(2 * pair, 2 * row, plus))));
             let images = [
                 packed(|y0, y1, u, v| [y0, u, y1, v]),
                 packed(|y0, y1, u, v| [u, y0, v, y1]),
-                lumas.chain(differences).collect(),
+                lumas.chain(chroma_row).collect(),
             ];
             for (layout, data) in LAYOUTS.into_iter().zip(images) {
                 assert_eq!(data.len(), layout.row_bytes(width) * layout.n_rows(height), "{layout:?}");
                 let got = rgb(layout, colors, size_px, &data);
                 for (ix, got) in got.chunks_exact(3).enumerate() {
                     let (x, y) = (ix % width, ix / width);
-                    let wanted = twin(colors, luma(x, y), difference(x, y, 0), difference(x, y, 40));
-                    for (got, wanted) in got.iter().zip(wanted) {
-                        assert!((f64::from(*got) - wanted).abs() <= 1.0, "{layout:?} {width}x{height} at {x}, {y}");
+                    let expected = twin(colors, luma(x, y), chroma(x, y, 0), chroma(x, y, 40));
+                    for (got, expected) in got.iter().zip(expected) {
+                        assert!((f64::from(*got) - expected).abs() <= 1.0, "{layout:?} {width}x{height} at {x}, {y}");
                     }
                 }
                 assert_eq!(got.len(), width * height * 3);
@@ -300,26 +298,26 @@ mod tests {
     }
 
     #[test]
-    fn devices_defaults_are_those_of_v4l2() {
-        let settled = |colorspace, ycbcr_enc, quantization, is_hdtv| {
-            let told = V4l2Colors { colorspace, ycbcr_enc, quantization, is_hdtv };
-            YuvColors::from_v4l2(told).map(|colors| (colors.matrix, colors.range)).ok()
+    fn unset_colors_use_v4l2_defaults() {
+        let resolved = |colorspace, ycbcr_enc, quantization, is_hdtv| {
+            let reported = V4l2Colors { colorspace, ycbcr_enc, quantization, is_hdtv };
+            YuvColors::from_v4l2(reported).map(|colors| (colors.matrix, colors.range)).ok()
         };
         use YuvMatrix::{Bt601, Bt709};
         use YuvRange::{Full, Limited};
-        assert_eq!(settled(0, 0, 0, false), Some((Bt601, Limited))); // Nothing told: sRGB.
-        assert_eq!(settled(0, 0, 0, true), Some((Bt709, Limited))); // An HDMI grabber.
-        assert_eq!(settled(1, 0, 0, true), Some((Bt601, Limited))); // SMPTE 170M
-        assert_eq!(settled(3, 0, 0, false), Some((Bt709, Limited))); // Rec. 709
-        assert_eq!(settled(7, 0, 0, false), Some((Bt601, Full))); // JPEG
-        assert_eq!(settled(8, 0, 1, false), Some((Bt601, Full))); // sRGB, told to be full.
-        assert_eq!(settled(8, 2, 0, false), Some((Bt709, Limited)));
-        assert_eq!(settled(7, 0, 2, false), Some((Bt601, Limited)));
-        assert_eq!(settled(12, 0, 0, false), Some((Bt709, Limited))); // DCI-P3
-        assert_eq!(settled(10, 0, 0, false), None); // BT.2020
-        assert_eq!(settled(2, 0, 0, false), None); // SMPTE 240M
-        assert_eq!(settled(2, 1, 0, false), Some((Bt601, Limited)));
-        assert_eq!(settled(8, 6, 0, false), None);
+        assert_eq!(resolved(0, 0, 0, false), Some((Bt601, Limited))); // Nothing told: sRGB.
+        assert_eq!(resolved(0, 0, 0, true), Some((Bt709, Limited))); // An HDMI grabber.
+        assert_eq!(resolved(1, 0, 0, true), Some((Bt601, Limited))); // SMPTE 170M
+        assert_eq!(resolved(3, 0, 0, false), Some((Bt709, Limited))); // Rec. 709
+        assert_eq!(resolved(7, 0, 0, false), Some((Bt601, Full))); // JPEG
+        assert_eq!(resolved(8, 0, 1, false), Some((Bt601, Full))); // sRGB, told to be full.
+        assert_eq!(resolved(8, 2, 0, false), Some((Bt709, Limited)));
+        assert_eq!(resolved(7, 0, 2, false), Some((Bt601, Limited)));
+        assert_eq!(resolved(12, 0, 0, false), Some((Bt709, Limited))); // DCI-P3
+        assert_eq!(resolved(10, 0, 0, false), None); // BT.2020
+        assert_eq!(resolved(2, 0, 0, false), None); // SMPTE 240M
+        assert_eq!(resolved(2, 1, 0, false), Some((Bt601, Limited)));
+        assert_eq!(resolved(8, 6, 0, false), None);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Samples to a file and back: nothing changes, nothing is reordered, and a damaged file gives what is left of it.
 
-use drivers::recording::{About, RIG_FILE, Recorder, Recording};
+use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
 use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion};
@@ -35,7 +35,7 @@ fn samples() -> Vec<Sample> {
                 exposure_secs: (tick % 30 == 5).then_some(1e-3),
                 n_skipped: u64::from(tick == 55),
             };
-            let format = PixelFormat::DepthU16 { metres_per_count: 1e-4 };
+            let format = PixelFormat::DepthU16 { meters_per_count: 1e-4 };
             let depth =
                 Image { stamp: Stamp(stamp.0 + 777), format, data: noise(tick, 16 * 12 * 2).into(), ..color.clone() };
             let depth_m =
@@ -78,12 +78,12 @@ fn record(path: &Path, samples: &[Sample]) {
         lens: Lens::BrownConrady([0.1, 0.2, 0.3, 0.4, 0.5]),
         rectified: false,
     };
-    let about = About {
+    let recording_metadata = RecordingMetadata {
         files: &[(RIG_FILE, RIG.as_bytes())],
         cameras: &[("wrist", &intrinsics)],
         joint_names: &["a".into(), "b".into()],
     };
-    let mut recorder = Recorder::create(path, &about).expect("a new file");
+    let mut recorder = Recorder::create(path, &recording_metadata).expect("a new file");
     for sample in samples {
         recorder.write(sample).expect("room on the disk");
     }
@@ -100,7 +100,7 @@ fn replay(path: &Path) -> (Vec<Sample>, Recording) {
 }
 
 #[test]
-fn a_replay_is_what_was_recorded_in_the_same_order() {
+fn replay_equals_recorded_samples_in_order() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let sent = samples();
@@ -113,16 +113,16 @@ fn a_replay_is_what_was_recorded_in_the_same_order() {
     assert_eq!(recording.damage(), None);
     assert_eq!(recording.attachment(RIG_FILE), Some(RIG.as_bytes()));
     assert_eq!(recording.joint_names(), Some(&["a".to_owned(), "b".to_owned()][..]));
-    let again = folder.path().join("again.mcap");
-    record(&again, &read);
+    let second_path = folder.path().join("again.mcap");
+    record(&second_path, &read);
     assert!(
-        std::fs::read(&path).expect("first") == std::fs::read(&again).expect("second"),
+        std::fs::read(&path).expect("first") == std::fs::read(&second_path).expect("second"),
         "a replay records to the same bytes"
     );
 }
 
 #[test]
-fn a_recording_cut_off_anywhere_gives_the_samples_before_the_cut() {
+fn truncated_recording_yields_samples_before_the_cut() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let sent = samples();
@@ -130,8 +130,8 @@ fn a_recording_cut_off_anywhere_gives_the_samples_before_the_cut() {
     let whole = std::fs::read(&path).expect("the file");
     let cut_path = folder.path().join("cut.mcap");
     let mut n_before = 0;
-    for eighth in 1..8 {
-        std::fs::write(&cut_path, &whole[..whole.len() * eighth / 8]).expect("a shorter file");
+    for eighths in 1..8 {
+        std::fs::write(&cut_path, &whole[..whole.len() * eighths / 8]).expect("a shorter file");
         let (read, recording) = replay(&cut_path);
         assert!(read.len() >= n_before && read.len() < sent.len(), "{} of {} samples", read.len(), sent.len());
         assert!(read[..] == sent[..read.len()], "what is left is unchanged");
@@ -143,7 +143,7 @@ fn a_recording_cut_off_anywhere_gives_the_samples_before_the_cut() {
 }
 
 #[test]
-fn a_flipped_bit_is_noticed() {
+fn flipped_bit_is_detected() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     record(&path, &samples());
@@ -153,14 +153,14 @@ fn a_flipped_bit_is_noticed() {
     std::fs::write(&path, bytes).expect("the file");
     let mut recording = Recording::open(&path).expect("the start is fine");
     let mut n_samples = 0;
-    let told = loop {
+    let damage_or_error = loop {
         match recording.next_sample() {
             Ok(Some(_)) => n_samples += 1,
             Ok(None) => break recording.damage().map(str::to_owned),
             Err(e) => break Some(e.to_string()),
         }
     };
-    assert!(n_samples > 10 && told.is_some(), "{n_samples} samples, {told:?}");
+    assert!(n_samples > 10 && damage_or_error.is_some(), "{n_samples} samples, {damage_or_error:?}");
 }
 
 #[test]
@@ -168,7 +168,7 @@ fn an_unfinished_recording_is_readable() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let sent = samples();
-    let mut recorder = Recorder::create(&path, &About::default()).expect("a new file");
+    let mut recorder = Recorder::create(&path, &RecordingMetadata::default()).expect("a new file");
     for sample in &sent {
         recorder.write(sample).expect("room on the disk");
     }
@@ -181,15 +181,15 @@ fn an_unfinished_recording_is_readable() {
 }
 
 #[test]
-fn what_is_no_recording_is_refused_in_one_sentence() {
+fn non_recordings_are_rejected() {
     let folder = tempfile::tempdir().expect("a folder");
     let missing = Recording::open(&folder.path().join("missing.mcap")).expect_err("there is none");
     assert!(matches!(missing, Error::Open { .. }) && missing.to_string().contains("missing.mcap"));
     for content in [&b""[..], b"short", b"a longer text that is no recording at all"] {
         let path = folder.path().join("text.mcap");
         std::fs::write(&path, content).expect("a file");
-        let refused = Recording::open(&path).expect_err("no recording");
-        assert!(matches!(refused, Error::NotARecording { .. }), "{refused}");
+        let error = Recording::open(&path).expect_err("no recording");
+        assert!(matches!(error, Error::NotARecording { .. }), "{error}");
     }
     let empty = folder.path().join("empty.mcap");
     record(&empty, &samples());
@@ -199,12 +199,12 @@ fn what_is_no_recording_is_refused_in_one_sentence() {
 }
 
 #[test]
-fn an_existing_file_is_refused_and_left_as_it_was() {
+fn existing_file_is_rejected_and_unchanged() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     record(&path, &samples());
     let before = std::fs::read(&path).expect("the file");
-    let refused = Recorder::create(&path, &About::default()).expect_err("the file is there");
-    assert!(matches!(refused, Error::Exists { .. }) && refused.to_string().contains("run.mcap"), "{refused}");
+    let error = Recorder::create(&path, &RecordingMetadata::default()).expect_err("the file is there");
+    assert!(matches!(error, Error::Exists { .. }) && error.to_string().contains("run.mcap"), "{error}");
     assert!(std::fs::read(&path).expect("the file") == before);
 }

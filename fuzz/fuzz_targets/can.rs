@@ -1,3 +1,3 @@
-//! See `drivers::hostile::frames`.
+//! See `drivers::fuzz::frames`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::frames(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::frames(bytes));

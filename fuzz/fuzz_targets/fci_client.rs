@@ -1,3 +1,3 @@
-//! See `drivers::hostile::client`.
+//! See `drivers::fuzz::client`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::client(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::client(bytes));

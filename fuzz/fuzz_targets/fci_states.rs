@@ -1,3 +1,3 @@
-//! See `drivers::hostile::states`.
+//! See `drivers::fuzz::states`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::states(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::states(bytes));

@@ -1,3 +1,3 @@
-//! See `drivers::hostile::messages`.
+//! See `drivers::fuzz::messages`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::messages(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::messages(bytes));

@@ -61,8 +61,8 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     // What lies too far out for one format is refused, all else comes back.
     for (write, read) in [(ply::write as fn(_, _) -> _, ply::read as fn(_) -> _), (spz::write, spz::read)] {
         if write(&path, &splats).is_ok() {
-            let again = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));
-            assert_eq!((again.n_splats(), again.sh_degree), (splats.n_splats(), splats.sh_degree));
+            let reread = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));
+            assert_eq!((reread.n_splats(), reread.sh_degree), (splats.n_splats(), splats.sh_degree));
         }
     }
 });

@@ -1,3 +1,3 @@
-//! See `drivers::hostile::nerfstudio`.
+//! See `drivers::fuzz::nerfstudio`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::nerfstudio(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::nerfstudio(bytes));

@@ -1,3 +1,3 @@
-//! See `drivers::hostile::pixels`.
+//! See `drivers::fuzz::pixels`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::pixels(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::pixels(bytes));

@@ -1,3 +1,3 @@
-//! See `drivers::hostile::recording`.
+//! See `drivers::fuzz::recording`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::recording(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::recording(bytes));

@@ -16,8 +16,8 @@ libfuzzer_sys::fuzz_target!(|text: &str| {
     match config::Rig::parse("rig.toml", text, URDF, &[]) {
         Ok(rig) => {
             let settled = rig.to_toml();
-            let again = config::Rig::parse("rig.toml", &settled, &rig.arm.urdf_text, &[]);
-            if let Err(error) = again {
+            let reread = config::Rig::parse("rig.toml", &settled, &rig.arm.urdf_text, &[]);
+            if let Err(error) = reread {
                 panic!("{error}\n{settled}");
             }
         }

@@ -1,3 +1,3 @@
-//! See `drivers::hostile::tum`.
+//! See `drivers::fuzz::tum`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::tum(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::tum(bytes));

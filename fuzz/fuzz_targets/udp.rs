@@ -1,3 +1,3 @@
-//! See `drivers::hostile::datagrams`.
+//! See `drivers::fuzz::datagrams`.
 #![no_main]
-libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::hostile::datagrams(bytes));
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| drivers::fuzz::datagrams(bytes));

@@ -80,8 +80,8 @@ impl Intrinsics {
         }
         let plane = match self.lens_in_use() {
             Lens::Pinhole => distorted,
-            Lens::BrownConrady(k) => lens::undo_brown_conrady(&k, distorted)?,
-            Lens::KannalaBrandt(k) => lens::undo_kannala_brandt(&k, distorted)?,
+            Lens::BrownConrady(k) => lens::undistort_brown_conrady(&k, distorted)?,
+            Lens::KannalaBrandt(k) => lens::undistort_kannala_brandt(&k, distorted)?,
         };
         Some(Vector3::new(plane.x, plane.y, 1.0))
     }
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn every_pixel_of_every_lens_comes_back() {
+    fn project_inverts_unproject_for_every_lens() {
         for lens in lenses() {
             let camera = camera(lens);
             for pixel in pixels() {
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn brown_conrady_follows_the_formula_by_hand() {
+    fn brown_conrady_matches_formula() {
         // x = 0.5, y = 0.25: r2 = 0.3125, r4 = 0.09765625, r6 = 0.030517578125.
         let camera = camera(Lens::BrownConrady([0.1, 0.2, 0.01, 0.02, 0.4]));
         let radial = 1.0 + 0.03125 + 0.01953125 + 0.01220703125;
@@ -219,14 +219,14 @@ mod tests {
     }
 
     #[test]
-    fn equidistant_fisheye_measures_the_angle() {
+    fn equidistant_fisheye_is_linear_in_angle() {
         let camera = camera(Lens::KannalaBrandt([0.0; 4]));
         let angle = 0.9_f64;
         let [u, v] = camera.project(&Vector3::new(3.0 * angle.sin(), 0.0, 3.0 * angle.cos())).unwrap();
         assert!((u - (600.0 * angle + 321.5)).abs() < 1e-10);
         assert!((v - 238.25).abs() < 1e-10);
-        let bent = Intrinsics { lens: Lens::KannalaBrandt([0.1, 0.0, 0.0, 0.01]), ..camera };
-        let [_, v] = bent.project(&Vector3::new(0.0, angle.sin(), angle.cos())).unwrap();
+        let distorted_camera = Intrinsics { lens: Lens::KannalaBrandt([0.1, 0.0, 0.0, 0.01]), ..camera };
+        let [_, v] = distorted_camera.project(&Vector3::new(0.0, angle.sin(), angle.cos())).unwrap();
         let by_hand = angle * (1.0 + 0.1 * 0.81 + 0.01 * 0.43046721);
         assert!((v - (580.0 * by_hand + 238.25)).abs() < 1e-10);
     }
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_seen_has_no_pixel() {
+    fn invisible_points_project_to_none() {
         for lens in lenses() {
             let camera = camera(lens);
             for point in [[0.0, 0.0, 0.0], [0.1, 0.0, -1.0], [1.0, 1.0, f64::NAN], [f64::NAN, 0.0, 1.0]] {
@@ -270,21 +270,22 @@ mod tests {
     }
 
     #[test]
-    fn a_barrel_lens_does_not_fold_the_far_side_back_into_the_image() {
+    fn barrel_distortion_stops_at_its_limit() {
         // r (1 - 0.3 r2) turns back at r = 1 / sqrt(0.9), where it is 2 / 3 of that.
         let camera = camera(Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]));
-        let turn = 1.0 / 0.9_f64.sqrt();
+        let turning_radius = 1.0 / 0.9_f64.sqrt();
         let at = |radius: f64| camera.project(&Vector3::new(radius * 0.6, radius * 0.8, 1.0));
-        assert!(at(turn * 0.999).is_some());
-        assert_eq!(at(turn * 1.001), None);
+        assert!(at(turning_radius * 0.999).is_some());
+        assert_eq!(at(turning_radius * 1.001), None);
         assert_eq!(at(1.8), None); // The formula alone would put it at 0.03 of the focal length.
-        let seen = |radius: f64| camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8]);
-        assert!(seen(turn * 2.0 / 3.0 * 0.999).is_some());
-        assert_eq!(seen(turn * 2.0 / 3.0 * 1.001), None);
+        let unproject_at =
+            |radius: f64| camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8]);
+        assert!(unproject_at(turning_radius * 2.0 / 3.0 * 0.999).is_some());
+        assert_eq!(unproject_at(turning_radius * 2.0 / 3.0 * 1.001), None);
     }
 
     #[test]
-    fn a_fisheye_shows_nothing_behind_the_camera() {
+    fn fisheye_stops_at_90_degrees() {
         let camera = camera(Lens::KannalaBrandt([0.0; 4]));
         assert!(camera.unproject([321.5 + 600.0 * 1.57, 238.25]).is_some());
         assert_eq!(camera.unproject([321.5 + 600.0 * 1.58, 238.25]), None);
@@ -293,18 +294,18 @@ mod tests {
     #[test]
     fn rectified_images_ignore_the_lens() {
         let point = Vector3::new(0.4, -0.3, 1.2);
-        let plain = camera(Lens::Pinhole);
+        let pinhole = camera(Lens::Pinhole);
         for lens in lenses().into_iter().skip(1) {
             let rectified = Intrinsics { rectified: true, ..camera(lens) };
-            assert_ne!(camera(lens).project(&point), plain.project(&point));
-            assert_eq!(rectified.project(&point), plain.project(&point));
-            assert_eq!(camera(lens).undistorted().project(&point), plain.project(&point));
+            assert_ne!(camera(lens).project(&point), pinhole.project(&point));
+            assert_eq!(rectified.project(&point), pinhole.project(&point));
+            assert_eq!(camera(lens).undistorted().project(&point), pinhole.project(&point));
             assert!(rectified.is_pinhole() && !camera(lens).is_pinhole());
         }
     }
 
     #[test]
-    fn scaling_keeps_corners_and_the_view() {
+    fn scaling_keeps_corners_and_field_of_view() {
         let half = camera(lenses()[1]).scaled(0.5);
         assert_eq!((half.size_px, half.focal_px), ([320, 240], [300.0, 290.0]));
         let odd = camera(lenses()[1]).scaled(0.3333);
@@ -317,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn nonsense_is_refused() {
+    fn invalid_intrinsics_are_rejected() {
         let good = camera(lenses()[1]);
         good.validate().unwrap();
         for bad in [

@@ -16,7 +16,7 @@ pub struct Chain {
     limits: Vec<JointLimits>,
     segments: Vec<Segment>,
     /// From the last joint's frame (axis along z) to the tip link.
-    last_from_tip: Fixed,
+    last_from_tip: RigidMotion,
 }
 
 /// A constant motion and then one joint along or about the z axis.
@@ -25,15 +25,15 @@ pub struct Chain {
 /// once, when the chain is built.
 #[derive(Clone, Debug)]
 struct Segment {
-    before: Fixed,
-    slides: bool,
+    before: RigidMotion,
+    is_prismatic: bool,
     joint_ix: usize,
     multiplier: f64,
     offset: f64,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Fixed {
+struct RigidMotion {
     rotation: Quaternion<f64>,
     translation: Vector3<f64>,
 }
@@ -52,32 +52,32 @@ impl Chain {
             joint_names: Vec::new(),
             limits: Vec::new(),
             segments: Vec::new(),
-            last_from_tip: Fixed::new(&Transform::identity()),
+            last_from_tip: RigidMotion::new(&Transform::identity()),
         };
         let mut constant = Transform::identity();
         for joint in robot.path(base_link, tip_link)? {
             constant *= joint.parent_from_joint;
-            let slides = match joint.kind {
+            let is_prismatic = match joint.kind {
                 JointKind::Fixed => continue,
-                JointKind::Turn => false,
-                JointKind::Slide => true,
+                JointKind::Revolute => false,
+                JointKind::Prismatic => true,
                 JointKind::Unsupported(kind) => {
                     return Err(Error::JointType { joint: joint.name.clone(), kind });
                 }
             };
-            let joint_from_aligned = turn_z_to(&joint.axis);
+            let joint_from_aligned = rotation_from_z_to(&joint.axis);
             let rule = follow_mimics(robot, joint)?;
             let joint_ix = chain.index_of(rule.source);
             chain.segments.push(Segment {
-                before: Fixed::new(&(constant * joint_from_aligned)),
-                slides,
+                before: RigidMotion::new(&(constant * joint_from_aligned)),
+                is_prismatic,
                 joint_ix,
                 multiplier: rule.multiplier,
                 offset: rule.offset,
             });
             constant = Transform::from_parts(Translation3::identity(), joint_from_aligned.inverse());
         }
-        chain.last_from_tip = Fixed::new(&constant);
+        chain.last_from_tip = RigidMotion::new(&constant);
         Ok(chain)
     }
 
@@ -128,12 +128,12 @@ impl Chain {
     /// Like [`Chain::forward`], into a place that exists; neither allocates. On error the place is left as it was.
     pub fn forward_into(&self, q: &[f64], base_from_tip: &mut Transform) -> Result<(), Error> {
         self.check(q)?;
-        let mut pose = Fixed::IDENTITY;
+        let mut pose = RigidMotion::IDENTITY;
         for segment in &self.segments {
-            pose.then(&segment.before);
+            pose.compose(&segment.before);
             pose.move_joint(segment, q);
         }
-        pose.then(&self.last_from_tip);
+        pose.compose(&self.last_from_tip);
         *base_from_tip = pose.transform();
         Ok(())
     }
@@ -143,11 +143,11 @@ impl Chain {
     pub fn jacobian(&self, q: &[f64]) -> Result<Matrix6xX<f64>, Error> {
         let tip_in_base = self.forward(q)?.translation.vector;
         let mut jacobian = Matrix6xX::zeros(self.n_joints());
-        let mut pose = Fixed::IDENTITY;
+        let mut pose = RigidMotion::IDENTITY;
         for segment in &self.segments {
-            pose.then(&segment.before);
+            pose.compose(&segment.before);
             let axis_in_base = rotate(&pose.rotation, &Vector3::z());
-            let (linear, angular) = match segment.slides {
+            let (linear, angular) = match segment.is_prismatic {
                 true => (axis_in_base, Vector3::zeros()),
                 false => (axis_in_base.cross(&(tip_in_base - pose.translation)), axis_in_base),
             };
@@ -202,8 +202,8 @@ impl Chain {
     }
 
     fn index_of(&mut self, source: &Joint) -> usize {
-        if let Some(known) = self.joint_names.iter().position(|name| *name == source.name) {
-            return known;
+        if let Some(known_ix) = self.joint_names.iter().position(|name| *name == source.name) {
+            return known_ix;
         }
         self.joint_names.push(source.name.clone());
         self.limits.push(source.limits);
@@ -212,23 +212,23 @@ impl Chain {
 }
 
 /// The joint that really moves, and how `joint` follows it.
-struct Rule<'a> {
+struct MimicRule<'a> {
     source: &'a Joint,
     multiplier: f64,
     offset: f64,
 }
 
-fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<Rule<'a>, Error> {
-    let mut rule = Rule { source: joint, multiplier: 1.0, offset: 0.0 };
-    let mut n_followed = 0;
+fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<MimicRule<'a>, Error> {
+    let mut rule = MimicRule { source: joint, multiplier: 1.0, offset: 0.0 };
+    let mut n_mimics = 0;
     while let Some(mimic) = &rule.source.mimic {
         let refused = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
         let source = robot.joint(&mimic.source).ok_or_else(|| refused("is not in the URDF"))?;
-        if !matches!(source.kind, JointKind::Turn | JointKind::Slide) {
+        if !matches!(source.kind, JointKind::Revolute | JointKind::Prismatic) {
             return Err(refused("is not a moving joint of one number"));
         }
-        n_followed += 1;
-        if n_followed > robot.joints().len() {
+        n_mimics += 1;
+        if n_mimics > robot.joints().len() {
             return Err(refused("follows it in turn"));
         }
         rule.offset += rule.multiplier * mimic.offset;
@@ -238,7 +238,7 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<Rule<'a>, Err
     Ok(rule)
 }
 
-fn turn_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
+fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
     // Opposite directions leave the turning axis open: any half turn about an axis across z does it.
     UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), axis)
         .unwrap_or_else(|| UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0)))
@@ -249,7 +249,7 @@ fn rotate(rotation: &Quaternion<f64>, vector: &Vector3<f64>) -> Vector3<f64> {
     vector + twice * rotation.scalar() + rotation.imag().cross(&twice)
 }
 
-impl Fixed {
+impl RigidMotion {
     const IDENTITY: Self = Self {
         rotation: Quaternion::from_vector(nalgebra::Vector4::new(0.0, 0.0, 0.0, 1.0)),
         translation: Vector3::new(0.0, 0.0, 0.0),
@@ -264,14 +264,14 @@ impl Fixed {
         Transform::from_parts(self.translation.into(), UnitQuaternion::new_unchecked(self.rotation))
     }
 
-    fn then(&mut self, next: &Self) {
+    fn compose(&mut self, next: &Self) {
         self.translation += rotate(&self.rotation, &next.translation);
         self.rotation *= next.rotation;
     }
 
     fn move_joint(&mut self, segment: &Segment, q: &[f64]) {
         let value = segment.multiplier * q[segment.joint_ix] + segment.offset;
-        if segment.slides {
+        if segment.is_prismatic {
             self.translation += rotate(&self.rotation, &Vector3::new(0.0, 0.0, value));
             return;
         }
@@ -349,24 +349,26 @@ mod tests {
     </robot>"#;
 
     fn odd_by_hand(q: &[f64]) -> Matrix4<f64> {
-        let turn = |axis: Vector3<f64>, angle: f64| Matrix4::from_axis_angle(&Unit::new_normalize(axis), angle);
-        let shift = |vector: Vector3<f64>| Matrix4::new_translation(&vector);
-        let rpy = |r: f64, p: f64, y: f64| turn(Vector3::z(), y) * turn(Vector3::y(), p) * turn(Vector3::x(), r);
+        let rotate_by = |axis: Vector3<f64>, angle: f64| Matrix4::from_axis_angle(&Unit::new_normalize(axis), angle);
+        let translate_by = |vector: Vector3<f64>| Matrix4::new_translation(&vector);
+        let rpy = |r: f64, p: f64, y: f64| {
+            rotate_by(Vector3::z(), y) * rotate_by(Vector3::y(), p) * rotate_by(Vector3::x(), r)
+        };
         let third = 3.0 * q[2] - 1.0;
-        shift(Vector3::new(0.1, 0.2, 0.3))
+        translate_by(Vector3::new(0.1, 0.2, 0.3))
             * rpy(0.4, -0.5, 0.6)
-            * turn(-Vector3::z(), q[0])
+            * rotate_by(-Vector3::z(), q[0])
             * rpy(1.0, 0.0, 0.0)
-            * shift(Vector3::new(1.0, 1.0, -1.0).normalize() * q[1])
-            * shift(Vector3::new(0.0, 0.3, 0.0))
+            * translate_by(Vector3::new(1.0, 1.0, -1.0).normalize() * q[1])
+            * translate_by(Vector3::new(0.0, 0.3, 0.0))
             * rpy(0.0, 0.0, 2.0)
-            * turn(Vector3::y(), -2.0 * q[0] + 0.3)
-            * shift(Vector3::x() * 0.5 * third)
-            * turn(Vector3::x(), third)
+            * rotate_by(Vector3::y(), -2.0 * q[0] + 0.3)
+            * translate_by(Vector3::x() * 0.5 * third)
+            * rotate_by(Vector3::x(), third)
     }
 
     #[test]
-    fn the_panda_agrees_with_its_published_numbers() {
+    fn panda_matches_published_dh_table() {
         let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
         for q in configurations(7) {
             assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &panda_by_dh(&q)) < CLOSE);
@@ -376,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn every_kind_of_joint_agrees_with_a_product_by_hand() {
+    fn all_joint_types_match_manual_product() {
         let chain = Chain::from_urdf(ODD, "a", "g").unwrap();
         assert_eq!(chain.joint_names(), ["down", "slide", "far"]);
         assert_eq!(chain.n_joints(), 3);
@@ -387,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn a_chain_without_joints_is_a_constant() {
+    fn chain_without_joints_is_constant() {
         let chain = Chain::from_urdf(PANDA, "link7", "tcp").unwrap();
         assert_eq!(chain.n_joints(), 0);
         assert!((chain.forward(&[]).unwrap().translation.z - 0.2104).abs() < CLOSE);
@@ -395,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn the_jacobian_matches_central_differences() {
+    fn jacobian_matches_central_differences() {
         const NUDGE: f64 = 1e-6;
         const ABS: f64 = 1e-8; // Truncation NUDGE², rounding 1e-16 / NUDGE, each times sizes near 10.
         for (urdf, base, tip) in [(PANDA, "link0", "tcp"), (PANDA, "link0", "finger_right"), (ODD, "a", "g")] {
@@ -427,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn forward_into_gives_the_same_bits_and_leaves_the_place_on_error() {
+    fn forward_into_matches_forward_and_keeps_output_on_error() {
         let chain = Chain::from_urdf(PANDA, "link0", "link8").unwrap();
         let mut pose = Transform::identity();
         chain.forward_into(&[0.3; 7], &mut pose).unwrap();
@@ -438,11 +440,11 @@ mod tests {
     }
 
     #[test]
-    fn wrong_configurations_get_one_clear_sentence() {
+    fn invalid_configurations_are_rejected() {
         let chain = Chain::from_urdf(PANDA, "link0", "link3").unwrap();
-        let told = |q: &[f64]| chain.forward(q).unwrap_err().to_string();
-        assert_eq!(told(&[0.0, 1.0]), "2 joint values given, the chain has 3: joint1, joint2, joint3");
-        assert_eq!(told(&[0.0, f64::NAN, 0.0]), r#"joint "joint2" is at NaN, not a finite number"#);
+        let error_of = |q: &[f64]| chain.forward(q).unwrap_err().to_string();
+        assert_eq!(error_of(&[0.0, 1.0]), "2 joint values given, the chain has 3: joint1, joint2, joint3");
+        assert_eq!(error_of(&[0.0, f64::NAN, 0.0]), r#"joint "joint2" is at NaN, not a finite number"#);
         assert!(chain.jacobian(&[0.0; 4]).is_err() && chain.tip_twist(&[0.0; 3], &[f64::INFINITY; 3]).is_err());
         let names = ["joint3", "x", "joint1", "joint2"].map(String::from);
         assert_eq!(chain.order_in(&names), Ok(vec![2, 3, 0]));
@@ -453,13 +455,13 @@ mod tests {
     }
 
     #[test]
-    fn joints_that_cannot_be_computed_are_refused() {
-        let told = |urdf: &str, base: &str, tip: &str| Chain::from_urdf(urdf, base, tip).unwrap_err().to_string();
+    fn unsupported_joints_are_rejected() {
+        let error_of = |urdf: &str, base: &str, tip: &str| Chain::from_urdf(urdf, base, tip).unwrap_err().to_string();
         assert_eq!(
-            told(ODD, "a", "soft"),
+            error_of(ODD, "a", "soft"),
             r#"joint "float" is floating, only fixed, revolute, continuous and prismatic joints can be computed"#
         );
-        let mimic = |from: &str, to: &str| told(&PANDA.replace(from, to), "link0", "finger_right");
+        let mimic = |from: &str, to: &str| error_of(&PANDA.replace(from, to), "link0", "finger_right");
         let source = r#"mimic joint="finger_joint_left""#;
         assert_eq!(
             mimic(source, r#"mimic joint="thumb""#),

@@ -58,7 +58,7 @@ const MAX_EARLY_SECS: f64 = 0.25;
 /// When all arrivals for a while are this late, seconds, the device clock jumped back a little, or was held.
 const MAX_LATE_SECS: f64 = 1.0;
 /// That while.
-const LATE_FOR_NANOS: i64 = 3_000_000_000;
+const MAX_LATE_NANOS: i64 = 3_000_000_000;
 
 const NANOS_PER_SEC: f64 = 1e9;
 
@@ -93,16 +93,16 @@ impl ClockMap {
         let since_nanos = device_nanos.saturating_sub(origin.device_nanos);
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival.nanos_since(origin.arrival).saturating_sub(since_nanos) as f64 / NANOS_PER_SEC;
-        let above_secs = delay_secs - self.line.at(device_secs);
+        let lateness_secs = delay_secs - self.line.at(device_secs);
         // The first arrival of all may have been late by any amount, so early ones are judged once a line has formed.
-        let settled = self.buckets.len() > 4;
-        if settled && above_secs < -MAX_EARLY_SECS {
+        let has_line = self.buckets.len() > 4;
+        if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
         }
-        if self.late_for_too_long(above_secs, arrival) {
+        if self.late_for_too_long(lateness_secs, arrival) {
             return self.restart(device_nanos, arrival);
         }
-        if self.keep(Bucket { index: since_nanos.div_euclid(BUCKET_NANOS), device_secs, delay_secs }) {
+        if self.insert(Bucket { index: since_nanos.div_euclid(BUCKET_NANOS), device_secs, delay_secs }) {
             self.line = self.fit();
         }
     }
@@ -150,16 +150,16 @@ impl ClockMap {
         self.start(device_nanos, arrival);
     }
 
-    fn late_for_too_long(&mut self, above_secs: f64, arrival: Stamp) -> bool {
-        if above_secs < MAX_LATE_SECS {
+    fn late_for_too_long(&mut self, lateness_secs: f64, arrival: Stamp) -> bool {
+        if lateness_secs < MAX_LATE_SECS {
             self.late_since_nanos = None;
             return false;
         }
-        arrival.0.saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0)) > LATE_FOR_NANOS
+        arrival.0.saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0)) > MAX_LATE_NANOS
     }
 
     /// Takes an arrival into its bucket; whether anything changed.
-    fn keep(&mut self, new: Bucket) -> bool {
+    fn insert(&mut self, new: Bucket) -> bool {
         let at = self.buckets.partition_point(|bucket| bucket.index < new.index);
         match self.buckets.get_mut(at) {
             None => self.buckets.push_back(new),
@@ -178,8 +178,8 @@ impl ClockMap {
             (Some(first), Some(last)) => last.device_secs - first.device_secs,
             _ => return self.line,
         };
-        let most = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
-        let drift = self.hull_slope().clamp(-most, most);
+        let max_drift = MAX_DRIFT * (span_secs / FULL_DRIFT_SECS).min(1.0);
+        let drift = self.hull_slope().clamp(-max_drift, max_drift);
         let offset_secs = self.buckets.iter().map(|bucket| bucket.delay_secs - drift * bucket.device_secs);
         Line { offset_secs: offset_secs.fold(f64::INFINITY, f64::min), drift }
     }
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_without_jitter_is_followed_exactly() {
+    fn clock_without_jitter_is_exact() {
         let mut clock = ClockMap::new();
         assert_eq!(clock.map(5), None);
         for ix in 0..1000 {
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn a_restarted_device_clock_is_noticed_and_learnt_anew() {
+    fn device_clock_restart_is_detected() {
         // Back to zero, far ahead, and back by less than it ran.
         for jump_nanos in [-70_000_000_000, 3_600_000_000_000, -4_000_000_000] {
             let mut device = Device::new(200.0, 7);
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_step_back_is_found_by_lasting_lateness() {
+    fn small_clock_step_is_detected() {
         let mut clock = ClockMap::new();
         let send = |clock: &mut ClockMap, ms: i64, behind_ms: i64| {
             clock.stamp((ms - behind_ms) * 1_000_000, Stamp(ms * 1_000_000)).0 - ms * 1_000_000
@@ -361,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_of_the_connection_changes_nothing() {
+    fn connection_stall_is_ignored() {
         let mut clock = ClockMap::new();
         for ix in 0..1000_i64 {
             let device = ix * 10_000_000;
@@ -374,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn disorder_on_the_wire_is_no_restart() {
+    fn reordered_messages_are_no_restart() {
         let mut clock = ClockMap::new();
         for ix in 0..1000_i64 {
             let device = (ix ^ 1) * 10_000_000;
@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn microseconds_go_on_past_32_bits() {
+    fn microseconds_unwrap_past_32_bits() {
         let mut wrapping = WrappingMicros::new();
         assert_eq!(wrapping.nanos(u32::MAX - 1), 4_294_967_294_000);
         assert_eq!(wrapping.nanos(1), 4_294_967_297_000);

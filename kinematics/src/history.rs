@@ -64,13 +64,13 @@ fn behind(newest: Stamp, asked: Stamp) -> String {
 struct Readings<T> {
     max_gap: Duration,
     capacity: usize,
-    kept: VecDeque<(Stamp, T)>,
+    buffer: VecDeque<(Stamp, T)>,
     n_refused: u64,
 }
 
 /// Two neighbours and where between them the stamp lies: at 0 or 1 it meets a reading, and where that has no neighbour near
 /// enough, it stands twice.
-struct Between<'a, T> {
+struct Bracket<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
     frac: f64,
@@ -78,29 +78,29 @@ struct Between<'a, T> {
 
 impl<T> Readings<T> {
     fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { max_gap, capacity: capacity.max(2), kept: VecDeque::new(), n_refused: 0 }
+        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_refused: 0 }
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
-        if let Some(&(newest, _)) = self.kept.back()
+        if let Some(&(newest, _)) = self.buffer.back()
             && stamp <= newest
         {
-            return self.refuse(HistoryError::OutOfOrder { newest, pushed: stamp });
+            return self.reject(HistoryError::OutOfOrder { newest, pushed: stamp });
         }
-        if self.kept.len() == self.capacity {
-            self.kept.pop_front();
+        if self.buffer.len() == self.capacity {
+            self.buffer.pop_front();
         }
-        self.kept.push_back((stamp, reading));
+        self.buffer.push_back((stamp, reading));
         Ok(())
     }
 
-    fn refuse(&mut self, why: HistoryError) -> Result<(), HistoryError> {
+    fn reject(&mut self, why: HistoryError) -> Result<(), HistoryError> {
         self.n_refused += 1;
         Err(why)
     }
 
-    fn around(&self, asked: Stamp) -> Result<Between<'_, T>, HistoryError> {
-        let (Some((oldest, _)), Some((newest, _))) = (self.kept.front(), self.kept.back()) else {
+    fn around(&self, asked: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
+        let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back()) else {
             return Err(HistoryError::NotYet { newest: None, asked });
         };
         if asked > *newest {
@@ -109,16 +109,16 @@ impl<T> Readings<T> {
         if asked < *oldest {
             return Err(HistoryError::TooOld { oldest: *oldest, asked });
         }
-        let after_ix = self.kept.partition_point(|(stamp, _)| *stamp < asked);
-        let reading = |ix: usize| self.kept.get(ix).map(|(stamp, reading)| (*stamp, reading));
+        let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < asked);
+        let reading = |ix: usize| self.buffer.get(ix).map(|(stamp, reading)| (*stamp, reading));
         let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
         let after = reading(after_ix).expect("the newest reading is not before the stamp");
         let before = after_ix.checked_sub(1).and_then(reading);
         if after.0 == asked {
             return Ok(match (before, reading(after_ix + 1)) {
-                (Some(before), _) if near(before.0, asked) => Between { before, after, frac: 1.0 },
-                (_, Some(next)) if near(asked, next.0) => Between { before: after, after: next, frac: 0.0 },
-                _ => Between { before: after, after, frac: 0.0 },
+                (Some(before), _) if near(before.0, asked) => Bracket { before, after, frac: 1.0 },
+                (_, Some(next)) if near(asked, next.0) => Bracket { before: after, after: next, frac: 0.0 },
+                _ => Bracket { before: after, after, frac: 0.0 },
             });
         }
         let before = before.expect("the oldest reading is not after the stamp");
@@ -126,15 +126,15 @@ impl<T> Readings<T> {
             return Err(HistoryError::Gap { before: before.0, after: after.0, max_gap: self.max_gap });
         }
         let frac = asked.secs_since(before.0) / after.0.secs_since(before.0);
-        Ok(Between { before, after, frac })
+        Ok(Bracket { before, after, frac })
     }
 
     fn newest(&self) -> Option<Stamp> {
-        self.kept.back().map(|(stamp, _)| *stamp)
+        self.buffer.back().map(|(stamp, _)| *stamp)
     }
 
     fn oldest(&self) -> Option<Stamp> {
-        self.kept.front().map(|(stamp, _)| *stamp)
+        self.buffer.front().map(|(stamp, _)| *stamp)
     }
 }
 
@@ -154,13 +154,13 @@ impl JointHistory {
     pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
         let numbers = || state.position.iter().chain(&state.velocity).chain(&state.effort);
         if !numbers().all(|number| number.is_finite()) {
-            return self.readings.refuse(HistoryError::NotFinite);
+            return self.readings.reject(HistoryError::NotFinite);
         }
-        if let Some((_, last)) = self.readings.kept.back()
+        if let Some((_, last)) = self.readings.buffer.back()
             && last.position.len() != state.position.len()
         {
             let expected = last.position.len();
-            return self.readings.refuse(HistoryError::JointCount { got: state.position.len(), expected });
+            return self.readings.reject(HistoryError::JointCount { got: state.position.len(), expected });
         }
         self.readings.push(state.stamp, state)
     }
@@ -171,21 +171,22 @@ impl JointHistory {
     /// velocities are the slope of that curve, efforts lie on a line. A stamp that meets a reading gives that reading, with
     /// the slope to a neighbour where it tells no velocities.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
-        let Between { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
+        let Bracket { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
         let span_secs = after.secs_since(before);
         let n_joints = a.position.len();
-        let told = |state: &JointState| state.velocity.len() == n_joints;
+        let has_velocities = |state: &JointState| state.velocity.len() == n_joints;
         if frac == 0.0 || frac == 1.0 {
-            let mut met = if frac == 0.0 { a.clone() } else { b.clone() };
-            if !told(&met) && before < after {
-                met.velocity = a.position.iter().zip(&b.position).map(|(from, to)| (to - from) / span_secs).collect();
+            let mut at_reading = if frac == 0.0 { a.clone() } else { b.clone() };
+            if !has_velocities(&at_reading) && before < after {
+                at_reading.velocity =
+                    a.position.iter().zip(&b.position).map(|(from, to)| (to - from) / span_secs).collect();
             }
-            return Ok(met);
+            return Ok(at_reading);
         }
-        let smooth = told(a) && told(b);
+        let is_cubic = has_velocities(a) && has_velocities(b);
         let curve = |joint: usize| {
             let (from, to) = (a.position[joint], b.position[joint]);
-            match smooth {
+            match is_cubic {
                 true => hermite([from, to], [a.velocity[joint], b.velocity[joint]], span_secs, frac),
                 false => (from + (to - from) * frac, (to - from) / span_secs),
             }
@@ -212,7 +213,7 @@ impl JointHistory {
 
     /// Forgets all readings, for a device whose clock started again.
     pub fn clear(&mut self) {
-        self.readings.kept.clear();
+        self.readings.buffer.clear();
     }
 }
 
@@ -241,14 +242,14 @@ impl PoseHistory {
     pub fn push(&mut self, stamp: Stamp, pose: Transform) -> Result<(), HistoryError> {
         let finite = transform::to_rows(&pose).iter().all(|number| number.is_finite());
         if !finite {
-            return self.readings.refuse(HistoryError::NotFinite);
+            return self.readings.reject(HistoryError::NotFinite);
         }
         self.readings.push(stamp, pose)
     }
 
     /// The pose at a stamp, by [`transform::interpolate`].
     pub fn at(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
-        let Between { before: (_, a), after: (_, b), frac } = self.readings.around(stamp)?;
+        let Bracket { before: (_, a), after: (_, b), frac } = self.readings.around(stamp)?;
         Ok(match frac {
             0.0 => *a,
             1.0 => *b,
@@ -259,7 +260,7 @@ impl PoseHistory {
     /// The pose at a stamp and the body's velocity there: the constant one between the neighbouring poses, in the body's axes
     /// at the stamp; zero where a pose has no neighbour near enough.
     pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
-        let Between { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
+        let Bracket { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
         let span_secs = after.secs_since(before);
         if span_secs <= 0.0 {
@@ -287,7 +288,7 @@ impl PoseHistory {
 
     /// Forgets all poses, for a source whose clock started again.
     pub fn clear(&mut self) {
-        self.readings.kept.clear();
+        self.readings.buffer.clear();
     }
 }
 
@@ -314,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cubic_motion_is_followed_exactly_when_velocities_are_told() {
+    fn cubic_motion_with_velocities_is_exact() {
         let motion =
             |secs: f64| (1.0 + secs - 3.0 * secs * secs + 20.0 * secs.powi(3), 1.0 - 6.0 * secs + 60.0 * secs * secs);
         let readings = (0..10).map(|ix| f64::from(ix) * 0.02).map(|secs| {
@@ -326,31 +327,31 @@ mod tests {
             let (position, velocity) = motion(secs);
             let at = history.at(Stamp::from_secs(secs)).unwrap();
             assert_eq!(at.stamp, Stamp::from_secs(secs));
-            for (got, wanted) in at.position.iter().zip([position, -2.0 * position]) {
-                assert!((got - wanted).abs() < 1e-12, "{secs}: {got} {wanted}");
+            for (got, expected_position) in at.position.iter().zip([position, -2.0 * position]) {
+                assert!((got - expected_position).abs() < 1e-12, "{secs}: {got} {expected_position}");
             }
             assert!((at.velocity[1] + 2.0 * velocity).abs() < 1e-11, "{secs}"); // Rounding over the 20 ms between readings.
         }
     }
 
     #[test]
-    fn without_velocities_the_way_is_a_line_and_its_slope_is_told() {
+    fn without_velocities_interpolation_is_linear() {
         let history = history([state(1.0, 0.5, None), state(1.02, 0.7, None)]);
         let at = history.at(Stamp::from_secs(1.005)).unwrap();
         assert!((at.position[0] - 0.55).abs() < 1e-12 && (at.position[1] + 1.1).abs() < 1e-12);
         assert!((at.velocity[0] - 10.0).abs() < 1e-9);
         assert!((at.effort[0] - 5.5).abs() < 1e-12);
         for (secs, position) in [(1.0, 0.5), (1.02, 0.7)] {
-            let met = history.at(Stamp::from_secs(secs)).unwrap();
-            assert!((met.velocity[0] - 10.0).abs() < 1e-9);
-            assert_eq!(JointState { velocity: vec![], ..met }, state(secs, position, None));
+            let at_reading = history.at(Stamp::from_secs(secs)).unwrap();
+            assert!((at_reading.velocity[0] - 10.0).abs() < 1e-9);
+            assert_eq!(JointState { velocity: vec![], ..at_reading }, state(secs, position, None));
         }
         let alone = self::history([state(1.0, 0.5, None)]);
         assert_eq!(alone.at(Stamp::from_secs(1.0)).unwrap(), state(1.0, 0.5, None));
     }
 
     #[test]
-    fn nothing_is_told_beyond_the_readings_and_the_reasons_differ() {
+    fn no_extrapolation_and_specific_errors() {
         let empty = JointHistory::new(MAX_GAP, 3);
         assert!(matches!(empty.at(Stamp(0)), Err(HistoryError::NotYet { newest: None, .. })));
         let mut history = JointHistory::new(MAX_GAP, 3);
@@ -373,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn readings_out_of_order_or_broken_are_dropped_and_counted() {
+    fn invalid_readings_are_dropped_and_counted() {
         let mut history = history([state(1.0, 0.5, None), state(1.01, 0.6, None)]);
         let late = history.push(state(1.005, 9.0, None));
         assert!(matches!(late, Err(HistoryError::OutOfOrder { .. })));
@@ -389,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_follow_the_same_rules() {
+    fn pose_history_follows_the_same_rules() {
         let pose = |x: f64| Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::new(0.0, 0.0, x));
         let mut history = PoseHistory::new(MAX_GAP, 10);
         history.push(Stamp::from_secs(1.0), pose(0.0)).unwrap();

@@ -20,7 +20,7 @@ const CONVERGED: f64 = 1e-15;
 /// Brown 1966 and Conrady 1919, in OpenCV's form; none beyond the radius where the radial part turns back.
 pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
     let distorted = brown_conrady_unchecked(k, plane);
-    let monotonic = positive_on(&radial_slope(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
+    let monotonic = positive_on(&radial_derivative(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
     monotonic.then_some(distorted)
 }
 
@@ -44,12 +44,12 @@ fn brown_conrady_unchecked(&[k1, k2, p1, p2, k3]: &[f64; 5], plane: Vector2<f64>
 }
 
 /// Slope of `r (1 + k1 r2 + k2 r4 + k3 r6)` by r, as a polynomial in r2.
-fn radial_slope(&[k1, k2, _, _, k3]: &[f64; 5]) -> [f64; 5] {
+fn radial_derivative(&[k1, k2, _, _, k3]: &[f64; 5]) -> [f64; 5] {
     [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0]
 }
 
 /// The point that [`brown_conrady`] puts at `distorted`.
-pub(crate) fn undo_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+pub(crate) fn undistort_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
     if length == 0.0 && k[2] == 0.0 && k[3] == 0.0 {
@@ -57,7 +57,7 @@ pub(crate) fn undo_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Optio
     }
     // Without the tangential part one dimension suffices; with it, that answer starts Newton's method in the plane.
     let radial = [1.0, k[0], k[1], k[4], 0.0];
-    let mut plane = match undo_odd_polynomial(&radial, &radial_slope(k), length, f64::INFINITY) {
+    let mut plane = match solve_odd_polynomial(&radial, &radial_derivative(k), length, f64::INFINITY) {
         Some(radius) if length > 0.0 => distorted * (radius / length),
         Some(_) => distorted,
         // Just outside the radial limit the tangential part may still bring the point in.
@@ -82,12 +82,12 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     let radius = plane.norm();
     let angle = radius.atan();
     let angle2 = angle * angle;
-    if !positive_on(&angle_slope(k), angle2) {
+    if !positive_on(&angle_derivative(k), angle2) {
         return None;
     }
     let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
     let length = angle * series;
-    let length_by_radius = evaluate(&angle_slope(k), angle2) / (1.0 + radius * radius);
+    let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
     // length / radius and its slope over radius; near the axis both quotients lose all digits, and the map is the identity
     // up to the third order.
     const NEAR_AXIS: f64 = 1e-6;
@@ -101,31 +101,31 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
 }
 
 /// Slope of `angle (1 + k1 angle2 + ...)` by the angle, as a polynomial in angle2.
-fn angle_slope(&[k1, k2, k3, k4]: &[f64; 4]) -> [f64; 5] {
+fn angle_derivative(&[k1, k2, k3, k4]: &[f64; 4]) -> [f64; 5] {
     [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]
 }
 
 /// The point that [`kannala_brandt`] puts at `distorted`; none at 90 degrees from the axis and more.
-pub(crate) fn undo_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
+pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
     let length = distorted.norm();
     if length == 0.0 {
         return Some(distorted);
     }
     let series = [1.0, k[0], k[1], k[2], k[3]];
-    let angle = undo_odd_polynomial(&series, &angle_slope(k), length, std::f64::consts::FRAC_PI_2)?;
+    let angle = solve_odd_polynomial(&series, &angle_derivative(k), length, std::f64::consts::FRAC_PI_2)?;
     (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
 }
 
 /// The smallest `x` from 0 to `limit` with `x p(x²) = target`, where the slope is positive all the way from 0 to it.
 ///
 /// Newton's method inside a bracket that every step narrows.
-fn undo_odd_polynomial(p: &[f64; 5], slope: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
+fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
     const MAX_STEPS: usize = 200; // Bisection alone needs about 60 from any bracket.
     let value = |x: f64| x * evaluate(p, x * x) - target;
     // First a bracket: x from `low`, where the value is below, to `high`, where it is above or the slope has turned.
     let (mut low, mut high) = (0.0, target.min(limit));
-    let rising_to = |x: f64| positive_on(slope, x * x);
-    while rising_to(high) && value(high) < 0.0 {
+    let is_rising_to = |x: f64| positive_on(derivative, x * x);
+    while is_rising_to(high) && value(high) < 0.0 {
         if high >= limit || high > f64::MAX.sqrt() * 0.25 {
             return None;
         }
@@ -135,14 +135,14 @@ fn undo_odd_polynomial(p: &[f64; 5], slope: &[f64; 5], target: f64, limit: f64) 
     // Now narrow it.
     let mut x = 0.5 * (low + high);
     for _ in 0..MAX_STEPS {
-        let rising = rising_to(x);
+        let rising = is_rising_to(x);
         if rising && value(x) < 0.0 {
             low = x;
         } else {
             high = x;
         }
         // Beyond the turn Newton's method could settle on another root.
-        let newton = x - value(x) / evaluate(slope, x * x);
+        let newton = x - value(x) / evaluate(derivative, x * x);
         let next = if rising && newton > low && newton < high { newton } else { 0.5 * (low + high) };
         let step = (next - x).abs();
         x = next;
@@ -151,7 +151,7 @@ fn undo_odd_polynomial(p: &[f64; 5], slope: &[f64; 5], target: f64, limit: f64) 
         }
     }
     const CLOSE: f64 = 1e-12;
-    (rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
+    (is_rising_to(x) && value(x).abs() <= CLOSE * target.max(1.0)).then_some(x)
 }
 
 fn evaluate(p: &[f64; 5], s: f64) -> f64 {
@@ -201,7 +201,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn positive_polynomials_are_told_from_those_that_dip() {
+    fn positive_polynomials_are_recognized() {
         // (s - 1)² + dip has its minimum, dip, at 1.
         let parabola = |dip: f64| [1.0 + dip, -2.0, 1.0, 0.0, 0.0];
         assert!(positive_on(&parabola(1e-3), 5.0));
@@ -218,9 +218,9 @@ mod tests {
     }
 
     #[test]
-    fn strong_lenses_are_undone_up_to_their_limit() {
+    fn undistortion_inverts_strong_lenses() {
         for k in [[-0.3, 0.1, 0.0, 0.0, 0.0], [-0.4, 0.0, 0.003, -0.002, 0.0], [0.5, -0.9, 0.0, 0.0, 0.3], [0.9; 5]] {
-            let mut n_seen = 0;
+            let mut n_checked = 0;
             for step in 0..400 {
                 let radius = f64::from(step) * 0.005;
                 let plane = Vector2::new(radius * 0.6, radius * -0.8);
@@ -229,11 +229,11 @@ mod tests {
                 if distorted.jacobian.determinant() < 1e-3 {
                     continue;
                 }
-                n_seen += 1;
-                let back = undo_brown_conrady(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
+                n_checked += 1;
+                let back = undistort_brown_conrady(&k, distorted.value).unwrap_or_else(|| panic!("{k:?} at {radius}"));
                 assert!((back - plane).norm() < 1e-11, "{k:?} at {radius}: off by {:e}", (back - plane).norm());
             }
-            assert!(n_seen > 100, "{k:?}: only {n_seen} points inside the limit");
+            assert!(n_checked > 100, "{k:?}: only {n_checked} points inside the limit");
         }
     }
 }

@@ -32,7 +32,7 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
         return Err(Error::TransformNotFinite { row: at / 4, column: at % 4, value: rows[at] });
     }
     let last = [rows[12], rows[13], rows[14], rows[15]];
-    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(got, wanted)| (got - wanted).abs() > RIGID_TOLERANCE) {
+    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(got, expected)| (got - expected).abs() > RIGID_TOLERANCE) {
         return Err(Error::LastRow { row: last });
     }
     let given = Matrix3::from_fn(|row, column| rows[4 * row + column]);
@@ -70,17 +70,17 @@ pub fn is_finite(transform: &Transform) -> bool {
 pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     let translation = a.translation.vector.lerp(&b.translation.vector, frac);
     // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter way.
-    let turn = (a.rotation.inverse() * b.rotation).scaled_axis();
-    Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(turn * frac))
+    let rotation_vector = (a.rotation.inverse() * b.rotation).scaled_axis();
+    Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(rotation_vector * frac))
 }
 
 /// Motion of a frame that keeps `twist` for `secs`: `world_from_frame` afterwards is the one before times this.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
 pub fn exp(twist: &Twist, secs: f64) -> Transform {
-    let turn = twist.angular_rad_s * secs;
-    let shift = twist.linear_m_s * secs;
-    let angle = turn.norm();
+    let rotation_vector = twist.angular_rad_s * secs;
+    let translation_part = twist.linear_m_s * secs;
+    let angle = rotation_vector.norm();
     // (1 - cos a) / a² and (a - sin a) / a³.
     let (first, second) = if angle < SMALL_ANGLE_RAD {
         (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
@@ -88,15 +88,15 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
         let half = (0.5 * angle).sin() / angle;
         (2.0 * half * half, (angle - angle.sin()) / angle.powi(3))
     };
-    let once = turn.cross(&shift);
-    let translation = shift + once * first + turn.cross(&once) * second;
-    Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(turn))
+    let first_cross = rotation_vector.cross(&translation_part);
+    let translation = translation_part + first_cross * first + rotation_vector.cross(&first_cross) * second;
+    Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(rotation_vector))
 }
 
 /// The constant twist that makes the motion `transform` in `secs`; the inverse of [`exp`] for turns below half a circle.
 pub fn log(transform: &Transform, secs: f64) -> Twist {
-    let turn = transform.rotation.scaled_axis();
-    let angle = turn.norm();
+    let rotation_vector = transform.rotation.scaled_axis();
+    let angle = rotation_vector.norm();
     // (1 - (a / 2) cot(a / 2)) / a².
     let second = if angle < SMALL_ANGLE_RAD {
         1.0 / 12.0 + angle * angle / 720.0
@@ -104,9 +104,9 @@ pub fn log(transform: &Transform, secs: f64) -> Twist {
         (1.0 - 0.5 * angle / (0.5 * angle).tan()) / (angle * angle)
     };
     let translation = transform.translation.vector;
-    let once = turn.cross(&translation);
-    let shift = translation - once * 0.5 + turn.cross(&once) * second;
-    Twist { linear_m_s: shift / secs, angular_rad_s: turn / secs }
+    let first_cross = rotation_vector.cross(&translation);
+    let translation_part = translation - first_cross * 0.5 + rotation_vector.cross(&first_cross) * second;
+    Twist { linear_m_s: translation_part / secs, angular_rad_s: rotation_vector / secs }
 }
 
 impl Twist {
@@ -135,8 +135,8 @@ mod tests {
 
     const CLOSE: f64 = 1e-12; // Rounding of a few products of numbers near 1.
 
-    fn pose(x: f64, turn: [f64; 3]) -> Transform {
-        Transform::new(Vector3::new(x, -0.4, 1.3), turn.into())
+    fn pose(x: f64, rotation_vector: [f64; 3]) -> Transform {
+        Transform::new(Vector3::new(x, -0.4, 1.3), rotation_vector.into())
     }
 
     fn distance(a: &Transform, b: &Transform) -> f64 {
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_come_back_and_are_row_major() {
+    fn rows_round_trip_and_are_row_major() {
         let a = pose(0.7, [0.3, -1.2, 2.0]);
         let rows = to_rows(&a);
         assert_eq!(rows[3], 0.7);
@@ -155,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn rounded_rotations_become_rotations() {
+    fn rounded_rotations_are_orthonormalized() {
         let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0])).map(|value| (value * 1e4).round() / 1e4);
         let read = from_rows(&rows).unwrap();
         let matrix = read.rotation.to_rotation_matrix().into_inner();
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_rigid_is_refused() {
+    fn non_rigid_matrices_are_rejected() {
         let rows = to_rows(&pose(0.7, [0.3, -1.2, 2.0]));
         let with = |at: usize, value: f64| {
             let mut changed = rows;
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn interpolation_meets_both_ends_and_goes_the_shorter_way() {
+    fn interpolation_hits_both_ends_and_is_shortest() {
         let a = pose(0.0, [0.0, 0.0, 0.0]);
         let b = pose(1.0, [0.0, 0.0, 1.0]);
         assert!(distance(&interpolate(&a, &b, 0.0), &a) < CLOSE);
@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_matches_a_turn_about_a_point_and_log_undoes_it() {
+    fn exp_matches_rotation_about_point_and_log_inverts_it() {
         // A quarter circle of radius 2 about the point (0, 2, 0).
         let quarter = Twist { linear_m_s: Vector3::new(PI, 0.0, 0.0), angular_rad_s: Vector3::new(0.0, 0.0, 0.5 * PI) };
         let moved = exp(&quarter, 1.0);
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn an_attached_frame_keeps_the_same_motion() {
+    fn attached_frame_has_same_motion() {
         let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
         let this_from_other = pose(0.2, [0.5, 0.1, -0.9]);
         let moved = this_from_other.inverse() * exp(&twist, 0.7) * this_from_other;
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resting_point_moves_against_the_frame() {
+    fn resting_point_moves_against_the_frame() {
         const STEP_SECS: f64 = 1e-6;
         let twist = Twist { linear_m_s: Vector3::new(0.3, -0.2, 0.5), angular_rad_s: Vector3::new(1.0, 0.4, -0.3) };
         let point_in_frame = Vector3::new(0.1, 0.5, 0.9);

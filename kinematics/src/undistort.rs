@@ -175,19 +175,19 @@ mod tests {
     const CUSHION: Lens = Lens::BrownConrady([0.2, 0.03, -0.001, 0.001, 0.0]);
 
     #[test]
-    fn a_pinhole_image_stays_as_it_is() {
+    fn pinhole_image_is_unchanged() {
         let rgb = noise(40 * 30 * 3);
         for intrinsics in [camera([40, 30], Lens::Pinhole), Intrinsics { rectified: true, ..camera([40, 30], CUSHION) }]
         {
             let out = Undistortion::new(&intrinsics).apply_rgb(&rgb).unwrap();
             assert!(out.chunks(4).zip(rgb.chunks(3)).all(|(out, rgb)| out[..3] == *rgb && out[3] == 255));
         }
-        let bent = Undistortion::new(&camera([40, 30], BARREL)).apply_rgb(&rgb).unwrap();
-        assert!(bent.chunks(4).zip(rgb.chunks(3)).any(|(out, rgb)| out[..3] != *rgb));
+        let distorted = Undistortion::new(&camera([40, 30], BARREL)).apply_rgb(&rgb).unwrap();
+        assert!(distorted.chunks(4).zip(rgb.chunks(3)).any(|(out, rgb)| out[..3] != *rgb));
     }
 
     #[test]
-    fn straight_lines_of_the_world_become_straight() {
+    fn straight_lines_become_straight() {
         // A ramp over the world's x / z as the lens shows it must become a ramp over columns.
         for lens in [BARREL, CUSHION, Lens::KannalaBrandt([0.02, -0.01, 0.0, 0.0])] {
             let intrinsics = camera([160, 120], lens);
@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_lens_did_not_see_is_transparent() {
+    fn pixels_outside_the_source_are_transparent() {
         let map = Undistortion::new(&camera([64, 48], CUSHION));
         assert!(map.n_outside() > 0);
         let out = map.apply_rgb(&vec![200; 64 * 48 * 3]).unwrap();
@@ -257,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_taken_from_the_pixel_that_holds_the_position() {
+    fn depth_uses_nearest_source_pixel() {
         let intrinsics = camera([33, 21], BARREL);
         let depth_m: Vec<f32> = (0..33 * 21).map(|at| at as f32).collect();
         let out = Undistortion::new(&intrinsics).apply_depth(&depth_m).unwrap();

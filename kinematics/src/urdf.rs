@@ -41,9 +41,9 @@ pub enum JointKind {
     /// Not at all.
     Fixed,
     /// About its axis, radians (revolute or continuous).
-    Turn,
+    Revolute,
     /// Along its axis, metres (prismatic).
-    Slide,
+    Prismatic,
     /// In a way that one number does not tell; the URDF's word for it.
     Unsupported(&'static str),
 }
@@ -122,18 +122,18 @@ impl Robot {
     pub fn path(&self, base_link: &str, tip_link: &str) -> Result<Vec<&Joint>, Error> {
         self.check_link(base_link)?;
         self.check_link(tip_link)?;
-        let mut upwards = Vec::new();
+        let mut joints_upwards = Vec::new();
         let mut link = tip_link;
         while link != base_link {
             let Some(&above) = self.joint_above.get(link) else {
-                let ancestors = upwards.iter().map(|joint: &&Joint| joint.parent.clone()).collect();
+                let ancestors = joints_upwards.iter().map(|joint: &&Joint| joint.parent.clone()).collect();
                 return Err(Error::NotBelow { tip: tip_link.into(), base: base_link.into(), ancestors });
             };
-            upwards.push(&self.joints[above]);
+            joints_upwards.push(&self.joints[above]);
             link = &self.joints[above].parent;
         }
-        upwards.reverse();
-        Ok(upwards)
+        joints_upwards.reverse();
+        Ok(joints_upwards)
     }
 
     fn check_link(&self, link: &str) -> Result<(), Error> {
@@ -174,10 +174,10 @@ fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
             return Err(refused(what, value));
         }
     }
-    let moves = matches!(kind, JointKind::Turn | JointKind::Slide);
+    let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
     let axis = match Unit::try_new(Vector3::from(parsed.axis.xyz.0), f64::MIN_POSITIVE) {
         Some(axis) => axis,
-        None if !moves => Vector3::x_axis(),
+        None if !is_movable => Vector3::x_axis(),
         None => return Err(refused("axis", parsed.axis.xyz.0)),
     };
     let limits = limits(parsed);
@@ -185,7 +185,7 @@ fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
         return Err(refused("range (lower, upper)", [limits.lower, limits.upper, 0.0]));
     }
     let mimic = match &parsed.mimic {
-        Some(mimic) if moves => Some(Mimic {
+        Some(mimic) if is_movable => Some(Mimic {
             source: mimic.joint.clone(),
             multiplier: mimic.multiplier.unwrap_or(1.0),
             offset: mimic.offset.unwrap_or(0.0),
@@ -216,8 +216,8 @@ fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
 fn kind(joint_type: &urdf_rs::JointType) -> JointKind {
     match joint_type {
         urdf_rs::JointType::Fixed => JointKind::Fixed,
-        urdf_rs::JointType::Revolute | urdf_rs::JointType::Continuous => JointKind::Turn,
-        urdf_rs::JointType::Prismatic => JointKind::Slide,
+        urdf_rs::JointType::Revolute | urdf_rs::JointType::Continuous => JointKind::Revolute,
+        urdf_rs::JointType::Prismatic => JointKind::Prismatic,
         urdf_rs::JointType::Floating => JointKind::Unsupported("floating"),
         urdf_rs::JointType::Planar => JointKind::Unsupported("planar"),
         urdf_rs::JointType::Spherical => JointKind::Unsupported("spherical"),
@@ -227,14 +227,14 @@ fn kind(joint_type: &urdf_rs::JointType) -> JointKind {
 fn limits(parsed: &urdf_rs::Joint) -> JointLimits {
     let limit = &parsed.limit;
     // The parser gives zeros where the file has no <limit> at all.
-    let bounded = *limit != urdf_rs::JointLimit::default();
-    let ranged = bounded && parsed.joint_type != urdf_rs::JointType::Continuous;
+    let has_limit = *limit != urdf_rs::JointLimit::default();
+    let has_range = has_limit && parsed.joint_type != urdf_rs::JointType::Continuous;
     let or_infinite = |given: bool, value: f64| if given { value } else { f64::INFINITY };
     JointLimits {
-        lower: -or_infinite(ranged, -limit.lower),
-        upper: or_infinite(ranged, limit.upper),
-        velocity: or_infinite(bounded, limit.velocity),
-        effort: or_infinite(bounded, limit.effort),
+        lower: -or_infinite(has_range, -limit.lower),
+        upper: or_infinite(has_range, limit.upper),
+        velocity: or_infinite(has_limit, limit.velocity),
+        effort: or_infinite(has_limit, limit.effort),
     }
 }
 
@@ -279,38 +279,38 @@ mod tests {
         format!(r#"<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{rest}</joint>"#)
     }
 
-    fn sentence(result: Result<Robot, Error>) -> String {
+    fn error_message(result: Result<Robot, Error>) -> String {
         let message = result.expect_err("this URDF must be refused").to_string();
         assert!(!message.contains('\n'), "more than one line: {message}");
         message
     }
 
     #[test]
-    fn a_file_without_links_or_without_xml_is_refused_in_one_sentence() {
-        let empty = sentence(Robot::parse(r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"></robot>"#));
+    fn files_without_links_or_xml_are_rejected() {
+        let empty = error_message(Robot::parse(r#"<robot xmlns:xacro="http://wiki.ros.org/xacro"></robot>"#));
         assert_eq!(empty, r#"urdf: robot "" has no <link> (an export that failed or was never expanded from xacro?)"#);
-        assert!(sentence(Robot::parse("")).starts_with("urdf: cannot be read"));
-        assert!(sentence(Robot::parse("{}")).starts_with("urdf: cannot be read"));
-        assert!(sentence(Robot::parse(r#"<robot name="r"><link name="a">"#)).starts_with("urdf: cannot be read"));
+        assert!(error_message(Robot::parse("")).starts_with("urdf: cannot be read"));
+        assert!(error_message(Robot::parse("{}")).starts_with("urdf: cannot be read"));
+        assert!(error_message(Robot::parse(r#"<robot name="r"><link name="a">"#)).starts_with("urdf: cannot be read"));
     }
 
     #[test]
-    fn trees_that_are_no_trees_are_refused() {
+    fn malformed_trees_are_rejected() {
         let twice = joint_xml("j", "fixed", "a", "b", "");
-        assert_eq!(sentence(robot(&(twice.clone() + &twice))), r#"urdf: joint "j" is defined twice"#);
-        assert_eq!(sentence(robot(r#"<link name="a"/>"#)), r#"urdf: link "a" is defined twice"#);
+        assert_eq!(error_message(robot(&(twice.clone() + &twice))), r#"urdf: joint "j" is defined twice"#);
+        assert_eq!(error_message(robot(r#"<link name="a"/>"#)), r#"urdf: link "a" is defined twice"#);
         let two = twice.clone() + &joint_xml("k", "fixed", "c", "b", "");
-        assert_eq!(sentence(robot(&two)), r#"urdf: link "b" has two parents, through joints "j" and "k""#);
+        assert_eq!(error_message(robot(&two)), r#"urdf: link "b" has two parents, through joints "j" and "k""#);
         let cycle = joint_xml("j", "fixed", "b", "c", "") + &joint_xml("k", "fixed", "c", "b", "");
         assert!(matches!(robot(&cycle), Err(Error::Cycle { .. })));
-        let own = joint_xml("j", "fixed", "c", "c", "");
-        assert_eq!(sentence(robot(&own)), r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#);
+        let self_loop = joint_xml("j", "fixed", "c", "c", "");
+        assert_eq!(error_message(robot(&self_loop)), r#"urdf: link "c" is its own ancestor (the joints form a cycle)"#);
         let nowhere = joint_xml("j", "fixed", "a", "d", "");
-        assert_eq!(sentence(robot(&nowhere)), r#"urdf: joint "j" joins link "d", which is not defined"#);
+        assert_eq!(error_message(robot(&nowhere)), r#"urdf: joint "j" joins link "d", which is not defined"#);
     }
 
     #[test]
-    fn numbers_that_are_none_are_refused() {
+    fn invalid_numbers_are_rejected() {
         for rest in [
             r#"<origin xyz="0 nan 0"/>"#,
             r#"<origin rpy="0 0 inf"/>"#,
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn the_root_and_the_way_down_are_found() {
+    fn root_and_path_are_found() {
         let chain = joint_xml("j", "revolute", "b", "c", "") + &joint_xml("k", "fixed", "a", "b", "");
         let found = robot(&chain).unwrap();
         assert_eq!(found.root(), Ok("a"));
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn limits_are_infinite_where_the_file_sets_none() {
+    fn missing_limits_are_infinite() {
         let limit = r#"<limit lower="-1" upper="2" velocity="3" effort="4"/>"#;
         let read = |kind: &str, rest: &str| robot(&joint_xml("j", kind, "a", "b", rest)).unwrap().joints()[0].limits;
         let given = JointLimits { lower: -1.0, upper: 2.0, velocity: 3.0, effort: 4.0 };

@@ -30,43 +30,43 @@ fn words(value: &Value) -> Vec<String> {
 }
 
 #[test]
-fn poses_agree_with_the_independent_library() {
+fn poses_match_independent_library() {
     let Some(robots) = robots() else { return };
     let mut n_poses = 0;
-    let mut worst_of_all: f64 = 0.0;
+    let mut max_difference: f64 = 0.0;
     for entry in robots.read_dir().unwrap() {
         let path = entry.unwrap().path();
         if !path.file_name().unwrap().to_str().unwrap().starts_with("fk_") {
             continue;
         }
-        let oracle: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
-        let urdf = std::fs::read_to_string(robots.join(oracle["urdf"].as_str().unwrap())).unwrap();
+        let expected_poses: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+        let urdf = std::fs::read_to_string(robots.join(expected_poses["urdf"].as_str().unwrap())).unwrap();
         let robot = Robot::parse(&urdf).unwrap();
-        let root = oracle["root"].as_str().unwrap();
+        let root = expected_poses["root"].as_str().unwrap();
         assert_eq!(robot.root().unwrap(), root);
-        let names = words(&oracle["joint_names"]);
-        for frame in words(&oracle["frames"]) {
+        let names = words(&expected_poses["joint_names"]);
+        for frame in words(&expected_poses["frames"]) {
             let chain = Chain::new(&robot, root, &frame).unwrap();
             let order = chain.order_in(&names).unwrap();
-            let mut worst: f64 = 0.0;
-            for sample in oracle["samples"].as_array().unwrap() {
+            let mut max_frame_difference: f64 = 0.0;
+            for sample in expected_poses["samples"].as_array().unwrap() {
                 let all = numbers(&sample["q"]);
                 let q: Vec<f64> = order.iter().map(|&at| all[at]).collect();
                 let rows: Vec<f64> = sample["T"][&frame].as_array().unwrap().iter().flat_map(numbers).collect();
                 let pose = chain.forward(&q).unwrap().to_homogeneous();
-                worst = worst.max((pose - Matrix4::from_row_slice(&rows)).abs().max());
+                max_frame_difference = max_frame_difference.max((pose - Matrix4::from_row_slice(&rows)).abs().max());
                 n_poses += 1;
             }
-            eprintln!("{}: {frame}: largest difference {worst:.1e}", path.display());
-            worst_of_all = worst_of_all.max(worst);
+            eprintln!("{}: {frame}: largest difference {max_frame_difference:.1e}", path.display());
+            max_difference = max_difference.max(max_frame_difference);
         }
     }
     assert!(n_poses >= 1000, "only {n_poses} poses compared");
-    assert!(worst_of_all < CLOSE, "largest difference {worst_of_all:e}");
+    assert!(max_difference < CLOSE, "largest difference {max_difference:e}");
 }
 
 #[test]
-fn the_file_without_a_robot_is_refused_in_one_sentence() {
+fn file_without_robot_is_rejected() {
     let Some(robots) = robots() else { return };
     let urdf = std::fs::read_to_string(robots.join("invalid_ur3.urdf")).unwrap();
     let message = Chain::from_urdf(&urdf, "base_link", "tool0").unwrap_err().to_string();

@@ -17,7 +17,7 @@ const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
 /// What the joints did at one step.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Reading {
+pub(crate) struct JointReading {
     pub(crate) nanos: i64,
     pub(crate) position_rad: Joints,
     pub(crate) velocity_rad_s: Joints,
@@ -29,63 +29,65 @@ pub(crate) struct Arm {
     data: MjData<Arc<MjModel>>,
     follower: Follower,
     n_steps: i64,
-    recent: VecDeque<Reading>,
-    keep_nanos: i64,
+    readings: VecDeque<JointReading>,
+    history_duration_nanos: i64,
 }
 
 impl Arm {
-    /// Puts the arm at the scan's start, at rest. Readings are kept for `keep_nanos`.
-    pub(crate) fn new(model: Arc<MjModel>, follower: Follower, keep_nanos: i64) -> Result<Self, Error> {
+    /// Puts the arm at the scan's start, at rest. Readings are kept for `history_duration_nanos`.
+    pub(crate) fn new(model: Arc<MjModel>, follower: Follower, history_duration_nanos: i64) -> Result<Self, Error> {
         let mut data = MjData::new(model);
         if data.qpos().len() != N_JOINTS {
             return Err(Error::NJoints { got: data.qpos().len(), expected: N_JOINTS });
         }
         data.qpos_mut().copy_from_slice(follower.position_rad().as_slice());
         data.forward();
-        Ok(Self { data, follower, n_steps: 0, recent: VecDeque::new(), keep_nanos })
+        Ok(Self { data, follower, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
     }
 
     /// Reads the joints, then moves on by one step.
-    pub(crate) fn step(&mut self) -> Reading {
+    pub(crate) fn step(&mut self) -> JointReading {
         let position_rad = Joints::from_column_slice(self.data.qpos());
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
         let torque_nm = self.control(&position_rad, &velocity_rad_s);
-        let reading = Reading { nanos: self.n_steps * STEP_NANOS, position_rad, velocity_rad_s, torque_nm };
+        let reading = JointReading { nanos: self.n_steps * STEP_NANOS, position_rad, velocity_rad_s, torque_nm };
         self.data.qfrc_applied_mut().copy_from_slice(torque_nm.as_slice());
         self.data.step();
         self.n_steps += 1;
         self.follower.advance(self.n_steps as f64 * STEP_SECS, STEP_SECS);
-        self.recent.push_back(reading);
-        while self.recent.front().is_some_and(|first| first.nanos + self.keep_nanos < reading.nanos) {
-            self.recent.pop_front();
+        self.readings.push_back(reading);
+        while self.readings.front().is_some_and(|first| first.nanos + self.history_duration_nanos < reading.nanos) {
+            self.readings.pop_front();
         }
         reading
     }
 
     /// Springs and dampers around the scan's joint positions, on top of what holds the arm's weight.
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
-        let late = self.follower.position_rad() - position_rad;
-        let slow = self.follower.velocity_rad_s() - velocity_rad_s;
+        let position_error = self.follower.position_rad() - position_rad;
+        let velocity_error = self.follower.velocity_rad_s() - velocity_rad_s;
         let bias = self.data.qfrc_bias();
         Joints::from_fn(|ix, _| {
-            let torque =
-                bias[ix] + STIFFNESS[ix] * late[ix] + DAMPING[ix] * slow[ix] + self.follower.velocity_rad_s()[ix];
+            let torque = bias[ix]
+                + STIFFNESS[ix] * position_error[ix]
+                + DAMPING[ix] * velocity_error[ix]
+                + self.follower.velocity_rad_s()[ix];
             torque.clamp(-panda::MAX_TORQUE_NM[ix], panda::MAX_TORQUE_NM[ix])
         })
     }
 
     /// Joint positions at a time among the kept readings: a cubic through both neighbours and their velocities.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
-        let first = self.recent.front()?;
+        let first = self.readings.front()?;
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;
         if nanos < first.nanos {
             return None;
         }
-        let before = self.recent.get(ix)?;
+        let before = self.readings.get(ix)?;
         if nanos == before.nanos {
             return Some(before.position_rad);
         }
-        let after = self.recent.get(ix + 1)?;
+        let after = self.readings.get(ix + 1)?;
         let share = (nanos - before.nanos) as f64 / STEP_NANOS as f64;
         let (square, cube) = (share * share, share * share * share);
         Some(

@@ -10,11 +10,11 @@ use std::f64::consts::TAU;
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum BaseMotion {
     /// The base is the world's origin.
-    Still,
+    Fixed,
     /// A quadruped crabs round the origin, its front mostly turned inwards; the factor on its speed.
     Lap(f64),
     /// A first stand far off, then a second close by; the factor on the speed.
-    Stands(f64),
+    Stations(f64),
 }
 
 /// Seconds a lap at speed 1, and the laps that count as the whole walk.
@@ -28,11 +28,11 @@ const PITCH_RAD: f64 = 0.006;
 pub(crate) const BODY_Z_M: f64 = 0.52;
 
 /// When the base leaves its first stand and how long it walks to the second, seconds at speed 1.
-const LEAVES_SECS: f64 = 14.0;
-const WALKS_SECS: f64 = 5.0;
+const DEPARTURE_SECS: f64 = 14.0;
+const WALK_DURATION_SECS: f64 = 5.0;
 /// The stands: x, y and heading, metres and radians.
-const FAR_STAND: [f64; 3] = [0.0, 0.15, -0.06];
-const NEAR_STAND: [f64; 3] = [1.15, 0.0, 0.02];
+const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
+const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 
 /// Where the arm stands on the quadruped's back; `mount` in the URDFs.
 pub(crate) fn base_from_arm() -> Transform {
@@ -46,7 +46,7 @@ pub(crate) fn smooth(share: f64) -> f64 {
 }
 
 /// A sine with a mean: mean, amplitude, period in seconds, phase in turns.
-pub(crate) fn swing([mean, amplitude, period, phase]: [f64; 4], at: f64) -> f64 {
+pub(crate) fn oscillate([mean, amplitude, period, phase]: [f64; 4], at: f64) -> f64 {
     mean + amplitude * ((at / period + phase) * TAU).sin()
 }
 
@@ -54,32 +54,33 @@ impl BaseMotion {
     /// The motion of a scene's base.
     pub(crate) fn of(scene: Scene, speed: f64) -> Self {
         match scene {
-            Scene::StaticArm => Self::Still,
+            Scene::StaticArm => Self::Fixed,
             Scene::MobileBase => Self::Lap(speed),
-            Scene::MobileArm => Self::Stands(speed),
+            Scene::MobileArm => Self::Stations(speed),
         }
     }
 
     /// Share of the whole walk (one lap, or from the first stand to the last) that lies behind; goes on past 1.
-    pub(crate) fn walked_share(&self, secs: f64) -> f64 {
+    pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
-            Self::Still => 0.0,
+            Self::Fixed => 0.0,
             Self::Lap(speed) => lap_secs(secs, *speed) / LAP_SECS,
-            Self::Stands(speed) => smooth((secs * speed - LEAVES_SECS) / WALKS_SECS),
+            Self::Stations(speed) => smooth((secs * speed - DEPARTURE_SECS) / WALK_DURATION_SECS),
         }
     }
 
     /// True pose of the base.
     pub(crate) fn world_from_base(&self, secs: f64) -> Transform {
         match self {
-            Self::Still => Transform::identity(),
-            Self::Lap(speed) => on_lap(lap_secs(secs, *speed), secs * speed),
-            Self::Stands(_) => {
-                let share = self.walked_share(secs);
-                let [x, y, yaw] = std::array::from_fn(|ix| FAR_STAND[ix] + (NEAR_STAND[ix] - FAR_STAND[ix]) * share);
+            Self::Fixed => Transform::identity(),
+            Self::Lap(speed) => lap_pose(lap_secs(secs, *speed), secs * speed),
+            Self::Stations(_) => {
+                let share = self.walked_frac(secs);
+                let [x, y, yaw] =
+                    std::array::from_fn(|ix| FAR_STATION[ix] + (NEAR_STATION[ix] - FAR_STATION[ix]) * share);
                 // The gait fades out before the base stands.
-                let vigor = (4.0 * share * (1.0 - share)).clamp(0.0, 1.0);
-                gait(secs, vigor, [x, y, yaw])
+                let gait_amplitude = (4.0 * share * (1.0 - share)).clamp(0.0, 1.0);
+                gait(secs, gait_amplitude, [x, y, yaw])
             }
         }
     }
@@ -87,22 +88,22 @@ impl BaseMotion {
     /// When the base leaves its first stand and when it comes to its last, seconds; zero where it has none.
     pub(crate) fn walk_secs(&self) -> [f64; 2] {
         match self {
-            Self::Stands(speed) => [LEAVES_SECS / speed, (LEAVES_SECS + WALKS_SECS) / speed],
-            Self::Still | Self::Lap(_) => [0.0; 2],
+            Self::Stations(speed) => [DEPARTURE_SECS / speed, (DEPARTURE_SECS + WALK_DURATION_SECS) / speed],
+            Self::Fixed | Self::Lap(_) => [0.0; 2],
         }
     }
 
     /// Whether the base stands and the arm may scan: seconds since it came to stand, and at which stand.
-    pub(crate) fn standing(&self, secs: f64) -> Option<(usize, f64)> {
+    pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
-            Self::Still => Some((0, secs)),
+            Self::Fixed => Some((0, secs)),
             Self::Lap(_) => None,
-            Self::Stands(speed) => {
+            Self::Stations(speed) => {
                 let at = secs * speed;
-                if at < LEAVES_SECS {
+                if at < DEPARTURE_SECS {
                     Some((0, at))
                 } else {
-                    (at > LEAVES_SECS + WALKS_SECS).then_some((1, at - LEAVES_SECS - WALKS_SECS))
+                    (at > DEPARTURE_SECS + WALK_DURATION_SECS).then_some((1, at - DEPARTURE_SECS - WALK_DURATION_SECS))
                 }
             }
         }
@@ -112,31 +113,32 @@ impl BaseMotion {
 /// Progress along the laps in seconds at even speed: starts at rest, then quickens and slackens by a third.
 fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
-    const SWING: (f64, f64) = (0.35, 7.3);
+    const OSCILLATION: (f64, f64) = (0.35, 7.3);
     let at = secs * speed;
     let ramp = (at / START_SECS).clamp(0.0, 1.0);
     let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
     // Its slope starts at zero too, so the first step is soft.
-    started + SWING.0 * SWING.1 / TAU * (1.0 - (started * TAU / SWING.1).cos())
+    started + OSCILLATION.0 * OSCILLATION.1 / TAU * (1.0 - (started * TAU / OSCILLATION.1).cos())
 }
 
-fn on_lap(at: f64, gait_secs: f64) -> Transform {
+fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     let around = at / LAP_SECS * TAU + std::f64::consts::PI;
-    let radius_m = swing([2.25, 0.38, 23.0, 0.1], at);
+    let radius_m = oscillate([2.25, 0.38, 23.0, 0.1], at);
     // From looking at the pedestal to looking past it.
-    let aside_rad = swing([0.25, 0.55, 15.7, 0.0], at);
-    let position = [radius_m * around.cos(), radius_m * around.sin(), around + std::f64::consts::PI + aside_rad];
+    let heading_offset_rad = oscillate([0.25, 0.55, 15.7, 0.0], at);
+    let position =
+        [radius_m * around.cos(), radius_m * around.sin(), around + std::f64::consts::PI + heading_offset_rad];
     gait(gait_secs, smooth(at / 2.0), position)
 }
 
 /// The body on its legs at a place and heading, bouncing and swaying.
-fn gait(secs: f64, vigor: f64, [x, y, yaw]: [f64; 3]) -> Transform {
+fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     let step = secs * GAIT_HZ * TAU;
-    let bounce_m = BOUNCE_M * vigor * (2.0 * step).sin();
-    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
-        * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PITCH_RAD * vigor * (2.0 * step + 0.7).sin())
-        * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), ROLL_RAD * vigor * step.sin());
-    Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), turn)
+    let bounce_m = BOUNCE_M * gait_amplitude * (2.0 * step).sin();
+    let rotation_vector = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
+        * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), PITCH_RAD * gait_amplitude * (2.0 * step + 0.7).sin())
+        * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), ROLL_RAD * gait_amplitude * step.sin());
+    Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), rotation_vector)
 }
 
 /// What a SLAM system gets wrong: a random walk that goes on as long as the base walks.
@@ -151,39 +153,39 @@ pub(crate) struct Drift {
 /// Steps of the random walk over the whole walk.
 const N_STEPS: f64 = 64.0;
 /// Height, roll and pitch are kept by gravity and the floor: their errors relative to the others.
-const MINOR: f64 = 0.3;
+const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
 /// Names the stream of random numbers.
 const DRIFT: u64 = 0xd41f;
 
 impl Drift {
     /// `size_m` and `size_rad` are the root mean square of the error at the end of the whole walk.
     pub(crate) fn new(seed: u64, size_m: f64, size_rad: f64) -> Self {
-        let per_step = |size: f64, weights: [f64; 3]| {
+        let step_sigmas = |size: f64, weights: [f64; 3]| {
             let norm = weights.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
             weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
         };
         Self {
             random: Random::new(seed, &[DRIFT]),
-            step_m: per_step(size_m, [1.0, 1.0, MINOR]),
-            step_rad: per_step(size_rad, [MINOR, MINOR, 1.0]),
+            step_m: step_sigmas(size_m, [1.0, 1.0, CONSTRAINED_AXIS_FRAC]),
+            step_rad: step_sigmas(size_rad, [CONSTRAINED_AXIS_FRAC, CONSTRAINED_AXIS_FRAC, 1.0]),
         }
     }
 
     /// The pose that is told for a true pose after a share of the walk.
-    pub(crate) fn told(&self, world_from_base: &Transform, walked_share: f64) -> Transform {
-        let steps = walked_share * N_STEPS;
-        let (mut shift, mut turn) = (Vector3::zeros(), Vector3::zeros());
+    pub(crate) fn reported(&self, world_from_base: &Transform, walked_frac: f64) -> Transform {
+        let steps = walked_frac * N_STEPS;
+        let (mut translation_error, mut rotation_vector) = (Vector3::zeros(), Vector3::zeros());
         let mut step = 0_u64;
         // Sums from the start: a few hundred steps even after a long run, and no state that could go out of step.
         while (step as f64) < steps {
             let share = smooth(steps - step as f64);
             let [a, b] = [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
-            shift += Vector3::from_fn(|axis, _| self.step_m[axis] * a[axis]) * share;
-            turn += Vector3::from_fn(|axis, _| self.step_rad[axis] * b[axis]) * share;
+            translation_error += Vector3::from_fn(|axis, _| self.step_m[axis] * a[axis]) * share;
+            rotation_vector += Vector3::from_fn(|axis, _| self.step_rad[axis] * b[axis]) * share;
             step += 1;
         }
-        let rotation = UnitQuaternion::from_scaled_axis(turn) * world_from_base.rotation;
-        Transform::from_parts((world_from_base.translation.vector + shift).into(), rotation)
+        let rotation = UnitQuaternion::from_scaled_axis(rotation_vector) * world_from_base.rotation;
+        Transform::from_parts((world_from_base.translation.vector + translation_error).into(), rotation)
     }
 }
 
@@ -192,29 +194,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_drift_has_the_size_asked_for_and_starts_at_zero() {
+    fn drift_has_configured_size_and_starts_at_zero() {
         const TOLERANCE: f64 = 0.1; // Four standard errors of a root mean square over this many seeds.
         const N_SEEDS: u64 = 800;
-        for (walked_share, growth) in [(1.0, 1.0_f64), (0.25, 0.5), (4.0, 2.0)] {
+        for (walked_frac, growth) in [(1.0, 1.0_f64), (0.25, 0.5), (4.0, 2.0)] {
             let (mut squares_m, mut squares_rad) = (0.0, 0.0);
             for seed in 0..N_SEEDS {
                 let drift = Drift::new(seed, 0.02, 0.0175);
                 let truth = BaseMotion::Lap(1.0).world_from_base(17.0);
-                let told = drift.told(&truth, walked_share);
-                squares_m += (told.translation.vector - truth.translation.vector).norm_squared();
-                squares_rad += told.rotation.angle_to(&truth.rotation).powi(2);
-                assert_eq!(drift.told(&truth, 0.0), truth);
+                let reported = drift.reported(&truth, walked_frac);
+                squares_m += (reported.translation.vector - truth.translation.vector).norm_squared();
+                squares_rad += reported.rotation.angle_to(&truth.rotation).powi(2);
+                assert_eq!(drift.reported(&truth, 0.0), truth);
             }
             let [rms_m, rms_rad] = [squares_m, squares_rad].map(|squares| (squares / N_SEEDS as f64).sqrt());
-            assert!((rms_m / (0.02 * growth) - 1.0).abs() < TOLERANCE, "{rms_m} m after {walked_share}");
-            assert!((rms_rad / (0.0175 * growth) - 1.0).abs() < TOLERANCE, "{rms_rad} rad after {walked_share}");
+            assert!((rms_m / (0.02 * growth) - 1.0).abs() < TOLERANCE, "{rms_m} m after {walked_frac}");
+            assert!((rms_rad / (0.0175 * growth) - 1.0).abs() < TOLERANCE, "{rms_rad} rad after {walked_frac}");
         }
     }
 
     #[test]
-    fn the_base_walks_smoothly_and_rests_at_its_stands() {
+    fn base_walks_smoothly_and_rests_at_stations() {
         const STEP_SECS: f64 = 1e-3;
-        for (motion, fastest_m_s) in [(BaseMotion::Lap(1.0), 0.9), (BaseMotion::Stands(1.0), 0.6)] {
+        for (motion, fastest_m_s) in [(BaseMotion::Lap(1.0), 0.9), (BaseMotion::Stations(1.0), 0.6)] {
             let mut before = motion.world_from_base(0.0);
             let mut speed_before = 0.0;
             for step in 1..60_000 {
@@ -223,7 +225,7 @@ mod tests {
                 let speed = (pose.translation.vector - before.translation.vector).norm() / STEP_SECS;
                 assert!(speed < fastest_m_s, "{motion:?}: {speed} m/s at {secs} s");
                 assert!((speed - speed_before).abs() / STEP_SECS < 4.0, "{motion:?}: a jerk at {secs} s");
-                if motion.standing(secs).is_some() {
+                if motion.station_at(secs).is_some() {
                     assert!(speed < 1e-9, "{motion:?} moves at {secs} s while it stands");
                 }
                 (before, speed_before) = (pose, speed);

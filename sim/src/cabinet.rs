@@ -4,7 +4,7 @@
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
-use crate::light::Blockers;
+use crate::light::Occluders;
 use crate::mesh::{Mesh, WHOLE};
 use crate::objects::Object;
 use crate::texture::{self, Texture};
@@ -34,8 +34,8 @@ fn furniture() -> Furniture {
     let mut furniture = Furniture::new(2);
     furniture.shelf(&upright([1.75, 2.15, 0.0], -90.0));
     furniture.bench(&upright([-0.2, 2.0, 0.0], -90.0));
-    furniture.pile(&upright([1.9, -1.5, 0.0], 35.0), 3);
-    furniture.pile(&upright([2.05, 1.05, 0.0], 12.0), 2);
+    furniture.add_boxes(&upright([1.9, -1.5, 0.0], 35.0), 3);
+    furniture.add_boxes(&upright([2.05, 1.05, 0.0], 12.0), 2);
     furniture.bench(&upright([0.4, -2.0, 0.0], 90.0));
     for (y, z, half, ix) in [(-1.15, 1.5, [0.38, 0.5], 7), (1.05, 1.75, [0.4, 0.45], 2), (-1.95, 1.6, [0.3, 0.45], 14)]
     {
@@ -53,7 +53,7 @@ fn furniture() -> Furniture {
 fn equip(furniture: &mut Furniture) {
     let [x, y, z] = SCREEN_M;
     let box_pose = upright([x + BOX_HALF_M[0], y, z], 180.0);
-    furniture.thing(&box_pose, BOX_HALF_M, 12, 12);
+    furniture.add_item(&box_pose, BOX_HALF_M, 12, 12);
     let mut screen = Mesh::default();
     let at = Point3::new(x - 0.002, y, z);
     screen.rectangle(at, Vector3::y() * -0.125, Vector3::z() * 0.09, lab_texture::picture(9));
@@ -62,14 +62,14 @@ fn equip(furniture: &mut Furniture) {
     for breaker in 0..14 {
         let y = -0.40 + 0.058 * f64::from(breaker);
         let picture = [13, 14, 15, 10, 7][breaker as usize % 5];
-        furniture.thing(&upright([back - 0.05, y, 1.29], 180.0), [0.045, 0.025, 0.055], picture, 12);
+        furniture.add_item(&upright([back - 0.05, y, 1.29], 180.0), [0.045, 0.025, 0.055], picture, 12);
     }
     furniture.frame(&upright([back - 0.012, 0.0, 1.29], 0.0), [0.010, 0.46, 0.018]);
     furniture.frame(&upright([back - 0.035, 0.0, 1.16], 0.0), [0.033, 0.46, 0.02]);
-    furniture.thing(&upright([back - 0.06, 0.28, 0.62], 180.0), [0.055, 0.13, 0.10], 8, 12);
-    furniture.thing(&upright([back - 0.05, -0.12, 0.60], 180.0), [0.045, 0.16, 0.08], 11, 12);
+    furniture.add_item(&upright([back - 0.06, 0.28, 0.62], 180.0), [0.055, 0.13, 0.10], 8, 12);
+    furniture.add_item(&upright([back - 0.05, -0.12, 0.60], 180.0), [0.045, 0.16, 0.08], 11, 12);
     let [x, y, z] = SWITCH_M;
-    furniture.thing(&upright([x, y, z], 180.0), [0.03, 0.08, 0.10], 10, 10);
+    furniture.add_item(&upright([x, y, z], 180.0), [0.03, 0.08, 0.10], 10, 10);
 }
 
 /// The sheets of the cabinet, and its open door.
@@ -99,11 +99,11 @@ fn shell() -> (Mesh, Mesh) {
 /// A round bar between two points.
 fn bar(from: [f64; 3], to: [f64; 3], radius_m: f64) -> Mesh {
     let (from, to) = (Vector3::from(from), Vector3::from(to));
-    let turn = UnitQuaternion::rotation_between(&Vector3::z(), &(to - from)).unwrap_or_default();
+    let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &(to - from)).unwrap_or_default();
     let length_m = (to - from).norm();
     let profile = [[0.0005, 0.0], [radius_m, 0.0], [radius_m, length_m], [0.0005, length_m]];
     let mut mesh = Mesh::default();
-    mesh.append_at(Mesh::lathe(&profile, 20, WHOLE, false), &Transform::from_parts(Translation3::from(from), turn));
+    mesh.append_at(Mesh::lathe(&profile, 20, WHOLE, false), &Transform::from_parts(Translation3::from(from), rotation));
     mesh
 }
 
@@ -182,20 +182,20 @@ pub(crate) fn objects() -> Vec<Object> {
 /// The textures by name, light included.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     const AMBIENT_REACH_M: f64 = 0.3;
-    let mut blockers = Blockers::new(AMBIENT_REACH_M);
-    furniture().block(&mut blockers);
+    let mut occluders = Occluders::new(AMBIENT_REACH_M);
+    furniture().add_occluders(&mut occluders);
     let middle_x = FRONT_X_M + 0.5 * DEPTH_M;
     for side in [-1.0, 1.0] {
         let wall = upright([middle_x, side * (HALF_M - SHEET_M), CENTER_Z_M], 0.0);
-        blockers.add_box(wall, [0.5 * DEPTH_M, SHEET_M, HALF_M]);
+        occluders.add_box(wall, [0.5 * DEPTH_M, SHEET_M, HALF_M]);
         let lid = upright([middle_x, 0.0, CENTER_Z_M + side * (HALF_M - SHEET_M)], 0.0);
-        blockers.add_box(lid, [0.5 * DEPTH_M, HALF_M, SHEET_M]);
+        occluders.add_box(lid, [0.5 * DEPTH_M, HALF_M, SHEET_M]);
     }
     let [near, far] = ROOM_X_M;
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
         let point = Point3::new(near + (far - near) * u, (1.0 - 2.0 * v) * ROOM_HALF_Y_M, 0.0);
-        blockers.light_share(&point, &Vector3::z(), name)
+        occluders.light_share(&point, &Vector3::z(), name)
     });
     let mut plate = lab_texture::mounting_plate();
     plate.shade(WHOLE, 80, |u, v, name| {
@@ -204,7 +204,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
             (0.5 - u) * 2.0 * HALF_M,
             CENTER_Z_M + (1.0 - 2.0 * v) * HALF_M,
         );
-        blockers.light_share(&point, &-Vector3::x(), name)
+        occluders.light_share(&point, &-Vector3::x(), name)
     });
     vec![
         ("items", lab_texture::items()),

@@ -220,7 +220,7 @@ pub struct DepthConfig {
     /// Further surfaces have no depth, metres.
     pub max_m: f64,
     /// Metres per count of the delivered image.
-    pub metres_per_count: f64,
+    pub meters_per_count: f64,
 }
 
 /// A depth sensor beside the colour sensor.
@@ -234,7 +234,7 @@ pub struct DepthSensor {
 
 impl Default for DepthConfig {
     fn default() -> Self {
-        Self { sensor: None, noise_sigma_m: 0.0015, hole_frac: 0.02, min_m: 0.1, max_m: 6.0, metres_per_count: 1e-4 }
+        Self { sensor: None, noise_sigma_m: 0.0015, hole_frac: 0.02, min_m: 0.1, max_m: 6.0, meters_per_count: 1e-4 }
     }
 }
 
@@ -252,7 +252,7 @@ impl CameraConfig {
             },
             rate_hz: 15.0,
             parent: Parent::Flange,
-            parent_from_camera: wrist_mount(50.0),
+            parent_from_camera: wrist_extrinsics(50.0),
             sensor: SensorConfig::default(),
             depth: Some(DepthConfig::default()),
         }
@@ -271,7 +271,7 @@ impl CameraConfig {
         Self {
             intrinsics: pinhole([1280, 720], [905.3, 904.7], [648.2, 355.1]),
             rate_hz: 4.0,
-            parent_from_camera: wrist_mount(80.0),
+            parent_from_camera: wrist_extrinsics(80.0),
             depth: Some(DepthConfig {
                 sensor: Some(DepthSensor {
                     intrinsics: pinhole([640, 480], [461.2, 461.5], [324.6, 236.9]),
@@ -280,7 +280,7 @@ impl CameraConfig {
                 noise_sigma_m: 0.0025,
                 min_m: 0.15,
                 max_m: 2.6,
-                metres_per_count: 0.00025,
+                meters_per_count: 0.00025,
                 ..DepthConfig::default()
             }),
             ..Self::wrist(name)
@@ -291,7 +291,7 @@ impl CameraConfig {
 /// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted to look past it.
 ///
 /// The tilt lets the arm look at the scene from low elevations without reaching its joint limits.
-fn wrist_mount(tilt_degrees: f64) -> Transform {
+fn wrist_extrinsics(tilt_degrees: f64) -> Transform {
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), tilt_degrees.to_radians());
     Transform::from_parts(Translation3::new(0.06, 0.0, 0.045), quarter * tilt)
@@ -347,7 +347,7 @@ impl Config {
         }
         for (ix, camera) in self.cameras.iter().enumerate() {
             if self.cameras[..ix].iter().any(|other| other.name == camera.name) {
-                return Err(Error::SameName { camera: camera.name.clone() });
+                return Err(Error::DuplicateName { camera: camera.name.clone() });
             }
             camera.check()?;
             if camera.parent == Parent::Flange && !self.scene.has_arm() {
@@ -356,7 +356,7 @@ impl Config {
         }
         for (ix, scanner) in self.scanners.iter().enumerate() {
             if self.scanners[..ix].iter().any(|other| other.name == scanner.name) {
-                return Err(Error::SameName { camera: scanner.name.clone() });
+                return Err(Error::DuplicateName { camera: scanner.name.clone() });
             }
             scanner.check()?;
         }
@@ -419,7 +419,7 @@ impl CameraConfig {
             check(&self.name, "hole_frac", depth.hole_frac, 0.0, 0.9)?;
             check(&self.name, "depth min_m", depth.min_m, 0.0, 10.0)?;
             check(&self.name, "depth max_m", depth.max_m, depth.min_m, 100.0)?;
-            check(&self.name, "metres_per_count", depth.metres_per_count, 1e-6, 0.1)?;
+            check(&self.name, "meters_per_count", depth.meters_per_count, 1e-6, 0.1)?;
         }
         Ok(())
     }
@@ -449,7 +449,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_default_rig_is_valid_and_bad_numbers_are_named() {
+    fn default_config_is_valid_and_errors_name_the_key() {
         let mut config = Config::default();
         assert!(config.check().is_ok());
         config.cameras[0].sensor.readout_micros = f64::NAN;
@@ -457,6 +457,6 @@ mod tests {
         assert!(message.contains("readout_micros") && message.contains("wrist"), "{message}");
         config = Config::default();
         config.cameras.push(CameraConfig::wrist("wrist"));
-        assert!(matches!(config.check(), Err(Error::SameName { .. })));
+        assert!(matches!(config.check(), Err(Error::DuplicateName { .. })));
     }
 }

@@ -1,16 +1,16 @@
 //! Steps the rig and makes the samples, in the order in which devices would deliver them.
 
-use crate::arm::{Reading, STEP_NANOS};
+use crate::arm::{JointReading, STEP_NANOS};
 use crate::base::Drift;
 use crate::cabinet_tour::light_frac;
 use crate::config::{CameraConfig, Config, Parent, Scene, SensorConfig};
 use crate::lidar::{self, RayCaster};
 use crate::noise;
-use crate::optics::{Optics, Shift};
+use crate::optics::{Optics, RowMotion};
 use crate::panda::Joints;
 use crate::random::Random;
 use crate::render::{Pending, Renderer};
-use crate::robot::{Posture, Robot};
+use crate::robot::{Robot, RobotPose};
 use crate::{Error, render};
 use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, TruthImage};
 use kinematics::{JointState, Stamp, Transform};
@@ -49,7 +49,7 @@ pub(crate) struct Engine {
 
 /// What is delivered next.
 enum Slot {
-    Joints(Reading),
+    Joints(JointReading),
     Image(Exposure),
     /// A pose of the base, at a time in nanoseconds.
     Base(i64),
@@ -78,7 +78,7 @@ struct Exposure {
     n_skipped: u64,
     world_from_camera: Transform,
     /// Camera poses at other instants relative to `world_from_camera`, where the shutter makes a difference.
-    shifts: Vec<Shift>,
+    row_motions: Vec<RowMotion>,
     picture: Pending,
     depth_picture: Option<Pending>,
 }
@@ -90,7 +90,7 @@ const STAGGER_NANOS: i64 = 3_700_000;
 /// Streams of random numbers of one image.
 const COLOR_NOISE: u64 = 1;
 const DEPTH_NOISE: u64 = 2;
-const DROPS: u64 = 3;
+const DROP_STREAM: u64 = 3;
 /// Stream of random numbers of one scan.
 const SCANS: u64 = 4;
 
@@ -137,7 +137,7 @@ impl Camera {
     }
 
     /// From the stamp to the arrival; never before the joints are known up to the last row.
-    fn wait_nanos(&self) -> i64 {
+    fn delivery_delay_nanos(&self) -> i64 {
         self.half_span_nanos() + STEP_NANOS + nanos_from_secs(1e-3 * self.sensor.latency_millis)
     }
 
@@ -160,7 +160,7 @@ impl Camera {
         offsets
     }
 
-    fn world_from_camera(&self, robot: &Posture) -> Transform {
+    fn world_from_camera(&self, robot: &RobotPose) -> Transform {
         match self.config.parent {
             Parent::Flange => robot.world_from_flange() * self.config.parent_from_camera,
             Parent::Base => robot.world_from_base * self.config.parent_from_camera,
@@ -263,11 +263,11 @@ impl Engine {
                 Some(Slot::Joints(reading)) => {
                     return Ok(Some((reading.nanos, Sample::Joints(self.joint_state(&reading)))));
                 }
-                Some(Slot::Base(nanos)) => self.tell_base(nanos),
+                Some(Slot::Base(nanos)) => self.emit_base_pose(nanos),
                 Some(Slot::Scan(scanner_ix, scan_ix, nanos)) => self.scan(scanner_ix, scan_ix, nanos)?,
                 Some(Slot::Image(exposure)) => {
                     self.n_pending -= 1;
-                    self.develop(exposure)?;
+                    self.finish_image(exposure)?;
                 }
             }
         }
@@ -284,7 +284,7 @@ impl Engine {
         self.queue_base_and_scans(nanos);
         for camera_ix in 0..self.cameras.len() {
             while !self.has_ended
-                && self.cameras[camera_ix].stamp_nanos() + self.cameras[camera_ix].wait_nanos() <= nanos
+                && self.cameras[camera_ix].stamp_nanos() + self.cameras[camera_ix].delivery_delay_nanos() <= nanos
             {
                 self.expose(camera_ix)?;
             }
@@ -309,11 +309,11 @@ impl Engine {
     }
 
     /// Tells a pose of the base as its SLAM system sees it, and the truth.
-    fn tell_base(&mut self, nanos: i64) {
+    fn emit_base_pose(&mut self, nanos: i64) {
         let (stamp, secs) = (Stamp(self.start.0 + nanos), nanos as f64 * 1e-9);
         let truth = self.robot.motion().world_from_base(secs);
-        let told = self.drift.told(&truth, self.robot.motion().walked_share(secs));
-        self.ready.push_back((nanos, Sample::Base(BasePose { stamp, world_from_base: told })));
+        let reported = self.drift.reported(&truth, self.robot.motion().walked_frac(secs));
+        self.ready.push_back((nanos, Sample::Base(BasePose { stamp, world_from_base: reported })));
         if self.config.truth {
             self.ready.push_back((nanos, Sample::BaseTruth(BasePose { stamp, world_from_base: truth })));
         }
@@ -328,7 +328,7 @@ impl Engine {
         let motion = self.robot.motion();
         let random = Random::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
         let world_from_base = |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
-        let points = lidar::turn(rays, scanner, self.config.ideal, random, world_from_base)?;
+        let points = lidar::scan_revolution(rays, scanner, self.config.ideal, random, world_from_base)?;
         let stamp = Stamp(self.start.0 + nanos);
         let scan = RangeScan { scanner: scanner.name.as_str().into(), stamp, points: points.into() };
         self.ready.push_back((arrival_nanos, Sample::Range(scan)));
@@ -339,10 +339,10 @@ impl Engine {
     fn expose(&mut self, camera_ix: usize) -> Result<(), Error> {
         let camera = &mut self.cameras[camera_ix];
         let (image_ix, stamp_nanos) = (camera.n_exposed, camera.stamp_nanos());
-        let arrival_nanos = stamp_nanos + camera.wait_nanos();
+        let arrival_nanos = stamp_nanos + camera.delivery_delay_nanos();
         camera.n_exposed += 1;
-        let luck = camera.random(self.config.seed, image_ix, DROPS).unit(0);
-        if luck < camera.sensor.dropped_frac || arrival_nanos < self.skip_before_nanos {
+        let drop_sample = camera.random(self.config.seed, image_ix, DROP_STREAM).unit(0);
+        if drop_sample < camera.sensor.dropped_frac || arrival_nanos < self.skip_before_nanos {
             camera.n_skipped += 1;
             return Ok(());
         }
@@ -350,10 +350,10 @@ impl Engine {
         let robot = robot_at(stamp_nanos)?;
         let world_from_camera = camera.world_from_camera(&robot);
         let camera_from_world = world_from_camera.inverse();
-        let mut shifts = Vec::new();
+        let mut row_motions = Vec::new();
         for offset in camera.row_offsets_nanos() {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
-            shifts.push(Shift::new(&(camera_from_world * world_from_row)));
+            row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
         }
         // A camera on the robot sees nothing of it; leaving it out keeps its shadow off the scene as well.
         let robot = (camera.config.parent == Parent::World).then_some(robot);
@@ -375,7 +375,7 @@ impl Engine {
             arrival_nanos,
             n_skipped,
             world_from_camera,
-            shifts,
+            row_motions,
             picture,
             depth_picture,
         }));
@@ -388,7 +388,7 @@ impl Engine {
     }
 
     /// Waits for the drawn picture and turns it into what the camera delivers.
-    fn develop(&mut self, exposure: Exposure) -> Result<(), Error> {
+    fn finish_image(&mut self, exposure: Exposure) -> Result<(), Error> {
         let camera = &self.cameras[exposure.camera_ix];
         let picture = exposure.picture.wait()?;
         let (seed, image_ix) = (self.config.seed, exposure.image_ix);
@@ -405,38 +405,40 @@ impl Engine {
             exposure_secs: Some(1e-6 * camera.sensor.exposure_micros),
             n_skipped: exposure.n_skipped,
         };
-        let is_moving = !exposure.shifts.is_empty();
-        let sharp = if self.config.truth || !is_moving { camera.optics.sharp(&picture) } else { Vec::new() };
-        let moving = if is_moving { camera.optics.moving(&picture, &exposure.shifts) } else { Vec::new() };
-        let seen = if is_moving { &moving } else { &sharp };
+        let is_moving = !exposure.row_motions.is_empty();
+        let motion_free =
+            if self.config.truth || !is_moving { camera.optics.motion_free(&picture) } else { Vec::new() };
+        let motion_blurred =
+            if is_moving { camera.optics.motion_blurred(&picture, &exposure.row_motions) } else { Vec::new() };
+        let sensed = if is_moving { &motion_blurred } else { &motion_free };
         let is_noisy = camera.sensor.noise_sigma > 0.0;
         let data = if is_noisy {
-            noise::add_color_noise(seen, &camera.sensor, camera.random(seed, image_ix, COLOR_NOISE))
+            noise::add_color_noise(sensed, &camera.sensor, camera.random(seed, image_ix, COLOR_NOISE))
         } else {
-            noise::to_bytes(seen)
+            noise::to_bytes(sensed)
         };
-        let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, seen));
+        let psnr_ceiling = (is_noisy && self.config.truth).then(|| noise::psnr(&data, sensed));
         self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(PixelFormat::Rgb8, data))));
-        let own_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
+        let sensor_depth_m = match (&camera.depth_optics, exposure.depth_picture) {
             (Some(optics), Some(picture)) => Some(optics.depth_m(&picture.wait()?)),
             _ => None,
         };
-        let wants_depth =
-            (camera.config.depth.is_some() && own_depth_m.is_none()) || (self.config.truth && self.config.truth_depth);
-        let depth_m = if wants_depth { camera.optics.depth_m(&picture) } else { Vec::new() };
+        let needs_depth = (camera.config.depth.is_some() && sensor_depth_m.is_none())
+            || (self.config.truth && self.config.truth_depth);
+        let depth_m = if needs_depth { camera.optics.depth_m(&picture) } else { Vec::new() };
         if let Some(depth) = &camera.config.depth {
             let width = depth_px[0] as usize;
             let random = camera.random(seed, image_ix, DEPTH_NOISE);
-            let seen_m = own_depth_m.as_ref().unwrap_or(&depth_m);
-            let counts = noise::depth_counts(seen_m, width, depth, random, self.config.ideal);
+            let sensed_m = sensor_depth_m.as_ref().unwrap_or(&depth_m);
+            let counts = noise::depth_counts(sensed_m, width, depth, random, self.config.ideal);
             let data = counts.iter().flat_map(|count| count.to_le_bytes()).collect();
-            let format = PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count };
+            let format = PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count };
             self.ready.push_back((exposure.arrival_nanos, Sample::Image(image(format, data))));
         }
         if self.config.truth {
             let depth_m = if self.config.truth_depth { depth_m } else { Vec::new() };
             let truth = TruthImage {
-                image: image(PixelFormat::Rgb8, noise::to_bytes(&sharp)),
+                image: image(PixelFormat::Rgb8, noise::to_bytes(&motion_free)),
                 depth_m: depth_m.into(),
                 world_from_camera: exposure.world_from_camera,
                 psnr_ceiling,
@@ -446,7 +448,7 @@ impl Engine {
         Ok(())
     }
 
-    fn joint_state(&self, reading: &Reading) -> JointState {
+    fn joint_state(&self, reading: &JointReading) -> JointState {
         let ordered = |joints: &Joints| self.joint_ixs.iter().map(|ix| joints[*ix]).collect();
         JointState {
             stamp: Stamp(self.start.0 + reading.nanos),

@@ -45,7 +45,7 @@ pub enum Error {
     },
     /// Two cameras cannot be told apart.
     #[error("two cameras are named {camera:?}")]
-    SameName {
+    DuplicateName {
         /// The name.
         camera: String,
     },

@@ -1,7 +1,7 @@
 //! Boxes of all kinds put together to benches, shelves and clutter, and remembered for the shadows they throw.
 
 use crate::lab_texture::picture;
-use crate::light::Blockers;
+use crate::light::Occluders;
 use crate::mesh::{Mesh, TextureRect};
 use crate::random::Random;
 use kinematics::Transform;
@@ -22,8 +22,8 @@ pub(crate) struct Furniture {
 
 /// Standing upright at a place, turned about z.
 pub(crate) fn upright(at_m: [f64; 3], yaw_degrees: f64) -> Transform {
-    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_degrees.to_radians());
-    Transform::from_parts(Translation3::from(Vector3::from(at_m)), turn)
+    let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_degrees.to_radians());
+    Transform::from_parts(Translation3::from(Vector3::from(at_m)), yaw)
 }
 
 /// A light wooden bench: half length, half depth and height of its top, metres.
@@ -44,7 +44,7 @@ impl Furniture {
     }
 
     /// The next random number.
-    fn draw(&mut self, lower: f64, upper: f64) -> f64 {
+    fn draw_uniform(&mut self, lower: f64, upper: f64) -> f64 {
         self.n_drawn += 1;
         self.random.between(self.n_drawn, lower, upper)
     }
@@ -56,12 +56,12 @@ impl Furniture {
     }
 
     /// A box whose front (+x), back and sides show one picture and whose top another.
-    pub(crate) fn thing(&mut self, world_from_box: &Transform, half_m: [f64; 3], front: usize, top: usize) {
+    pub(crate) fn add_item(&mut self, world_from_box: &Transform, half_m: [f64; 3], front: usize, top: usize) {
         let (around, above) = (picture(front), picture(top));
-        self.boxed(world_from_box, half_m, &[around, around, around, around, above, above]);
+        self.add_textured_box(world_from_box, half_m, &[around, around, around, around, above, above]);
     }
 
-    fn boxed(&mut self, world_from_box: &Transform, half_m: [f64; 3], sides: &[TextureRect; 6]) {
+    fn add_textured_box(&mut self, world_from_box: &Transform, half_m: [f64; 3], sides: &[TextureRect; 6]) {
         self.things.append_at(Mesh::cuboid(half_m, sides), world_from_box);
         self.solids.push((*world_from_box, half_m));
     }
@@ -85,25 +85,25 @@ impl Furniture {
     pub(crate) fn bench(&mut self, world_from_bench: &Transform) {
         let [half_length, half_depth, top_m] = BENCH_M;
         let at = |x: f64, y: f64, z: f64| world_from_bench * Translation3::new(x, y, z);
-        self.thing(&at(0.0, 0.0, top_m), [half_depth, half_length, 0.025], 12, 2);
+        self.add_item(&at(0.0, 0.0, top_m), [half_depth, half_length, 0.025], 12, 2);
         for (x, y) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
             let leg = at(x * (half_depth - 0.05), y * (half_length - 0.05), 0.5 * top_m);
             self.frame(&leg, [0.025, 0.025, 0.5 * top_m - 0.025]);
         }
-        let drawer_y = self.draw(-0.5, 0.5);
-        self.thing(&at(-0.05, drawer_y, 0.36), [0.26, 0.22, 0.36], 11, 12);
+        let drawer_y = self.draw_uniform(-0.5, 0.5);
+        self.add_item(&at(-0.05, drawer_y, 0.36), [0.26, 0.22, 0.36], 11, 12);
         let mut y = -half_length + 0.05;
         loop {
-            let half = [self.draw(0.06, 0.2), self.draw(0.08, 0.2), self.draw(0.07, 0.24)];
+            let half = [self.draw_uniform(0.06, 0.2), self.draw_uniform(0.08, 0.2), self.draw_uniform(0.07, 0.24)];
             y += half[1];
             if y + half[1] > half_length {
                 break;
             }
             let front = self.draw_picture(&[0, 1, 7, 8, 9, 9, 11, 13, 14, 15]);
-            let (x, turn) = (self.draw(-0.15, 0.12), self.draw(-14.0, 14.0));
-            let pose = at(x, y, top_m + 0.025 + half[2]) * upright([0.0; 3], turn);
-            self.thing(&pose, half, front, 12);
-            y += half[1] + self.draw(0.03, 0.16);
+            let (x, yaw) = (self.draw_uniform(-0.15, 0.12), self.draw_uniform(-14.0, 14.0));
+            let pose = at(x, y, top_m + 0.025 + half[2]) * upright([0.0; 3], yaw);
+            self.add_item(&pose, half, front, 12);
+            y += half[1] + self.draw_uniform(0.03, 0.16);
         }
     }
 
@@ -112,49 +112,51 @@ impl Furniture {
         let [half_length, half_depth, height_m] = SHELF_M;
         let at = |x: f64, y: f64, z: f64| world_from_shelf * Translation3::new(x, y, z);
         for side in [-1.0, 1.0] {
-            self.thing(&at(0.0, side * half_length, 0.5 * height_m), [half_depth, 0.015, 0.5 * height_m], 3, 3);
+            self.add_item(&at(0.0, side * half_length, 0.5 * height_m), [half_depth, 0.015, 0.5 * height_m], 3, 3);
         }
         self.frame(&at(-half_depth, 0.0, 0.5 * height_m), [0.006, half_length, 0.5 * height_m]);
         for board in 0..5 {
             let z = 0.08 + 0.42 * f64::from(board);
-            self.thing(&at(0.0, 0.0, z), [half_depth, half_length, 0.013], 2, 2);
+            self.add_item(&at(0.0, 0.0, z), [half_depth, half_length, 0.013], 2, 2);
             if board == 4 {
                 break;
             }
             let mut y = -half_length + 0.03;
             loop {
-                let half = [self.draw(0.10, 0.19), self.draw(0.08, 0.26), self.draw(0.09, 0.185)];
+                let half =
+                    [self.draw_uniform(0.10, 0.19), self.draw_uniform(0.08, 0.26), self.draw_uniform(0.09, 0.185)];
                 y += half[1];
                 if y + half[1] > half_length - 0.02 {
                     break;
                 }
                 let front = self.draw_picture(&[0, 1, 4, 5, 6, 4, 5, 6, 10, 13, 14, 15]);
-                let x = half_depth - half[0] - self.draw(0.0, 0.05);
-                self.thing(&at(x, y, z + 0.013 + half[2]), half, front, 12);
-                y += half[1] + self.draw(0.005, 0.05);
+                let x = half_depth - half[0] - self.draw_uniform(0.0, 0.05);
+                self.add_item(&at(x, y, z + 0.013 + half[2]), half, front, 12);
+                y += half[1] + self.draw_uniform(0.005, 0.05);
             }
         }
     }
 
     /// A pile of crates and cartons.
-    pub(crate) fn pile(&mut self, world_from_pile: &Transform, n_boxes: usize) {
+    pub(crate) fn add_boxes(&mut self, world_from_boxes: &Transform, n_boxes: usize) {
         let mut z = 0.0;
         for _ in 0..n_boxes {
-            let half = [self.draw(0.2, 0.32), self.draw(0.22, 0.36), self.draw(0.14, 0.26)];
-            let (x, y, turn) = (self.draw(-0.06, 0.06), self.draw(-0.06, 0.06), self.draw(-20.0, 20.0));
+            let half = [self.draw_uniform(0.2, 0.32), self.draw_uniform(0.22, 0.36), self.draw_uniform(0.14, 0.26)];
+            let (x, y, yaw) =
+                (self.draw_uniform(-0.06, 0.06), self.draw_uniform(-0.06, 0.06), self.draw_uniform(-20.0, 20.0));
             let front = self.draw_picture(&[0, 1, 2, 3, 10, 11]);
-            let pose = world_from_pile * upright([x, y, z + half[2]], turn);
-            self.thing(&pose, half, front, front);
+            let pose = world_from_boxes * upright([x, y, z + half[2]], yaw);
+            self.add_item(&pose, half, front, front);
             z += 2.0 * half[2];
         }
     }
 
     /// Every larger solid, to stand in the light's way; clutter on boards throws no shadow that can be seen on the floor.
-    pub(crate) fn block(&self, blockers: &mut Blockers) {
-        const LEAST_HALF_M: f64 = 0.22;
-        let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= LEAST_HALF_M);
+    pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
+        const MIN_HALF_M: f64 = 0.22;
+        let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);
         for (world_from_box, half_m) in self.solids.iter().filter(|(_, half_m)| large(half_m)) {
-            blockers.add_box(*world_from_box, *half_m);
+            occluders.add_box(*world_from_box, *half_m);
         }
     }
 }

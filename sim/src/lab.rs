@@ -3,7 +3,7 @@
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
-use crate::light::Blockers;
+use crate::light::Occluders;
 use crate::mesh::{Mesh, WHOLE};
 use crate::objects::{Object, shade_box};
 use crate::texture::{self, Texture};
@@ -29,7 +29,7 @@ const BENCHES: [[f64; 3]; 7] = [
 ];
 const SHELVES: [[f64; 3]; 6] =
     [[-7.2, -2.6, 0.0], [-7.2, 0.2, 0.0], [-7.2, 2.9, 0.0], [7.2, 1.6, 180.0], [7.2, -1.9, 180.0], [2.8, 4.7, -90.0]];
-const PILES: [([f64; 3], usize); 8] = [
+const BOX_STACKS: [([f64; 3], usize); 8] = [
     ([4.2, 2.3, 20.0], 3),
     ([4.9, 1.5, -30.0], 2),
     ([-4.4, 2.2, 40.0], 3),
@@ -79,8 +79,8 @@ fn furniture() -> Furniture {
     for [x, y, degrees] in SHELVES {
         furniture.shelf(&upright([x, y, 0.0], degrees));
     }
-    for ([x, y, degrees], n_boxes) in PILES {
-        furniture.pile(&upright([x, y, 0.0], degrees), n_boxes);
+    for ([x, y, degrees], n_boxes) in BOX_STACKS {
+        furniture.add_boxes(&upright([x, y, 0.0], degrees), n_boxes);
     }
     for (wall, [along, z, half_width, half_height], ix) in POSTERS {
         let pose = world_from_wall(wall) * upright([0.0, along, z], 0.0);
@@ -197,17 +197,17 @@ fn tubes() -> Mesh {
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     /// As far as furniture darkens the floor beside it.
     const AMBIENT_REACH_M: f64 = 1.2;
-    let mut blockers = Blockers::new(AMBIENT_REACH_M);
-    furniture().block(&mut blockers);
-    blockers.add_box(world_from_pedestal(), PEDESTAL_HALF_M);
+    let mut occluders = Occluders::new(AMBIENT_REACH_M);
+    furniture().add_occluders(&mut occluders);
+    occluders.add_box(world_from_pedestal(), PEDESTAL_HALF_M);
     let size_m = ROOM_HALF_M.map(|half| 2.0 * half);
     let mut tiles = lab_texture::floor_tiles(size_m, 3.2);
     tiles.shade(WHOLE, 150, |u, v, name| {
         let point = Point3::new((2.0 * u - 1.0) * ROOM_HALF_M[0], (1.0 - 2.0 * v) * ROOM_HALF_M[1], 0.0);
-        blockers.light_share(&point, &Vector3::z(), name)
+        occluders.light_share(&point, &Vector3::z(), name)
     });
     let mut wood = texture::wood();
-    shade_box(&mut wood, &blockers, PEDESTAL_HALF_M, &world_from_pedestal());
+    shade_box(&mut wood, &occluders, PEDESTAL_HALF_M, &world_from_pedestal());
     vec![
         ("items", lab_texture::items()),
         ("posters", lab_texture::posters()),

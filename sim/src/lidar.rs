@@ -17,7 +17,7 @@ pub(crate) struct RayCaster {
 }
 
 /// Groups of geometry that rays see: all but the robot and glass.
-fn seen_groups() -> [u8; 6] {
+fn visible_groups() -> [u8; 6] {
     let mut groups = [1; 6];
     groups[ARM_GROUP] = 0;
     groups[crate::scene::GLASS_GROUP] = 0;
@@ -31,20 +31,25 @@ impl RayCaster {
         Self { data }
     }
 
-    /// Distances along unit vectors from one point, metres; `None` where a ray meets nothing within `reach_m`.
-    fn cast(&mut self, from: &Vector3<f64>, towards: &[[f64; 3]], reach_m: f64) -> Result<Vec<Option<f64>>, Error> {
+    /// Distances along unit vectors from one point, metres; `None` where a ray meets nothing within `max_distance_m`.
+    fn cast(
+        &mut self,
+        from: &Vector3<f64>,
+        towards: &[[f64; 3]],
+        max_distance_m: f64,
+    ) -> Result<Vec<Option<f64>>, Error> {
         let origin = [from.x, from.y, from.z];
-        let groups = seen_groups();
+        let groups = visible_groups();
         let (_, distances) = self
             .data
-            .try_multi_ray(&origin, towards, Some(&groups), true, None, reach_m, None)
+            .try_multi_ray(&origin, towards, Some(&groups), true, None, max_distance_m, None)
             .map_err(|error| Error::Rays { reason: error.to_string() })?;
         Ok(distances.into_iter().map(|distance| (distance >= 0.0).then_some(distance)).collect())
     }
 }
 
 /// One turn that began at a time; `world_from_base` tells where the base is so many nanoseconds after it.
-pub(crate) fn turn(
+pub(crate) fn scan_revolution(
     rays: &mut RayCaster,
     scanner: &ScannerConfig,
     ideal: bool,
@@ -53,7 +58,7 @@ pub(crate) fn turn(
 ) -> Result<Vec<RangePoint>, Error> {
     let period_nanos = 1e9 / scanner.rate_hz;
     let [lowest, highest] = scanner.elevation_rad;
-    let rise = if scanner.n_rings > 1 { (highest - lowest) / f64::from(scanner.n_rings - 1) } else { 0.0 };
+    let elevation_step = if scanner.n_rings > 1 { (highest - lowest) / f64::from(scanner.n_rings - 1) } else { 0.0 };
     let mut points = Vec::new();
     for column in 0..scanner.n_columns {
         let share = f64::from(column) / f64::from(scanner.n_columns);
@@ -63,7 +68,7 @@ pub(crate) fn turn(
         let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();
         let directions: Vec<Vector3<f64>> = (0..scanner.n_rings)
             .map(|ring| {
-                let (up, flat) = (lowest + rise * f64::from(ring)).sin_cos();
+                let (up, flat) = (lowest + elevation_step * f64::from(ring)).sin_cos();
                 Vector3::new(flat * cos, flat * sin, up)
             })
             .collect();
@@ -73,13 +78,13 @@ pub(crate) fn turn(
         for (ring, (direction, distance_m)) in directions.iter().zip(distances).enumerate() {
             let counter = u64::from(column) * u64::from(scanner.n_rings) + ring as u64;
             let Some(true_m) = distance_m else { continue };
-            let is_lost = !ideal && random.unit(2 * counter) < scanner.dropped_frac;
+            let is_dropped = !ideal && random.unit(2 * counter) < scanner.dropped_frac;
             let noise = if ideal { 0.0 } else { f64::from(random.normals(2 * counter + 1)[0]) };
             let range_m = true_m + scanner.noise_sigma_m * noise;
-            if is_lost || range_m < scanner.min_m || range_m > scanner.max_m {
+            if is_dropped || range_m < scanner.min_m || range_m > scanner.max_m {
                 continue;
             }
-            let position_m = (direction * range_m).map(|metres| metres as f32).into();
+            let position_m = (direction * range_m).map(|meters| meters as f32).into();
             points.push(RangePoint { position_m, ring: ring as u16, offset_micros });
         }
     }

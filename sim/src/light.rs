@@ -33,12 +33,12 @@ const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
 
 impl Lamp {
-    fn towards(&self) -> Vector3<f64> {
+    fn to_lamp(&self) -> Vector3<f64> {
         -Vector3::from(self.direction).normalize()
     }
 
     fn brightness(&self, normal: &Vector3<f64>) -> f64 {
-        self.diffuse[1] * normal.dot(&self.towards()).max(0.0)
+        self.diffuse[1] * normal.dot(&self.to_lamp()).max(0.0)
     }
 }
 
@@ -60,7 +60,7 @@ pub(crate) fn mjcf(gain: f64) -> (String, String) {
 }
 
 /// What stands in the light's way.
-pub(crate) struct Blockers {
+pub(crate) struct Occluders {
     /// Boxes: pose of the centre inverted, and half sizes.
     boxes: Vec<(Transform, Vector3<f64>)>,
     ellipsoids: Vec<Ellipsoid>,
@@ -76,7 +76,7 @@ struct Ellipsoid {
     sphere_from_offset: Matrix3<f64>,
 }
 
-impl Blockers {
+impl Occluders {
     /// Nothing yet. What is further away than `ambient_reach_m` takes no ambient light.
     pub(crate) fn new(ambient_reach_m: f64) -> Self {
         Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0), ambient_reach_m }
@@ -99,18 +99,18 @@ impl Blockers {
         self.bounds = bounds;
     }
 
-    fn blocks(&self, from: &Point3<f64>, direction: &Vector3<f64>, reach_m: f64) -> bool {
+    fn is_occluded(&self, from: &Point3<f64>, direction: &Vector3<f64>, max_distance_m: f64) -> bool {
         let hits_box = |(box_from_world, half_m): &(Transform, Vector3<f64>)| {
-            hits_box(&(box_from_world * from).coords, &(box_from_world * direction), half_m, reach_m)
+            hits_box(&(box_from_world * from).coords, &(box_from_world * direction), half_m, max_distance_m)
         };
         if self.boxes.iter().any(hits_box) {
             return true;
         }
         let (center, radius_m) = self.bounds;
-        hits_sphere(&((from - center) / radius_m), &(direction / radius_m), reach_m)
+        hits_sphere(&((from - center) / radius_m), &(direction / radius_m), max_distance_m)
             && self.ellipsoids.iter().any(|ellipsoid| {
                 let offset = ellipsoid.sphere_from_offset * (from - ellipsoid.center);
-                hits_sphere(&offset, &(ellipsoid.sphere_from_offset * direction), reach_m)
+                hits_sphere(&offset, &(ellipsoid.sphere_from_offset * direction), max_distance_m)
             })
     }
 
@@ -129,15 +129,15 @@ impl Blockers {
     }
 
     fn key_share(&self, from: &Point3<f64>, random: Random) -> f64 {
-        let towards = KEY.towards();
-        let side = towards.cross(&Vector3::x()).normalize();
-        let across = towards.cross(&side);
+        let to_lamp = KEY.to_lamp();
+        let side = to_lamp.cross(&Vector3::x()).normalize();
+        let across = to_lamp.cross(&side);
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
             // Spread evenly over the lamp's disc, turned by chance (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
             let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
-            let direction = (towards + side * (radius * cos) + across * (radius * sin)).normalize();
-            !self.blocks(from, &direction, 10.0)
+            let direction = (to_lamp + side * (radius * cos) + across * (radius * sin)).normalize();
+            !self.is_occluded(from, &direction, 10.0)
         });
         n_free.count() as f64 / N_KEY_RAYS as f64
     }
@@ -151,7 +151,7 @@ impl Blockers {
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
             let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
             let direction = normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
-            !self.blocks(from, &direction, self.ambient_reach_m)
+            !self.is_occluded(from, &direction, self.ambient_reach_m)
         });
         n_free.count() as f64 / N_AMBIENT_RAYS as f64
     }
@@ -186,11 +186,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_box_darkens_the_side_away_from_the_lamp_and_the_corner_below_it() {
-        let mut blockers = Blockers::new(0.25);
-        blockers.add_box(Transform::translation(0.0, 0.0, 0.05), [0.05; 3]);
+    fn box_shades_far_side_and_contact_corner() {
+        let mut occluders = Occluders::new(0.25);
+        occluders.add_box(Transform::translation(0.0, 0.0, 0.05), [0.05; 3]);
         let up = Vector3::z();
-        let share = |x: f64, y: f64| blockers.light_share(&Point3::new(x, y, 0.0), &up, 1);
+        let share = |x: f64, y: f64| occluders.light_share(&Point3::new(x, y, 0.0), &up, 1);
         assert!(share(0.5, 0.5) > 0.99, "far away: {}", share(0.5, 0.5));
         assert!(share(0.055, 0.0) < 0.5, "in the shadow: {}", share(0.055, 0.0));
         let before = share(-0.055, 0.0);
@@ -198,12 +198,12 @@ mod tests {
     }
 
     #[test]
-    fn rays_meet_ellipsoids_where_they_are() {
-        let mut blockers = Blockers::new(0.25);
+    fn rays_hit_ellipsoids() {
+        let mut occluders = Occluders::new(0.25);
         let axes = [Vector3::x() * 0.2, Vector3::y() * 0.1, Vector3::z() * 0.1];
-        blockers.add_ellipsoids([(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(), (Point3::new(1.0, 0.0, 0.0), 0.2));
-        let hits = |y: f64, reach: f64| blockers.blocks(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach);
+        occluders.add_ellipsoids([(Point3::new(1.0, 0.0, 0.0), axes)].into_iter(), (Point3::new(1.0, 0.0, 0.0), 0.2));
+        let hits = |y: f64, reach: f64| occluders.is_occluded(&Point3::new(0.0, y, 0.0), &Vector3::x(), reach);
         assert!(hits(0.09, 2.0) && !hits(0.11, 2.0) && !hits(0.0, 0.79) && hits(0.0, 0.81));
-        assert!(!blockers.blocks(&Point3::origin(), &-Vector3::x(), 2.0));
+        assert!(!occluders.is_occluded(&Point3::origin(), &-Vector3::x(), 2.0));
     }
 }

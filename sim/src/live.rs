@@ -17,7 +17,7 @@ const MAX_READINGS: usize = 1000;
 /// Range scans that wait.
 const MAX_SCANS: usize = 20;
 /// True images of a camera that wait: they are large.
-const MAX_TRUE_IMAGES: usize = 8;
+const MAX_TRUTH_IMAGES: usize = 8;
 /// A player that is later than this skips images.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
@@ -33,24 +33,24 @@ pub struct LiveRig {
 
 /// Ground truth beside the live devices.
 pub struct LiveTruth {
-    player: Arc<Player>,
+    simulation: Arc<SimulationThread>,
 }
 
 impl LiveTruth {
     /// The oldest truth that was not taken yet, without waiting; poses first.
     pub fn take(&self) -> Option<Sample> {
-        let mut state = self.player.shared.lock();
-        state.true_poses.pop_front().or_else(|| state.true_images.pop_front())
+        let mut state = self.simulation.shared.lock();
+        state.truth_poses.pop_front().or_else(|| state.truth_images.pop_front())
     }
 }
 
 /// The thread that plays; it ends when the last device is dropped.
-struct Player {
-    shared: Arc<Shared>,
+struct SimulationThread {
+    shared: Arc<SharedQueues>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Drop for Player {
+impl Drop for SimulationThread {
     fn drop(&mut self) {
         self.shared.lock().stop = true;
         if let Some(thread) = self.thread.take() {
@@ -61,23 +61,23 @@ impl Drop for Player {
 }
 
 #[derive(Default)]
-struct Shared {
-    state: Mutex<State>,
+struct SharedQueues {
+    state: Mutex<QueueState>,
     arrived: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct QueueState {
     /// One a camera.
     images: Vec<VecDeque<Image>>,
     /// Images of a camera lost and not yet told: colour and depth.
-    lost: Vec<[u64; 2]>,
+    n_dropped: Vec<[u64; 2]>,
     readings: VecDeque<JointState>,
     poses: VecDeque<BasePose>,
     /// One a scanner.
     scans: Vec<VecDeque<RangeScan>>,
-    true_images: VecDeque<Sample>,
-    true_poses: VecDeque<Sample>,
+    truth_images: VecDeque<Sample>,
+    truth_poses: VecDeque<Sample>,
     /// Why there will be no more samples.
     end: Option<String>,
     stop: bool,
@@ -86,28 +86,28 @@ struct State {
 impl LiveRig {
     pub(crate) fn start(engine: Engine, info: RigInfo, start: Stamp) -> Result<Self, Error> {
         let names: Vec<Arc<str>> = info.cameras.iter().map(|camera| camera.name.as_str().into()).collect();
-        let shared = Arc::new(Shared::default());
+        let shared = Arc::new(SharedQueues::default());
         {
             let mut state = shared.lock();
             state.images = vec![VecDeque::new(); names.len()];
-            state.lost = vec![[0; 2]; names.len()];
+            state.n_dropped = vec![[0; 2]; names.len()];
             state.scans = vec![VecDeque::new(); info.scanner_names.len()];
         }
         let thread = std::thread::Builder::new().name("sim-live".to_owned()).spawn({
             let shared = Arc::clone(&shared);
             let scanner_names = info.scanner_names.clone();
-            move || play(engine, &shared, &Names { cameras: names, scanners: scanner_names }, start)
+            move || run_simulation(engine, &shared, &DeviceNames { cameras: names, scanners: scanner_names }, start)
         });
-        let player = Arc::new(Player { shared, thread: Some(thread.map_err(Error::Thread)?) });
+        let simulation = Arc::new(SimulationThread { shared, thread: Some(thread.map_err(Error::Thread)?) });
         let cameras = info.cameras.iter().enumerate().map(|(camera_ix, camera)| {
             let (name, intrinsics) = (camera.name.clone(), camera.intrinsics.clone());
-            Box::new(LiveCamera { player: Arc::clone(&player), camera_ix, name, intrinsics }) as Box<dyn Camera>
+            Box::new(LiveCamera { simulation: Arc::clone(&simulation), camera_ix, name, intrinsics }) as Box<dyn Camera>
         });
-        let arm = LiveArm { player: Arc::clone(&player), joint_names: info.joint_names.clone() };
-        let base = LiveBase { player: Arc::clone(&player) };
+        let arm = LiveArm { simulation: Arc::clone(&simulation), joint_names: info.joint_names.clone() };
+        let base = LiveBase { simulation: Arc::clone(&simulation) };
         let scanners = info.scanner_names.iter().enumerate().map(|(scanner_ix, name)| {
-            let (player, name) = (Arc::clone(&player), name.clone());
-            Box::new(LiveScanner { player, scanner_ix, name }) as Box<dyn RangeScanner>
+            let (simulation, name) = (Arc::clone(&simulation), name.clone());
+            Box::new(LiveScanner { simulation, scanner_ix, name }) as Box<dyn RangeScanner>
         });
         Ok(Self {
             devices: Devices {
@@ -116,28 +116,28 @@ impl LiveRig {
                 base: info.has_moving_base.then(|| Box::new(base) as Box<dyn Base>),
                 scanners: scanners.collect(),
             },
-            truth: LiveTruth { player },
+            truth: LiveTruth { simulation },
             info,
         })
     }
 }
 
 /// Names of the devices, in the order of their queues.
-struct Names {
+struct DeviceNames {
     cameras: Vec<Arc<str>>,
     scanners: Vec<String>,
 }
 
 /// Delivers samples when their time comes, until the rig ends or nobody is left.
-fn play(mut engine: Engine, shared: &Shared, names: &Names, start: Stamp) {
+fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames, start: Stamp) {
     engine.set_start(start);
-    let began = Instant::now();
+    let started = Instant::now();
     let end = loop {
-        let late_from = began.elapsed().saturating_sub(MAX_LATE);
-        engine.skip_before(i64::try_from(late_from.as_nanos()).unwrap_or(i64::MAX));
+        let skip_until = started.elapsed().saturating_sub(MAX_LATE);
+        engine.skip_before(i64::try_from(skip_until.as_nanos()).unwrap_or(i64::MAX));
         match engine.next() {
             Ok(Some(delivery)) => {
-                wait_until(began, delivery.0);
+                wait_until(started, delivery.0);
                 if !shared.deliver(delivery, names) {
                     return;
                 }
@@ -150,23 +150,23 @@ fn play(mut engine: Engine, shared: &Shared, names: &Names, start: Stamp) {
     shared.arrived.notify_all();
 }
 
-fn wait_until(began: Instant, nanos: i64) {
-    let due = began + Duration::from_nanos(u64::try_from(nanos).unwrap_or(0));
+fn wait_until(started: Instant, nanos: i64) {
+    let due = started + Duration::from_nanos(u64::try_from(nanos).unwrap_or(0));
     std::thread::sleep(due.saturating_duration_since(Instant::now()));
 }
 
-fn kind(image: &Image) -> usize {
+fn stream_ix(image: &Image) -> usize {
     usize::from(matches!(image.format, PixelFormat::DepthU16 { .. }))
 }
 
-impl Shared {
+impl SharedQueues {
     /// The state, also after a thread panicked while it held it: queues are never left half changed.
-    fn lock(&self) -> MutexGuard<'_, State> {
+    fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Queues a sample; false when nobody wants it any more.
-    fn deliver(&self, (_, sample): Delivery, names: &Names) -> bool {
+    fn deliver(&self, (_, sample): Delivery, names: &DeviceNames) -> bool {
         let mut state = self.lock();
         match sample {
             Sample::Image(image) => {
@@ -174,28 +174,30 @@ impl Shared {
                     state.put_image(camera_ix, image);
                 }
             }
-            Sample::Joints(reading) => put(&mut state.readings, MAX_READINGS, reading),
-            Sample::Base(pose) => put(&mut state.poses, MAX_READINGS, pose),
+            Sample::Joints(reading) => push_bounded(&mut state.readings, MAX_READINGS, reading),
+            Sample::Base(pose) => push_bounded(&mut state.poses, MAX_READINGS, pose),
             Sample::Range(scan) => {
                 if let Some(scanner_ix) = names.scanners.iter().position(|name| **name == *scan.scanner) {
-                    put(&mut state.scans[scanner_ix], MAX_SCANS, scan);
+                    push_bounded(&mut state.scans[scanner_ix], MAX_SCANS, scan);
                 }
             }
-            image @ Sample::Truth(_) => put(&mut state.true_images, MAX_TRUE_IMAGES * names.cameras.len(), image),
-            pose @ Sample::BaseTruth(_) => put(&mut state.true_poses, MAX_READINGS, pose),
+            image @ Sample::Truth(_) => {
+                push_bounded(&mut state.truth_images, MAX_TRUTH_IMAGES * names.cameras.len(), image)
+            }
+            pose @ Sample::BaseTruth(_) => push_bounded(&mut state.truth_poses, MAX_READINGS, pose),
         }
-        let goes_on = !state.stop;
+        let is_running = !state.stop;
         drop(state);
         self.arrived.notify_all();
-        goes_on
+        is_running
     }
 
     /// Waits for `take` to find something; an error tells that nothing came, or will come.
     fn wait<T>(
         &self,
         timeout: Duration,
-        mut take: impl FnMut(&mut State) -> Option<T>,
-        silence: impl FnOnce() -> drivers::Error,
+        mut take: impl FnMut(&mut QueueState) -> Option<T>,
+        timeout_error: impl FnOnce() -> drivers::Error,
     ) -> Result<T, drivers::Error> {
         let until = Instant::now() + timeout;
         let mut state = self.lock();
@@ -208,33 +210,33 @@ impl Shared {
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return Err(silence());
+                return Err(timeout_error());
             }
             state = self.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
 
-impl State {
+impl QueueState {
     /// Queues an image; where there is no room the camera's oldest goes, and the next of its kind tells so.
     fn put_image(&mut self, camera_ix: usize, mut image: Image) {
         let queue = &mut self.images[camera_ix];
-        let lost = &mut self.lost[camera_ix];
-        image.n_skipped += std::mem::take(&mut lost[kind(&image)]);
+        let n_dropped = &mut self.n_dropped[camera_ix];
+        image.n_skipped += std::mem::take(&mut n_dropped[stream_ix(&image)]);
         queue.push_back(image);
         if queue.len() <= MAX_IMAGES {
             return;
         }
         let Some(oldest) = queue.pop_front() else { return };
-        let n_lost = oldest.n_skipped + 1;
-        match queue.iter_mut().find(|image| kind(image) == kind(&oldest)) {
-            Some(next) => next.n_skipped += n_lost,
-            None => lost[kind(&oldest)] += n_lost,
+        let n_newly_dropped = oldest.n_skipped + 1;
+        match queue.iter_mut().find(|image| stream_ix(image) == stream_ix(&oldest)) {
+            Some(next) => next.n_skipped += n_newly_dropped,
+            None => n_dropped[stream_ix(&oldest)] += n_newly_dropped,
         }
     }
 }
 
-fn put<T>(queue: &mut VecDeque<T>, max: usize, item: T) {
+fn push_bounded<T>(queue: &mut VecDeque<T>, max: usize, item: T) {
     if queue.len() >= max {
         queue.pop_front();
     }
@@ -242,7 +244,7 @@ fn put<T>(queue: &mut VecDeque<T>, max: usize, item: T) {
 }
 
 struct LiveCamera {
-    player: Arc<Player>,
+    simulation: Arc<SimulationThread>,
     camera_ix: usize,
     name: String,
     intrinsics: Intrinsics,
@@ -258,13 +260,13 @@ impl Camera for LiveCamera {
     }
 
     fn next_image(&mut self, timeout: Duration) -> Result<Image, drivers::Error> {
-        let silence = || drivers::Error::NoImage { camera: self.name.clone(), waited: timeout };
-        self.player.shared.wait(timeout, |state| state.images[self.camera_ix].pop_front(), silence)
+        let timeout_error = || drivers::Error::NoImage { camera: self.name.clone(), waited: timeout };
+        self.simulation.shared.wait(timeout, |state| state.images[self.camera_ix].pop_front(), timeout_error)
     }
 }
 
 struct LiveArm {
-    player: Arc<Player>,
+    simulation: Arc<SimulationThread>,
     joint_names: Vec<String>,
 }
 
@@ -274,24 +276,24 @@ impl Arm for LiveArm {
     }
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, drivers::Error> {
-        let silence = || drivers::Error::NoJoints { waited: timeout };
-        self.player.shared.wait(timeout, |state| state.readings.pop_front(), silence)
+        let timeout_error = || drivers::Error::NoJoints { waited: timeout };
+        self.simulation.shared.wait(timeout, |state| state.readings.pop_front(), timeout_error)
     }
 }
 
 struct LiveBase {
-    player: Arc<Player>,
+    simulation: Arc<SimulationThread>,
 }
 
 impl Base for LiveBase {
     fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, drivers::Error> {
-        let silence = || drivers::Error::NoBasePose { waited: timeout };
-        self.player.shared.wait(timeout, |state| state.poses.pop_front(), silence)
+        let timeout_error = || drivers::Error::NoBasePose { waited: timeout };
+        self.simulation.shared.wait(timeout, |state| state.poses.pop_front(), timeout_error)
     }
 }
 
 struct LiveScanner {
-    player: Arc<Player>,
+    simulation: Arc<SimulationThread>,
     scanner_ix: usize,
     name: String,
 }
@@ -302,7 +304,7 @@ impl RangeScanner for LiveScanner {
     }
 
     fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, drivers::Error> {
-        let silence = || drivers::Error::NoScan { scanner: self.name.clone(), waited: timeout };
-        self.player.shared.wait(timeout, |state| state.scans[self.scanner_ix].pop_front(), silence)
+        let timeout_error = || drivers::Error::NoScan { scanner: self.name.clone(), waited: timeout };
+        self.simulation.shared.wait(timeout, |state| state.scans[self.scanner_ix].pop_front(), timeout_error)
     }
 }

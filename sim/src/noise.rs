@@ -61,19 +61,19 @@ pub(crate) fn depth_counts(
     random: Random,
     ideal: bool,
 ) -> Vec<u16> {
-    let in_range = |metres: f32| f64::from(metres) >= depth.min_m && f64::from(metres) <= depth.max_m;
-    let to_count = |metres: f64| ((metres / depth.metres_per_count).clamp(0.0, f64::from(u16::MAX)) + 0.5) as u16;
+    let in_range = |meters: f32| f64::from(meters) >= depth.min_m && f64::from(meters) <= depth.max_m;
+    let to_count = |meters: f64| ((meters / depth.meters_per_count).clamp(0.0, f64::from(u16::MAX)) + 0.5) as u16;
     if ideal {
-        return depth_m.iter().map(|&metres| if in_range(metres) { to_count(metres.into()) } else { 0 }).collect();
+        return depth_m.iter().map(|&meters| if in_range(meters) { to_count(meters.into()) } else { 0 }).collect();
     }
     let holes = Holes::new(depth_m, width, depth.hole_frac, random);
     let mut counts = vec![0; depth_m.len()];
     counts.par_iter_mut().enumerate().for_each(|(ix, count)| {
-        let metres = depth_m[ix];
-        if in_range(metres) && !holes.contains(ix) {
+        let meters = depth_m[ix];
+        if in_range(meters) && !holes.contains(ix) {
             let normal = f64::from(random.normals(ix as u64)[0]);
-            let metres = f64::from(metres);
-            *count = to_count(metres + depth.noise_sigma_m * metres * metres * normal);
+            let meters = f64::from(meters);
+            *count = to_count(meters + depth.noise_sigma_m * meters * meters * normal);
         }
     });
     counts
@@ -103,10 +103,10 @@ impl Holes {
             .zip(depth_m.par_chunks(width))
             .for_each(|(is_edge, depth_m)| mark_edges(is_edge, depth_m));
         let n_edge = is_edge.iter().filter(|is_edge| **is_edge).count() as f64;
-        let n_wanted = hole_frac * depth_m.len() as f64;
-        let edge_share = (0.7 * n_wanted / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
+        let n_holes_target = hole_frac * depth_m.len() as f64;
+        let edge_share = (0.7 * n_holes_target / n_edge.max(1.0)).min(MAX_EDGE_SHARE);
         let n_rest = depth_m.len() as f64 - n_edge;
-        let cluster_share = ((n_wanted - edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
+        let cluster_share = ((n_holes_target - edge_share * n_edge) / n_rest.max(1.0)).clamp(0.0, 1.0);
         Self { is_edge, width, random, edge_share, cluster_share }
     }
 
@@ -122,11 +122,11 @@ impl Holes {
 
 /// Marks the pixels of a row where depth jumps within two pixels, where one eye sees what the other does not.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
-    const REACH_PX: usize = 2;
+    const EDGE_RADIUS_PX: usize = 2;
     const JUMP_FRAC: f32 = 0.03;
-    for (column, window) in depth_m.windows(2 * REACH_PX + 1).enumerate() {
-        let (a, b) = (window[0], window[2 * REACH_PX]);
-        is_edge[column + REACH_PX] = (a - b).abs() > JUMP_FRAC * a.min(b);
+    for (column, window) in depth_m.windows(2 * EDGE_RADIUS_PX + 1).enumerate() {
+        let (a, b) = (window[0], window[2 * EDGE_RADIUS_PX]);
+        is_edge[column + EDGE_RADIUS_PX] = (a - b).abs() > JUMP_FRAC * a.min(b);
     }
 }
 
@@ -135,7 +135,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn color_noise_has_the_configured_sigma_and_grows_with_brightness() {
+    fn color_noise_matches_configuration() {
         let sensor = SensorConfig::default();
         for level in [40.0, 128.0, 200.0] {
             let colors = vec![level as f32; 3 * 100_000];
@@ -152,14 +152,14 @@ mod tests {
     }
 
     #[test]
-    fn depth_has_the_configured_noise_holes_and_limits() {
+    fn depth_noise_holes_and_limits_match_configuration() {
         let depth = DepthConfig::default();
         let plane = vec![1.0_f32; 640 * 480];
         let counts = depth_counts(&plane, 640, &depth, Random::new(1, &[3]), false);
-        let metres: Vec<f64> =
+        let meters: Vec<f64> =
             counts.iter().filter(|count| **count > 0).map(|count| f64::from(*count) * 1e-4).collect();
-        let holes = 1.0 - metres.len() as f64 / plane.len() as f64;
-        let sigma = (metres.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / metres.len() as f64).sqrt();
+        let holes = 1.0 - meters.len() as f64 / plane.len() as f64;
+        let sigma = (meters.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / meters.len() as f64).sqrt();
         assert!((holes - 0.02).abs() < 0.003, "{holes}");
         assert!((sigma - 0.0015).abs() < 0.00005, "{sigma}");
         let near = depth_counts(&[0.05, 7.0, 0.5], 3, &depth, Random::new(1, &[3]), true);

@@ -1,6 +1,6 @@
 //! What stands in the static-arm scene: meshes, textures with the light painted in, and where everything is.
 
-use crate::light::Blockers;
+use crate::light::Occluders;
 use crate::mesh::{BOX_FACES, Mesh, WHOLE};
 use crate::texture::{self, Texture};
 use crate::toy;
@@ -78,9 +78,9 @@ pub(crate) struct Object {
 /// Everything but the arm.
 pub(crate) fn objects() -> Vec<Object> {
     let object = |name, material, mesh, world_from_mesh| Object { name, material, mesh, world_from_mesh };
-    let blockers = blockers();
+    let occluders = occluders();
     let toy_light = |point: &Point3<f64>, normal: &Vector3<f64>, name: u64| {
-        blockers.light_share(&(world_from_toy() * point), &(world_from_toy() * normal), name)
+        occluders.light_share(&(world_from_toy() * point), &(world_from_toy() * normal), name)
     };
     let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
     let here = Transform::identity();
@@ -99,23 +99,23 @@ pub(crate) fn objects() -> Vec<Object> {
 
 /// The textures by name, light included.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
-    let blockers = blockers();
+    let occluders = occluders();
     let [mut brick, mut plaster] = [texture::brick_wall(), texture::plaster_wall()];
     for (wall, side) in [(&mut brick, 1.0), (&mut plaster, -1.0)] {
         let world_from_wall = world_from_wall(side);
         wall.shade(WHOLE, 160, |u, v, name| {
             let point = Point3::new(0.0, (2.0 * u - 1.0) * WALL_HALF_M[0], (1.0 - 2.0 * v) * WALL_HALF_M[1]);
-            blockers.light_share(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
+            occluders.light_share(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
         });
     }
     let mut metal = texture::metal_table([2.0 * TABLE_HALF_XY_M[1], 2.0 * TABLE_HALF_XY_M[0]]);
     metal.shade(WHOLE, 400, |u, v, name| {
         let right_up = Vector3::new((1.0 - 2.0 * v) * TABLE_HALF_XY_M[0], (1.0 - 2.0 * u) * TABLE_HALF_XY_M[1], 0.0);
-        blockers.light_share(&(table_center() + right_up), &Vector3::z(), name)
+        occluders.light_share(&(table_center() + right_up), &Vector3::z(), name)
     });
     let [mut wood, mut tags] = [texture::wood(), texture::tags()];
-    shade_box(&mut wood, &blockers, BLOCK_HALF_M, &world_from_block());
-    shade_box(&mut tags, &blockers, [CUBE_HALF_M; 3], &world_from_cube());
+    shade_box(&mut wood, &occluders, BLOCK_HALF_M, &world_from_block());
+    shade_box(&mut tags, &occluders, [CUBE_HALF_M; 3], &world_from_cube());
     vec![
         ("brick", brick),
         ("plaster", plaster),
@@ -127,35 +127,35 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     ]
 }
 
-pub(crate) fn shade_box(texture: &mut Texture, blockers: &Blockers, half_m: [f64; 3], world_from_box: &Transform) {
+pub(crate) fn shade_box(texture: &mut Texture, occluders: &Occluders, half_m: [f64; 3], world_from_box: &Transform) {
     for side in 0..6 {
         texture.shade(texture::side_rectangle(side), 40, |u, v, name| {
             let (point, normal) = Mesh::on_cuboid(half_m, side, u, v);
-            blockers.light_share(&(world_from_box * point), &(world_from_box * normal), name)
+            occluders.light_share(&(world_from_box * point), &(world_from_box * normal), name)
         });
     }
 }
 
-fn blockers() -> Blockers {
+fn occluders() -> Occluders {
     const WALL_HALF_THICKNESS_M: f64 = 0.005;
     /// Of the size of the objects.
     const AMBIENT_REACH_M: f64 = 0.25;
-    let mut blockers = Blockers::new(AMBIENT_REACH_M);
-    blockers.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
-    blockers.add_box(world_from_block(), BLOCK_HALF_M);
+    let mut occluders = Occluders::new(AMBIENT_REACH_M);
+    occluders.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
+    occluders.add_box(world_from_block(), BLOCK_HALF_M);
     let table = table_center() - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M);
     let [half_x, half_y] = TABLE_HALF_XY_M;
-    blockers.add_box(Translation3::from(table.coords).into(), [half_x, half_y, TABLE_HALF_THICKNESS_M]);
+    occluders.add_box(Translation3::from(table.coords).into(), [half_x, half_y, TABLE_HALF_THICKNESS_M]);
     for side in [1.0, -1.0] {
         let world_from_box = world_from_wall(side) * Translation3::new(-WALL_HALF_THICKNESS_M, 0.0, 0.0);
-        blockers.add_box(world_from_box, [WALL_HALF_THICKNESS_M, WALL_HALF_M[0], WALL_HALF_M[1]]);
+        occluders.add_box(world_from_box, [WALL_HALF_THICKNESS_M, WALL_HALF_M[0], WALL_HALF_M[1]]);
     }
     let world_from_toy = world_from_toy();
     let (center, radius_m) = toy::bounds();
     let ellipsoids = toy::ellipsoids()
         .map(|(center, half_axes)| (world_from_toy * center, half_axes.map(|axis| world_from_toy * axis)));
-    blockers.add_ellipsoids(ellipsoids, (world_from_toy * center, radius_m));
-    blockers
+    occluders.add_ellipsoids(ellipsoids, (world_from_toy * center, radius_m));
+    occluders
 }
 
 fn table_top() -> Mesh {

@@ -4,7 +4,7 @@
 use crate::Error;
 use crate::config::CameraConfig;
 use crate::render::{Picture, View};
-use crate::robot::Posture;
+use crate::robot::RobotPose;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::{IndexedParallelIterator, ParallelIterator, ParallelSliceMut};
@@ -27,16 +27,16 @@ pub(crate) struct Optics {
 
 /// Pose of the drawn picture as seen by the camera at another instant, in f32.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Shift {
-    turn: Matrix3<f32>,
-    offset_m: Vector3<f32>,
+pub(crate) struct RowMotion {
+    rotation_matrix: Matrix3<f32>,
+    translation_m: Vector3<f32>,
 }
 
-impl Shift {
+impl RowMotion {
     pub(crate) fn new(drawn_from_camera: &Transform) -> Self {
         Self {
-            turn: drawn_from_camera.rotation.to_rotation_matrix().matrix().cast(),
-            offset_m: drawn_from_camera.translation.vector.cast(),
+            rotation_matrix: drawn_from_camera.rotation.to_rotation_matrix().matrix().cast(),
+            translation_m: drawn_from_camera.translation.vector.cast(),
         }
     }
 }
@@ -47,8 +47,8 @@ const MAX_CORRECTIONS: usize = 3;
 const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
-    pub(crate) fn new(camera: &CameraConfig, is_sharp: bool) -> Result<Self, Error> {
-        Self::with_lens(camera, &camera.intrinsics, camera.sensor.supersample, is_sharp)
+    pub(crate) fn new(camera: &CameraConfig, is_motion_free: bool) -> Result<Self, Error> {
+        Self::with_lens(camera, &camera.intrinsics, camera.sensor.supersample, is_motion_free)
     }
 
     /// Optics of another sensor in the same camera.
@@ -56,7 +56,7 @@ impl Optics {
         camera: &CameraConfig,
         intrinsics: &Intrinsics,
         supersample: u32,
-        is_sharp: bool,
+        is_motion_free: bool,
     ) -> Result<Self, Error> {
         let intrinsics = intrinsics.clone();
         let [width, height] = intrinsics.size_px;
@@ -70,7 +70,7 @@ impl Optics {
             }
         }
         // Room for what shear and blur bring in from outside: a few pixels at the speeds of the arm.
-        let margin_px = if is_sharp { 0 } else { 4 + height / 60 };
+        let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
             view_focal_px: intrinsics.focal_px.map(|focal| focal * f64::from(supersample)),
@@ -112,7 +112,7 @@ impl Optics {
     }
 
     /// The picture to draw for a pose.
-    pub(crate) fn view(&self, world_from_camera: Transform, robot: Option<Posture>, light_frac: f64) -> View {
+    pub(crate) fn view(&self, world_from_camera: Transform, robot: Option<RobotPose>, light_frac: f64) -> View {
         View {
             size_px: self.view_size_px,
             focal_px: self.view_focal_px,
@@ -124,7 +124,7 @@ impl Optics {
     }
 
     /// What each pixel sees at the picture's own instant: `[height, width, 3]`, 0 to 255.
-    pub(crate) fn sharp(&self, picture: &Picture) -> Vec<f32> {
+    pub(crate) fn motion_free(&self, picture: &Picture) -> Vec<f32> {
         if self.intrinsics.is_pinhole() {
             return self.expose(|row, colors| self.average_blocks(picture, row, colors));
         }
@@ -157,23 +157,28 @@ impl Optics {
 
     /// What each pixel sees when its row is exposed at other instants, of which the mean counts.
     ///
-    /// `shifts` holds those of the first row, then of the second. A pixel's ray is followed into the drawn picture with
+    /// `row_motions` holds those of the first row, then of the second. A pixel's ray is followed into the drawn picture with
     /// the depth drawn there, so surfaces land where they belong; only a strip beside a depth edge, as wide as the edge's
     /// own parallax over the readout, repeats what lies beside it.
-    pub(crate) fn moving(&self, picture: &Picture, shifts: &[Shift]) -> Vec<f32> {
-        let n_samples = shifts.len() / self.intrinsics.size_px[1] as usize;
+    pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
+        let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
-            for shift in &shifts[row * n_samples..(row + 1) * n_samples] {
+            for row_motion in &row_motions[row * n_samples..(row + 1) * n_samples] {
                 // A pixel's neighbour has moved by almost as much: where the search starts.
-                let mut moved = [0.0; 2];
+                let mut offset_px = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
-                    let still = self.drawn_from_ray(ray);
-                    let drawn = self.follow(picture, shift, ray, [still[0] + moved[0], still[1] + moved[1]]);
-                    moved = [drawn[0] - still[0], drawn[1] - still[1]];
-                    let seen = self.color_at(picture, drawn);
+                    let static_px = self.drawn_from_ray(ray);
+                    let drawn = self.trace_pixel(
+                        picture,
+                        row_motion,
+                        ray,
+                        [static_px[0] + offset_px[0], static_px[1] + offset_px[1]],
+                    );
+                    offset_px = [drawn[0] - static_px[0], drawn[1] - static_px[1]];
+                    let sampled = self.color_at(picture, drawn);
                     for channel in 0..3 {
-                        color[channel] += share * seen[channel];
+                        color[channel] += share * sampled[channel];
                     }
                 }
             }
@@ -211,13 +216,13 @@ impl Optics {
     }
 
     /// Where a ray of the shifted camera meets the drawn surface, searched from a first guess.
-    fn follow(&self, picture: &Picture, shift: &Shift, ray: &[f32; 2], guess: [f32; 2]) -> [f32; 2] {
-        let direction = shift.turn * Vector3::new(ray[0], ray[1], 1.0);
+    fn trace_pixel(&self, picture: &Picture, row_motion: &RowMotion, ray: &[f32; 2], guess: [f32; 2]) -> [f32; 2] {
+        let direction = row_motion.rotation_matrix * Vector3::new(ray[0], ray[1], 1.0);
         let mut depth = nearest_depth(picture, guess);
         let mut drawn = guess;
         for _ in 0..MAX_CORRECTIONS {
-            let along = (depth - shift.offset_m.z) / direction.z;
-            let at = |axis: usize| (direction[axis] * along + shift.offset_m[axis]) / depth;
+            let along = (depth - row_motion.translation_m.z) / direction.z;
+            let at = |axis: usize| (direction[axis] * along + row_motion.translation_m[axis]) / depth;
             drawn = self.drawn_from_ray(&[at(0), at(1)]);
             let found = nearest_depth(picture, drawn);
             let is_same = (found - depth).abs() < SAME_DEPTH_FRAC * depth;

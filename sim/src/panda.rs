@@ -46,10 +46,10 @@ pub(crate) const MAX_JERK_RAD_S3: [f64; N_JOINTS] = [7500.0, 3750.0, 5000.0, 625
 pub(crate) const MAX_TORQUE_NM: [f64; N_JOINTS] = [87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0];
 
 impl Link {
-    fn fixed_part(&self) -> Transform {
-        let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), self.alpha_rad);
-        let shift = Vector3::new(self.a_m, 0.0, 0.0) + turn * Vector3::new(0.0, 0.0, self.d_m);
-        Transform::from_parts(Translation3::from(shift), turn)
+    fn parent_from_joint(&self) -> Transform {
+        let link_rotation = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), self.alpha_rad);
+        let link_translation = Vector3::new(self.a_m, 0.0, 0.0) + link_rotation * Vector3::new(0.0, 0.0, self.d_m);
+        Transform::from_parts(Translation3::from(link_translation), link_rotation)
     }
 }
 
@@ -58,7 +58,7 @@ fn frames(position_rad: &Joints) -> ([Transform; N_JOINTS], Transform) {
     let mut base_from_link = Transform::identity();
     let mut frames = [Transform::identity(); N_JOINTS];
     for (ix, link) in LINKS.iter().enumerate() {
-        base_from_link *= link.fixed_part();
+        base_from_link *= link.parent_from_joint();
         base_from_link *= UnitQuaternion::from_axis_angle(&Vector3::z_axis(), position_rad[ix]);
         frames[ix] = base_from_link;
     }
@@ -150,7 +150,7 @@ pub(crate) fn mjcf(on_flange: &str) -> String {
     let mut xml = String::from("<body name=\"panda_link0\" childclass=\"arm\">\n");
     write_parts(&mut xml, BASE);
     for (ix, link) in LINKS.iter().enumerate() {
-        let pose = pose_attributes(&link.fixed_part());
+        let pose = pose_attributes(&link.parent_from_joint());
         let [number, inertia, mass] = [ix as f64 + 1.0, 0.012 * MASS_KG[ix], MASS_KG[ix]];
         let (lower, upper) = (LOWER_RAD[ix], UPPER_RAD[ix]);
         let _ = writeln!(

@@ -83,13 +83,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quantiles_are_those_of_the_normal_distribution() {
+    fn quantiles_match_normal_distribution() {
         assert!((normal_quantile(0.975) - 1.959_963_984_540_054).abs() < 1e-9);
         assert!((normal_quantile(0.001) + 3.090_232_306_167_813).abs() < 1e-9);
     }
 
     #[test]
-    fn normals_have_mean_zero_and_variance_one_and_keys_differ() {
+    fn normals_are_standard_and_depend_on_key() {
         let random = Random::new(7, &[1, 2]);
         let numbers: Vec<f64> = (0..50_000).flat_map(|ix| random.normals(ix)).map(f64::from).collect();
         let n = numbers.len() as f64;

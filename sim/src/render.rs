@@ -4,7 +4,7 @@
 
 use crate::Error;
 use crate::egl::HeadlessContext;
-use crate::robot::Posture;
+use crate::robot::RobotPose;
 use crate::scene::ARM_GROUP;
 use crossbeam_channel::{Receiver, Sender, bounded};
 use kinematics::Transform;
@@ -22,14 +22,14 @@ pub(crate) struct View {
     pub(crate) principal_px: [f64; 2],
     pub(crate) world_from_camera: Transform,
     /// Where the robot is; not drawn, and without a shadow, when `None`.
-    pub(crate) robot: Option<Posture>,
+    pub(crate) robot: Option<RobotPose>,
     /// Brightness of all lamps; 1 is as built.
     pub(crate) light_frac: f64,
 }
 
 impl View {
     /// A small picture of whatever is at the origin.
-    fn any() -> Self {
+    fn warm_up() -> Self {
         Self {
             size_px: [16, 16],
             focal_px: [16.0; 2],
@@ -53,7 +53,7 @@ pub(crate) struct Picture {
 
 /// Hands views to the render thread; dropping it ends the thread.
 pub(crate) struct Renderer {
-    jobs: Option<Sender<Job>>,
+    job_sender: Option<Sender<Job>>,
     thread: Option<JoinHandle<()>>,
     name: String,
 }
@@ -69,18 +69,18 @@ pub(crate) struct Pending(Receiver<Picture>);
 impl Pending {
     /// Waits for the picture.
     pub(crate) fn wait(self) -> Result<Picture, Error> {
-        self.0.recv().map_err(|_| stopped())
+        self.0.recv().map_err(|_| render_thread_stopped())
     }
 }
 
-fn stopped() -> Error {
+fn render_thread_stopped() -> Error {
     Error::Stopped { reason: "it did not answer".to_owned() }
 }
 
 impl Renderer {
     /// Starts the thread and its context.
     pub(crate) fn start(model: Arc<MjModel>, near_far_m: [f64; 2]) -> Result<Self, Error> {
-        let (jobs, queue) = bounded::<Job>(4);
+        let (job_sender, queue) = bounded::<Job>(4);
         let (ready, started) = bounded(1);
         let thread = std::thread::Builder::new()
             .name("sim-render".to_owned())
@@ -91,8 +91,8 @@ impl Renderer {
                 }
             })
             .map_err(Error::Thread)?;
-        let name = started.recv().map_err(|_| stopped())??;
-        Ok(Self { jobs: Some(jobs), thread: Some(thread), name })
+        let name = started.recv().map_err(|_| render_thread_stopped())??;
+        Ok(Self { job_sender: Some(job_sender), thread: Some(thread), name })
     }
 
     /// What draws, as OpenGL names it.
@@ -103,15 +103,15 @@ impl Renderer {
     /// Queues a view; the picture is asked for later.
     pub(crate) fn submit(&self, view: View) -> Result<Pending, Error> {
         let (reply, picture) = bounded(1);
-        let jobs = self.jobs.as_ref().ok_or_else(stopped)?;
-        jobs.send(Job { view, reply }).map_err(|_| stopped())?;
+        let job_sender = self.job_sender.as_ref().ok_or_else(render_thread_stopped)?;
+        job_sender.send(Job { view, reply }).map_err(|_| render_thread_stopped())?;
         Ok(Pending(picture))
     }
 }
 
 impl Drop for Renderer {
     fn drop(&mut self) {
-        self.jobs = None;
+        self.job_sender = None;
         if let Some(thread) = self.thread.take() {
             // A panic of the thread was reported by the panic hook; there is nothing left to do here.
             let _ = thread.join();
@@ -138,7 +138,7 @@ fn draw_all(
     };
     // Drivers compile their shaders for the first picture: seconds on a busy processor, which no camera shall seem to
     // be silent for.
-    canvas.draw(&View::any());
+    canvas.draw(&View::warm_up());
     // A closed channel means that the rig is gone already; `queue` is closed then as well.
     let _ = ready.send(Ok(current.renderer().to_owned()));
     for job in queue {
@@ -166,8 +166,8 @@ impl Canvas {
         }
         self.data.forward_kinematics();
         self.scene.update(&mut self.data, &options, &MjvPerturb::default(), &mut MjvCamera::default());
-        self.aim(view);
-        self.dim(view.light_frac as f32);
+        self.set_view(view);
+        self.scale_lights(view.light_frac as f32);
         let [width, height] = view.size_px;
         let viewport = MjrRectangle::new(0, 0, i32::try_from(width).unwrap_or(0), i32::try_from(height).unwrap_or(0));
         self.scene.render(&viewport, &self.context);
@@ -175,7 +175,7 @@ impl Canvas {
     }
 
     /// Points both of the scene's cameras; MuJoCo draws from their mean.
-    fn aim(&mut self, view: &View) {
+    fn set_view(&mut self, view: &View) {
         let [near, far] = self.near_far_m;
         let pose = &view.world_from_camera;
         let in_f32 = |vector: Vector3<f64>| [vector.x as f32, vector.y as f32, vector.z as f32];
@@ -199,7 +199,7 @@ impl Canvas {
     }
 
     /// Makes all lamps brighter or darker.
-    fn dim(&mut self, light_frac: f32) {
+    fn scale_lights(&mut self, light_frac: f32) {
         // SAFETY: only colours of lamps are written, which hold plain numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
@@ -224,7 +224,7 @@ impl Canvas {
             depth_m.extend(
                 depth_from_bottom[width * row..width * (row + 1)]
                     .iter()
-                    .map(|depth| metres_from_depth(*depth, self.near_far_m)),
+                    .map(|depth| meters_from_depth(*depth, self.near_far_m)),
             );
         }
         Picture { size_px, rgb, depth_m }
@@ -232,7 +232,7 @@ impl Canvas {
 }
 
 /// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
-fn metres_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
+fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
     let [near, far] = near_far_m.map(|metres| metres as f32);
     near * far / (far - depth * (far - near))
 }

@@ -1,20 +1,20 @@
 //! The robot as a whole: where its base is, and what its arm does if it has one.
 
-use crate::arm::{Arm, Reading, STEP_NANOS};
+use crate::arm::{Arm, JointReading, STEP_NANOS};
 use crate::base::BaseMotion;
 use crate::panda::{self, Joints};
 use kinematics::Transform;
 
 /// Where the robot is at one instant.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Posture {
+pub(crate) struct RobotPose {
     pub(crate) world_from_base: Transform,
     pub(crate) base_from_arm: Transform,
     /// `None` where there is no arm.
     pub(crate) joints_rad: Option<Joints>,
 }
 
-impl Posture {
+impl RobotPose {
     /// Pose of the flange; of the arm's place where there is no arm.
     pub(crate) fn world_from_flange(&self) -> Transform {
         let arm_from_flange = self.joints_rad.as_ref().map_or_else(Transform::identity, panda::base_from_flange);
@@ -40,19 +40,19 @@ impl Robot {
     }
 
     /// Moves on by one step; gives the time before it, nanoseconds, and what the arm's joints told then.
-    pub(crate) fn step(&mut self) -> (i64, Option<Reading>) {
+    pub(crate) fn step(&mut self) -> (i64, Option<JointReading>) {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
         (nanos, self.arm.as_mut().map(Arm::step))
     }
 
     /// The robot at a time in its recent past; `None` where the arm's readings do not reach.
-    pub(crate) fn at(&self, nanos: i64) -> Option<Posture> {
+    pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
         let joints_rad = match &self.arm {
             Some(arm) => Some(arm.position_at(nanos)?),
             None => None,
         };
         let world_from_base = self.motion.world_from_base(nanos as f64 * 1e-9);
-        Some(Posture { world_from_base, base_from_arm: self.base_from_arm, joints_rad })
+        Some(RobotPose { world_from_base, base_from_arm: self.base_from_arm, joints_rad })
     }
 }

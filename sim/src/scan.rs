@@ -17,63 +17,66 @@ use std::f64::consts::TAU;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,
-    only_azimuth: bool,
+    is_azimuth_only: bool,
 }
 
 /// One swinging quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
-struct Swing(f64, f64, f64, f64);
+struct Oscillation(f64, f64, f64, f64);
 
-impl Swing {
+impl Oscillation {
     fn at(&self, secs: f64) -> f64 {
         let Self(mean, amplitude, period_secs, phase) = self;
         mean + amplitude * ((secs / period_secs + phase) * TAU).sin()
     }
 }
 
-const AZIMUTH_DEGREES: Swing = Swing(0.0, 45.0, 11.3, -0.20);
-const ELEVATION_DEGREES: Swing = Swing(40.0, 20.0, 7.1, 0.35);
-const DISTANCE_M: Swing = Swing(0.35, 0.10, 9.2, 0.10);
-const ROLL_DEGREES: Swing = Swing(0.0, 20.0, 8.3, 0.60);
-const LOOK_X_M: Swing = Swing(0.0, 0.03, 6.3, 0.0);
-const LOOK_Y_M: Swing = Swing(0.0, 0.04, 7.7, 0.5);
+const AZIMUTH_DEGREES: Oscillation = Oscillation(0.0, 45.0, 11.3, -0.20);
+const ELEVATION_DEGREES: Oscillation = Oscillation(40.0, 20.0, 7.1, 0.35);
+const DISTANCE_M: Oscillation = Oscillation(0.35, 0.10, 9.2, 0.10);
+const ROLL_DEGREES: Oscillation = Oscillation(0.0, 20.0, 8.3, 0.60);
+const LOOK_AT_X_M: Oscillation = Oscillation(0.0, 0.03, 6.3, 0.0);
+const LOOK_AT_Y_M: Oscillation = Oscillation(0.0, 0.04, 7.7, 0.5);
 /// Height of the point looked at above the table, metres.
-const LOOK_ABOVE_M: f64 = 0.06;
+const LOOK_AT_HEIGHT_M: f64 = 0.06;
 /// The motion starts from rest within this time, seconds.
 const START_SECS: f64 = 0.5;
 /// The speed swings by this share, with this period in seconds.
-const SPEED_SWING: (f64, f64) = (0.35, 4.9);
+const SPEED_OSCILLATION: (f64, f64) = (0.35, 4.9);
 
 impl Scan {
-    /// With `only_azimuth` all swings but that of the azimuth rest at their means: the camera turns about one axis.
-    pub(crate) fn new(speed: f64, only_azimuth: bool) -> Self {
-        Self { speed, only_azimuth }
+    /// With `is_azimuth_only` all swings but that of the azimuth rest at their means: the camera turns about one axis.
+    pub(crate) fn new(speed: f64, is_azimuth_only: bool) -> Self {
+        Self { speed, is_azimuth_only }
     }
 
-    fn swing(&self, swing: &Swing, at: f64) -> f64 {
-        if self.only_azimuth { swing.0 } else { swing.at(at) }
+    fn oscillation(&self, oscillation: &Oscillation, at: f64) -> f64 {
+        if self.is_azimuth_only { oscillation.0 } else { oscillation.at(at) }
     }
 
     /// Progress along the tour, in seconds at even speed; starts at rest.
     fn progress(&self, secs: f64) -> f64 {
-        let (share, period_secs) = SPEED_SWING;
+        let (share, period_secs) = SPEED_OSCILLATION;
         // The integral of a ramp from 0 to 1 whose slope is smooth at both ends.
         let ramp = (secs / START_SECS).clamp(0.0, 1.0);
         let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
-        let even = started * self.speed;
-        even + share * period_secs / TAU * (1.0 - (even * TAU / period_secs).cos())
+        let uniform_secs = started * self.speed;
+        uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
 
     /// Where the camera should be: x right, y down, z to the point looked at.
     pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
         let at = self.progress(secs);
         let azimuth = AZIMUTH_DEGREES.at(at).to_radians();
-        let elevation = self.swing(&ELEVATION_DEGREES, at).to_radians();
-        let [look_x_m, look_y_m] = [&LOOK_X_M, &LOOK_Y_M].map(|swing| self.swing(swing, at));
-        let target = Vector3::new(TARGET_XY_M[0] + look_x_m, TARGET_XY_M[1] + look_y_m, TABLE_Z_M + LOOK_ABOVE_M);
+        let elevation = self.oscillation(&ELEVATION_DEGREES, at).to_radians();
+        let [look_at_x_m, look_at_y_m] =
+            [&LOOK_AT_X_M, &LOOK_AT_Y_M].map(|oscillation| self.oscillation(oscillation, at));
+        let target =
+            Vector3::new(TARGET_XY_M[0] + look_at_x_m, TARGET_XY_M[1] + look_at_y_m, TABLE_Z_M + LOOK_AT_HEIGHT_M);
         let back = Vector3::new(-elevation.cos() * azimuth.cos(), -elevation.cos() * azimuth.sin(), elevation.sin());
         let upright = looking_along(&-back);
-        let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.swing(&ROLL_DEGREES, at).to_radians());
-        Transform::from_parts(Translation3::from(target + back * self.swing(&DISTANCE_M, at)), upright * roll)
+        let roll =
+            UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.oscillation(&ROLL_DEGREES, at).to_radians());
+        Transform::from_parts(Translation3::from(target + back * self.oscillation(&DISTANCE_M, at)), upright * roll)
     }
 }
 
@@ -114,23 +117,23 @@ pub(crate) struct Follower {
 }
 
 /// Where the arm likes to be: far from its limits, elbow up.
-const COMFORTABLE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
+const REST_POSTURE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
 /// Distance kept from the joint limits, radians.
 const LIMIT_MARGIN_RAD: f64 = 0.05;
 /// Share of the joints' largest speed that the scan uses.
-const SPEED_SHARE: f64 = 0.5;
+const SPEED_LIMIT_FRAC: f64 = 0.5;
 /// Damping of the least squares, in metres and radians.
 const DAMPING: f64 = 0.03;
 /// How fast pose errors and discomfort fade, per second.
 const POSE_GAIN_HZ: f64 = 8.0;
-const COMFORT_GAIN_HZ: f64 = 0.6;
+const REST_POSTURE_GAIN_HZ: f64 = 0.6;
 /// The joint velocity follows its wish as a critically damped spring of this frequency, radians per second: what keeps
 /// the motion smooth.
 const SMOOTHING_RAD_S: f64 = 40.0;
 /// A joint may approach its limit by this share of the remaining distance per second.
-const APPROACH_HZ: f64 = 3.0;
+const LIMIT_APPROACH_HZ: f64 = 3.0;
 /// Share of the arm's largest accelerations and jerks that the scan uses.
-const BEND_SHARE: f64 = 0.6;
+const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 
 impl Follower {
     /// Starts at rest, at the scan's first pose.
@@ -139,30 +142,30 @@ impl Follower {
         let mut follower = Self {
             scan,
             flange_from_camera,
-            position_rad: Joints::from(COMFORTABLE_RAD),
+            position_rad: Joints::from(REST_POSTURE_RAD),
             velocity_rad_s: Joints::zeros(),
             acceleration_rad_s2: Joints::zeros(),
         };
-        let wanted = scan.arm_from_camera(0.0);
+        let target_pose = scan.arm_from_camera(0.0);
         for _ in 0..3000 {
-            let step = follower.wish(&wanted, &Vector6::zeros()) * 0.01;
+            let step = follower.desired_velocity(&target_pose, &Vector6::zeros()) * 0.01;
             follower.position_rad = clamp_to_limits(follower.position_rad + step);
         }
         let base_from_camera = panda::base_from_flange(&follower.position_rad) * flange_from_camera;
-        if pose_error(&wanted, &base_from_camera).norm() > TOLERANCE {
+        if pose_error(&target_pose, &base_from_camera).norm() > TOLERANCE {
             return Err(Error::Unreachable { at_secs: 0.0 });
         }
-        follower.clone().warn_where_the_arm_falls_short();
+        follower.clone().warn_if_tour_is_unreachable();
         Ok(follower)
     }
 
     /// Tries half a minute of the scan without dynamics: with some camera mounts the arm meets its limits and looks away.
-    fn warn_where_the_arm_falls_short(mut self) {
-        const TRIED_SECS: f64 = 30.0;
+    fn warn_if_tour_is_unreachable(mut self) {
+        const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
         const TOLERANCE_RAD: f64 = 0.35;
         let (mut worst_rad, mut secs) = (0.0_f64, 0.0);
-        while secs < TRIED_SECS {
+        while secs < CHECKED_SECS {
             secs += STEP_SECS;
             self.advance(secs, STEP_SECS);
             let base_from_camera = panda::base_from_flange(&self.position_rad) * self.flange_from_camera;
@@ -185,18 +188,20 @@ impl Follower {
 
     /// Moves on to a time, `step_secs` after the previous one.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
-        let wanted = self.scan.arm_from_camera(secs);
+        let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
-        let wanted_twist = pose_error(&wanted, &before) / step_secs;
-        let wish = self.wish(&wanted, &wanted_twist);
+        let target_twist = pose_error(&target_pose, &before) / step_secs;
+        let desired_velocity = self.desired_velocity(&target_pose, &target_twist);
         for ix in 0..N_JOINTS {
             let allowed = self.allowed_speed_rad_s(ix);
-            let slow = wish[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
+            let velocity_error = desired_velocity[ix].clamp(allowed[0], allowed[1]) - self.velocity_rad_s[ix];
             let acceleration = self.acceleration_rad_s2[ix];
-            let jerk = (slow * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
-            let (max_jerk, max_bend) = (panda::MAX_JERK_RAD_S3[ix], panda::MAX_ACCELERATION_RAD_S2[ix]);
-            let acceleration = acceleration + jerk.clamp(-BEND_SHARE * max_jerk, BEND_SHARE * max_jerk) * step_secs;
-            self.acceleration_rad_s2[ix] = acceleration.clamp(-BEND_SHARE * max_bend, BEND_SHARE * max_bend);
+            let jerk = (velocity_error * SMOOTHING_RAD_S - 2.0 * acceleration) * SMOOTHING_RAD_S;
+            let (max_jerk, max_acceleration) = (panda::MAX_JERK_RAD_S3[ix], panda::MAX_ACCELERATION_RAD_S2[ix]);
+            let acceleration =
+                acceleration + jerk.clamp(-DYNAMICS_LIMIT_FRAC * max_jerk, DYNAMICS_LIMIT_FRAC * max_jerk) * step_secs;
+            self.acceleration_rad_s2[ix] =
+                acceleration.clamp(-DYNAMICS_LIMIT_FRAC * max_acceleration, DYNAMICS_LIMIT_FRAC * max_acceleration);
         }
         self.velocity_rad_s += self.acceleration_rad_s2 * step_secs;
         self.position_rad = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
@@ -204,20 +209,20 @@ impl Follower {
 
     /// Lowest and highest joint velocity: slower towards a limit the nearer it is.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
-        let (position, fastest) = (self.position_rad[ix], SPEED_SHARE * panda::MAX_SPEED_RAD_S[ix]);
+        let (position, fastest) = (self.position_rad[ix], SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix]);
         let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
         let to_upper = panda::UPPER_RAD[ix] - LIMIT_MARGIN_RAD - position;
-        let towards = |distance: f64| (APPROACH_HZ * distance).clamp(0.0, fastest);
+        let towards = |distance: f64| (LIMIT_APPROACH_HZ * distance).clamp(0.0, fastest);
         [-towards(to_lower), towards(to_upper)]
     }
 
     /// Joint velocity that would bring the camera to the wanted pose, and the free joint motion to a comfortable one.
-    fn wish(&self, wanted: &Transform, wanted_twist: &Vector6<f64>) -> Joints {
+    fn desired_velocity(&self, target_pose: &Transform, target_twist: &Vector6<f64>) -> Joints {
         let (base_from_camera, jacobian) = panda::jacobian(&self.position_rad, &self.flange_from_camera);
-        let twist = wanted_twist + pose_error(wanted, &base_from_camera) * POSE_GAIN_HZ;
-        let comfort = (Joints::from(COMFORTABLE_RAD) - self.position_rad) * COMFORT_GAIN_HZ;
+        let twist = target_twist + pose_error(target_pose, &base_from_camera) * POSE_GAIN_HZ;
+        let rest_posture_velocity = (Joints::from(REST_POSTURE_RAD) - self.position_rad) * REST_POSTURE_GAIN_HZ;
         let inverse = damped_inverse(&jacobian);
-        comfort + inverse * (twist - jacobian * comfort)
+        rest_posture_velocity + inverse * (twist - jacobian * rest_posture_velocity)
     }
 }
 
@@ -228,10 +233,17 @@ fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
 }
 
 /// Translation and rotation from the actual to the wanted pose, along the world's axes.
-fn pose_error(wanted: &Transform, actual: &Transform) -> Vector6<f64> {
-    let shift = wanted.translation.vector - actual.translation.vector;
-    let turn = (wanted.rotation * actual.rotation.inverse()).scaled_axis();
-    Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
+fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
+    let translation_error = target_pose.translation.vector - actual.translation.vector;
+    let rotation_error = (target_pose.rotation * actual.rotation.inverse()).scaled_axis();
+    Vector6::new(
+        translation_error.x,
+        translation_error.y,
+        translation_error.z,
+        rotation_error.x,
+        rotation_error.y,
+        rotation_error.z,
+    )
 }
 
 fn clamp_to_limits(position_rad: Joints) -> Joints {

@@ -38,10 +38,10 @@ fn brightness(scene: Scene) -> f64 {
 /// Builds the model for pictures of up to `largest_px`.
 pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Error> {
     let mut files = MjVfs::new();
-    let mut assets = format!("{MATERIALS}{}", more_materials(config.scene));
+    let mut assets = format!("{MATERIALS}{}", extra_materials(config.scene));
     let mut bodies = String::new();
-    let made = Made::get(config.scene)?;
-    for (name, png) in &made.textures_png {
+    let scene_assets = SceneAssets::get(config.scene)?;
+    for (name, png) in &scene_assets.textures_png {
         add_file(&mut files, &format!("{name}.png"), png)?;
         let specular = if *name == "metal" { 0.25 } else { 0.03 };
         let _ = writeln!(
@@ -50,7 +50,7 @@ pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Er
              <material name=\"{name}\" texture=\"{name}\" specular=\"{specular}\" shininess=\"0.4\"/>"
         );
     }
-    for Object { name, material, mesh, world_from_mesh } in &made.objects {
+    for Object { name, material, mesh, world_from_mesh } in &scene_assets.objects {
         add_file(&mut files, &format!("{name}.msh"), &mesh.to_msh())?;
         let _ = writeln!(assets, "<mesh name=\"{name}\" file=\"{name}.msh\" inertia=\"shell\"/>");
         let pose = panda::pose_attributes(world_from_mesh);
@@ -89,9 +89,9 @@ fn robot(config: &Config) -> String {
     if !config.scene.has_moving_base() {
         return arm;
     }
-    let mount = panda::pose_attributes(&base::base_from_arm());
+    let arm_mount_pose = panda::pose_attributes(&base::base_from_arm());
     format!(
-        "<body name=\"base\" mocap=\"true\" childclass=\"arm\">\n{QUADRUPED}<body name=\"mount\" {mount}>\n{arm}</body>\n</body>\n"
+        "<body name=\"base\" mocap=\"true\" childclass=\"arm\">\n{QUADRUPED}<body name=\"mount\" {arm_mount_pose}>\n{arm}</body>\n</body>\n"
     )
 }
 
@@ -108,7 +108,7 @@ const QUADRUPED: &str = "<geom type=\"box\" size=\"0.38 0.13 0.08\" material=\"q
      <geom type=\"capsule\" fromto=\"-0.3 -0.17 0 -0.4 -0.19 -0.26\" size=\"0.04\" material=\"quadruped\"/>\n\
      <geom type=\"capsule\" fromto=\"-0.4 -0.19 -0.26 -0.3 -0.19 -0.49\" size=\"0.025\" material=\"arm_gray\"/>\n";
 
-fn more_materials(scene: Scene) -> &'static str {
+fn extra_materials(scene: Scene) -> &'static str {
     match scene {
         Scene::StaticArm => "",
         Scene::MobileBase => lab::MATERIALS,
@@ -117,17 +117,17 @@ fn more_materials(scene: Scene) -> &'static str {
 }
 
 /// What is made once a process, as it takes a second and no configuration changes it.
-struct Made {
+struct SceneAssets {
     textures_png: Vec<(&'static str, Vec<u8>)>,
     objects: Vec<Object>,
 }
 
-impl Made {
+impl SceneAssets {
     fn get(scene: Scene) -> Result<Arc<Self>, Error> {
-        static MADE: Mutex<BTreeMap<&str, Arc<Made>>> = Mutex::new(BTreeMap::new());
-        let mut all = MADE.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(made) = all.get(scene.name()) {
-            return Ok(Arc::clone(made));
+        static SCENE_ASSETS: Mutex<BTreeMap<&str, Arc<SceneAssets>>> = Mutex::new(BTreeMap::new());
+        let mut all = SCENE_ASSETS.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(scene_assets) = all.get(scene.name()) {
+            return Ok(Arc::clone(scene_assets));
         }
         let encode = |(name, texture): (&'static str, Texture)| {
             texture.to_png().map(|png| (name, png)).map_err(|source| Error::Texture { name, source })
@@ -138,9 +138,9 @@ impl Made {
             Scene::MobileArm => (cabinet::textures(), cabinet::objects()),
         };
         let textures_png = textures.into_par_iter().map(encode).collect::<Result<_, _>>()?;
-        let made = Arc::new(Self { textures_png, objects });
-        all.insert(scene.name(), Arc::clone(&made));
-        Ok(made)
+        let scene_assets = Arc::new(Self { textures_png, objects });
+        all.insert(scene.name(), Arc::clone(&scene_assets));
+        Ok(scene_assets)
     }
 }
 
@@ -176,7 +176,7 @@ mod tests {
     use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
     #[test]
-    fn mujocos_flange_is_where_our_kinematics_and_the_urdf_put_it() {
+    fn flange_matches_kinematics_and_urdf() {
         const TOLERANCE: f64 = 1e-9;
         let model = build(&Config::default(), [64, 64]).expect("the scene is valid");
         let flange_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, "panda_link8").expect("the flange is a body");
@@ -197,7 +197,7 @@ mod tests {
     }
 
     #[test]
-    fn mujocos_moving_base_and_its_arm_are_where_our_urdfs_put_them() {
+    fn moving_base_and_arm_match_urdfs() {
         const TOLERANCE: f64 = 1e-9;
         let names = |scene: Scene| if scene.has_arm() { Config::default().joint_names } else { Vec::new() };
         for scene in [Scene::MobileBase, Scene::MobileArm] {

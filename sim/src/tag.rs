@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tags_have_a_white_margin_a_black_border_and_distance_eleven() {
+    fn tags_have_margin_border_and_hamming_distance_11() {
         for id in 0..CODES.len() {
             let cells = cells(id);
             assert!(cells[0].iter().all(|white| *white) && cells[9].iter().all(|white| *white));

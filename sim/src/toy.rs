@@ -13,28 +13,28 @@ struct Part {
     /// Rotation about y, radians: positive tips the part's x axis down.
     pitch_rad: f64,
     /// Rotation about x before that, radians.
-    lean_rad: f64,
+    roll_rad: f64,
     band: FurBand,
     n_hairs: u64,
     hair_m: f64,
 }
 
-const fn part(center_m: [f64; 3], half_m: [f64; 3], pitch_rad: f64, lean_rad: f64, band: FurBand) -> Part {
-    Part { center_m, half_m, pitch_rad, lean_rad, band, n_hairs: 0, hair_m: 0.0 }
+const fn part(center_m: [f64; 3], half_m: [f64; 3], pitch_rad: f64, roll_rad: f64, band: FurBand) -> Part {
+    Part { center_m, half_m, pitch_rad, roll_rad, band, n_hairs: 0, hair_m: 0.0 }
 }
 
 impl Part {
-    const fn hairy(self, n_hairs: u64, hair_m: f64) -> Self {
+    const fn with_hair(self, n_hairs: u64, hair_m: f64) -> Self {
         Self { n_hairs, hair_m, ..self }
     }
 
     fn half_axes(&self) -> [Vector3<f64>; 3] {
-        let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), self.pitch_rad)
-            * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), self.lean_rad);
+        let rotation = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), self.pitch_rad)
+            * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), self.roll_rad);
         [
-            turn * Vector3::new(self.half_m[0], 0.0, 0.0),
-            turn * Vector3::new(0.0, self.half_m[1], 0.0),
-            turn * Vector3::new(0.0, 0.0, self.half_m[2]),
+            rotation * Vector3::new(self.half_m[0], 0.0, 0.0),
+            rotation * Vector3::new(0.0, self.half_m[1], 0.0),
+            rotation * Vector3::new(0.0, 0.0, self.half_m[2]),
         ]
     }
 
@@ -49,28 +49,28 @@ const DENSITY: u64 = 3;
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
 const PARTS: [Part; 22] = [
     // Trunk, chest and belly.
-    part([0.0, 0.0, 0.062], [0.048, 0.027, 0.027], 0.0, 0.0, FurBand::Coat).hairy(900, 0.010),
-    part([0.034, 0.0, 0.068], [0.024, 0.024, 0.027], -0.3, 0.0, FurBand::Coat).hairy(300, 0.010),
-    part([0.0, 0.0, 0.052], [0.038, 0.021, 0.020], 0.0, 0.0, FurBand::Light).hairy(160, 0.009),
+    part([0.0, 0.0, 0.062], [0.048, 0.027, 0.027], 0.0, 0.0, FurBand::Coat).with_hair(900, 0.010),
+    part([0.034, 0.0, 0.068], [0.024, 0.024, 0.027], -0.3, 0.0, FurBand::Coat).with_hair(300, 0.010),
+    part([0.0, 0.0, 0.052], [0.038, 0.021, 0.020], 0.0, 0.0, FurBand::Light).with_hair(160, 0.009),
     // Neck, head, muzzle.
-    part([0.052, 0.0, 0.092], [0.028, 0.016, 0.019], -0.95, 0.0, FurBand::Coat).hairy(350, 0.008),
-    part([0.070, 0.0, 0.113], [0.026, 0.018, 0.020], 0.35, 0.0, FurBand::Coat).hairy(400, 0.006),
-    part([0.090, 0.0, 0.104], [0.016, 0.014, 0.014], 0.35, 0.0, FurBand::Light).hairy(160, 0.003),
+    part([0.052, 0.0, 0.092], [0.028, 0.016, 0.019], -0.95, 0.0, FurBand::Coat).with_hair(350, 0.008),
+    part([0.070, 0.0, 0.113], [0.026, 0.018, 0.020], 0.35, 0.0, FurBand::Coat).with_hair(400, 0.006),
+    part([0.090, 0.0, 0.104], [0.016, 0.014, 0.014], 0.35, 0.0, FurBand::Light).with_hair(160, 0.003),
     // Nostrils and eyes.
     part([0.1045, 0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
     part([0.1045, -0.006, 0.103], [0.002, 0.002, 0.0028], 0.35, 0.0, FurBand::Dark),
     part([0.079, 0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
     part([0.079, -0.0165, 0.119], [0.0042, 0.0030, 0.0048], 0.3, 0.0, FurBand::Dark),
     // Ears and their insides.
-    part([0.060, 0.014, 0.143], [0.006, 0.009, 0.024], -0.25, -0.30, FurBand::Coat).hairy(180, 0.005),
-    part([0.060, -0.014, 0.143], [0.006, 0.009, 0.024], -0.25, 0.30, FurBand::Coat).hairy(180, 0.005),
+    part([0.060, 0.014, 0.143], [0.006, 0.009, 0.024], -0.25, -0.30, FurBand::Coat).with_hair(180, 0.005),
+    part([0.060, -0.014, 0.143], [0.006, 0.009, 0.024], -0.25, 0.30, FurBand::Coat).with_hair(180, 0.005),
     part([0.0635, 0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, -0.30, FurBand::Pink),
     part([0.0635, -0.014, 0.143], [0.005, 0.0062, 0.019], -0.25, 0.30, FurBand::Pink),
     // Legs, then hooves.
-    part([0.034, 0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).hairy(130, 0.006),
-    part([0.034, -0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).hairy(130, 0.006),
-    part([-0.034, 0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).hairy(130, 0.006),
-    part([-0.034, -0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).hairy(130, 0.006),
+    part([0.034, 0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).with_hair(130, 0.006),
+    part([0.034, -0.016, 0.028], [0.011, 0.010, 0.026], 0.0, 0.0, FurBand::Coat).with_hair(130, 0.006),
+    part([-0.034, 0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).with_hair(130, 0.006),
+    part([-0.034, -0.016, 0.028], [0.012, 0.011, 0.026], 0.1, 0.0, FurBand::Coat).with_hair(130, 0.006),
     part([0.035, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
     part([0.035, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
     part([-0.037, 0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
@@ -129,7 +129,7 @@ pub(crate) fn fur(light: Light<'_>) -> Mesh {
             let normal = ellipsoid_normal(&half_axes, &direction);
             let length_m = part.hair_m * random.between(8 * hair + 2, 0.8, 1.5);
             let hair_at = Hair { root, normal, length_m, width_m: 0.0011, band: part.band };
-            grow(&mut mesh, light, random, 8 * hair + 3, &hair_at);
+            grow_hair(&mut mesh, light, random, 8 * hair + 3, &hair_at);
         }
     }
     add_mane(&mut mesh, light);
@@ -154,7 +154,7 @@ struct Hair {
 }
 
 /// Adds a tapered hair of two pieces that leans back and droops; it uses five counters.
-fn grow(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, hair: &Hair) {
+fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, hair: &Hair) {
     let jitter = Vector3::new(
         random.between(counter, -0.45, 0.45),
         random.between(counter + 1, -0.45, 0.45),
@@ -213,7 +213,13 @@ fn add_mane(mesh: &mut Mesh, light: Light<'_>) {
         let normal = Vector3::new(-0.35, 60.0 * aside, 0.9).normalize();
         let length_m = random.between(9 * hair + 2, 0.012, 0.022);
         let root = root + Vector3::new(0.0, aside, -0.004);
-        grow(mesh, light, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+        grow_hair(
+            mesh,
+            light,
+            random,
+            9 * hair + 3,
+            &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark },
+        );
     }
 }
 
@@ -225,6 +231,12 @@ fn add_tail(mesh: &mut Mesh, light: Light<'_>) {
             Point3::new(-0.046 - 0.020 * along, random.between(9 * hair + 1, -0.003, 0.003), 0.075 - 0.030 * along);
         let normal = Vector3::new(-0.5, 0.0, -0.8).normalize();
         let length_m = 0.012 + 0.016 * along;
-        grow(mesh, light, random, 9 * hair + 3, &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark });
+        grow_hair(
+            mesh,
+            light,
+            random,
+            9 * hair + 3,
+            &Hair { root, normal, length_m, width_m: 0.0013, band: FurBand::Dark },
+        );
     }
 }

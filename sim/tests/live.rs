@@ -6,8 +6,8 @@ use sim::Config;
 use std::time::Duration;
 
 #[test]
-fn devices_deliver_stamped_samples_until_the_rig_ends() {
-    const PATIENCE: Duration = Duration::from_secs(60);
+fn live_devices_deliver_until_the_rig_ends() {
+    const TIMEOUT: Duration = Duration::from_secs(60);
     const START: Stamp = Stamp(5_000_000_000_000);
     let mut config = Config { duration_secs: Some(1.0), ..Config::default() };
     config.cameras[0].intrinsics = config.cameras[0].intrinsics.resized([160, 120]);
@@ -16,7 +16,7 @@ fn devices_deliver_stamped_samples_until_the_rig_ends() {
     let mut newest = START;
     let mut n_readings = 0;
     let arm = rig.devices.arm.as_mut().expect("the rig has an arm");
-    while let Ok(state) = arm.read(PATIENCE) {
+    while let Ok(state) = arm.read(TIMEOUT) {
         assert!(n_readings == 0 || state.stamp > newest);
         assert_eq!((state.position.len(), state.velocity.len()), (7, 7));
         newest = state.stamp;
@@ -28,12 +28,12 @@ fn devices_deliver_stamped_samples_until_the_rig_ends() {
 
     let camera = &mut rig.devices.cameras[0];
     assert_eq!(camera.name(), "wrist");
-    let (mut n_color, mut n_depth, mut n_lost) = (0, 0, 0);
+    let (mut n_color, mut n_depth, mut n_dropped) = (0, 0, 0);
     let end = loop {
-        match camera.next_image(PATIENCE) {
+        match camera.next_image(TIMEOUT) {
             Ok(image) if image.format == PixelFormat::Rgb8 => {
                 n_color += 1;
-                n_lost += image.n_skipped;
+                n_dropped += image.n_skipped;
             }
             Ok(_) => n_depth += 1,
             Err(error) => break error,
@@ -42,7 +42,7 @@ fn devices_deliver_stamped_samples_until_the_rig_ends() {
     assert!(matches!(end, drivers::Error::Simulation { .. }), "{end}");
     assert!(n_color >= 1 && n_depth >= 1, "{n_color} colour, {n_depth} depth");
     // Nobody took images while the joints were read: what did not fit the queue was counted.
-    assert!(n_color + n_lost <= 15 && n_color + n_depth <= 8, "{n_color} colour, {n_depth} depth, {n_lost} lost");
+    assert!(n_color + n_dropped <= 15 && n_color + n_depth <= 8, "{n_color} colour, {n_depth} depth, {n_dropped} lost");
     let truth = rig.truth.take().expect("truth came along");
     assert!(matches!(truth, drivers::Sample::Truth(truth) if truth.psnr_ceiling.is_some()));
 }

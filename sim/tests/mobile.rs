@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::play;
+use common::run_rig;
 use drivers::Image;
 use kinematics::{Intrinsics, Transform};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -51,7 +51,7 @@ fn lens_of(config: &Config) -> Intrinsics {
 fn scans_hit_the_walls_within_their_noise() {
     let config = Config { duration_secs: Some(2.0), ..mobile_base(1.0) };
     let noise_m = config.scanners[0].noise_sigma_m;
-    let run = play(&config);
+    let run = run_rig(&config);
     assert!(run.scans.len() >= 18, "{} scans", run.scans.len());
     let world_from_base = |nanos: i64| {
         let after = run.true_base.partition_point(|pose| pose.stamp.0 < nanos).clamp(1, run.true_base.len() - 1);
@@ -66,13 +66,17 @@ fn scans_hit_the_walls_within_their_noise() {
             let world_from_scanner: Transform = pose * config.scanners[0].base_from_scanner;
             let at = world_from_scanner * Point3::from(point.position_m).cast::<f64>();
             n_points += 1.0;
-            let beyond = [at.x.abs() - ROOM_HALF_M[0], at.y.abs() - ROOM_HALF_M[1]];
-            assert!(beyond[0] < 0.15 && beyond[1] < 0.15 && at.z > -0.15 && at.z < ROOM_HEIGHT_M + 0.15, "{at}");
+            let past_wall_m = [at.x.abs() - ROOM_HALF_M[0], at.y.abs() - ROOM_HALF_M[1]];
+            assert!(
+                past_wall_m[0] < 0.15 && past_wall_m[1] < 0.15 && at.z > -0.15 && at.z < ROOM_HEIGHT_M + 0.15,
+                "{at}"
+            );
             // Above all furniture and below the lamps only walls are left.
             if at.z > 2.15 && at.z < 2.6 {
                 let ray = (at.coords - world_from_scanner.translation.vector).normalize();
                 // The error along the ray of a wall met at an angle.
-                let (axis, off) = if beyond[0] > beyond[1] { (0, beyond[0]) } else { (1, beyond[1]) };
+                let (axis, off) =
+                    if past_wall_m[0] > past_wall_m[1] { (0, past_wall_m[0]) } else { (1, past_wall_m[1]) };
                 squares += (off / ray[axis].abs()).powi(2);
                 n_wall += 1.0;
             }
@@ -85,49 +89,53 @@ fn scans_hit_the_walls_within_their_noise() {
 }
 
 #[test]
-fn told_poses_drift_and_the_truth_beside_them_is_exact() {
+fn reported_poses_drift_and_ground_truth_is_exact() {
     let config = Config { duration_secs: Some(12.0), ..mobile_base(0.5) };
-    let run = play(&config);
-    assert_eq!(run.told.len(), run.true_base.len());
-    let apart_m = |ix: usize| {
-        let (told, truth) = (&run.told[ix], &run.true_base[ix]);
-        assert_eq!(told.stamp, truth.stamp);
-        (told.world_from_base.translation.vector - truth.world_from_base.translation.vector).norm()
+    let run = run_rig(&config);
+    assert_eq!(run.reported_base.len(), run.true_base.len());
+    let distance_m = |ix: usize| {
+        let (reported_base, truth) = (&run.reported_base[ix], &run.true_base[ix]);
+        assert_eq!(reported_base.stamp, truth.stamp);
+        (reported_base.world_from_base.translation.vector - truth.world_from_base.translation.vector).norm()
     };
-    assert!(apart_m(0) == 0.0 && apart_m(run.told.len() - 1) > 1e-4 && apart_m(run.told.len() - 1) < 0.1);
+    assert!(
+        distance_m(0) == 0.0
+            && distance_m(run.reported_base.len() - 1) > 1e-4
+            && distance_m(run.reported_base.len() - 1) < 0.1
+    );
     for truth in &run.truth {
         // Base poses come every 10 ms and images between them: as far as the straight line between poses goes.
         let ix = run.true_base.partition_point(|pose| pose.stamp < truth.image.stamp).clamp(1, run.true_base.len() - 1);
         let (a, b) = (&run.true_base[ix - 1], &run.true_base[ix]);
         let share = truth.image.stamp.secs_since(a.stamp) / b.stamp.secs_since(a.stamp);
         let base = kinematics::transform::interpolate(&a.world_from_base, &b.world_from_base, share);
-        let apart = (base * config.cameras[0].parent_from_camera).inverse() * truth.world_from_camera;
-        assert!(apart.translation.vector.norm() < 5e-5 && apart.rotation.angle() < 5e-5, "{apart}");
+        let difference = (base * config.cameras[0].parent_from_camera).inverse() * truth.world_from_camera;
+        assert!(difference.translation.vector.norm() < 5e-5 && difference.rotation.angle() < 5e-5, "{difference}");
     }
-    let ideal = play(&Config { ideal: true, ..config });
-    assert!(ideal.told.iter().zip(&ideal.true_base).all(|(told, truth)| told == truth));
+    let ideal = run_rig(&Config { ideal: true, ..config });
+    assert!(ideal.reported_base.iter().zip(&ideal.true_base).all(|(reported_base, truth)| reported_base == truth));
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bits_and_another_seed_other_drift_and_echoes() {
+fn runs_are_deterministic_per_seed() {
     for config in [mobile_base(2.0), mobile_arm(2.0)] {
         let config = Config { n_images: Some(3), ..config };
-        let first = play(&config);
-        assert!(first == play(&config));
-        let other = play(&Config { seed: 2, ..config.clone() });
+        let first = run_rig(&config);
+        assert!(first == run_rig(&config));
+        let other = run_rig(&Config { seed: 2, ..config.clone() });
         assert!(first.color != other.color && first.true_base == other.true_base);
         assert!(config.scanners.is_empty() || first.scans != other.scans);
     }
 }
 
 #[test]
-fn depth_of_a_sensor_of_its_own_shows_the_same_surfaces_as_the_color_camera() {
+fn separate_depth_sensor_matches_color_camera() {
     const TOLERANCE_FRAC: f64 = 0.01; // A pixel of slanted surface; wrong frames or lenses are ten times further off.
     let config = Config { ideal: true, n_images: Some(4), ..mobile_arm(1.0) };
-    let run = play(&config);
+    let run = run_rig(&config);
     let color = lens_of(&config);
     let sensor = config.cameras[0].depth.clone().and_then(|depth| depth.sensor).expect("a sensor of its own");
-    let (mut n_alike, mut n_seen) = (0, 0);
+    let (mut n_matching, mut n_seen) = (0, 0);
     for (image, truth) in run.depth.iter().zip(&run.truth) {
         assert_eq!(image.size_px, [160, 120]);
         for (ix, count) in image.data.chunks_exact(2).enumerate() {
@@ -140,19 +148,19 @@ fn depth_of_a_sensor_of_its_own_shows_the_same_surfaces_as_the_color_camera() {
             };
             let seen = f64::from(truth.depth_m[v as usize * 320 + u as usize]);
             n_seen += 1;
-            n_alike += usize::from((seen / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
+            n_matching += usize::from((seen / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
         }
     }
     // Depth edges, where the two look past each other, are the rest.
-    assert!(n_seen > 20_000 && n_alike as f64 > 0.93 * f64::from(n_seen), "{n_alike} of {n_seen}");
+    assert!(n_seen > 20_000 && n_matching as f64 > 0.93 * f64::from(n_seen), "{n_matching} of {n_seen}");
 }
 
 #[test]
-fn scenes_are_not_easy_and_noise_leaves_room() {
-    let mut told = Vec::new();
+fn mean_image_scores_low_and_noise_ceiling_is_high() {
+    let mut reported_base = Vec::new();
     for config in [mobile_base(0.5), mobile_arm(0.5)] {
         let name = config.scene.name();
-        let run = play(&Config { n_images: Some(32), scanners: vec![], ..config });
+        let run = run_rig(&Config { n_images: Some(32), scanners: vec![], ..config });
         for truth in &run.truth {
             let ceiling = truth.psnr_ceiling.expect("there is noise");
             assert!(ceiling > 40.0 && ceiling < 45.5, "{name}: {ceiling} dB");
@@ -169,26 +177,26 @@ fn scenes_are_not_easy_and_noise_leaves_room() {
         };
         let tests: Vec<f64> = run.color.iter().step_by(8).map(psnr).collect();
         let mean_psnr = tests.iter().sum::<f64>() / tests.len() as f64;
-        told.push((name, mean_psnr));
+        reported_base.push((name, mean_psnr));
     }
-    assert!(told.iter().all(|(_, mean_psnr)| *mean_psnr < 15.0), "the mean images score {told:?} dB");
+    assert!(reported_base.iter().all(|(_, mean_psnr)| *mean_psnr < 15.0), "the mean images score {reported_base:?} dB");
 }
 
 #[test]
-fn the_light_changes_as_the_arm_goes_in_and_the_camera_gets_inside() {
-    let still = |light_inside_frac: f64| {
+fn light_changes_when_camera_enters_cabinet() {
+    let run_with_light = |light_inside_frac: f64| {
         let config = mobile_arm(0.25);
         // Second stand, the camera in the cabinet: 19 s, 9 s outside, 11 s on the way in.
         let config = Config { light_inside_frac, duration_secs: Some(40.0), truth_depth: false, ..config };
-        play(&config)
+        run_rig(&config)
     };
-    let (steady, dimmed) = (still(1.0), still(0.5));
+    let (constant_light, dimmed) = (run_with_light(1.0), run_with_light(0.5));
     let brightness =
         |image: &Image| image.data.iter().map(|byte| f64::from(*byte)).sum::<f64>() / image.data.len() as f64;
     let (mut n_same, mut n_darker) = (0, 0);
-    for (steady, dimmed) in steady.truth.iter().zip(&dimmed.truth) {
-        let depth_m = steady.world_from_camera.translation.vector.x - 2.05;
-        let share = brightness(&dimmed.image) / brightness(&steady.image);
+    for (constant_light, dimmed) in constant_light.truth.iter().zip(&dimmed.truth) {
+        let depth_m = constant_light.world_from_camera.translation.vector.x - 2.05;
+        let share = brightness(&dimmed.image) / brightness(&constant_light.image);
         if depth_m < -0.2 {
             assert!((share - 1.0).abs() < 1e-9, "{share} at {depth_m} m");
             n_same += 1;

@@ -12,9 +12,9 @@ use nalgebra::{Point3, Vector3};
 use sim::{Config, DepthConfig, RigInfo};
 use std::collections::BTreeMap;
 
-fn play(config: &Config) -> Run {
-    let run = common::play(config);
-    let of_base = (run.told.len(), run.true_base.len(), run.scans.len());
+fn run_rig(config: &Config) -> Run {
+    let run = common::run_rig(config);
+    let of_base = (run.reported_base.len(), run.true_base.len(), run.scans.len());
     assert_eq!(of_base, (0, 0, 0), "a static arm has neither");
     run
 }
@@ -72,9 +72,9 @@ fn pixel(intrinsics: &Intrinsics, world_from_camera: &Transform, point: &Point3<
 }
 
 #[test]
-fn forward_kinematics_of_the_joint_readings_gives_the_true_camera_pose() {
+fn forward_kinematics_matches_true_camera_pose() {
     const TOLERANCE_M: f64 = 2e-6; // The straight line between readings 1 ms apart; the motion bends by up to 10 rad/s^2.
-    let run = play(&Config { n_images: Some(40), truth: true, ..Config::default() });
+    let run = run_rig(&Config { n_images: Some(40), truth: true, ..Config::default() });
     let camera = &run.info.cameras[0];
     let mut worst_m: f64 = 0.0;
     for truth in &run.truth {
@@ -88,8 +88,8 @@ fn forward_kinematics_of_the_joint_readings_gives_the_true_camera_pose() {
 }
 
 #[test]
-fn the_arm_scans_inside_its_limits_and_sees_the_target_from_many_sides() {
-    let run = play(&Config { ideal: true, truth: true, n_images: Some(30), ..slow_camera() });
+fn scan_stays_within_limits_and_covers_the_target() {
+    let run = run_rig(&Config { ideal: true, truth: true, n_images: Some(30), ..slow_camera() });
     let chain = chain(&run.info);
     for state in &run.joints {
         for (ix, limits) in chain.limits().iter().enumerate() {
@@ -98,11 +98,11 @@ fn the_arm_scans_inside_its_limits_and_sees_the_target_from_many_sides() {
             assert!(speed < limits.velocity, "joint {ix} at {speed} rad/s");
         }
     }
-    for (ix, (bend, jerk)) in MAX_BEND_RAD_S2.into_iter().zip(MAX_JERK_RAD_S3).enumerate() {
+    for (ix, (max_acceleration, jerk)) in MAX_ACCELERATION_RAD_S2.into_iter().zip(MAX_JERK_RAD_S3).enumerate() {
         let speeds: Vec<f64> = run.joints.iter().map(|state| state.velocity[ix]).collect();
         for speeds in speeds.windows(3) {
             let [first, second] = [speeds[1] - speeds[0], speeds[2] - speeds[1]].map(|change| change * 1e3);
-            assert!(first.abs() < bend, "joint {ix}: {first} rad/s^2");
+            assert!(first.abs() < max_acceleration, "joint {ix}: {first} rad/s^2");
             assert!((second - first).abs() * 1e3 < jerk, "joint {ix}: {} rad/s^3", (second - first) * 1e3);
         }
     }
@@ -125,7 +125,7 @@ fn the_arm_scans_inside_its_limits_and_sees_the_target_from_many_sides() {
 }
 
 /// What Franka allows its arm.
-const MAX_BEND_RAD_S2: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
+const MAX_ACCELERATION_RAD_S2: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
 const MAX_JERK_RAD_S3: [f64; 7] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
 
 /// One image a second, small: for looking at the motion alone.
@@ -138,21 +138,21 @@ fn slow_camera() -> Config {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bits_and_another_seed_does_not() {
+fn runs_are_deterministic_per_seed() {
     let config = Config { n_images: Some(4), truth_depth: true, ..Config::default() };
-    let (first, again) = (play(&config), play(&config));
+    let (first, again) = (run_rig(&config), run_rig(&config));
     assert_eq!(first.color, again.color);
     assert_eq!(first.depth, again.depth);
     assert_eq!(first.truth, again.truth);
     assert_eq!(first.joints, again.joints);
-    let other = play(&Config { seed: 2, ..config });
+    let other = run_rig(&Config { seed: 2, ..config });
     assert_ne!(first.color[0].data, other.color[0].data);
     assert_eq!(first.truth[0].image.data, other.truth[0].image.data);
 }
 
 #[test]
-fn the_tag_on_top_of_the_cube_lies_where_the_pose_says_and_reads_as_id_4() {
-    let run = play(&ideal(12));
+fn tag_on_cube_is_at_its_pose_with_id_4() {
+    let run = run_rig(&ideal(12));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let n_cells = sim::tag::N_CELLS as f64;
     let truth = run.truth.last().expect("images came");
@@ -166,11 +166,11 @@ fn the_tag_on_top_of_the_cube_lies_where_the_pose_says_and_reads_as_id_4() {
 }
 
 #[test]
-fn edges_of_the_tag_are_drawn_within_a_fifth_of_a_pixel() {
+fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
     const TOLERANCE_PX: f64 = 0.2;
     let mut config = ideal(3);
     config.cameras[0].sensor.supersample = 4; // Jagged edges would need many of them to average out.
-    let run = play(&config);
+    let run = run_rig(&config);
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("images came");
     // Across the four outer edges of the black border, one cell inside the margin: brightness falls to half at the edge.
@@ -195,9 +195,9 @@ fn edges_of_the_tag_are_drawn_within_a_fifth_of_a_pixel() {
 }
 
 #[test]
-fn depth_is_that_of_the_table_and_the_cube() {
+fn depth_matches_table_and_cube() {
     const TOLERANCE_M: f64 = 1e-4; // Twice the depth image's counts of 0.1 mm would be too lax for the noise-free depth.
-    let run = play(&ideal(5));
+    let run = run_rig(&ideal(5));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let truth = run.truth.last().expect("images came");
     let depth = run.depth.last().expect("depth came");
@@ -223,8 +223,8 @@ fn counts(depth: &Image) -> Vec<f64> {
 }
 
 #[test]
-fn noise_is_as_configured() {
-    let run = play(&Config { truth_depth: true, n_images: Some(6), ..Config::default() });
+fn noise_matches_configuration() {
+    let run = run_rig(&Config { truth_depth: true, n_images: Some(6), ..Config::default() });
     for truth in &run.truth {
         let ceiling = truth.psnr_ceiling.expect("there is noise");
         assert!(ceiling > 40.0 && ceiling < 44.0, "{ceiling} dB");
@@ -247,7 +247,7 @@ fn noise_is_as_configured() {
 }
 
 #[test]
-fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
+fn rolling_shutter_uses_the_pose_of_each_row() {
     const TOLERANCE_PX: f64 = 0.3;
     const READOUT_SECS: f64 = 0.04; // Slower than real ones, so that there is more to see.
     let mut config = Config { n_images: Some(16), ..Config::default() };
@@ -259,15 +259,15 @@ fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
         readout_micros: 1e6 * READOUT_SECS,
         ..config.cameras[0].sensor
     };
-    let run = play(&config);
+    let run = run_rig(&config);
     let (intrinsics, chain) = (&run.info.cameras[0].intrinsics, chain(&run.info));
     let mut largest_px: f64 = 0.0;
     for (image, truth) in run.color.iter().zip(&run.truth).skip(1) {
         // The middle of the lower edge of the black border, found along the tag's middle line.
         let line: Vec<Point3<f64>> = (0..=200).map(|ix| on_tag(0.5, 0.85 + 0.1 * f64::from(ix) / 200.0)).collect();
-        let still = |point: &Point3<f64>| pixel(intrinsics, &truth.world_from_camera, point);
-        let sheared = |point: &Point3<f64>| {
-            let mut seen = still(point);
+        let static_pixel = |point: &Point3<f64>| pixel(intrinsics, &truth.world_from_camera, point);
+        let rolling_pixel = |point: &Point3<f64>| {
+            let mut seen = static_pixel(point);
             for _ in 0..3 {
                 let share = seen[1] / f64::from(intrinsics.size_px[1]) - 0.5;
                 let stamp = truth.image.stamp.plus_secs(READOUT_SECS * share);
@@ -276,7 +276,7 @@ fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
             }
             seen
         };
-        if !line.iter().all(|point| still(point).iter().all(|value| *value > 40.0 && *value < 440.0)) {
+        if !line.iter().all(|point| static_pixel(point).iter().all(|value| *value > 40.0 && *value < 440.0)) {
             continue;
         }
         let edge = |image: &Image, at: &dyn Fn(&Point3<f64>) -> [f64; 2]| {
@@ -284,20 +284,21 @@ fn the_rolling_shutter_puts_each_row_where_its_own_pose_sees_it() {
             let half = 0.5 * (brightness[0] + brightness[200]);
             at(&line[brightness.iter().position(|value| *value > half).expect("white follows black")])
         };
-        let (expected, got) = (sheared(&line[100]), edge(image, &sheared));
+        let (expected, got) = (rolling_pixel(&line[100]), edge(image, &rolling_pixel));
         let error_px = (expected[0] - got[0]).hypot(expected[1] - got[1]);
         assert!(error_px < TOLERANCE_PX, "{error_px} px at {expected:?}");
-        largest_px = largest_px.max((still(&line[100])[0] - expected[0]).hypot(still(&line[100])[1] - expected[1]));
+        largest_px = largest_px
+            .max((static_pixel(&line[100])[0] - expected[0]).hypot(static_pixel(&line[100])[1] - expected[1]));
     }
     assert!(largest_px > 3.0 * TOLERANCE_PX, "the shear was only {largest_px} px: nothing was tested");
 }
 
 #[test]
-fn the_mean_image_is_far_from_every_view() {
+fn mean_image_scores_low() {
     let mut config = Config { n_images: Some(32), truth: false, ideal: true, ..Config::default() };
     config.cameras[0].rate_hz = 2.0;
     config.cameras[0].depth = None;
-    let images = play(&config).color;
+    let images = run_rig(&config).color;
     let is_test = |ix: usize| ix.is_multiple_of(8);
     let n_train = images.iter().enumerate().filter(|(ix, _)| !is_test(*ix)).count() as f64;
     let mut mean = vec![0.0; images[0].data.len()];
@@ -319,12 +320,12 @@ fn the_mean_image_is_far_from_every_view() {
 }
 
 #[test]
-fn lost_images_are_counted_and_samples_come_in_the_order_of_delivery() {
+fn dropped_images_are_counted_and_samples_are_ordered() {
     let mut config = Config { truth: false, n_images: Some(20), ..slow_camera() };
     config.cameras[0].rate_hz = 30.0;
     config.cameras[0].sensor.dropped_frac = 0.3;
     let mut rig = sim::open(&config).expect("the rig opens").into_lockstep();
-    let (mut newest_joints, mut lost, mut images) = (Stamp(0), 0, BTreeMap::new());
+    let (mut newest_joints, mut n_dropped, mut images) = (Stamp(0), 0, BTreeMap::new());
     while let Some(sample) = rig.next_sample().expect("the rig plays") {
         match sample {
             Sample::Joints(state) => newest_joints = state.stamp,
@@ -332,7 +333,7 @@ fn lost_images_are_counted_and_samples_come_in_the_order_of_delivery() {
                 let age = newest_joints.nanos_since(image.stamp);
                 // Half the readout and exposure, one step, 20 ms of latency, and up to one step more.
                 assert!((29_000_000..=30_100_000).contains(&age), "{age} ns");
-                lost += image.n_skipped;
+                n_dropped += image.n_skipped;
                 images.insert(image.stamp, image.n_skipped);
             }
             _ => {}
@@ -342,6 +343,6 @@ fn lost_images_are_counted_and_samples_come_in_the_order_of_delivery() {
     let span = images.keys().last().expect("images").secs_since(*images.keys().next().expect("images"));
     let n_periods = (span * 30.0).round() as u64;
     let before_first = images.values().next().expect("images");
-    assert_eq!(n_periods + 1, 20 + lost - before_first);
-    assert!(lost > 2, "{lost} lost");
+    assert_eq!(n_periods + 1, 20 + n_dropped - before_first);
+    assert!(n_dropped > 2, "{n_dropped} lost");
 }

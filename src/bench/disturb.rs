@@ -6,7 +6,7 @@
 //! A disturbance is a function of its size, a seed, and the keyframes: it has no state, and what befalls a keyframe depends
 //! on no other one's order. Sizes of one seed share their random directions, so that a curve over sizes has no noise of its own.
 
-use crate::bench::statistics::Between;
+use crate::bench::statistics::Interpolation;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use sha2::{Digest, Sha256};
@@ -65,7 +65,7 @@ impl Disturbance {
     }
 
     /// Sizes that are measured, from none to large; of keyframes, from few to many.
-    pub(crate) fn usual_levels(self) -> &'static [f64] {
+    pub(crate) fn default_levels(self) -> &'static [f64] {
         match self {
             Self::PoseNoise => &[0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0],
             Self::ClockOffset => &[0.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0],
@@ -75,10 +75,10 @@ impl Disturbance {
     }
 
     /// How break points between two sizes are found.
-    pub(crate) fn between(self) -> Between {
+    pub(crate) fn interpolation(self) -> Interpolation {
         match self {
-            Self::Keyframes => Between::Log,
-            Self::PoseNoise | Self::ClockOffset | Self::Exposure => Between::Linear,
+            Self::Keyframes => Interpolation::Log,
+            Self::PoseNoise | Self::ClockOffset | Self::Exposure => Interpolation::Linear,
         }
     }
 
@@ -97,7 +97,7 @@ impl Disturbance {
             Self::PoseNoise => pose_noise(keyframes, level, seed),
             Self::ClockOffset => clock_offset(keyframes, level * 1e-3 * nanos_per_sec),
             Self::Exposure => exposure_step(keyframes, level),
-            Self::Keyframes => fewer(keyframes, level),
+            Self::Keyframes => subsample(keyframes, level),
         }
     }
 }
@@ -113,9 +113,9 @@ fn map(keyframes: &[Arc<Keyframe>], mut change: impl FnMut(&mut Keyframe)) -> Ve
 
 /// Moves a camera; its depth sensor moves along.
 fn move_to(keyframe: &mut Keyframe, world_from_camera: Transform) {
-    let moved_from_before = world_from_camera * keyframe.world_from_camera.inverse();
+    let moved_from_original = world_from_camera * keyframe.world_from_camera.inverse();
     if let Some(depth) = &mut keyframe.depth {
-        depth.world_from_camera = moved_from_before * depth.world_from_camera;
+        depth.world_from_camera = moved_from_original * depth.world_from_camera;
     }
     keyframe.world_from_camera = world_from_camera;
 }
@@ -127,10 +127,10 @@ fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<
         if keyframe.split == Split::Test {
             return;
         }
-        let [x, y, z, turn_x, turn_y, turn_z] = six_normals(seed, &keyframe.camera, keyframe.stamp);
+        let [x, y, z, rotation_x, rotation_y, rotation_z] = six_normals(seed, &keyframe.camera, keyframe.stamp);
         let camera_from_disturbed = Transform::from_parts(
             (Vector3::new(x, y, z) * sigma_m).into(),
-            UnitQuaternion::from_scaled_axis(Vector3::new(turn_x, turn_y, turn_z) * sigma_rad),
+            UnitQuaternion::from_scaled_axis(Vector3::new(rotation_x, rotation_y, rotation_z) * sigma_rad),
         );
         move_to(keyframe, keyframe.world_from_camera * camera_from_disturbed);
     })
@@ -205,7 +205,7 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
         keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).map(|keyframe| keyframe.stamp).collect();
     stamps.sort();
     let Some(middle) = stamps.get(stamps.len() / 2).copied() else { return keyframes.to_vec() };
-    let [darker, brighter] = [-0.5, 0.5].map(|share| exposed(2.0_f64.powf(share * step_ev)));
+    let [darker, brighter] = [-0.5, 0.5].map(|fraction| exposure_table(2.0_f64.powf(fraction * step_ev)));
     map(keyframes, |keyframe| {
         let table = if keyframe.stamp < middle { &darker } else { &brighter };
         let pixels = keyframe.rgba_srgb.chunks_exact(4);
@@ -218,7 +218,7 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
 /// What becomes of each sRGB byte when the light is multiplied by `gain`: linear light, clipped, rounded to 8 bits.
 ///
 /// Source: IEC 61966-2-1 for both curves.
-fn exposed(gain: f64) -> [u8; 256] {
+fn exposure_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|byte| {
         let srgb = byte as f64 / 255.0;
         let linear = if srgb <= 0.04045 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) };
@@ -231,18 +231,18 @@ fn exposed(gain: f64) -> [u8; 256] {
 }
 
 /// Keeps `n` training keyframes, spread evenly over all; test keyframes stay.
-fn fewer(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
+fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
     let n_all = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count() as f64;
-    let share = (n / n_all).min(1.0);
-    let mut n_seen = 0.0;
+    let fraction = (n / n_all).min(1.0);
+    let mut n_visited = 0.0;
     let mut is_kept = |keyframe: &&Arc<Keyframe>| {
         if keyframe.split == Split::Test {
             return true;
         }
         // The one in the middle of each of n equal stretches.
-        let before = (n_seen * share + 0.5).floor();
-        n_seen += 1.0;
-        (n_seen * share + 0.5).floor() > before
+        let before = (n_visited * fraction + 0.5).floor();
+        n_visited += 1.0;
+        (n_visited * fraction + 0.5).floor() > before
     };
     keyframes.iter().filter(|keyframe| is_kept(keyframe)).cloned().collect()
 }
@@ -251,7 +251,7 @@ fn fewer(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
 mod tests {
     use super::*;
 
-    const CLOSE: f64 = 1e-9; // Rounding of products of poses near 1.
+    const TOLERANCE: f64 = 1e-9; // Rounding of products of poses near 1.
 
     /// A camera on a line, turning: 0.1 m and 0.02 rad a keyframe, 10 keyframes a second, gray images.
     fn capture(n: i64) -> Vec<Arc<Keyframe>> {
@@ -294,115 +294,124 @@ mod tests {
     }
 
     #[test]
-    fn pose_noise_leaves_test_keyframes_alone_and_size_zero_changes_nothing() {
+    fn pose_noise_spares_test_keyframes_and_zero_is_identity() {
         let capture = capture(40);
-        for what in Disturbance::ALL {
-            let changed = what.apply(&capture, 3.0, 1, 1e9);
+        for disturbance in Disturbance::ALL {
+            let changed = disturbance.apply(&capture, 3.0, 1, 1e9);
             let tests = |keyframes: &[Arc<Keyframe>]| -> Vec<Arc<Keyframe>> {
                 keyframes.iter().filter(|keyframe| keyframe.split == Split::Test).cloned().collect()
             };
-            let stay = matches!(what, Disturbance::PoseNoise | Disturbance::Keyframes);
+            let is_unchanged = matches!(disturbance, Disturbance::PoseNoise | Disturbance::Keyframes);
             for (before, after) in tests(&capture).iter().zip(tests(&changed)) {
                 let is_same =
                     before.world_from_camera == after.world_from_camera && before.rgba_srgb == after.rgba_srgb;
-                assert_eq!(is_same, stay, "{what:?} and a test keyframe");
+                assert_eq!(is_same, is_unchanged, "{disturbance:?} and a test keyframe");
             }
-            assert_eq!(tests(&changed).len(), 5, "{what:?}");
+            assert_eq!(tests(&changed).len(), 5, "{disturbance:?}");
         }
-        for what in [Disturbance::PoseNoise, Disturbance::ClockOffset, Disturbance::Exposure] {
-            for (before, after) in capture.iter().zip(what.apply(&capture, 0.0, 1, 1e9)) {
-                let off = before.world_from_camera.inverse() * after.world_from_camera;
-                assert!(off.translation.vector.norm() + off.rotation.angle() < CLOSE, "{what:?} of size 0 moves");
-                assert_eq!(before.rgba_srgb, after.rgba_srgb, "{what:?}");
+        for disturbance in [Disturbance::PoseNoise, Disturbance::ClockOffset, Disturbance::Exposure] {
+            for (before, after) in capture.iter().zip(disturbance.apply(&capture, 0.0, 1, 1e9)) {
+                let difference = before.world_from_camera.inverse() * after.world_from_camera;
+                assert!(
+                    difference.translation.vector.norm() + difference.rotation.angle() < TOLERANCE,
+                    "{disturbance:?} of size 0 moves"
+                );
+                assert_eq!(before.rgba_srgb, after.rgba_srgb, "{disturbance:?}");
             }
         }
     }
 
     #[test]
-    fn pose_noise_has_the_size_asked_for() {
+    fn pose_noise_has_the_requested_std() {
         /// Four standard errors of a standard deviation over three axes of 3500 keyframes.
-        const REL: f64 = 0.03;
+        const REL_TOLERANCE: f64 = 0.03;
         let capture = capture(4000);
         let noisy = pose_noise(&capture, 20.0, 7);
-        let (mut shifts, mut turns) = (Vec::new(), Vec::new());
+        let (mut translations, mut rotations) = (Vec::new(), Vec::new());
         for (before, after) in trained(&capture).zip(trained(&noisy)) {
-            let off = before.world_from_camera.inverse() * after.world_from_camera;
-            shifts.extend(off.translation.vector.iter().copied());
-            turns.extend(off.rotation.scaled_axis().iter().copied());
+            let difference = before.world_from_camera.inverse() * after.world_from_camera;
+            translations.extend(difference.translation.vector.iter().copied());
+            rotations.extend(difference.rotation.scaled_axis().iter().copied());
             let [depth_before, depth_after] =
                 [before, after].map(|keyframe| keyframe.depth.as_ref().expect("depth").world_from_camera);
             let camera_from_depth = |camera: &Transform, depth: &Transform| camera.inverse() * depth;
             let moved = camera_from_depth(&before.world_from_camera, &depth_before).inverse()
                 * camera_from_depth(&after.world_from_camera, &depth_after);
-            assert!(moved.translation.vector.norm() + moved.rotation.angle() < CLOSE, "depth moves with its camera");
+            assert!(
+                moved.translation.vector.norm() + moved.rotation.angle() < TOLERANCE,
+                "depth moves with its camera"
+            );
         }
-        for (values, sigma) in [(shifts, 0.02), (turns, 2.0_f64.to_radians())] {
+        for (values, sigma) in [(translations, 0.02), (rotations, 2.0_f64.to_radians())] {
             let n = values.len() as f64;
             let mean = values.iter().sum::<f64>() / n;
             let std = (values.iter().map(|value| value * value).sum::<f64>() / n).sqrt();
             assert!(mean.abs() < 4.0 * sigma / n.sqrt(), "mean {mean}");
-            assert!((std / sigma - 1.0).abs() < REL, "standard deviation {std}, not {sigma}");
+            assert!((std / sigma - 1.0).abs() < REL_TOLERANCE, "standard deviation {std}, not {sigma}");
         }
     }
 
     #[test]
-    fn pose_noise_is_the_same_again_grows_along_a_line_and_follows_the_seed() {
+    fn pose_noise_is_deterministic_linear_and_seeded() {
         let capture = capture(10);
-        let shift = |sigma_mm: f64, seed: u64| {
+        let translation_of = |sigma_mm: f64, seed: u64| {
             let noisy = pose_noise(&capture, sigma_mm, seed);
             (capture[1].world_from_camera.inverse() * noisy[1].world_from_camera).translation.vector
         };
-        assert_eq!(shift(5.0, 1), shift(5.0, 1));
-        assert!((shift(10.0, 1) - 2.0 * shift(5.0, 1)).norm() < CLOSE);
-        assert!((shift(5.0, 2) - shift(5.0, 1)).norm() > 1e-4);
+        assert_eq!(translation_of(5.0, 1), translation_of(5.0, 1));
+        assert!((translation_of(10.0, 1) - 2.0 * translation_of(5.0, 1)).norm() < TOLERANCE);
+        assert!((translation_of(5.0, 2) - translation_of(5.0, 1)).norm() > 1e-4);
         let alone = pose_noise(&capture[1..2], 5.0, 1);
         assert_eq!(alone[0].world_from_camera, pose_noise(&capture, 5.0, 1)[1].world_from_camera);
     }
 
     #[test]
-    fn a_clock_offset_takes_the_pose_of_another_time() {
+    fn clock_offset_uses_poses_of_a_later_time() {
         let capture = capture(20);
         // 50 ms are half of the way to the next keyframe, 250 ms go past the end.
         for (millis, n_keyframes) in [(50.0, 0.5), (200.0, 2.0), (250.0, 2.5), (-50.0, -0.5)] {
             let moved = Disturbance::ClockOffset.apply(&capture, millis, 1, 1e9);
             for (before, after) in trained(&capture).zip(trained(&moved)) {
-                let wanted_x = before.world_from_camera.translation.x + 0.1 * n_keyframes;
-                let wanted_turn = before.world_from_camera.rotation.angle() + 0.02 * n_keyframes;
-                assert!((after.world_from_camera.translation.x - wanted_x).abs() < CLOSE, "{millis} ms");
-                assert!((after.world_from_camera.rotation.angle() - wanted_turn).abs() < CLOSE, "{millis} ms");
+                let expected_x = before.world_from_camera.translation.x + 0.1 * n_keyframes;
+                let expected_angle_rad = before.world_from_camera.rotation.angle() + 0.02 * n_keyframes;
+                assert!((after.world_from_camera.translation.x - expected_x).abs() < TOLERANCE, "{millis} ms");
+                assert!(
+                    (after.world_from_camera.rotation.angle() - expected_angle_rad).abs() < TOLERANCE,
+                    "{millis} ms"
+                );
             }
         }
         // Where stamps count images, a second is what the rate says it is: 100 ms at 1 image a second of 0.1 s stamps.
         let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
-        assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < CLOSE);
+        assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < TOLERANCE);
         let alone = clock_offset(&capture[1..2], 1e8);
         assert_eq!(alone[0].world_from_camera, capture[1].world_from_camera, "one keyframe tells no motion");
     }
 
     #[test]
     fn exposure_is_multiplied_in_linear_light() {
-        assert!(exposed(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
-        let doubled = exposed(2.0);
+        assert!(exposure_table(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
+        let doubled = exposure_table(2.0);
         // 128 is 0.2159 of the light; 0.4317 is 175.6. 188 is just above half of the light.
         assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 176, 255, 255));
         let capture = capture(20);
         let stepped = exposure_step(&capture, 2.0);
-        assert_eq!(stepped[1].rgba_srgb[1], exposed(0.5)[128]);
+        assert_eq!(stepped[1].rgba_srgb[1], exposure_table(0.5)[128]);
         assert_eq!(stepped[19].rgba_srgb[1], 176);
-        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposed(2.0)[10]], "alpha stays");
+        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposure_table(2.0)[10]], "alpha stays");
         assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha stays");
     }
 
     #[test]
-    fn fewer_keyframes_are_spread_over_all() {
+    fn subsampled_keyframes_are_spread_evenly() {
         let capture = capture(80);
         for n in [1, 3, 10, 69, 70] {
-            let kept = fewer(&capture, f64::from(n));
+            let kept = subsample(&capture, f64::from(n));
             let ixs: Vec<i64> = trained(&kept).map(|keyframe| keyframe.stamp.0 / 100_000_000).collect();
             assert_eq!(ixs.len(), n as usize);
             let (first, last) = (ixs[0], ixs[ixs.len() - 1]);
             assert!(first <= 80 / i64::from(n) && last >= 79 - 80 / i64::from(n), "{ixs:?}");
         }
-        assert_eq!(trained(&fewer(&capture, 300.0)).count(), 70);
+        assert_eq!(trained(&subsample(&capture, 300.0)).count(), 70);
     }
 }

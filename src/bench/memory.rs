@@ -40,7 +40,7 @@ pub(crate) struct Sample {
 
 /// Which part of resident memory is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Beyond {
+pub(crate) enum Excluded {
     /// All of it: GPU buffers are in other memory.
     Nothing,
     /// All but the models.
@@ -49,14 +49,14 @@ pub(crate) enum Beyond {
     Training,
 }
 
-impl Beyond {
+impl Excluded {
     fn bytes(self, sample: &Sample) -> f64 {
-        let taken_off = match self {
+        let excluded_bytes = match self {
             Self::Nothing => 0,
             Self::Model => sample.model_bytes,
             Self::Training => sample.gpu_bytes.saturating_sub(sample.gpu_image_bytes),
         };
-        sample.resident_bytes as f64 - taken_off as f64
+        sample.resident_bytes as f64 - excluded_bytes as f64
     }
 }
 
@@ -78,7 +78,7 @@ pub(crate) struct Growth {
 
 impl Growth {
     /// `None` if less than a minute of samples counts.
-    pub(crate) fn of(samples: &[Sample], beyond: Beyond) -> Option<Self> {
+    pub(crate) fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
         let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
         let last = samples.last()?;
         let from_seconds = full_at.unwrap_or(0.5 * last.seconds);
@@ -88,7 +88,7 @@ impl Growth {
         }
         let of_group = |group: &[&Sample]| {
             let seconds: Vec<f64> = group.iter().map(|sample| sample.seconds).collect();
-            let bytes: Vec<f64> = group.iter().map(|sample| beyond.bytes(sample)).collect();
+            let bytes: Vec<f64> = group.iter().map(|sample| excluded.bytes(sample)).collect();
             median(&seconds).zip(median(&bytes))
         };
         let groups: Vec<(f64, f64)> = counted.chunks(counted.len().div_ceil(MAX_GROUPS)).filter_map(of_group).collect();
@@ -135,49 +135,49 @@ mod tests {
     }
 
     #[test]
-    fn growth_counts_from_the_full_store_on_and_jumps_do_not_move_it() {
+    fn growth_starts_at_full_store_and_ignores_jumps() {
         let growing = |seconds: f64| {
             let jump = if (1000.0..1010.0).contains(&seconds) { 5e8 } else { 0.0 };
             if seconds < 150.0 { 1e7 * seconds } else { 2e9 + 1e8 * seconds / 3600.0 + jump }
         };
-        let growth = Growth::of(&samples(3600, growing), Beyond::Model).expect("an hour");
+        let growth = Growth::of(&samples(3600, growing), Excluded::Model).expect("an hour");
         assert!(growth.store_was_full && growth.from_seconds == 160.0 && growth.to_seconds == 3599.0, "{growth:?}");
         assert!((growth.bytes_per_hour - 1e8).abs() < 1e6, "{growth:?}");
         assert!((growth.percent_per_hour - 4.9).abs() < 0.1, "{growth:?}");
     }
 
     #[test]
-    fn bytes_of_models_and_training_are_no_growth() {
+    fn model_and_training_bytes_are_excluded_from_growth() {
         let mut with_model = samples(600, |seconds| 1e9 + 1e6 * seconds);
         for sample in &mut with_model {
             sample.model_bytes = sample.resident_bytes - 1_000_000_000;
         }
-        let rate = |samples: &[Sample], beyond| Growth::of(samples, beyond).expect("long enough").bytes_per_hour;
-        assert!(rate(&with_model, Beyond::Model).abs() < 1.0);
-        assert!((rate(&with_model, Beyond::Nothing) - 3.6e9).abs() < 1e6);
+        let rate = |samples: &[Sample], excluded| Growth::of(samples, excluded).expect("long enough").bytes_per_hour;
+        assert!(rate(&with_model, Excluded::Model).abs() < 1.0);
+        assert!((rate(&with_model, Excluded::Nothing) - 3.6e9).abs() < 1e6);
         for sample in &mut with_model {
             (sample.gpu_bytes, sample.model_bytes) = (sample.model_bytes + 5_000_000, 0);
             sample.gpu_image_bytes = 5_000_000;
         }
-        assert!(rate(&with_model, Beyond::Training).abs() < 1.0);
+        assert!(rate(&with_model, Excluded::Training).abs() < 1.0);
     }
 
     #[test]
-    fn a_store_that_is_never_full_leaves_the_second_half() {
+    fn growth_uses_second_half_if_store_never_fills() {
         let mut never_full = samples(400, |_| 1e9);
         never_full.iter_mut().for_each(|sample| sample.evicted = 0);
-        let growth = Growth::of(&never_full, Beyond::Model).expect("long enough");
+        let growth = Growth::of(&never_full, Excluded::Model).expect("long enough");
         assert!(!growth.store_was_full && growth.from_seconds == 200.0, "{growth:?}");
         assert_eq!(
-            Growth::of(&samples(200, |_| 1e9), Beyond::Model),
+            Growth::of(&samples(200, |_| 1e9), Excluded::Model),
             None,
             "40 s after the store was full and settled"
         );
-        assert_eq!(Growth::of(&[], Beyond::Model), None);
+        assert_eq!(Growth::of(&[], Excluded::Model), None);
     }
 
     #[test]
-    fn memory_of_this_process_is_read() {
+    fn resident_memory_is_read() {
         let (before, _) = resident_bytes().expect("Linux");
         // Far more than concurrent tests free in the meantime.
         let held = vec![1u8; 512 << 20];

@@ -32,14 +32,14 @@ pub(crate) struct Table {
 impl Findings {
     /// Writes all files; the page's place comes back.
     pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<PathBuf> {
-        let place = |ending: &str| folder.join(format!("{}{ending}", self.name));
-        run_folder::write_json(&place(".json"), &self.numbers)?;
+        let path_with = |suffix: &str| folder.join(format!("{}{suffix}", self.name));
+        run_folder::write_json(&path_with(".json"), &self.numbers)?;
         let mut page = self.page_head();
         for (part, chart) in &self.charts {
             let drawing = chart.draw();
             let svg = drawing.svg();
-            write_file(&place(&format!("{part}.svg")), svg.as_bytes())?;
-            write_file(&place(&format!("{part}.png")), &raster::png(&drawing)?)?;
+            write_file(&path_with(&format!("{part}.svg")), svg.as_bytes())?;
+            write_file(&path_with(&format!("{part}.png")), &raster::png(&drawing)?)?;
             let title = escaped(&chart.title);
             write!(page, "<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n")?;
         }
@@ -47,13 +47,13 @@ impl Findings {
             page.push_str(&table.html());
         }
         page.push_str("</main></body></html>\n");
-        let page_place = place(".html");
-        write_file(&page_place, page.as_bytes())?;
-        Ok(page_place)
+        let page_path = path_with(".html");
+        write_file(&page_path, page.as_bytes())?;
+        Ok(page_path)
     }
 
     /// Prints the tables, or one JSON object.
-    pub(crate) fn tell(&self, page: &Path, json: bool) -> anyhow::Result<()> {
+    pub(crate) fn print_summary(&self, page: &Path, json: bool) -> anyhow::Result<()> {
         if json {
             return print::report_json(&serde_json::json!({ "event": "done", "page": page, "findings": self.numbers }));
         }
@@ -86,8 +86,8 @@ th,td{padding:.3rem .8rem;border-bottom:1px solid #ddd;text-align:right;white-sp
 th:first-child,td:first-child{text-align:left}h1{font-size:1.5rem}h2{font-size:1.1rem;margin-bottom:0}\
 .wide{overflow-x:auto}</style>\n";
 
-fn write_file(place: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    std::fs::write(place, bytes).with_context(|| format!("cannot write {}", place.display()))
+fn write_file(path_with: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    std::fs::write(path_with, bytes).with_context(|| format!("cannot write {}", path_with.display()))
 }
 
 impl Table {
@@ -133,13 +133,13 @@ mod tests {
     }
 
     #[test]
-    fn tables_are_escaped_and_in_line() {
+    fn tables_are_escaped_and_aligned() {
         assert_eq!(table().text(), "\nSizes\n  data    dB\n  a<b   1.25");
         assert!(table().html().contains("<tr><td>a&lt;b</td><td>1.25</td></tr>"));
     }
 
     #[test]
-    fn every_file_is_written() {
+    fn findings_write_every_file() {
         let folder = tempfile::tempdir().expect("a folder");
         let findings = Findings {
             name: "curve",

@@ -31,12 +31,12 @@ struct File {
 impl Peer {
     /// Reads a file; one of another form is the caller's mistake.
     pub(crate) fn load(path: &Path) -> Result<Self, BadArgument> {
-        let wrong = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
-        let text = std::fs::read_to_string(path).map_err(|error| wrong(&format!("cannot be read ({error})")))?;
+        let invalid = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
+        let text = std::fs::read_to_string(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text)
-            .map_err(|error| wrong(&format!("wants an object with rows of seconds and psnr ({error})")))?;
+            .map_err(|error| invalid(&format!("wants an object with rows of seconds and psnr ({error})")))?;
         if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {
-            return Err(wrong("has no row, or one whose seconds are not above 0"));
+            return Err(invalid("has no row, or one whose seconds are not above 0"));
         }
         let label = path.file_stem().map_or_else(|| "peer".to_owned(), |stem| stem.to_string_lossy().into_owned());
         let mut rows = file.rows;
@@ -55,20 +55,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_curve_is_read_and_other_files_are_told() {
+    fn peer_curve_is_parsed_and_invalid_files_are_reported() {
         let folder = tempfile::tempdir().expect("a folder");
-        let place = folder.path().join("gsplat_fox.json");
-        let write = |text: &str| std::fs::write(&place, text).expect("written");
+        let path = folder.path().join("gsplat_fox.json");
+        let write = |text: &str| std::fs::write(&path, text).expect("written");
         write(
             r#"{"args": {"seed": 0}, "rows": [{"seconds": 1.0, "step": 9, "psnr": 12.4, "ssim": 0.6, "n": 7, "bytes": 1652}, {"seconds": 0.5, "psnr": 11.0}]}"#,
         );
-        let peer = Peer::load(&place).expect("a curve");
+        let peer = Peer::load(&path).expect("a curve");
         assert_eq!((peer.label.as_str(), peer.rows[1].n, peer.rows[1].bytes), ("gsplat_fox", Some(7), Some(1652)));
         assert_eq!(peer.curve(), [(0.5, 11.0), (1.0, 12.4)]);
         for other in ["[]", r#"{"rows": []}"#, r#"{"rows": [{"seconds": 0.0, "psnr": 1.0}]}"#] {
             write(other);
-            let told = Peer::load(&place).expect_err("no curve").0;
-            assert!(told.contains("gsplat_fox.json"), "{told}");
+            let message = Peer::load(&path).expect_err("no curve").0;
+            assert!(message.contains("gsplat_fox.json"), "{message}");
         }
         assert!(Peer::load(Path::new("absent.json")).expect_err("absent").0.contains("cannot be read"));
     }

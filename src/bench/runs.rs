@@ -2,12 +2,12 @@
 
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
-use crate::exit::{BadArgument, LackOfEvidence};
-use crate::method::{self, Kind, Recipe};
-use crate::run_folder::MadeFolders;
-use crate::session::{Eval, Evaluators, Limits, Outcome, Tell};
+use crate::exit::{BadArgument, InsufficientData};
+use crate::method::{self, ModelKind, ModelSpec};
+use crate::run_folder::CreatedFolders;
+use crate::session::{Evaluation, Evaluators, Limits, OutputMode, TrainingOutcome};
 use crate::stop::Stop;
-use crate::training::{self, Plan};
+use crate::training::{self, TrainingPlan};
 use crate::training_args::TrainingArgs;
 use crate::{print, run_folder};
 use anyhow::{Context, bail};
@@ -40,7 +40,7 @@ pub(crate) struct BenchArgs {
 
 /// What makes two runs the same.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Settings {
+pub(crate) struct RunSettings {
     pub(crate) data: PathBuf,
     pub(crate) method: String,
     pub(crate) seed: u64,
@@ -64,7 +64,7 @@ pub(crate) struct Settings {
 /// What was done to the training keyframes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Disturbed {
-    pub(crate) what: String,
+    pub(crate) disturbance: String,
     pub(crate) level: f64,
     pub(crate) unit: String,
     /// Images a second where stamps only count images.
@@ -73,7 +73,7 @@ pub(crate) struct Disturbed {
 
 /// Scores and size at one time. What is not known is `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Measured {
+pub(crate) struct RunScores {
     pub(crate) seconds: f64,
     pub(crate) step: u64,
     pub(crate) psnr: Option<f64>,
@@ -88,9 +88,9 @@ pub(crate) struct Measured {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Run {
     pub(crate) name: String,
-    pub(crate) settings: Settings,
-    pub(crate) marks: Vec<Measured>,
-    pub(crate) end: Measured,
+    pub(crate) settings: RunSettings,
+    pub(crate) evaluations: Vec<RunScores>,
+    pub(crate) end: RunScores,
 }
 
 impl Run {
@@ -103,9 +103,9 @@ impl Run {
     /// `(seconds, dB)` at the marks and at the end.
     pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
         /// An end this close after a mark is the mark.
-        const SAME: f64 = 1.02;
-        let is_new = self.marks.last().is_none_or(|last| self.end.seconds > SAME * last.seconds);
-        let points = self.marks.iter().chain(is_new.then_some(&self.end));
+        const MIN_SECONDS_RATIO: f64 = 1.02;
+        let is_new = self.evaluations.last().is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
+        let points = self.evaluations.iter().chain(is_new.then_some(&self.end));
         points.filter_map(|point| Some((point.seconds, point.psnr?))).collect()
     }
 }
@@ -116,14 +116,14 @@ pub(crate) struct NamedData {
     pub(crate) path: PathBuf,
     pub(crate) data: Data,
     /// The scene models that the flags and the recording ask for.
-    pub(crate) recipes: Vec<Recipe>,
+    pub(crate) model_specs: Vec<ModelSpec>,
 }
 
 /// One training to do.
 pub(crate) struct Job<'a> {
     pub(crate) name: String,
     pub(crate) data: &'a NamedData,
-    pub(crate) recipe: Recipe,
+    pub(crate) model_spec: ModelSpec,
     pub(crate) limits: Limits,
     pub(crate) disturbed: Option<Disturbed>,
     pub(crate) variant: Option<String>,
@@ -137,7 +137,7 @@ pub(crate) struct Job<'a> {
 pub(crate) struct Runs<'a> {
     args: &'a BenchArgs,
     out: PathBuf,
-    made: MadeFolders,
+    created: CreatedFolders,
     gpu: Arc<Gpu>,
     stop: Stop,
     n_all: usize,
@@ -146,8 +146,8 @@ pub(crate) struct Runs<'a> {
 
 impl NamedData {
     /// The scene model, for a bench of one; several are refused.
-    pub(crate) fn only_recipe(&self) -> Result<&Recipe, BadArgument> {
-        match &self.recipes[..] {
+    pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec, BadArgument> {
+        match &self.model_specs[..] {
             [one] => Ok(one),
             _ => {
                 Err(BadArgument(format!("{}: this bench is of one method, {} are too many", self.name, self.methods())))
@@ -157,8 +157,8 @@ impl NamedData {
 
     /// How splats are trained, for a bench of what only those have; other scene models are refused.
     pub(crate) fn splats(&self) -> Result<&SplatOptions, BadArgument> {
-        match &self.recipes[..] {
-            [Recipe { kind: Kind::Splat, options }] => Ok(options),
+        match &self.model_specs[..] {
+            [ModelSpec { kind: ModelKind::Splat, options }] => Ok(options),
             _ => {
                 let (data, methods) = (&self.name, self.methods());
                 Err(BadArgument(format!("{data}: this bench is of splats, and the method is {methods}")))
@@ -167,8 +167,8 @@ impl NamedData {
     }
 
     fn methods(&self) -> String {
-        let kinds: Vec<Kind> = self.recipes.iter().map(|recipe| recipe.kind).collect();
-        method::in_words(&kinds)
+        let kinds: Vec<ModelKind> = self.model_specs.iter().map(|model_spec| model_spec.kind).collect();
+        method::describe(&kinds)
     }
 }
 
@@ -176,7 +176,7 @@ impl NamedData {
 impl Drop for Runs<'_> {
     fn drop(&mut self) {
         if std::fs::read_dir(self.out.join(RUNS)).is_ok_and(|mut runs| runs.next().is_none()) {
-            std::mem::take(&mut self.made).take_back();
+            std::mem::take(&mut self.created).remove_created();
         }
     }
 }
@@ -185,12 +185,12 @@ impl<'a> Runs<'a> {
     /// Makes the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
         let stop = Stop::on_ctrl_c()?;
-        let mut made = MadeFolders::default();
-        let out = made.make(args.out.as_deref())?;
+        let mut created = CreatedFolders::default();
+        let out = created.make(args.out.as_deref())?;
         let runs = out.join(RUNS);
         std::fs::create_dir_all(&runs).with_context(|| format!("cannot make the folder {}", runs.display()))?;
         log::info!("{}", gpu.describe());
-        Ok(Self { args, out, made, gpu, stop, n_all: 0, n_done: 0 })
+        Ok(Self { args, out, created, gpu, stop, n_all: 0, n_done: 0 })
     }
 
     /// The folder of the bench.
@@ -208,27 +208,27 @@ impl<'a> Runs<'a> {
         self.n_all = self.n_done + n_more;
     }
 
-    /// Loads data, and finds a name for it that none of `taken` has.
-    pub(crate) fn load(&self, path: &Path, taken: &mut HashSet<String>) -> anyhow::Result<NamedData> {
+    /// Loads data, and finds a name for it that none of `used_names` has.
+    pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> anyhow::Result<NamedData> {
         training::check_before_data(&self.args.training, path, &self.args.images)?;
         let overrides = self.args.training.overrides();
         let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
         if data.of_split(Split::Test).is_empty() {
             let reason = "no image is held out for testing, so nothing can be scored: see --holdout";
-            return Err(LackOfEvidence(format!("{}: {reason}", path.display())).into());
+            return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
         }
-        let recipes = training::recipes(&self.args.training, &data, None, self.gpu.is_software())?;
-        Ok(NamedData { name: free_name(path, taken), path: path.to_owned(), data, recipes })
+        let model_specs = training::model_specs(&self.args.training, &data, None, self.gpu.is_software())?;
+        Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
     /// The run of a job: out of its file, or trained now and written there.
     pub(crate) fn run(&mut self, job: Job<'_>) -> anyhow::Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
-        let place = self.out.join(RUNS).join(format!("{}.json", file_name(&job.name)));
-        if place.exists() {
-            let kept = read(&place)?;
-            if let Some(difference) = difference(&kept.settings, &settings)? {
+        let path = self.out.join(RUNS).join(format!("{}.json", file_name(&job.name)));
+        if path.exists() {
+            let cached = read(&path)?;
+            if let Some(difference) = difference(&cached.settings, &settings)? {
                 return Err(BadArgument(format!(
                     "--out {}: the run {} in it differs in {difference}; name another folder",
                     self.out.display(),
@@ -236,16 +236,16 @@ impl<'a> Runs<'a> {
                 ))
                 .into());
             }
-            self.tell(&kept, true)?;
-            return Ok(kept);
+            self.report(&cached, true)?;
+            return Ok(cached);
         }
         log::info!("run {} of {}: {}", self.n_done, self.n_all, job.name);
         let outcome = self.train(&job).with_context(|| format!("run {}", job.name))?;
         let run = Run {
             name: job.name,
             settings,
-            marks: outcome.marks.iter().map(of_mark).collect(),
-            end: Measured {
+            evaluations: outcome.evaluations.iter().map(from_evaluation).collect(),
+            end: RunScores {
                 seconds: outcome.seconds,
                 step: outcome.steps,
                 psnr: outcome.scores.psnr,
@@ -257,40 +257,41 @@ impl<'a> Runs<'a> {
             },
         };
         // Beside its place first: a file that is there is whole.
-        let unfinished = place.with_extension("part");
+        let unfinished = path.with_extension("part");
         run_folder::write_json(&unfinished, &run)?;
-        std::fs::rename(&unfinished, &place).with_context(|| format!("cannot write {}", place.display()))?;
-        self.tell(&run, false)?;
+        std::fs::rename(&unfinished, &path).with_context(|| format!("cannot write {}", path.display()))?;
+        self.report(&run, false)?;
         Ok(run)
     }
 
-    fn train(&self, job: &Job<'_>) -> anyhow::Result<Outcome> {
+    fn train(&self, job: &Job<'_>) -> anyhow::Result<TrainingOutcome> {
         let thorough = Evaluator::thorough(None)?;
-        let at_marks = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
-        let Recipe { kind, options } = job.recipe.clone();
+        let during_training = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
+        let ModelSpec { kind, options } = job.model_spec.clone();
         let n_planned_steps = job.limits.steps.unwrap_or(options.n_planned_steps);
-        let plan = Plan {
-            recipe: Recipe { kind, options: SplatOptions { n_planned_steps, ..options } },
-            evaluators: Evaluators { at_marks, most_at_marks: usize::MAX, at_end: thorough },
+        let plan = TrainingPlan {
+            model_spec: ModelSpec { kind, options: SplatOptions { n_planned_steps, ..options } },
+            evaluators: Evaluators { during_training, max_images_during_training: usize::MAX, at_end: thorough },
             limits: job.limits,
-            tell: if self.args.json { Tell::Nothing } else { Tell::Bar },
+            output: if self.args.json { OutputMode::Nothing } else { OutputMode::Bar },
         };
-        let session = training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.learning, &self.stop)?;
-        if self.stop.asked() && !session.is_over() {
+        let session =
+            training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.preparation_time, &self.stop)?;
+        if self.stop.requested() && !session.is_over() {
             bail!("stopped before its end: the same command with --out {} goes on from there", self.out.display());
         }
-        session.conclude()
+        session.score_without_saving()
     }
 
-    fn settings(&self, job: &Job<'_>) -> Settings {
+    fn settings(&self, job: &Job<'_>) -> RunSettings {
         let data = &job.data.data;
         let n_test = data.of_split(Split::Test).len();
-        Settings {
+        RunSettings {
             data: job.data.path.clone(),
-            method: job.recipe.kind.name().to_owned(),
-            seed: job.recipe.options.seed,
-            max_splats: job.recipe.options.max_splats,
-            max_bytes: job.recipe.options.max_bytes,
+            method: job.model_spec.kind.name().to_owned(),
+            seed: job.model_spec.options.seed,
+            max_splats: job.model_spec.options.max_splats,
+            max_bytes: job.model_spec.options.max_bytes,
             seconds: job.limits.seconds,
             steps: job.limits.steps,
             scale: self.args.images.scale,
@@ -305,20 +306,20 @@ impl<'a> Runs<'a> {
         }
     }
 
-    fn tell(&self, run: &Run, is_kept: bool) -> anyhow::Result<()> {
+    fn report(&self, run: &Run, is_cached: bool) -> anyhow::Result<()> {
         #[derive(Serialize)]
         struct Event<'a> {
             event: &'static str,
-            kept: bool,
+            cached: bool,
             #[serde(flatten)]
             run: &'a Run,
         }
         if self.args.json {
-            return print::report_json(&Event { event: "run", kept: is_kept, run });
+            return print::report_json(&Event { event: "run", cached: is_cached, run });
         }
-        let (end, kept) = (&run.end, if is_kept { ", done before" } else { "" });
+        let (end, cached) = (&run.end, if is_cached { ", done before" } else { "" });
         print::report(format_args!(
-            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{kept}",
+            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
             self.n_done,
             self.n_all,
             run.name,
@@ -332,44 +333,44 @@ impl<'a> Runs<'a> {
     }
 }
 
-fn of_mark(mark: &Eval) -> Measured {
-    Measured {
-        seconds: mark.seconds,
-        step: mark.step,
-        psnr: mark.scores.psnr,
-        ssim: mark.scores.ssim,
-        lpips: mark.scores.lpips,
-        depth_rmse_m: mark.scores.depth_rmse_m,
-        primitives: mark.primitives,
-        bytes: mark.bytes,
+fn from_evaluation(evaluation: &Evaluation) -> RunScores {
+    RunScores {
+        seconds: evaluation.seconds,
+        step: evaluation.step,
+        psnr: evaluation.scores.psnr,
+        ssim: evaluation.scores.ssim,
+        lpips: evaluation.scores.lpips,
+        depth_rmse_m: evaluation.scores.depth_rmse_m,
+        primitives: evaluation.primitives,
+        bytes: evaluation.bytes,
     }
 }
 
-fn read(place: &Path) -> anyhow::Result<Run> {
-    let told = || format!("{} is no finished run: remove it to have it done again", place.display());
-    let text = std::fs::read_to_string(place).with_context(told)?;
-    serde_json::from_str(&text).with_context(told)
+fn read(path: &Path) -> anyhow::Result<Run> {
+    let message = || format!("{} is no finished run: remove it to have it done again", path.display());
+    let text = std::fs::read_to_string(path).with_context(message)?;
+    serde_json::from_str(&text).with_context(message)
 }
 
 /// The first setting that differs, in words.
-fn difference(kept: &Settings, wanted: &Settings) -> anyhow::Result<Option<String>> {
-    let fields = |settings: &Settings| serde_json::to_value(settings).context("settings are plain data");
-    let (kept, wanted) = (fields(kept)?, fields(wanted)?);
-    let Some(wanted) = wanted.as_object() else { bail!("settings are an object") };
-    Ok(wanted
+fn difference(cached: &RunSettings, requested: &RunSettings) -> anyhow::Result<Option<String>> {
+    let fields = |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
+    let (cached, requested) = (fields(cached)?, fields(requested)?);
+    let Some(requested) = requested.as_object() else { bail!("settings are an object") };
+    Ok(requested
         .iter()
-        .find(|(key, value)| kept[key.as_str()] != **value)
-        .map(|(key, value)| format!("{key} ({} there, {value} now)", kept[key.as_str()])))
+        .find(|(key, value)| cached[key.as_str()] != **value)
+        .map(|(key, value)| format!("{key} ({} there, {value} now)", cached[key.as_str()])))
 }
 
 /// A name for data from its path, with a number where it is taken already.
-fn free_name(path: &Path, taken: &mut HashSet<String>) -> String {
-    let whole = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    let stem = if whole.is_dir() { whole.file_name() } else { whole.file_stem() };
+fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
+    let canonical = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let stem = if canonical.is_dir() { canonical.file_name() } else { canonical.file_stem() };
     let stem = stem.map_or_else(|| "data".to_owned(), |stem| stem.to_string_lossy().into_owned());
     let mut name = stem.clone();
     let mut n = 2;
-    while !taken.insert(name.clone()) {
+    while !used_names.insert(name.clone()) {
         name = format!("{stem}-{n}");
         n += 1;
     }
@@ -387,7 +388,7 @@ pub(crate) mod tests {
 
     /// A run that ended with these figures.
     pub(crate) fn run(name: &str, curve: &[(f64, f64)], n_splats: u64) -> Run {
-        let measured = |&(seconds, psnr): &(f64, f64)| Measured {
+        let scores_at = |&(seconds, psnr): &(f64, f64)| RunScores {
             seconds,
             step: 10,
             psnr: Some(psnr),
@@ -397,7 +398,7 @@ pub(crate) mod tests {
             primitives: n_splats,
             bytes: 0,
         };
-        let settings = Settings {
+        let settings = RunSettings {
             data: "fox".into(),
             method: "splat".into(),
             seed: 1,
@@ -415,43 +416,43 @@ pub(crate) mod tests {
             adapter: "none".into(),
             version: "0".into(),
         };
-        let marks = curve.iter().map(measured).collect();
-        Run { name: name.into(), settings, marks, end: measured(curve.last().expect("a point")) }
+        let evaluations = curve.iter().map(scores_at).collect();
+        Run { name: name.into(), settings, evaluations, end: scores_at(curve.last().expect("a point")) }
     }
 
     #[test]
-    fn a_run_comes_back_from_its_file() {
+    fn run_round_trips_through_its_file() {
         let folder = tempfile::tempdir().expect("a folder");
-        let place = folder.path().join("run.json");
+        let path = folder.path().join("run.json");
         let written = run("fox seed 1", &[(0.25, 12.3), (4.0, 21.456_789)], 900);
-        run_folder::write_json(&place, &written).expect("written");
-        assert_eq!(read(&place).expect("read"), written);
-        std::fs::write(&place, "{").expect("written");
-        assert!(read(&place).expect_err("cut off").to_string().contains("run.json"));
+        run_folder::write_json(&path, &written).expect("written");
+        assert_eq!(read(&path).expect("read"), written);
+        std::fs::write(&path, "{").expect("written");
+        assert!(read(&path).expect_err("cut off").to_string().contains("run.json"));
     }
 
     #[test]
-    fn a_difference_names_the_setting() {
-        let kept = run("a", &[(1.0, 20.0)], 1).settings;
-        assert_eq!(difference(&kept, &kept).expect("plain"), None);
-        let wanted = Settings { max_splats: 2000, ..kept.clone() };
-        let told = difference(&kept, &wanted).expect("plain").expect("one differs");
-        assert_eq!(told, "max_splats (1000 there, 2000 now)");
+    fn settings_difference_names_the_setting() {
+        let cached = run("a", &[(1.0, 20.0)], 1).settings;
+        assert_eq!(difference(&cached, &cached).expect("plain"), None);
+        let requested = RunSettings { max_splats: 2000, ..cached.clone() };
+        let message = difference(&cached, &requested).expect("plain").expect("one differs");
+        assert_eq!(message, "max_splats (1000 there, 2000 now)");
     }
 
     #[test]
-    fn names_are_free_and_fit_for_files() {
-        let mut taken = HashSet::new();
-        assert_eq!(free_name(Path::new("absent/fox.mcap"), &mut taken), "fox");
-        assert_eq!(free_name(Path::new("other/fox.mcap"), &mut taken), "fox-2");
+    fn names_are_unique_and_valid_file_names() {
+        let mut used_names = HashSet::new();
+        assert_eq!(unique_name(Path::new("absent/fox.mcap"), &mut used_names), "fox");
+        assert_eq!(unique_name(Path::new("other/fox.mcap"), &mut used_names), "fox-2");
         assert_eq!(file_name("a b/c 0.5 mm"), "a-b-c-0.5-mm");
     }
 
     #[test]
-    fn an_end_at_a_mark_counts_once() {
+    fn final_evaluation_is_not_counted_twice() {
         let mut run = run("a", &[(1.0, 20.0), (4.0, 24.0)], 1);
         assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0)]);
-        run.end = Measured { seconds: 6.0, psnr: Some(25.0), ..run.end };
+        run.end = RunScores { seconds: 6.0, psnr: Some(25.0), ..run.end };
         assert_eq!(run.curve(), [(1.0, 20.0), (4.0, 24.0), (6.0, 25.0)]);
     }
 }

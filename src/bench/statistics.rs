@@ -4,11 +4,11 @@
 pub(crate) fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
-    let middle = sorted.len() / 2;
+    let middle_ix = sorted.len() / 2;
     match sorted.len() {
         0 => None,
-        n if n % 2 == 1 => Some(sorted[middle]),
-        _ => Some(0.5 * (sorted[middle - 1] + sorted[middle])),
+        n if n % 2 == 1 => Some(sorted[middle_ix]),
+        _ => Some(0.5 * (sorted[middle_ix - 1] + sorted[middle_ix])),
     }
 }
 
@@ -35,15 +35,15 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     Some((values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt())
 }
 
-/// When a curve of `(seconds, dB)` first reaches `wanted_db`, interpolated over the logarithm of time.
+/// When a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
 ///
 /// A curve that starts above reached it by its first point at the latest: that time is the answer.
-pub(crate) fn secs_to(curve: &[(f64, f64)], wanted_db: f64) -> Option<f64> {
-    let at = curve.iter().position(|(_, psnr)| *psnr >= wanted_db)?;
+pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
+    let at = curve.iter().position(|(_, psnr)| *psnr >= target_db)?;
     let (secs, psnr) = curve[at];
-    let Some((earlier_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else { return Some(secs) };
-    let frac = (wanted_db - earlier_psnr) / (psnr - earlier_psnr);
-    Some(earlier_secs * (secs / earlier_secs).powf(frac))
+    let Some((previous_secs, earlier_psnr)) = at.checked_sub(1).map(|before| curve[before]) else { return Some(secs) };
+    let frac = (target_db - earlier_psnr) / (psnr - earlier_psnr);
+    Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
 /// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of x.
@@ -58,7 +58,7 @@ pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
 
 /// How values between two levels of a disturbance are found.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Between {
+pub(crate) enum Interpolation {
     /// On a straight line over the level.
     Linear,
     /// On a straight line over the logarithm of the level, which is above 0.
@@ -66,34 +66,37 @@ pub(crate) enum Between {
 }
 
 /// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never does.
-pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, between: Between) -> Option<f64> {
+pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Interpolation) -> Option<f64> {
     let floor = curve.first()?.1 - drop_db;
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;
     let ((before, psnr_before), (level, psnr)) = (curve[at.checked_sub(1)?], curve[at]);
     let frac = (psnr_before - floor) / (psnr_before - psnr);
-    Some(match between {
-        Between::Linear => before + frac * (level - before),
-        Between::Log => before * (level / before).powf(frac),
+    Some(match interpolation {
+        Interpolation::Linear => before + frac * (level - before),
+        Interpolation::Log => before * (level / before).powf(frac),
     })
 }
 
 /// Growth of a count below which a gain per doubling would divide noise by next to nothing.
-const LEAST_GROWTH: f64 = 1.05;
+const MIN_GROWTH: f64 = 1.05;
 
 /// What doubling the count gained between two points of `(count, dB)`; `None` where the count hardly grew.
 pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64> {
     let growth = more.0 / fewer.0;
-    (growth >= LEAST_GROWTH).then(|| (more.1 - fewer.1) / growth.log2())
+    (growth >= MIN_GROWTH).then(|| (more.1 - fewer.1) / growth.log2())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const CLOSE: f64 = 1e-12; // Rounding of a few operations on numbers near 1.
+    const TOLERANCE: f64 = 1e-12; // Rounding of a few operations on numbers near 1.
 
-    fn assert_close(got: Option<f64>, wanted: f64) {
-        assert!(got.is_some_and(|got| (got - wanted).abs() < CLOSE * wanted.abs().max(1.0)), "{got:?}, not {wanted}");
+    fn assert_close(got: Option<f64>, expected: f64) {
+        assert!(
+            got.is_some_and(|got| (got - expected).abs() < TOLERANCE * expected.abs().max(1.0)),
+            "{got:?}, not {expected}"
+        );
     }
 
     #[test]
@@ -106,13 +109,13 @@ mod tests {
     }
 
     #[test]
-    fn the_spread_is_that_of_a_sample() {
+    fn sample_std_uses_n_minus_one() {
         assert_eq!(sample_std(&[1.0]), None);
         assert_close(sample_std(&[2.0, 4.0, 4.0, 4.0, 5.0, 5.0, 7.0, 9.0]), (32.0_f64 / 7.0).sqrt());
     }
 
     #[test]
-    fn a_quality_is_reached_between_two_points() {
+    fn time_to_quality_is_interpolated() {
         let curve = [(1.0, 20.0), (4.0, 24.0), (16.0, 23.0), (64.0, 30.0)];
         assert_close(secs_to(&curve, 22.0), 2.0);
         assert_close(secs_to(&curve, 24.0), 4.0);
@@ -121,18 +124,18 @@ mod tests {
     }
 
     #[test]
-    fn a_break_lies_between_two_levels() {
+    fn break_point_is_interpolated() {
         let curve = [(0.0, 30.0), (2.0, 29.6), (4.0, 28.6), (8.0, 24.6)];
-        assert_close(break_point(&curve, 1.0, Between::Linear), 3.2);
-        assert_close(break_point(&curve, 3.0, Between::Linear), 5.6);
-        assert_eq!(break_point(&curve, 6.0, Between::Linear), None, "it never falls so far");
-        assert_eq!(break_point(&[], 1.0, Between::Linear), None);
+        assert_close(break_point(&curve, 1.0, Interpolation::Linear), 3.2);
+        assert_close(break_point(&curve, 3.0, Interpolation::Linear), 5.6);
+        assert_eq!(break_point(&curve, 6.0, Interpolation::Linear), None, "it never falls so far");
+        assert_eq!(break_point(&[], 1.0, Interpolation::Linear), None);
         let fewer = [(100.0, 30.0), (25.0, 28.0)];
-        assert_close(break_point(&fewer, 1.0, Between::Log), 50.0);
+        assert_close(break_point(&fewer, 1.0, Interpolation::Log), 50.0);
     }
 
     #[test]
-    fn doubling_pays_what_it_gains() {
+    fn gain_per_doubling() {
         assert_close(db_per_doubling((1000.0, 20.0), (4000.0, 23.0)), 1.5);
         assert_close(db_per_doubling((1000.0, 20.0), (2000.0, 19.5)), -0.5);
         assert_eq!(db_per_doubling((1000.0, 20.0), (1000.0, 21.0)), None);
@@ -140,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slope_is_that_of_most_pairs() {
+    fn slope_is_robust_to_outliers() {
         let mut points: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), 3.0 - 0.25 * f64::from(x))).collect();
         points[20].1 = 1e6;
         points[21].1 = -1e6;

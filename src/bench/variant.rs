@@ -1,6 +1,6 @@
 //! Ways to train that are compared with each other.
 
-use trainer::splat::{CameraChoice, SplatOptions};
+use trainer::splat::{CameraRefinement, SplatOptions};
 
 /// One of them.
 pub(crate) struct Variant {
@@ -11,12 +11,16 @@ pub(crate) struct Variant {
 /// Nothing is looked for about cameras.
 pub(crate) const CAMERAS_AS_GIVEN: Variant = Variant {
     name: "cameras as given",
-    change: |options| SplatOptions { cameras: CameraChoice::default(), align: CameraChoice::default(), ..options },
+    change: |options| SplatOptions {
+        cameras: CameraRefinement::default(),
+        align: CameraRefinement::default(),
+        ..options
+    },
 };
 
 impl Variant {
-    /// How it trains where `usual` is asked for.
-    pub(crate) fn options(&self, usual: &SplatOptions) -> SplatOptions {
-        (self.change)(usual.clone())
+    /// How it trains where `base` is asked for.
+    pub(crate) fn options(&self, base: &SplatOptions) -> SplatOptions {
+        (self.change)(base.clone())
     }
 }

@@ -16,7 +16,7 @@ use std::time::Duration;
 /// Size of the requested pictures, pixels.
 const SIZE_PX: [u32; 2] = [960, 720];
 /// Angle between two pictures on the circle around the scene, radians.
-const TURN_RAD: f64 = 0.05;
+const STEP_RAD: f64 = 0.05;
 /// The connection counts as dead after this long without a byte: the server sends its status several times a second.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
 /// Maximum length of a text message; the list of keyframes is the longest.
@@ -48,11 +48,11 @@ impl Viewer {
             reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
             stream: stream.try_clone().context("cannot share a connection")?,
             n_pictures: n_pictures.clone(),
-            n_asked: 0,
+            n_requested: 0,
             center_m: Point3::origin(),
             radius_m: 1.0,
         };
-        client.shake_hands(address)?;
+        client.handshake(address)?;
         let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
         Ok(Self { stream, n_pictures, thread: Some(thread.context("cannot start a thread")?) })
     }
@@ -82,14 +82,14 @@ struct Client {
     reader: BufReader<TcpStream>,
     stream: TcpStream,
     n_pictures: Arc<AtomicU64>,
-    n_asked: u64,
+    n_requested: u64,
     /// Of the scene, in world.
     center_m: Point3<f64>,
     radius_m: f64,
 }
 
 impl Client {
-    fn shake_hands(&mut self, address: SocketAddr) -> anyhow::Result<()> {
+    fn handshake(&mut self, address: SocketAddr) -> anyhow::Result<()> {
         write!(
             self.stream,
             "GET /ws HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
@@ -106,12 +106,12 @@ impl Client {
     }
 
     fn run(mut self) -> anyhow::Result<()> {
-        self.ask()?;
+        self.request_picture()?;
         loop {
-            let (kind, n_bytes) = self.next_frame()?;
-            match kind {
-                TEXT => self.take_text(n_bytes)?,
-                BINARY => self.take_binary(n_bytes)?,
+            let (opcode, n_bytes) = self.next_frame()?;
+            match opcode {
+                TEXT => self.handle_text(n_bytes)?,
+                BINARY => self.handle_binary(n_bytes)?,
                 PING => {
                     let mut contents = vec![0; usize::try_from(n_bytes.min(125))?];
                     self.reader.read_exact(&mut contents)?;
@@ -123,7 +123,7 @@ impl Client {
         }
     }
 
-    fn take_text(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+    fn handle_text(&mut self, n_bytes: u64) -> anyhow::Result<()> {
         ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
         let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
         match message["type"].as_str() {
@@ -136,14 +136,14 @@ impl Client {
             // There is no picture yet.
             Some("error") => {
                 std::thread::sleep(Duration::from_millis(200));
-                self.ask()?;
+                self.request_picture()?;
             }
             _ => {}
         }
         Ok(())
     }
 
-    fn take_binary(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+    fn handle_binary(&mut self, n_bytes: u64) -> anyhow::Result<()> {
         let mut length = [0; 4];
         self.reader.read_exact(&mut length)?;
         let n_header = u64::from(u32::from_le_bytes(length));
@@ -152,35 +152,35 @@ impl Client {
         self.skip(n_bytes.saturating_sub(4 + n_header))?;
         if header["type"] == "picture" && header["last"] == true {
             self.n_pictures.fetch_add(1, Ordering::Relaxed);
-            self.ask()?;
+            self.request_picture()?;
         }
         Ok(())
     }
 
     /// Requests the next picture on a circle around the scene.
-    fn ask(&mut self) -> anyhow::Result<()> {
-        let angle = self.n_asked as f64 * TURN_RAD;
-        let away = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
+    fn request_picture(&mut self) -> anyhow::Result<()> {
+        let angle = self.n_requested as f64 * STEP_RAD;
+        let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
         // `face_towards` has z forward and y up, but a camera's y axis points down.
-        let world_from_camera = Transform::face_towards(&(self.center_m + away), &self.center_m, &-Vector3::z());
-        let order = json!({
+        let world_from_camera = Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
+        let request = json!({
             "type": "render",
-            "id": self.n_asked,
+            "id": self.n_requested,
             "world_from_camera": world_from_camera.to_homogeneous().transpose().as_slice(),
             "size_px": SIZE_PX,
             "projection": { "kind": "pinhole", "vertical_fov_rad": 0.9 },
             "outputs": ["color", "depth"],
         });
-        self.n_asked += 1;
-        self.send(TEXT, order.to_string().as_bytes())
+        self.n_requested += 1;
+        self.send(TEXT, request.to_string().as_bytes())
     }
 
     /// Kind and length of the next frame; the server sends each message as one frame.
     fn next_frame(&mut self) -> anyhow::Result<(u8, u64)> {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
-        let is_whole = head[0] & 0x80 != 0;
-        ensure!(is_whole, "the server sent a fragmented message, expected one frame per message");
+        let is_final = head[0] & 0x80 != 0;
+        ensure!(is_final, "the server sent a fragmented message, expected one frame per message");
         let n_bytes = match head[1] {
             126 => {
                 let mut bytes = [0; 2];
@@ -205,8 +205,8 @@ impl Client {
     }
 
     /// Sends a frame. Its mask is zero: the protocol requires one, but on loopback there is no proxy to protect.
-    fn send(&mut self, kind: u8, contents: &[u8]) -> anyhow::Result<()> {
-        let mut frame = vec![0x80 | kind];
+    fn send(&mut self, opcode: u8, contents: &[u8]) -> anyhow::Result<()> {
+        let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {
             Ok(n @ 0..126) => frame.push(0x80 | n),
             _ => {
@@ -228,15 +228,15 @@ mod tests {
     use viz::{Hub, Server, ServerConfig};
 
     #[test]
-    fn a_viewer_is_served_and_leaves() {
+    fn viewer_receives_pictures_and_disconnects() {
         let hub = Hub::new();
         let listen = "127.0.0.1:0".parse().expect("an address");
         let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
         let viewer = Viewer::connect(server.address()).expect("served");
-        let begun = Instant::now();
+        let started = Instant::now();
         let mut n_drawn = 0;
         while viewer.n_pictures() < 3 {
-            assert!(viewer.is_connected() && begun.elapsed() < Duration::from_secs(60), "{}", viewer.n_pictures());
+            assert!(viewer.is_connected() && started.elapsed() < Duration::from_secs(60), "{}", viewer.n_pictures());
             let Some(pending) = hub.next_request() else {
                 std::thread::sleep(Duration::from_millis(1));
                 continue;
@@ -254,13 +254,13 @@ mod tests {
         assert!(n_drawn >= 4, "one failed request and three pictures, of one stage each if the server draws fast");
         drop(viewer);
         while hub.n_clients() > 0 {
-            assert!(begun.elapsed() < Duration::from_secs(60));
+            assert!(started.elapsed() < Duration::from_secs(60));
             std::thread::sleep(Duration::from_millis(1));
         }
     }
 
     #[test]
-    fn what_is_no_server_is_refused() {
+    fn connecting_to_a_non_websocket_server_fails() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
         let address = listener.local_addr().expect("bound");
         let other = std::thread::spawn(move || {
@@ -269,8 +269,8 @@ mod tests {
             assert!(n_read > 0);
             stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
         });
-        let refused = Viewer::connect(address).expect_err("no WebSocket").to_string();
-        assert!(refused.contains("404"), "{refused}");
+        let error_message = Viewer::connect(address).expect_err("no WebSocket").to_string();
+        assert!(error_message.contains("404"), "{error_message}");
         other.join().expect("no panic");
     }
 }

@@ -22,7 +22,7 @@ pub(crate) struct Axis {
 
 /// An axis that knows its data.
 #[derive(Clone, Debug)]
-pub(super) struct Span {
+pub(super) struct AxisRange {
     scale: Scale,
     low: f64,
     high: f64,
@@ -31,13 +31,13 @@ pub(super) struct Span {
 }
 
 /// A linear axis shows at least this much, so that noise does not look like news.
-const LEAST_SPAN: f64 = 1.0;
+const MIN_SPAN: f64 = 1.0;
 /// Ticks an axis has at about.
 const N_TICKS: f64 = 7.0;
 
 impl Axis {
     /// The axis around `values`.
-    pub(super) fn span(&self, values: impl Iterator<Item = f64>) -> Span {
+    pub(super) fn span(&self, values: impl Iterator<Item = f64>) -> AxisRange {
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
         for value in values.filter(|value| value.is_finite()) {
             (low, high) = (low.min(value), high.max(value));
@@ -47,13 +47,13 @@ impl Axis {
         }
         let (low, high) = match &self.scale {
             Scale::Linear => {
-                let missing = (LEAST_SPAN - (high - low)).max(0.0) / 2.0;
-                let room = 0.05 * (high - low).max(LEAST_SPAN);
-                (low - missing - room, high + missing + room)
+                let missing = (MIN_SPAN - (high - low)).max(0.0) / 2.0;
+                let padding = 0.05 * (high - low).max(MIN_SPAN);
+                (low - missing - padding, high + missing + padding)
             }
             Scale::Log => {
-                let room = (high / low).powf(0.03).max(1.03);
-                (low / room, high * room)
+                let padding = (high / low).powf(0.03).max(1.03);
+                (low / padding, high * padding)
             }
             Scale::Levels(_) => (low, high),
         };
@@ -64,12 +64,12 @@ impl Axis {
             Scale::Log => log_ticks(low, high),
             Scale::Levels(levels) => levels.clone(),
         };
-        let ticks = ticks.into_iter().map(|value| (value, short(value))).collect();
-        Span { scale: self.scale.clone(), low, high, ticks }
+        let ticks = ticks.into_iter().map(|value| (value, compact_number(value))).collect();
+        AxisRange { scale: self.scale.clone(), low, high, ticks }
     }
 }
 
-impl Span {
+impl AxisRange {
     /// Where a value lies: 0 at the low end, 1 at the high end.
     pub(super) fn frac(&self, value: f64) -> f64 {
         match &self.scale {
@@ -77,14 +77,14 @@ impl Span {
             Scale::Log => (value / self.low).ln() / (self.high / self.low).ln(),
             Scale::Levels(levels) => {
                 // Half a step of room at both ends.
-                (level_place(levels, value) + 0.5) / levels.len().max(1) as f64
+                (level_position(levels, value) + 0.5) / levels.len().max(1) as f64
             }
         }
     }
 }
 
 /// A value's place among levels: 0 at the first, 1 at the second and so on.
-fn level_place(levels: &[f64], value: f64) -> f64 {
+fn level_position(levels: &[f64], value: f64) -> f64 {
     if levels.len() < 2 {
         return 0.0;
     }
@@ -125,15 +125,15 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 /// A number for an axis: three digits after the point at most, thousands as k, millions as M.
-pub(crate) fn short(value: f64) -> String {
-    let (value, ending) = match value.abs() {
+pub(crate) fn compact_number(value: f64) -> String {
+    let (value, suffix) = match value.abs() {
         size if size >= 1e6 => (value / 1e6, "M"),
         size if size >= 1e3 => (value / 1e3, "k"),
         _ => (value, ""),
     };
     let text = format!("{value:.3}");
     let text = text.trim_end_matches('0').trim_end_matches('.');
-    format!("{}{ending}", if text == "-0" { "0" } else { text })
+    format!("{}{suffix}", if text == "-0" { "0" } else { text })
 }
 
 #[cfg(test)]
@@ -145,14 +145,14 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_short() {
-        let told = [0.25, 60.0, 0.1, 512_000.0, 1e6, 1500.0, -0.0001, 25.0].map(short);
-        assert_eq!(told, ["0.25", "60", "0.1", "512k", "1M", "1.5k", "0", "25"]);
+    fn axis_numbers_are_compact() {
+        let labels = [0.25, 60.0, 0.1, 512_000.0, 1e6, 1500.0, -0.0001, 25.0].map(compact_number);
+        assert_eq!(labels, ["0.25", "60", "0.1", "512k", "1M", "1.5k", "0", "25"]);
     }
 
     #[test]
-    fn ticks_are_round_numbers_inside() {
-        let labels = |span: Span| -> Vec<String> { span.ticks.into_iter().map(|(_, label)| label).collect() };
+    fn ticks_are_round_and_within_range() {
+        let labels = |span: AxisRange| -> Vec<String> { span.ticks.into_iter().map(|(_, label)| label).collect() };
         assert_eq!(labels(axis(Scale::Linear).span([21.0, 33.0].into_iter())), ["22", "24", "26", "28", "30", "32"]);
         let log = labels(axis(Scale::Log).span([1900.0, 70_000.0].into_iter()));
         assert_eq!(log, ["2k", "5k", "10k", "20k", "50k"]);
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn levels_stand_at_equal_distances() {
+    fn levels_are_evenly_spaced() {
         let span = axis(Scale::Levels(vec![0.0, 1.0, 10.0, 50.0])).span([0.0, 50.0].into_iter());
         let at = |value: f64| span.frac(value);
         assert_eq!([at(0.0), at(1.0), at(10.0), at(50.0)], [0.125, 0.375, 0.625, 0.875]);
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_logarithmic_axis_keeps_ratios() {
+    fn log_axis_preserves_ratios() {
         let span = axis(Scale::Log).span([1.0, 16.0].into_iter());
         let step = span.frac(2.0) - span.frac(1.0);
         assert!((span.frac(16.0) - span.frac(8.0) - step).abs() < 1e-12);

@@ -8,7 +8,7 @@ pub(crate) type Color = [u8; 3];
 /// Sizes of text; each is a height at which the picture's letters exist.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum TextSize {
-    Usual,
+    Normal,
     Title,
 }
 
@@ -16,7 +16,7 @@ impl TextSize {
     /// Height of a line of text.
     pub(crate) fn height(self) -> f64 {
         match self {
-            Self::Usual => 12.0,
+            Self::Normal => 12.0,
             Self::Title => 16.0,
         }
     }
@@ -32,20 +32,20 @@ pub(crate) enum Anchor {
 
 /// One thing drawn; y points down.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Shape {
+pub(crate) enum VectorShape {
     /// A line through points; `dash` is the length of dashes and of gaps.
     Line { points: Vec<[f64; 2]>, color: Color, width: f64, dash: Option<[f64; 2]> },
     /// A filled polygon.
     Area { points: Vec<[f64; 2]>, color: Color, opacity_frac: f64 },
-    /// One line of text, centered vertically on `at`; `upright` text runs from bottom to top.
-    Text { at: [f64; 2], text: String, color: Color, size: TextSize, anchor: Anchor, upright: bool },
+    /// One line of text, centered vertically on `at`; `vertical` text runs from bottom to top.
+    Text { at: [f64; 2], text: String, color: Color, size: TextSize, anchor: Anchor, vertical: bool },
 }
 
 /// Shapes in the order in which they are drawn, on white.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Drawing {
     pub(crate) size: [f64; 2],
-    pub(crate) shapes: Vec<Shape>,
+    pub(crate) shapes: Vec<VectorShape>,
 }
 
 impl Drawing {
@@ -64,9 +64,9 @@ impl Drawing {
     }
 }
 
-fn element(shape: &Shape) -> String {
+fn element(shape: &VectorShape) -> String {
     match shape {
-        Shape::Line { points, color, width, dash } => {
+        VectorShape::Line { points, color, width, dash } => {
             let dash = dash.map_or(String::new(), |[dash, gap]| format!(" stroke-dasharray=\"{dash} {gap}\""));
             format!(
                 "<polyline points=\"{}\" fill=\"none\" stroke=\"{}\" stroke-width=\"{width}\" stroke-linejoin=\"round\"{dash}/>\n",
@@ -74,19 +74,19 @@ fn element(shape: &Shape) -> String {
                 hex(*color)
             )
         }
-        Shape::Area { points, color, opacity_frac } => {
+        VectorShape::Area { points, color, opacity_frac } => {
             let opacity = if *opacity_frac < 1.0 { format!(" fill-opacity=\"{opacity_frac}\"") } else { String::new() };
             format!("<polygon points=\"{}\" fill=\"{}\"{opacity}/>\n", coordinates(points), hex(*color))
         }
-        Shape::Text { at: [x, y], text, color, size, anchor, upright } => {
+        VectorShape::Text { at: [x, y], text, color, size, anchor, vertical } => {
             let anchor = match anchor {
                 Anchor::Start => "start",
                 Anchor::Middle => "middle",
                 Anchor::End => "end",
             };
-            let turn = if *upright { format!(" transform=\"rotate(-90 {x:.2} {y:.2})\"") } else { String::new() };
+            let rotation = if *vertical { format!(" transform=\"rotate(-90 {x:.2} {y:.2})\"") } else { String::new() };
             format!(
-                "<text x=\"{x:.2}\" y=\"{y:.2}\" font-size=\"{}\" fill=\"{}\" text-anchor=\"{anchor}\" dominant-baseline=\"central\"{turn}>{}</text>\n",
+                "<text x=\"{x:.2}\" y=\"{y:.2}\" font-size=\"{}\" fill=\"{}\" text-anchor=\"{anchor}\" dominant-baseline=\"central\"{rotation}>{}</text>\n",
                 size.height(),
                 hex(*color),
                 escaped(text)
@@ -118,10 +118,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn text_cannot_break_the_file() {
+    fn svg_text_is_escaped() {
         let at = [1.0, 2.0];
-        let (color, size, anchor) = ([0, 114, 178], TextSize::Usual, Anchor::Start);
-        let text = Shape::Text { at, text: "a<b> & \"c\"".into(), color, size, anchor, upright: true };
+        let (color, size, anchor) = ([0, 114, 178], TextSize::Normal, Anchor::Start);
+        let text = VectorShape::Text { at, text: "a<b> & \"c\"".into(), color, size, anchor, vertical: true };
         let svg = Drawing { size: [10.0, 5.0], shapes: vec![text] }.svg();
         assert!(svg.contains("a&lt;b&gt; &amp; &quot;c&quot;</text>"), "{svg}");
         assert!(svg.contains("fill=\"#0072b2\"") && svg.contains("rotate(-90 1.00 2.00)"), "{svg}");

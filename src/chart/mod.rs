@@ -7,8 +7,8 @@ mod axis;
 pub(crate) mod drawing;
 pub(crate) mod raster;
 
-pub(crate) use axis::{Axis, Scale, short};
-use drawing::{Anchor, Color, Drawing, Shape, TextSize};
+pub(crate) use axis::{Axis, Scale, compact_number};
+use drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
 use raster::text_width;
 
 /// A chart in words and numbers.
@@ -21,9 +21,9 @@ pub(crate) struct Chart {
     pub(crate) y: Axis,
     pub(crate) lines: Vec<Line>,
     /// Levels on the y axis worth a dashed line, with what they mean.
-    pub(crate) floors: Vec<(f64, String)>,
+    pub(crate) thresholds: Vec<(f64, String)>,
     /// Places on the x axis worth a dashed line.
-    pub(crate) rules: Vec<Rule>,
+    pub(crate) markers: Vec<Marker>,
 }
 
 /// One line of a chart.
@@ -33,7 +33,7 @@ pub(crate) struct Line {
     /// In the order of x.
     pub(crate) points: Vec<Point>,
     /// Told apart from our own lines by dashes.
-    pub(crate) is_foreign: bool,
+    pub(crate) is_peer: bool,
 }
 
 /// A point, and how far the values behind it spread.
@@ -47,7 +47,7 @@ pub(crate) struct Point {
 
 /// A place on the x axis, explained above the chart.
 #[derive(Clone, Debug)]
-pub(crate) struct Rule {
+pub(crate) struct Marker {
     pub(crate) x: f64,
     pub(crate) label: String,
     /// The line it belongs to.
@@ -65,13 +65,13 @@ const PLOT_HEIGHT: f64 = 380.0;
 const LEFT: f64 = 66.0;
 const MARGIN: f64 = 18.0;
 /// Room below the plot for tick labels and the axis label.
-const BELOW: f64 = 56.0;
+const MARGIN_BELOW: f64 = 56.0;
 const TITLE_HEIGHT: f64 = 54.0;
-const RULE_ROW: f64 = 15.0;
+const MARKER_ROW: f64 = 15.0;
 const LEGEND_SWATCH: f64 = 34.0;
 const LEGEND_ROW: f64 = 15.0;
 /// Letters a line of the legend.
-const LEGEND_LETTERS: usize = 26;
+const MAX_LEGEND_CHARS: usize = 26;
 
 /// Where the plot lies, and what its axes span.
 struct Plot {
@@ -79,8 +79,8 @@ struct Plot {
     right: f64,
     top: f64,
     bottom: f64,
-    x: axis::Span,
-    y: axis::Span,
+    x: axis::AxisRange,
+    y: axis::AxisRange,
 }
 
 impl Plot {
@@ -101,42 +101,42 @@ impl Chart {
     /// The chart drawn; the legend stands beside the data, never over them.
     pub(crate) fn draw(&self) -> Drawing {
         let legend = self.legend();
-        let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Usual));
+        let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Normal));
         let legend_width = LEGEND_SWATCH + longest.fold(0.0, f64::max);
-        let top = TITLE_HEIGHT + RULE_ROW * self.rules.len() as f64;
+        let top = TITLE_HEIGHT + MARKER_ROW * self.markers.len() as f64;
         let points = || self.lines.iter().flat_map(|line| &line.points);
-        let heights = points().flat_map(|point| [point.low, point.high]).chain(self.floors.iter().map(|floor| floor.0));
-        let places = points().map(|point| point.x).chain(self.rules.iter().map(|rule| rule.x));
+        let ys = points().flat_map(|point| [point.low, point.high]).chain(self.thresholds.iter().map(|floor| floor.0));
+        let xs = points().map(|point| point.x).chain(self.markers.iter().map(|marker| marker.x));
         let plot = Plot {
             left: LEFT,
             right: WIDTH - legend_width - 2.0 * MARGIN,
             top,
             bottom: top + PLOT_HEIGHT,
-            x: self.x.span(places),
-            y: self.y.span(heights),
+            x: self.x.span(xs),
+            y: self.y.span(ys),
         };
-        let size = [WIDTH, plot.bottom + BELOW];
+        let size = [WIDTH, plot.bottom + MARGIN_BELOW];
         let mut shapes = Vec::new();
         self.draw_grid(&plot, &mut shapes);
-        self.draw_floors(&plot, &mut shapes);
+        self.draw_thresholds(&plot, &mut shapes);
         for (ix, line) in self.lines.iter().enumerate() {
             draw_band(line, color_of(ix), &plot, &mut shapes);
         }
-        self.draw_rules(&plot, &mut shapes);
+        self.draw_markers(&plot, &mut shapes);
         for (ix, line) in self.lines.iter().enumerate() {
             draw_line(line, ix, &plot, &mut shapes);
         }
-        self.draw_words(&plot, &mut shapes);
+        self.draw_titles(&plot, &mut shapes);
         draw_legend(&legend, &plot, &mut shapes);
         Drawing { size, shapes }
     }
 
-    fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+    fn draw_grid(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
         let mut free_from = f64::MIN;
         for (value, label) in &plot.x.ticks {
             let x = plot.x(*value);
             shapes.push(line_between([x, plot.top], [x, plot.bottom], GRID, 1.0));
-            let half = 0.5 * text_width(label, TextSize::Usual);
+            let half = 0.5 * text_width(label, TextSize::Normal);
             if x - half < free_from {
                 continue;
             }
@@ -149,51 +149,52 @@ impl Chart {
             shapes.push(text([plot.left - 8.0, y], label, INK, Anchor::End));
         }
         let corners = [[plot.left, plot.top], [plot.left, plot.bottom], [plot.right, plot.bottom]];
-        shapes.push(Shape::Line { points: corners.to_vec(), color: FAINT_INK, width: 1.0, dash: None });
+        shapes.push(VectorShape::Line { points: corners.to_vec(), color: FAINT_INK, width: 1.0, dash: None });
     }
 
-    fn draw_floors(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
-        for (value, _) in &self.floors {
+    fn draw_thresholds(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
+        for (value, _) in &self.thresholds {
             let y = plot.y(*value);
             let points = vec![[plot.left, y], [plot.right, y]];
-            shapes.push(Shape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+            shapes.push(VectorShape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
         }
     }
 
     /// Each rule has a row of its own above the plot, so that no two labels meet.
-    fn draw_rules(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
-        for (row, rule) in self.rules.iter().enumerate() {
-            let (x, color) = (plot.x(rule.x), color_of(rule.line_ix));
-            let y = TITLE_HEIGHT + RULE_ROW * (row as f64 + 0.4);
+    fn draw_markers(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
+        for (row, marker) in self.markers.iter().enumerate() {
+            let (x, color) = (plot.x(marker.x), color_of(marker.line_ix));
+            let y = TITLE_HEIGHT + MARKER_ROW * (row as f64 + 0.4);
             let points = vec![[x, y + 7.0], [x, plot.bottom]];
-            shapes.push(Shape::Line { points, color, width: 1.2, dash: Some([5.0, 4.0]) });
-            let half = 0.5 * text_width(&rule.label, TextSize::Usual);
+            shapes.push(VectorShape::Line { points, color, width: 1.2, dash: Some([5.0, 4.0]) });
+            let half = 0.5 * text_width(&marker.label, TextSize::Normal);
             let center = x.min(plot.right - half).max(plot.left + half);
-            shapes.push(text([center, y], &rule.label, color, Anchor::Middle));
+            shapes.push(text([center, y], &marker.label, color, Anchor::Middle));
         }
     }
 
-    fn draw_words(&self, plot: &Plot, shapes: &mut Vec<Shape>) {
+    fn draw_titles(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
         let size = TextSize::Title;
         let anchor = Anchor::Start;
         let at = [LEFT, 20.0];
-        shapes.push(Shape::Text { at, text: self.title.clone(), color: INK, size, anchor, upright: false });
+        shapes.push(VectorShape::Text { at, text: self.title.clone(), color: INK, size, anchor, vertical: false });
         shapes.push(text([LEFT, 40.0], &self.subtitle, FAINT_INK, Anchor::Start));
         let middle = 0.5 * (plot.left + plot.right);
         shapes.push(text([middle, plot.bottom + 38.0], &self.x.label, INK, Anchor::Middle));
         let at = [18.0, 0.5 * (plot.top + plot.bottom)];
-        let (size, anchor) = (TextSize::Usual, Anchor::Middle);
-        shapes.push(Shape::Text { at, text: self.y.label.clone(), color: INK, size, anchor, upright: true });
+        let (size, anchor) = (TextSize::Normal, Anchor::Middle);
+        shapes.push(VectorShape::Text { at, text: self.y.label.clone(), color: INK, size, anchor, vertical: true });
     }
 
     fn legend(&self) -> Vec<Entry> {
         let lines = self.lines.iter().enumerate().map(|(ix, line)| Entry {
-            swatch: Swatch::Line { ix, is_foreign: line.is_foreign },
-            rows: wrapped(&line.label, LEGEND_LETTERS),
+            swatch: Swatch::Line { ix, is_peer: line.is_peer },
+            rows: wrap(&line.label, MAX_LEGEND_CHARS),
         });
-        let floors = self.floors.iter();
-        let floors = floors.map(|(_, label)| Entry { swatch: Swatch::Floor, rows: wrapped(label, LEGEND_LETTERS) });
-        lines.chain(floors).collect()
+        let thresholds = self.thresholds.iter();
+        let thresholds =
+            thresholds.map(|(_, label)| Entry { swatch: Swatch::Threshold, rows: wrap(label, MAX_LEGEND_CHARS) });
+        lines.chain(thresholds).collect()
     }
 }
 
@@ -204,23 +205,23 @@ struct Entry {
 }
 
 enum Swatch {
-    Line { ix: usize, is_foreign: bool },
-    Floor,
+    Line { ix: usize, is_peer: bool },
+    Threshold,
 }
 
-fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<Shape>) {
+fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<VectorShape>) {
     let left = plot.right + MARGIN;
     let mut y = plot.top + 8.0;
     for entry in legend {
         let points = vec![[left, y], [left + 24.0, y]];
         match entry.swatch {
-            Swatch::Line { ix, is_foreign } => {
-                let dash = is_foreign.then_some(FOREIGN_DASH);
-                shapes.push(Shape::Line { points, color: color_of(ix), width: 2.0, dash });
+            Swatch::Line { ix, is_peer } => {
+                let dash = is_peer.then_some(PEER_DASH);
+                shapes.push(VectorShape::Line { points, color: color_of(ix), width: 2.0, dash });
                 draw_dot([left + 12.0, y], ix, shapes);
             }
-            Swatch::Floor => {
-                shapes.push(Shape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
+            Swatch::Threshold => {
+                shapes.push(VectorShape::Line { points, color: FAINT_INK, width: 1.2, dash: Some([2.0, 3.0]) });
             }
         }
         for row in &entry.rows {
@@ -231,26 +232,26 @@ fn draw_legend(legend: &[Entry], plot: &Plot, shapes: &mut Vec<Shape>) {
     }
 }
 
-const FOREIGN_DASH: [f64; 2] = [6.0, 3.0];
+const PEER_DASH: [f64; 2] = [6.0, 3.0];
 
 fn color_of(line_ix: usize) -> Color {
     COLORS[line_ix % COLORS.len()]
 }
 
-fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<Shape>) {
+fn draw_band(line: &Line, color: Color, plot: &Plot, shapes: &mut Vec<VectorShape>) {
     if line.points.len() < 2 || line.points.iter().all(|point| point.low == point.high) {
         return;
     }
     let above = line.points.iter().map(|point| [plot.x(point.x), plot.y(point.high)]);
     let below = line.points.iter().rev().map(|point| [plot.x(point.x), plot.y(point.low)]);
-    shapes.push(Shape::Area { points: above.chain(below).collect(), color, opacity_frac: 0.2 });
+    shapes.push(VectorShape::Area { points: above.chain(below).collect(), color, opacity_frac: 0.2 });
 }
 
-fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<Shape>) {
+fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>) {
     let points: Vec<[f64; 2]> = line.points.iter().map(|point| plot.at(point)).collect();
-    let dash = line.is_foreign.then_some(FOREIGN_DASH);
+    let dash = line.is_peer.then_some(PEER_DASH);
     if points.len() > 1 {
-        shapes.push(Shape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
+        shapes.push(VectorShape::Line { points: points.clone(), color: color_of(ix), width: 2.0, dash });
     }
     for at in points {
         draw_dot(at, ix, shapes);
@@ -258,26 +259,27 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<Shape>) {
 }
 
 /// A dot whose form tells the line: disc, square, triangle, diamond.
-fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<Shape>) {
-    let (n_corners, first_turn, radius) = [(24, 0.0, 3.6), (4, 0.125, 4.6), (3, 0.75, 5.2), (4, 0.0, 5.0)][line_ix % 4];
+fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
+    let (n_corners, first_angle_frac, radius) =
+        [(24, 0.0, 3.6), (4, 0.125, 4.6), (3, 0.75, 5.2), (4, 0.0, 5.0)][line_ix % 4];
     let corner = |ix: u32| {
-        let angle = std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_turn);
+        let angle = std::f64::consts::TAU * (f64::from(ix) / f64::from(n_corners) + first_angle_frac);
         [x + radius * angle.cos(), y + radius * angle.sin()]
     };
     let points = (0..n_corners).map(corner).collect();
-    shapes.push(Shape::Area { points, color: color_of(line_ix), opacity_frac: 1.0 });
+    shapes.push(VectorShape::Area { points, color: color_of(line_ix), opacity_frac: 1.0 });
 }
 
-fn line_between(from: [f64; 2], to: [f64; 2], color: Color, width: f64) -> Shape {
-    Shape::Line { points: vec![from, to], color, width, dash: None }
+fn line_between(from: [f64; 2], to: [f64; 2], color: Color, width: f64) -> VectorShape {
+    VectorShape::Line { points: vec![from, to], color, width, dash: None }
 }
 
-fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> Shape {
-    Shape::Text { at, text: text.to_owned(), color, size: TextSize::Usual, anchor, upright: false }
+fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> VectorShape {
+    VectorShape::Text { at, text: text.to_owned(), color, size: TextSize::Normal, anchor, vertical: false }
 }
 
-/// Text in rows of at most `n_letters`, broken after spaces and, where a word is longer, anywhere.
-fn wrapped(text: &str, n_letters: usize) -> Vec<String> {
+/// Text in rows of at most `max_chars`, broken after spaces and, where a word is longer, anywhere.
+fn wrap(text: &str, max_chars: usize) -> Vec<String> {
     let mut rows = vec![String::new()];
     for word in text.split_inclusive(' ') {
         let mut left: Vec<char> = word.chars().collect();
@@ -285,11 +287,11 @@ fn wrapped(text: &str, n_letters: usize) -> Vec<String> {
             let row = rows.last_mut().expect("there is always a row");
             let n_used = row.chars().count();
             let n_word = left.iter().filter(|letter| **letter != ' ').count();
-            if n_used > 0 && n_used + n_word > n_letters {
+            if n_used > 0 && n_used + n_word > max_chars {
                 rows.push(String::new());
                 continue;
             }
-            row.extend(left.drain(..left.len().min(n_letters + 1 - n_used.min(n_letters))));
+            row.extend(left.drain(..left.len().min(max_chars + 1 - n_used.min(max_chars))));
         }
     }
     rows.iter().map(|row| row.trim_end().to_owned()).collect()
@@ -300,21 +302,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn long_labels_are_broken_into_rows() {
-        assert_eq!(wrapped("sa, splat", 26), ["sa, splat"]);
-        assert_eq!(wrapped("one two three", 8), ["one two", "three"]);
-        let rows = wrapped(&"x".repeat(60), 26);
+    fn long_labels_are_wrapped() {
+        assert_eq!(wrap("sa, splat", 26), ["sa, splat"]);
+        assert_eq!(wrap("one two three", 8), ["one two", "three"]);
+        let rows = wrap(&"x".repeat(60), 26);
         assert!(rows.iter().all(|row| row.len() <= 27), "{rows:?}");
         assert_eq!(rows.concat(), "x".repeat(60));
     }
 
     #[test]
-    fn nothing_is_drawn_outside_and_the_legend_lies_beside_the_data() {
+    fn drawing_stays_in_bounds() {
         let point = |x: f64, y: f64| Point { x, y, low: y - 1.0, high: y + 0.5 };
         let line = |label: &str| Line {
             label: label.into(),
             points: vec![point(0.25, 11.0), point(60.0, 36.0)],
-            is_foreign: false,
+            is_peer: false,
         };
         let chart = Chart {
             title: "A title".into(),
@@ -322,26 +324,26 @@ mod tests {
             x: Axis { label: "seconds".into(), scale: Scale::Log, ticks: vec![0.25, 1.0, 60.0] },
             y: Axis { label: "PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
             lines: vec![line("a"), line("a much longer name of some other data")],
-            floors: Vec::new(),
-            rules: vec![Rule { x: 60.0, label: "a long word about the very end".into(), line_ix: 0 }],
+            thresholds: Vec::new(),
+            markers: vec![Marker { x: 60.0, label: "a long word about the very end".into(), line_ix: 0 }],
         };
         let drawing = chart.draw();
         let [width, height] = drawing.size;
         for shape in &drawing.shapes {
-            let (points, room) = match shape {
-                Shape::Line { points, .. } | Shape::Area { points, .. } => (points.clone(), 0.0),
-                Shape::Text { at, text, size, anchor, upright, .. } => {
-                    let room = if *upright { 0.0 } else { text_width(text, *size) };
+            let (points, padding) = match shape {
+                VectorShape::Line { points, .. } | VectorShape::Area { points, .. } => (points.clone(), 0.0),
+                VectorShape::Text { at, text, size, anchor, vertical, .. } => {
+                    let padding = if *vertical { 0.0 } else { text_width(text, *size) };
                     let from = match anchor {
                         Anchor::Start => 0.0,
-                        Anchor::Middle => -0.5 * room,
-                        Anchor::End => -room,
+                        Anchor::Middle => -0.5 * padding,
+                        Anchor::End => -padding,
                     };
-                    (vec![[at[0] + from, at[1]]], room)
+                    (vec![[at[0] + from, at[1]]], padding)
                 }
             };
             for [x, y] in points {
-                assert!(x >= 0.0 && x + room <= width && (0.0..=height).contains(&y), "{shape:?}");
+                assert!(x >= 0.0 && x + padding <= width && (0.0..=height).contains(&y), "{shape:?}");
             }
         }
     }
@@ -355,8 +357,8 @@ mod tests {
             x: axis(Scale::Log),
             y: axis(Scale::Linear),
             lines: Vec::new(),
-            floors: Vec::new(),
-            rules: Vec::new(),
+            thresholds: Vec::new(),
+            markers: Vec::new(),
         };
         let drawing = chart.draw();
         assert!(!drawing.svg().contains("NaN"));

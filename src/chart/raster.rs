@@ -1,6 +1,6 @@
 //! A drawing as a PNG picture, on machines without fonts: letters come as pictures with the program.
 
-use super::drawing::{Anchor, Color, Drawing, Shape, TextSize};
+use super::drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
 use anyhow::Context;
 use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
@@ -11,7 +11,7 @@ const PIXELS_PER_UNIT: u32 = 2;
 
 fn raster_height(size: TextSize) -> RasterHeight {
     match size {
-        TextSize::Usual => RasterHeight::Size24,
+        TextSize::Normal => RasterHeight::Size24,
         TextSize::Title => RasterHeight::Size32,
     }
 }
@@ -30,15 +30,15 @@ pub(crate) fn png(drawing: &Drawing) -> anyhow::Result<Vec<u8>> {
     picture.fill(tiny_skia::Color::WHITE);
     for shape in &drawing.shapes {
         match shape {
-            Shape::Line { points, color, width, dash } => line(&mut picture, points, *color, *width, *dash),
-            Shape::Area { points, color, opacity_frac } => area(&mut picture, points, *color, *opacity_frac),
-            Shape::Text { at, text, color, size, anchor, upright } => {
+            VectorShape::Line { points, color, width, dash } => line(&mut picture, points, *color, *width, *dash),
+            VectorShape::Area { points, color, opacity_frac } => area(&mut picture, points, *color, *opacity_frac),
+            VectorShape::Text { at, text, color, size, anchor, vertical } => {
                 let start = match anchor {
                     Anchor::Start => 0.0,
                     Anchor::Middle => -0.5 * text_width(text, *size),
                     Anchor::End => -text_width(text, *size),
                 };
-                Letters { at: *at, start, color: *color, size: *size, upright: *upright }.draw(&mut picture, text);
+                TextRun { at: *at, start, color: *color, size: *size, vertical: *vertical }.draw(&mut picture, text);
             }
         }
     }
@@ -51,9 +51,9 @@ pub(crate) fn png(drawing: &Drawing) -> anyhow::Result<Vec<u8>> {
 
 fn line(picture: &mut Pixmap, points: &[[f64; 2]], color: Color, width: f64, dash: Option<[f64; 2]>) {
     let Some(path) = path(points, false) else { return };
-    let dash = dash.and_then(|lengths| StrokeDash::new(lengths.map(single).to_vec(), 0.0));
+    let dash = dash.and_then(|lengths| StrokeDash::new(lengths.map(to_f32).to_vec(), 0.0));
     let (line_cap, line_join) = (LineCap::Butt, LineJoin::Round);
-    let stroke = Stroke { width: single(width), dash, line_cap, line_join, ..Stroke::default() };
+    let stroke = Stroke { width: to_f32(width), dash, line_cap, line_join, ..Stroke::default() };
     picture.stroke_path(&path, &paint(color, 1.0), &stroke, to_pixels(), None);
 }
 
@@ -65,7 +65,7 @@ fn area(picture: &mut Pixmap, points: &[[f64; 2]], color: Color, opacity_frac: f
 fn path(points: &[[f64; 2]], closed: bool) -> Option<Path> {
     let mut path = PathBuilder::new();
     for (ix, point) in points.iter().enumerate() {
-        let [x, y] = point.map(single);
+        let [x, y] = point.map(to_f32);
         if ix == 0 { path.move_to(x, y) } else { path.line_to(x, y) }
     }
     if closed {
@@ -86,52 +86,52 @@ fn to_pixels() -> Transform {
 }
 
 /// One line of text in the making.
-struct Letters {
+struct TextRun {
     at: [f64; 2],
     /// Where the text starts, from `at` along its direction.
     start: f64,
     color: Color,
     size: TextSize,
-    upright: bool,
+    vertical: bool,
 }
 
-impl Letters {
+impl TextRun {
     fn draw(&self, picture: &mut Pixmap, text: &str) {
         let height = raster_height(self.size);
-        let mut along = pixel(self.start);
+        let mut cursor = pixel(self.start);
         for letter in text.chars() {
-            let drawn = get_raster(letter, FontWeight::Regular, height)
+            let glyph = get_raster(letter, FontWeight::Regular, height)
                 .or_else(|| get_raster('?', FontWeight::Regular, height))
                 .expect("the font has a question mark");
-            for (row, opacities) in drawn.rows().enumerate() {
+            for (row, opacities) in glyph.rows().enumerate() {
                 for (column, opacity) in opacities.iter().enumerate() {
-                    let right = along + column as i64;
+                    let right = cursor + column as i64;
                     let down = row as i64 - height.val() as i64 / 2;
                     self.blend(picture, right, down, *opacity);
                 }
             }
-            along += drawn.width() as i64;
+            cursor += glyph.width() as i64;
         }
     }
 
     /// Mixes the color into one pixel; `right` and `down` are from `at`, as the text runs.
     fn blend(&self, picture: &mut Pixmap, right: i64, down: i64, opacity: u8) {
         let [x, y] = self.at.map(pixel);
-        let [x, y] = if self.upright { [x + down, y - right] } else { [x + right, y + down] };
+        let [x, y] = if self.vertical { [x + down, y - right] } else { [x + right, y + down] };
         let (width, height) = (i64::from(picture.width()), i64::from(picture.height()));
         if opacity == 0 || !(0..width).contains(&x) || !(0..height).contains(&y) {
             return;
         }
         let first = usize::try_from(4 * (y * width + x)).expect("inside the picture");
-        let share = f64::from(opacity) / 255.0;
+        let alpha = f64::from(opacity) / 255.0;
         for (under, over) in picture.data_mut()[first..first + 3].iter_mut().zip(self.color) {
-            *under = byte(f64::from(*under) * (1.0 - share) + f64::from(over) * share);
+            *under = byte(f64::from(*under) * (1.0 - alpha) + f64::from(over) * alpha);
         }
     }
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "pictures are drawn in f32")]
-fn single(value: f64) -> f32 {
+fn to_f32(value: f64) -> f32 {
     value as f32
 }
 
@@ -150,13 +150,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shapes_and_letters_reach_the_picture() {
+    fn shapes_and_text_are_rasterized() {
         let color = [213, 94, 0];
-        let (size, anchor) = (TextSize::Usual, Anchor::Middle);
-        let text = |at, upright| Shape::Text { at, text: "H".into(), color, size, anchor, upright };
+        let (size, anchor) = (TextSize::Normal, Anchor::Middle);
+        let text = |at, vertical| VectorShape::Text { at, text: "H".into(), color, size, anchor, vertical };
         let shapes = vec![
-            Shape::Line { points: vec![[0.0, 2.0], [40.0, 2.0]], color, width: 2.0, dash: None },
-            Shape::Area {
+            VectorShape::Line { points: vec![[0.0, 2.0], [40.0, 2.0]], color, width: 2.0, dash: None },
+            VectorShape::Area {
                 points: vec![[0.0, 30.0], [10.0, 30.0], [10.0, 40.0], [0.0, 40.0]],
                 color,
                 opacity_frac: 0.5,
@@ -170,7 +170,7 @@ mod tests {
         assert_eq!(picture.get_pixel(40, 4).0, color);
         let half = picture.get_pixel(5, 70).0;
         // Half way to white, rounded either way.
-        assert!(half.iter().zip([234, 175, 128]).all(|(got, wanted)| got.abs_diff(wanted) <= 1), "{half:?}");
+        assert!(half.iter().zip([234, 175, 128]).all(|(got, expected)| got.abs_diff(expected) <= 1), "{half:?}");
         assert_eq!(picture.get_pixel(60, 70).0, [255; 3]);
         let inked = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
             x.flat_map(|x| y.clone().map(move |y| (x, y)))

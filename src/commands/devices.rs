@@ -21,7 +21,7 @@ pub(crate) struct Args {
 
 /// One thing found.
 #[derive(Debug, PartialEq, Eq, Serialize)]
-struct Found {
+struct DeviceInfo {
     /// `gpu`, `camera`, `can` or `simulation`.
     kind: &'static str,
     /// What to write into a rig file or to show.
@@ -46,8 +46,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         if args.json {
             print::json(device)?;
         } else {
-            let mark = if device.usable { "yes" } else { "no " };
-            print::line(format_args!("{mark}  {:10} {:14} {}", device.kind, device.address, device.name))?;
+            let label = if device.usable { "yes" } else { "no " };
+            print::line(format_args!("{label}  {:10} {:14} {}", device.kind, device.address, device.name))?;
             print::line(format_args!("     {}", device.note))?;
         }
     }
@@ -59,33 +59,33 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
-fn gpu() -> Found {
+fn gpu() -> DeviceInfo {
     let (name, usable, note) = match super::open_gpu() {
         Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "in software: works, slowly".to_owned()),
         Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
         Err(error) => ("none".to_owned(), false, error.to_string()),
     };
-    Found { kind: "gpu", address: "default".into(), name, usable, note }
+    DeviceInfo { kind: "gpu", address: "default".into(), name, usable, note }
 }
 
-fn simulation() -> Found {
+fn simulation() -> DeviceInfo {
     let usable = cfg!(feature = "sim");
     let note = if usable {
         "`--sim` puts simulated twins in the place of a rig's devices"
     } else {
         "built without simulation: `make deps`, then `cargo build --release --features sim`"
     };
-    Found { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
+    DeviceInfo { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
 }
 
 /// V4L2 devices that give images, with all that they offer.
 #[cfg(target_os = "linux")]
-fn video_devices(cameras: Vec<Result<v4l2::Found, v4l2::Problem>>) -> Vec<Found> {
-    let describe = |camera: v4l2::Found| {
+fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<DeviceInfo> {
+    let describe = |camera: v4l2::FoundCamera| {
         let usb = camera.usb_mbits.map_or(String::new(), |mbits| format!(", USB at {mbits} Mbit/s"));
         let serial = camera.serial.as_ref().map_or(String::new(), |serial| format!(", serial {serial}"));
         let offers = v4l2::summary(&camera.modes);
-        Found {
+        DeviceInfo {
             kind: "camera",
             address: camera.address(),
             usable: !camera.modes.is_empty(),
@@ -93,20 +93,20 @@ fn video_devices(cameras: Vec<Result<v4l2::Found, v4l2::Problem>>) -> Vec<Found>
             name: camera.name,
         }
     };
-    let refused = |problem: v4l2::Problem| Found {
+    let unavailable = |problem: v4l2::Problem| DeviceInfo {
         kind: "camera",
         address: "unknown".into(),
         name: "V4L2".into(),
         usable: false,
         note: problem.to_string(),
     };
-    cameras.into_iter().map(|camera| camera.map_or_else(refused, describe)).collect()
+    cameras.into_iter().map(|camera| camera.map_or_else(unavailable, describe)).collect()
 }
 
 /// RealSense cameras by their maker's library.
 #[cfg(feature = "realsense")]
-fn realsense_cameras(_sys: &Path) -> Vec<Found> {
-    let found = |address, name, usable, note| Found { kind: "camera", address, name, usable, note };
+fn realsense_cameras(_sys: &Path) -> Vec<DeviceInfo> {
+    let found = |address, name, usable, note| DeviceInfo { kind: "camera", address, name, usable, note };
     match drivers::realsense::cameras() {
         Ok(cameras) => cameras
             .into_iter()
@@ -122,7 +122,7 @@ fn realsense_cameras(_sys: &Path) -> Vec<Found> {
 
 /// RealSense cameras on USB, as the kernel tells.
 #[cfg(any(not(feature = "realsense"), test))]
-fn realsense_on_usb(sys: &Path) -> Vec<Found> {
+fn realsense_on_usb(sys: &Path) -> Vec<DeviceInfo> {
     let usb = sys.join("bus/usb/devices");
     children(&usb)
         .into_iter()
@@ -132,18 +132,18 @@ fn realsense_on_usb(sys: &Path) -> Vec<Found> {
             let note =
                 "also driver realsense, in a program that was built with `cargo build --release --features realsense`"
                     .into();
-            Some(Found { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
+            Some(DeviceInfo { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
         })
         .collect()
 }
 
 #[cfg(not(feature = "realsense"))]
-fn realsense_cameras(sys: &Path) -> Vec<Found> {
+fn realsense_cameras(sys: &Path) -> Vec<DeviceInfo> {
     realsense_on_usb(sys)
 }
 
 /// CAN interfaces, real and virtual.
-fn can_interfaces(sys: &Path) -> Vec<Found> {
+fn can_interfaces(sys: &Path) -> Vec<DeviceInfo> {
     drivers::can::interfaces(sys)
         .into_iter()
         .map(|interface| {
@@ -151,7 +151,7 @@ fn can_interfaces(sys: &Path) -> Vec<Found> {
                 .unwrap_or_else(|| "unknown".into());
             let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` tells how it is set up");
             let usable = cfg!(target_os = "linux");
-            Found { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
+            DeviceInfo { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
         })
         .collect()
 }
@@ -202,8 +202,8 @@ mod tests {
     }
 
     #[test]
-    fn cameras_are_told_by_the_name_that_stays() {
-        let camera = v4l2::Found {
+    fn cameras_are_listed_by_stable_path() {
+        let camera = v4l2::FoundCamera {
             node: "/dev/video2".into(),
             name: "C920".into(),
             bus: "usb-0000:00:14.0-2".into(),
@@ -213,8 +213,8 @@ mod tests {
             modes: Vec::new(),
         };
         let source = std::io::ErrorKind::PermissionDenied.into();
-        let refused = v4l2::Problem::Open { path: "/dev/video4".into(), source };
-        let found = video_devices(vec![Ok(camera), Err(refused)]);
+        let unavailable = v4l2::Problem::Open { path: "/dev/video4".into(), source };
+        let found = video_devices(vec![Ok(camera), Err(unavailable)]);
         assert_eq!(found[0].address, "/dev/v4l/by-id/usb-A1B2-index0");
         assert!(found[0].note.contains("/dev/video2, at usb-0000:00:14.0-2, serial A1B2, USB at 480 Mbit/s"));
         assert!(!found[0].usable && !found[1].usable, "the one offers nothing, the other may not be opened");
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn an_absent_sysfs_has_no_devices() {
+    fn missing_sysfs_gives_no_devices() {
         let sys = tempfile::tempdir().expect("folder");
         assert_eq!(realsense_on_usb(sys.path()), []);
         assert_eq!(can_interfaces(sys.path()), []);

@@ -3,7 +3,7 @@
 mod franka;
 mod listen;
 
-use super::within;
+use super::number_in_range;
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
 use crate::open;
@@ -18,11 +18,11 @@ use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 
 /// A model of a million splats with its keyframes and the optimiser's state fits into this.
-const ENOUGH_MEMORY_KIB: u64 = 4 << 20;
+const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
 /// Where `run` serves unless told otherwise.
-const USUAL_ADDRESS: &str = "127.0.0.1:7007";
+const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
 /// Stamps are compared with the time an image row takes, tens of microseconds.
-const FINE_CLOCK: Duration = Duration::from_micros(1);
+const MAX_CLOCK_STEP: Duration = Duration::from_micros(1);
 
 /// Flags of `doctor`.
 #[derive(Debug, clap::Args)]
@@ -30,7 +30,7 @@ pub(crate) struct Args {
     /// Rig file: what it names is checked against what it wants
     rig: Option<PathBuf>,
     /// Then read the rig's devices for S seconds and tell rates, latencies and losses; nothing is moved
-    #[arg(long, value_name = "S", requires = "rig", value_parser = within(1.0..=3600.0))]
+    #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     listen: Option<f64>,
     /// Print one JSON object a line
     #[arg(long)]
@@ -48,24 +48,24 @@ enum Verdict {
 /// One thing looked at.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 struct Finding {
-    what: &'static str,
+    check: &'static str,
     verdict: Verdict,
-    says: String,
+    message: String,
     #[serde(skip_serializing_if = "Option::is_none")]
-    mend: Option<String>,
+    remedy: Option<String>,
 }
 
 impl Finding {
-    fn ok(what: &'static str, says: impl Into<String>) -> Self {
-        Self { what, verdict: Verdict::Ok, says: says.into(), mend: None }
+    fn ok(check: &'static str, message: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Ok, message: message.into(), remedy: None }
     }
 
-    fn warn(what: &'static str, says: impl Into<String>, mend: impl Into<String>) -> Self {
-        Self { what, verdict: Verdict::Warn, says: says.into(), mend: Some(mend.into()) }
+    fn warn(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Warn, message: message.into(), remedy: Some(remedy.into()) }
     }
 
-    fn fail(what: &'static str, says: impl Into<String>, mend: impl Into<String>) -> Self {
-        Self { what, verdict: Verdict::Fail, says: says.into(), mend: Some(mend.into()) }
+    fn fail(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { check, verdict: Verdict::Fail, message: message.into(), remedy: Some(remedy.into()) }
     }
 }
 
@@ -87,40 +87,40 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.extend(realsense(rig.as_ref()));
     findings.extend(can(rig.as_ref()));
     findings.extend(franka::franka(rig.as_ref()));
-    findings.push(port(USUAL_ADDRESS));
+    findings.push(port(DEFAULT_ADDRESS));
     findings.extend(rig.iter().filter_map(motion));
     findings.extend(rig.iter().flat_map(|rig| senders(rig).into_iter().chain(files(rig))));
-    tell(&findings, args.json)?;
+    print_findings(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
-        let heard = listen::listen(rig, secs, &Stop::on_ctrl_c()?)?;
-        for device in &heard.devices {
+        let result = listen::listen(rig, secs, &Stop::on_ctrl_c()?)?;
+        for device in &result.devices {
             if args.json {
                 print::json(device)?;
             } else {
                 print::line(device)?;
             }
         }
-        tell(&heard.findings, args.json)?;
-        findings.extend(heard.findings);
+        print_findings(&result.findings, args.json)?;
+        findings.extend(result.findings);
     }
     let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
     Ok(if failed { Exit::Failed } else { Exit::Done })
 }
 
-fn tell(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
+fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
     for finding in findings {
         if as_json {
             print::json(finding)?;
             continue;
         }
-        let mark = match finding.verdict {
+        let label = match finding.verdict {
             Verdict::Ok => "ok  ",
             Verdict::Warn => "warn",
             Verdict::Fail => "fail",
         };
-        print::line(format_args!("{mark}  {:12} {}", finding.what, finding.says))?;
-        if let Some(mend) = &finding.mend {
-            print::line(format_args!("      {:12} -> {mend}", ""))?;
+        print::line(format_args!("{label}  {:12} {}", finding.check, finding.message))?;
+        if let Some(remedy) = &finding.remedy {
+            print::line(format_args!("      {:12} -> {remedy}", ""))?;
         }
     }
     Ok(())
@@ -131,18 +131,18 @@ fn gpu() -> Vec<Finding> {
         Ok(gpu) => gpu,
         Err(error) => {
             let adapters = Gpu::adapters();
-            let mend = if adapters.is_empty() {
+            let remedy = if adapters.is_empty() {
                 "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (in software; a GPU needs its own driver)"
                     .to_owned()
             } else {
                 format!("unset FIELDRIG_GPU, or let it name one of: {}", numbered(&adapters))
             };
-            return vec![Finding::fail("gpu", error.to_string(), mend)];
+            return vec![Finding::fail("gpu", error.to_string(), remedy)];
         }
     };
     let adapter = if gpu.is_software() {
-        let mend = "install the Vulkan driver of the GPU, if there is one: training is slow in software";
-        Finding::warn("gpu", gpu.describe(), mend)
+        let remedy = "install the Vulkan driver of the GPU, if there is one: training is slow in software";
+        Finding::warn("gpu", gpu.describe(), remedy)
     } else {
         Finding::ok("gpu", gpu.describe())
     };
@@ -150,8 +150,8 @@ fn gpu() -> Vec<Finding> {
     let lanes = optional.subgroup_lanes.map_or("none".to_owned(), |lanes| lanes.to_string());
     let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are not known" };
     let mib = gpu.max_binding_bytes() >> 20;
-    let says = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
-    let mut findings = vec![adapter, Finding::ok("gpu limits", says)];
+    let message = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
+    let mut findings = vec![adapter, Finding::ok("gpu limits", message)];
     let adapters = Gpu::adapters();
     if adapters.len() > 1 {
         findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N picks one", numbered(&adapters))));
@@ -168,14 +168,14 @@ fn simulation() -> Finding {
     if cfg!(feature = "sim") {
         Finding::ok("simulation", "MuJoCo is built in")
     } else {
-        let mend = "make deps && cargo build --release --features sim";
-        Finding::warn("simulation", "built without MuJoCo: `--sim` is not there", mend)
+        let remedy = "make deps && cargo build --release --features sim";
+        Finding::warn("simulation", "built without MuJoCo: `--sim` is not there", remedy)
     }
 }
 
 /// The smallest step the monotonic clock shows.
 fn clock() -> Finding {
-    let mut finest = Duration::MAX;
+    let mut min_step = Duration::MAX;
     for _ in 0..1000 {
         let start = Instant::now();
         let step = loop {
@@ -184,13 +184,13 @@ fn clock() -> Finding {
                 break step;
             }
         };
-        finest = finest.min(step);
+        min_step = min_step.min(step);
     }
-    let says = format!("monotonic clock, steps of {finest:?}");
-    if finest <= FINE_CLOCK {
-        Finding::ok("clock", says)
+    let message = format!("monotonic clock, steps of {min_step:?}");
+    if min_step <= MAX_CLOCK_STEP {
+        Finding::ok("clock", message)
     } else {
-        Finding::warn("clock", says, "stamps are this coarse: look for another clock source below")
+        Finding::warn("clock", message, "stamps are this coarse: look for another clock source below")
     }
 }
 
@@ -201,8 +201,8 @@ fn clock_source(sys: &Path) -> Finding {
     };
     let current = current.trim();
     if matches!(current, "hpet" | "acpi_pm" | "pit" | "jiffies") {
-        let mend = format!("echo tsc | sudo tee {}", folder.join("current_clocksource").display());
-        return Finding::warn("clock source", format!("{current}: slow to read"), mend);
+        let remedy = format!("echo tsc | sudo tee {}", folder.join("current_clocksource").display());
+        return Finding::warn("clock source", format!("{current}: slow to read"), remedy);
     }
     Finding::ok("clock source", current)
 }
@@ -224,11 +224,11 @@ fn memory(proc: &Path) -> Finding {
     else {
         return Finding::ok("memory", "the kernel does not tell");
     };
-    let says = format!("{} MiB available", available_kib >> 10);
-    if available_kib >= ENOUGH_MEMORY_KIB {
-        Finding::ok("memory", says)
+    let message = format!("{} MiB available", available_kib >> 10);
+    if available_kib >= SUFFICIENT_MEMORY_KIB {
+        Finding::ok("memory", message)
     } else {
-        Finding::warn("memory", says, "close other programs, or lower max_keyframes and max_splats in the rig file")
+        Finding::warn("memory", message, "close other programs, or lower max_keyframes and max_splats in the rig file")
     }
 }
 
@@ -238,9 +238,9 @@ fn realtime(proc: &Path) -> Finding {
     match limit.as_deref() {
         None => Finding::ok("real time", "the kernel does not tell"),
         Some("0") => {
-            let says = "real-time priority is not allowed; only arms controlled at 1 kHz need it";
-            let mend = r#"echo "$USER - rtprio 99" | sudo tee -a /etc/security/limits.conf, then log in again"#;
-            Finding::warn("real time", says, mend)
+            let message = "real-time priority is not allowed; only arms controlled at 1 kHz need it";
+            let remedy = r#"echo "$USER - rtprio 99" | sudo tee -a /etc/security/limits.conf, then log in again"#;
+            Finding::warn("real time", message, remedy)
         }
         Some(limit) => Finding::ok("real time", format!("priority up to {limit}")),
     }
@@ -273,22 +273,25 @@ fn cameras(dev: &Path) -> Finding {
     if denied.is_empty() {
         return Finding::ok("cameras", format!("{} video devices, none refused", nodes.len()));
     }
-    let says = format!("no permission to open {}", denied.join(", "));
-    Finding::warn("cameras", says, "sudo usermod -aG video $USER, then log in again")
+    let message = format!("no permission to open {}", denied.join(", "));
+    Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
 }
 
 /// What a camera on USB offers and its port cannot carry.
 #[cfg(target_os = "linux")]
-fn usb(camera: &v4l2::Found) -> Option<Finding> {
-    let carries = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
+fn usb(camera: &v4l2::FoundCamera) -> Option<Finding> {
+    let bandwidth = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
     let name = format!("{} ({})", camera.name, camera.node.display());
-    let beyond = camera.beyond_usb();
-    if beyond.is_empty() {
-        return Some(Finding::ok("usb", format!("{name}: its port carries {carries}, enough for all that it offers")));
+    let unsupported = camera.modes_exceeding_usb();
+    if unsupported.is_empty() {
+        return Some(Finding::ok(
+            "usb",
+            format!("{name}: its port carries {bandwidth}, enough for all that it offers"),
+        ));
     }
-    let says = format!("{name}: its port carries {carries} at most, too little for {}", beyond.join(", "));
-    let mend = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
-    Some(Finding::warn("usb", says, mend))
+    let message = format!("{name}: its port carries {bandwidth} at most, too little for {}", unsupported.join(", "));
+    let remedy = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
+    Some(Finding::warn("usb", message, remedy))
 }
 
 /// V4L2 cameras of a rig that are not plugged in.
@@ -300,7 +303,7 @@ fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
         std::iter::once(&camera.device).chain(depth).map(move |device| (&camera.name, device))
     });
     let missing = devices.filter_map(|(name, device)| {
-        let problem = v4l2::look_for(device).err()?;
+        let problem = v4l2::check_connected(device).err()?;
         Some(Finding::fail("cameras", format!("camera {name:?}: {problem}"), "plug it in, or name another one"))
     });
     missing.collect()
@@ -309,34 +312,39 @@ fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
 /// RealSense cameras that are plugged in, and whether those of the rig are.
 #[cfg(feature = "realsense")]
 fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
-    const WHAT: &str = "realsense";
+    const CHECK: &str = "realsense";
     let found = match drivers::realsense::cameras() {
         Ok(found) => found,
         Err(problem) => {
-            return vec![Finding::fail(WHAT, problem.to_string(), "install the udev rules of the RealSense SDK")];
+            return vec![Finding::fail(CHECK, problem.to_string(), "install the udev rules of the RealSense SDK")];
         }
     };
     let mut findings = Vec::new();
     for camera in &found {
         let name = format!("{} {}", camera.name, camera.serial);
         if camera.is_on_usb2() {
-            let mend = "a USB 3 port and the cable that came with it; turn the plug over once";
-            findings.push(Finding::warn(WHAT, format!("{name}: runs at USB 2, which carries few of its modes"), mend));
+            let remedy = "a USB 3 port and the cable that came with it; turn the plug over once";
+            findings.push(Finding::warn(
+                CHECK,
+                format!("{name}: runs at USB 2, which carries few of its modes"),
+                remedy,
+            ));
         }
         if camera.has_old_firmware() {
-            let wanted = camera.recommended_firmware.as_deref().unwrap_or_default();
-            let says = format!("{name}: firmware {} is older than the library wants ({wanted})", camera.firmware);
-            findings.push(Finding::warn(WHAT, says, "rs-fw-update of the RealSense SDK"));
+            let recommended = camera.recommended_firmware.as_deref().unwrap_or_default();
+            let message =
+                format!("{name}: firmware {} is older than the library wants ({recommended})", camera.firmware);
+            findings.push(Finding::warn(CHECK, message, "rs-fw-update of the RealSense SDK"));
         }
         if !camera.is_on_usb2() && !camera.has_old_firmware() {
-            findings.push(Finding::ok(WHAT, format!("{name}, firmware {}", camera.firmware)));
+            findings.push(Finding::ok(CHECK, format!("{name}, firmware {}", camera.firmware)));
         }
     }
     for camera in realsense_of(rig) {
-        let is_there = found.iter().any(|there| camera.device.is_empty() || there.serial == camera.device);
-        if !is_there {
-            let says = format!("camera {:?}: no RealSense camera {:?} is plugged in", camera.name, camera.device);
-            findings.push(Finding::fail(WHAT, says, "fieldrig devices lists those that there are"));
+        let is_connected = found.iter().any(|device| camera.device.is_empty() || device.serial == camera.device);
+        if !is_connected {
+            let message = format!("camera {:?}: no RealSense camera {:?} is plugged in", camera.name, camera.device);
+            findings.push(Finding::fail(CHECK, message, "fieldrig devices lists those that there are"));
         }
     }
     findings
@@ -345,9 +353,9 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
 #[cfg(not(feature = "realsense"))]
 fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     let missing = realsense_of(rig).map(|camera| {
-        let says = format!("camera {:?}: this program was built without RealSense cameras", camera.name);
-        let mend = "install the RealSense SDK (librealsense2), then cargo build --release --features realsense";
-        Finding::fail("realsense", says, mend)
+        let message = format!("camera {:?}: this program was built without RealSense cameras", camera.name);
+        let remedy = "install the RealSense SDK (librealsense2), then cargo build --release --features realsense";
+        Finding::fail("realsense", message, remedy)
     });
     missing.collect()
 }
@@ -376,21 +384,21 @@ fn can(rig: Option<&Rig>) -> Vec<Finding> {
                 continue;
             }
         };
-        let own = BusConfig {
+        let default_config = BusConfig {
             interface,
             bitrate_hz: link.bitrate_hz.unwrap_or(1_000_000),
             data_bitrate_hz: link.data_bitrate_hz,
             accept_no_restart: false,
         };
-        let complaints = link.complaints(bus.unwrap_or(&own));
-        if complaints.is_empty() {
+        let problems = link.problems(bus.unwrap_or(&default_config));
+        if problems.is_empty() {
             findings.push(Finding::ok("can", link.to_string()));
         }
-        findings.extend(complaints.into_iter().map(|complaint| {
-            let says = format!("{}: {}", link.interface, complaint.what);
+        findings.extend(problems.into_iter().map(|complaint| {
+            let message = format!("{}: {}", link.interface, complaint.check);
             match bus {
-                Some(_) => Finding::fail("can", says, complaint.command),
-                None => Finding::warn("can", says, complaint.command),
+                Some(_) => Finding::fail("can", message, complaint.command),
+                None => Finding::warn("can", message, complaint.command),
             }
         }));
     }
@@ -406,8 +414,8 @@ fn port(address: &str) -> Finding {
     match TcpListener::bind(address) {
         Ok(_) => Finding::ok("network", format!("{address} is free for the page")),
         Err(error) => {
-            let mend = "name another address: fieldrig run ... --listen 127.0.0.1:7008";
-            Finding::warn("network", format!("{address}: {error}"), mend)
+            let remedy = "name another address: fieldrig run ... --listen 127.0.0.1:7008";
+            Finding::warn("network", format!("{address}: {error}"), remedy)
         }
     }
 }
@@ -418,7 +426,7 @@ fn senders(rig: &Rig) -> Vec<Finding> {
     let scanners = rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp);
     let scanners = scanners.map(|scanner| (format!("range scanner {:?}", scanner.name), scanner.address));
     let arm = (rig.arm.driver == ArmDriver::Udp).then(|| open::udp_arm_address(rig));
-    let (arm, wrong) = match arm {
+    let (arm, invalid) = match arm {
         Some(Ok(address)) => (Some(("arm".to_owned(), address)), None),
         Some(Err(error)) => {
             (None, Some(Finding::fail("udp", format!("{error:#}"), "arm.address = \"127.0.0.1:7011\"")))
@@ -430,15 +438,15 @@ fn senders(rig: &Rig) -> Vec<Finding> {
         .map(|(device, address)| match UdpSocket::bind(address) {
             Ok(_) => Finding::ok("udp", format!("{device}: {address} is free to listen on")),
             Err(error) => {
-                let says = format!("{device}: {address}: {error}");
+                let message = format!("{device}: {address}: {error}");
                 Finding::fail(
                     "udp",
-                    says,
+                    message,
                     "another program listens there, a fieldrig perhaps: end it, or name another address",
                 )
             }
         })
-        .chain(wrong);
+        .chain(invalid);
     findings.collect()
 }
 
@@ -461,11 +469,11 @@ fn files(rig: &Rig) -> Vec<Finding> {
         let file = &camera.realsense.file;
         camera.driver == CameraDriver::Realsense && !file.as_os_str().is_empty() && !file.is_file()
     };
-    let tell = |camera: &Camera| {
-        let says = format!("camera {:?}: there is no file {}", camera.name, camera.realsense.file.display());
-        Finding::fail("realsense", says, "camera.NAME.realsense.file is a path from the rig file's folder")
+    let print_findings = |camera: &Camera| {
+        let message = format!("camera {:?}: there is no file {}", camera.name, camera.realsense.file.display());
+        Finding::fail("realsense", message, "camera.NAME.realsense.file is a path from the rig file's folder")
     };
-    rig.cameras.iter().filter(missing).map(tell).collect()
+    rig.cameras.iter().filter(missing).map(print_findings).collect()
 }
 
 #[cfg(test)]
@@ -481,35 +489,35 @@ mod tests {
     }
 
     #[test]
-    fn little_memory_is_told() {
-        let little = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  1048576 kB\n");
-        assert_eq!(memory(little.path()).verdict, Verdict::Warn);
-        assert!(memory(little.path()).says.contains("1024 MiB"));
-        let much = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  7000000 kB\n");
-        assert_eq!(memory(much.path()).verdict, Verdict::Ok);
+    fn low_memory_is_reported() {
+        let low = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  1048576 kB\n");
+        assert_eq!(memory(low.path()).verdict, Verdict::Warn);
+        assert!(memory(low.path()).message.contains("1024 MiB"));
+        let plenty = folder_with("meminfo", "MemTotal:  8000000 kB\nMemAvailable:  7000000 kB\n");
+        assert_eq!(memory(plenty.path()).verdict, Verdict::Ok);
     }
 
     #[test]
-    fn missing_real_time_priority_is_told_with_its_remedy() {
+    fn missing_real_time_priority_is_reported_with_remedy() {
         let denied =
             folder_with("self/limits", "Max nice priority         0          0\nMax realtime priority     0       0\n");
         let finding = realtime(denied.path());
         assert_eq!(finding.verdict, Verdict::Warn);
-        assert!(finding.mend.expect("a remedy").contains("rtprio"));
+        assert!(finding.remedy.expect("a remedy").contains("rtprio"));
         let allowed = folder_with("self/limits", "Max realtime priority     99      99\n");
         assert_eq!(realtime(allowed.path()).verdict, Verdict::Ok);
     }
 
     #[test]
-    fn a_slow_clock_source_is_told() {
+    fn slow_clock_source_is_reported() {
         let path = "devices/system/clocksource/clocksource0/current_clocksource";
         assert_eq!(clock_source(folder_with(path, "hpet\n").path()).verdict, Verdict::Warn);
         assert_eq!(clock_source(folder_with(path, "tsc\n").path()).verdict, Verdict::Ok);
     }
 
     #[test]
-    fn a_port_too_slow_for_its_camera_is_told() {
-        let mut camera = v4l2::Found {
+    fn insufficient_usb_bandwidth_is_reported() {
+        let mut camera = v4l2::FoundCamera {
             node: "/dev/video0".into(),
             name: "1440p".into(),
             bus: "usb-1".into(),
@@ -520,7 +528,7 @@ mod tests {
         };
         let finding = usb(&camera).expect("a camera on USB");
         assert_eq!(finding.verdict, Verdict::Warn);
-        assert!(finding.says.contains("24.6 MB/s") && finding.says.contains("221 MB/s"), "{}", finding.says);
+        assert!(finding.message.contains("24.6 MB/s") && finding.message.contains("221 MB/s"), "{}", finding.message);
         camera.usb_mbits = Some(5000.0);
         assert_eq!(usb(&camera).expect("a camera on USB").verdict, Verdict::Ok);
         camera.usb_mbits = None;
@@ -528,35 +536,35 @@ mod tests {
     }
 
     #[test]
-    fn a_taken_port_is_told() {
-        let taken = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        let address = taken.local_addr().expect("bound").to_string();
+    fn occupied_port_is_reported() {
+        let occupied = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = occupied.local_addr().expect("bound").to_string();
         assert_eq!(port(&address).verdict, Verdict::Warn);
-        drop(taken);
+        drop(occupied);
         assert_eq!(port(&address).verdict, Verdict::Ok);
     }
 
     #[test]
-    fn taken_ports_of_senders_and_missing_files_are_told() {
-        let taken = UdpSocket::bind("127.0.0.1:0").expect("a free port");
+    fn occupied_udp_ports_and_missing_files_are_reported() {
+        let occupied = UdpSocket::bind("127.0.0.1:0").expect("a free port");
         let overrides = [
             crate::config::Override::new("base.driver", "udp"),
-            crate::config::Override::new("base.address", taken.local_addr().expect("bound").to_string()),
+            crate::config::Override::new("base.address", occupied.local_addr().expect("bound").to_string()),
             crate::config::Override::new("camera.wrist.driver", "realsense"),
             crate::config::Override::new("camera.wrist.realsense.file", "nowhere.bag"),
         ];
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
         assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Fail]);
-        drop(taken);
+        drop(occupied);
         assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Ok]);
-        let told = files(&rig);
-        assert!(told.len() == 1 && told[0].says.contains("nowhere.bag"), "{told:?}");
+        let findings = files(&rig);
+        assert!(findings.len() == 1 && findings[0].message.contains("nowhere.bag"), "{findings:?}");
     }
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn what_opening_would_refuse_is_told_without_opening_it() {
+    fn invalid_rig_is_reported_without_opening_devices() {
         let rig = |name: &str, overrides: &[(&'static str, &'static str)]| {
             let overrides: Vec<_> =
                 overrides.iter().map(|(key, value)| crate::config::Override::new(key, *value)).collect();
@@ -565,14 +573,15 @@ mod tests {
         };
         let absent =
             rig("static-arm.toml", &[("camera.wrist.driver", "v4l2"), ("camera.wrist.device", "no such serial")]);
-        let told = missing_v4l2(&absent);
-        assert!(told.iter().any(|finding| finding.says.contains("\"no such serial\"")), "{told:?}");
-        let told = senders(&rig("static-arm.toml", &[("arm.driver", "udp"), ("arm.address", "localhost")]));
-        assert!(told.len() == 1 && told[0].says.contains("arm.address is \"localhost\""), "{told:?}");
+        let findings = missing_v4l2(&absent);
+        assert!(findings.iter().any(|finding| finding.message.contains("\"no such serial\"")), "{findings:?}");
+        let findings = senders(&rig("static-arm.toml", &[("arm.driver", "udp"), ("arm.address", "localhost")]));
+        assert!(findings.len() == 1 && findings[0].message.contains("arm.address is \"localhost\""), "{findings:?}");
         assert_eq!(motion(&rig("static-arm.toml", &[])), None, "nothing is moved");
         for (on_loss, verdict) in [("hold", Verdict::Ok), ("release", Verdict::Fail)] {
-            let told = motion(&rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)])).expect("it is moved");
-            assert_eq!(told.verdict, verdict, "{told:?}");
+            let findings =
+                motion(&rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)])).expect("it is moved");
+            assert_eq!(findings.verdict, verdict, "{findings:?}");
         }
     }
 }

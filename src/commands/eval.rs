@@ -2,7 +2,7 @@
 
 use crate::config::{Override, Rig};
 use crate::data::{self, Data, DataArgs, Purpose};
-use crate::evaluate::{Evaluator, ImageScores, Scores, warn_of_other_place};
+use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
 use crate::exit::{self, Exit};
 use crate::join::KeyframeList;
 use crate::{method, print};
@@ -30,14 +30,14 @@ pub(crate) struct Args {
 
 /// What is printed with `--json`.
 #[derive(Debug, Serialize)]
-struct Judged {
+struct EvalResult {
     #[serde(flatten)]
     scores: Scores,
-    per_image: Vec<Named>,
+    per_image: Vec<NamedScores>,
 }
 
 #[derive(Debug, Serialize)]
-struct Named {
+struct NamedScores {
     name: String,
     #[serde(flatten)]
     scores: ImageScores,
@@ -50,45 +50,45 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.images.holdout()?;
     data::expect(&args.data)?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
-    let overrides = as_trained(&args.model);
+    let overrides = training_overrides(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);
     let n_trained_on = n_trained_on(args, &tests, data.rig.is_some());
     if n_trained_on > 0 {
         log::warn!("the model was trained on {n_trained_on} of the {} images that are scored", tests.len());
     }
-    if data.rig.as_ref().is_some_and(|rig| is_other_rig(rig, &args.model)) {
+    if data.rig.as_ref().is_some_and(|rig| differs_from_training_rig(rig, &args.model)) {
         log::warn!(
             "the model was trained with another rig file: what it knows about cameras corrects that one; see --rig"
         );
     }
     let images = evaluator.score_all(model.as_mut(), tests.iter())?;
-    warn_of_other_place(&images.iter().filter_map(|image| image.seen_frac).collect::<Vec<_>>());
+    warn_if_hardly_covered(&images.iter().filter_map(|image| image.covered_frac).collect::<Vec<_>>());
     let scores = Scores::mean(&images);
     let is_test = |keyframe: &Keyframe| keyframe.split == Split::Test;
     let names = data.keyframes.iter().zip(data.names).filter(|(keyframe, _)| is_test(keyframe)).map(|(_, name)| name);
-    let per_image: Vec<Named> = names.zip(images).map(|(name, scores)| Named { name, scores }).collect();
+    let per_image: Vec<NamedScores> = names.zip(images).map(|(name, scores)| NamedScores { name, scores }).collect();
     if args.json {
-        print::json(&Judged { scores, per_image })?;
+        print::json(&EvalResult { scores, per_image })?;
     } else {
         for image in &per_image {
             print::line(format_args!("{:30} {}", image.name, Scores::mean(std::slice::from_ref(&image.scores))))?;
         }
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
-    Ok(exit::after(&data.losses))
+    Ok(exit::from_losses(&data.dropped_messages))
 }
 
 /// Whether the base was realigned when the model was trained: else its scene is not where the images' poses have it.
-fn as_trained(model: &Path) -> Vec<Override> {
-    let trained_with = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
-    trained_with.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
+fn training_overrides(model: &Path) -> Vec<Override> {
+    let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
+    training_rig.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
 }
 
 /// Whether the cameras of a rig are not those that the model was trained with, as the rig file in its folder has them.
-fn is_other_rig(rig: &Rig, model: &Path) -> bool {
-    let trained_with = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
-    trained_with.is_ok_and(|trained_with| !rig.sees_like(&trained_with))
+fn differs_from_training_rig(rig: &Rig, model: &Path) -> bool {
+    let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
+    training_rig.is_ok_and(|training_rig| !rig.has_same_calibration(&training_rig))
 }
 
 /// How many of the images to score the model was trained on, as the list in its folder says; 0 where there is none.

@@ -3,14 +3,14 @@
 use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
 use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList, Use};
-use crate::method::{self, Kind};
+use crate::join::{Join, KeyframeList, SampleUse};
+use crate::method::{self, ModelKind};
 use crate::open;
 use crate::partial::{self, Partial};
 use crate::print::{self, counted};
 use crate::run_folder;
 use crate::splat_file;
-use crate::stands::Stands;
+use crate::stations::Stations;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use trainer::tsdf::TsdfModel;
@@ -29,7 +29,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
     /// Of a distance field, make the mesh coarser: one vertex per cell of this width, metres
-    #[arg(long, value_name = "M", value_parser = cell)]
+    #[arg(long, value_name = "M", value_parser = parse_cell_width)]
     cell_m: Option<f64>,
     /// Of a recording, export exactly the keyframes this `keyframes.txt` lists [default: those a run would accept]
     #[arg(long, value_name = "FILE")]
@@ -51,7 +51,7 @@ enum Format {
 
 impl Format {
     /// The ending of its files; a folder has none.
-    fn ending(self) -> Option<&'static str> {
+    fn extension(self) -> Option<&'static str> {
         match self {
             Self::Ply => Some("ply"),
             Self::Spz => Some("spz"),
@@ -61,7 +61,7 @@ impl Format {
     }
 }
 
-fn cell(text: &str) -> Result<f64, String> {
+fn parse_cell_width(text: &str) -> Result<f64, String> {
     let width_m = text.parse().ok().filter(|width_m: &f64| *width_m > 0.0 && width_m.is_finite());
     width_m.ok_or_else(|| "expected a number above 0".to_owned())
 }
@@ -89,27 +89,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         (Format::Ply | Format::Glb, Contents::DistanceField) => export_mesh(args),
         (Format::Nerfstudio, Contents::Recording) => export_recording(args),
         (Format::Glb, Contents::Splats) => {
-            Err(wrong_kind("splats, which have no mesh: glb is of a distance field", args))
+            Err(unsupported("splats, which have no mesh: glb is of a distance field", args))
         }
         (Format::Spz, Contents::DistanceField) => {
-            Err(wrong_kind("a distance field, which has no splats but a mesh: ply or glb", args))
+            Err(unsupported("a distance field, which has no splats but a mesh: ply or glb", args))
         }
-        (_, Contents::NeuralField) => Err(wrong_kind("a neural field, which has neither splats nor a mesh", args)),
+        (_, Contents::NeuralField) => Err(unsupported("a neural field, which has neither splats nor a mesh", args)),
         (Format::Ply | Format::Spz | Format::Glb, Contents::Recording) => {
-            Err(wrong_kind("splats and meshes are written of a model, this is a recording", args))
+            Err(unsupported("splats and meshes are written of a model, this is a recording", args))
         }
-        (Format::Nerfstudio, _) => Err(wrong_kind("nerfstudio is written of a recording, this is a model", args)),
+        (Format::Nerfstudio, _) => Err(unsupported("nerfstudio is written of a recording, this is a model", args)),
     }
 }
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {
     ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
     match method::kind_in(path)? {
-        Some(Kind::Tsdf) => return Ok(Contents::DistanceField),
-        Some(Kind::Nerf) => return Ok(Contents::NeuralField),
-        Some(Kind::Splat) | None => {}
+        Some(ModelKind::Tsdf) => return Ok(Contents::DistanceField),
+        Some(ModelKind::Nerf) => return Ok(Contents::NeuralField),
+        Some(ModelKind::Splat) | None => {}
     }
-    if splat_file::is_one(path) {
+    if splat_file::is_splat_file(path) {
         run_folder::expect_model(path)?;
         return Ok(Contents::Splats);
     }
@@ -120,10 +120,10 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
 
 /// Refuses a file that is there already, or whose name says another format.
 fn check_file(args: &Args) -> Result<(), BadArgument> {
-    let Some(ending) = args.to.ending() else { return Ok(()) };
+    let Some(extension) = args.to.extension() else { return Ok(()) };
     let out = args.out.display();
-    if !args.out.extension().is_some_and(|given| given.eq_ignore_ascii_case(ending)) {
-        return Err(BadArgument(format!("--out {out}: the name of such a file ends in .{ending}")));
+    if !args.out.extension().is_some_and(|actual| actual.eq_ignore_ascii_case(extension)) {
+        return Err(BadArgument(format!("--out {out}: the name of such a file ends in .{extension}")));
     }
     if args.out.exists() {
         return Err(BadArgument(format!("--out {out}: it is there already, name another file")));
@@ -131,7 +131,7 @@ fn check_file(args: &Args) -> Result<(), BadArgument> {
     Ok(())
 }
 
-fn wrong_kind(sentence: &str, args: &Args) -> anyhow::Error {
+fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
     BadArgument(format!("{}: {sentence}", args.from.display())).into()
 }
 
@@ -166,8 +166,8 @@ fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
     }
     partial.keep();
     let triangles = |mesh: &Mesh| counted(mesh.triangles.len() as u64, "triangle");
-    let of_all = if coarser.is_some() { format!(" in place of {}", triangles(&mesh)) } else { String::new() };
-    print::report(format!("{}{of_all} -> {}", triangles(written), args.out.display()));
+    let replaced = if coarser.is_some() { format!(" in place of {}", triangles(&mesh)) } else { String::new() };
+    print::report(format!("{}{replaced} -> {}", triangles(written), args.out.display()));
     Ok(Exit::Done)
 }
 
@@ -184,26 +184,26 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
     }
     join.finish();
     bar.finish_and_clear();
-    let unlisted = join.check_list()?;
+    let missing_from_list = join.check_list()?;
     let mut keyframes: Vec<_> = join.keyframes().cloned().collect();
-    if let Some(mut stands) = Stands::new(&opened.rig) {
-        keyframes = stands.corrected(keyframes);
+    if let Some(mut stations) = Stations::new(&opened.rig) {
+        keyframes = stations.corrected(keyframes);
     }
     let written = write_nerfstudio(&args.out, keyframes.into_iter())
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut losses = join.counts().losses(Use::Watched);
-    losses.extend(opened.damage.get().cloned());
-    losses.extend(unlisted);
-    Ok(exit::after(&losses))
+    let mut dropped_messages = join.counts().dropped_messages(SampleUse::Watched);
+    dropped_messages.extend(opened.damage.get().cloned());
+    dropped_messages.extend(missing_from_list);
+    Ok(exit::from_losses(&dropped_messages))
 }
 
 fn sentence(written: Written) -> String {
-    let Written { n_images, n_depth, n_depth_left_out } = written;
-    let left_out = match n_depth_left_out as u64 {
+    let Written { n_images, n_depth, n_depth_skipped } = written;
+    let skipped = match n_depth_skipped as u64 {
         0 => String::new(),
         n => format!(", {} left out: their lens is not that of their photo", counted(n, "depth image")),
     };
-    format!("{}, {n_depth} of them with depth{left_out}", counted(n_images as u64, "photo"))
+    format!("{}, {n_depth} of them with depth{skipped}", counted(n_images as u64, "photo"))
 }

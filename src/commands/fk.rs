@@ -85,8 +85,8 @@ fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
         ensure!(!names[..at].contains(name), "joint {name:?} is named twice in joint_names");
         if robot.joint(name).is_none() {
             let nearest = robot.joints().iter().max_by(|a, b| {
-                let likeness = |joint: &str| strsim::jaro_winkler(joint, name);
-                likeness(&a.name).total_cmp(&likeness(&b.name))
+                let similarity = |joint: &str| strsim::jaro_winkler(joint, name);
+                similarity(&a.name).total_cmp(&similarity(&b.name))
             });
             let hint = nearest.map(|joint| format!("; the nearest is {:?}", joint.name)).unwrap_or_default();
             bail!("joint {name:?} is not in the URDF{hint}");

@@ -27,7 +27,7 @@ pub(crate) struct Args {
     lpips_weights: Option<PathBuf>,
     /// Metres per count, when both pictures are 16-bit depth
     #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = positive)]
-    metres_per_count: f64,
+    meters_per_count: f64,
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -61,14 +61,14 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     }
     let scores = match (rendered, truth) {
         (DynamicImage::ImageLuma16(rendered), DynamicImage::ImageLuma16(truth)) => {
-            depth_scores([rendered.as_raw(), truth.as_raw()], args.metres_per_count)?
+            depth_scores([rendered.as_raw(), truth.as_raw()], args.meters_per_count)?
         }
         (rendered, truth) => {
             let (rendered, truth) = (rendered.into_rgba8(), truth.into_rgba8());
             color_scores(&PixelPair::new(size_px, &rendered, &truth)?, lpips_weights(&args).as_deref())?
         }
     };
-    if args.json { print::json(&scores) } else { Ok(print::line(scores.for_people())?) }
+    if args.json { print::json(&scores) } else { Ok(print::line(scores.to_text())?) }
 }
 
 fn open(path: &Path) -> anyhow::Result<DynamicImage> {
@@ -85,15 +85,15 @@ fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::R
     Ok(Scores { psnr: Some(psnr(pair)?), ssim: Some(ssim(pair)?), lpips, depth_rmse_m: None })
 }
 
-fn depth_scores(counts: [&Vec<u16>; 2], metres_per_count: f64) -> anyhow::Result<Scores> {
+fn depth_scores(counts: [&Vec<u16>; 2], meters_per_count: f64) -> anyhow::Result<Scores> {
     #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
-    let metres_from_count = |count: &u16| (f64::from(*count) * metres_per_count) as f32;
-    let [rendered_m, truth_m] = counts.map(|counts| counts.iter().map(metres_from_count).collect::<Vec<_>>());
+    let meters_from_count = |count: &u16| (f64::from(*count) * meters_per_count) as f32;
+    let [rendered_m, truth_m] = counts.map(|counts| counts.iter().map(meters_from_count).collect::<Vec<_>>());
     Ok(Scores { depth_rmse_m: depth_rmse_m(&rendered_m, &truth_m)?, ..Scores::default() })
 }
 
 impl Scores {
-    fn for_people(&self) -> String {
+    fn to_text(&self) -> String {
         let parts = [
             self.psnr.map(|psnr| format!("PSNR {psnr:.3} dB")),
             self.ssim.map(|ssim| format!("SSIM {ssim:.5}")),

@@ -24,7 +24,7 @@ use std::sync::Arc;
 use trainer::gpu::{Gpu, GpuOptions};
 
 /// Reads a number of a flag, which has to lie within a range.
-fn within(range: RangeInclusive<f64>) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
+fn number_in_range(range: RangeInclusive<f64>) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
     move |text| {
         let number = text.parse().ok().filter(|number| range.contains(number));
         number.ok_or_else(|| format!("allowed are {} to {}", range.start(), range.end()))
@@ -39,7 +39,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Train(args) => train::run(&args),
         Command::View(args) => view::run(&args),
         Command::Render(args) => render::run(&args),
-        Command::Eval(args) => eval::run(&args),
+        Command::Evaluation(args) => eval::run(&args),
         Command::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
         Command::Export(args) => export::run(&args),
         Command::Fk(args) => fk::run(args).map(|()| Exit::Done),
@@ -60,11 +60,11 @@ pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
 fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
-        ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|it| it != word));
+        ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
         Ok(text) => {
-            let is_wrong = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
-            Some(text.parse().map_err(is_wrong)?)
+            let invalid = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            Some(text.parse().map_err(invalid)?)
         }
         Err(_) => None,
     };

@@ -15,7 +15,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 /// Targets this near to the end of a range are in it, rad or m.
-const TOLD_RAD: f64 = 1e-4;
+const TOLERANCE_RAD: f64 = 1e-4;
 /// How soon Ctrl-C is noticed.
 const POLL: Duration = Duration::from_millis(50);
 /// A movable arm that says nothing for so long is lost, whatever it was asked for.
@@ -41,7 +41,7 @@ pub(crate) struct Args {
     enable_motion: bool,
     /// End as soon as it has arrived, also where its motors let go of it then
     #[arg(long)]
-    leave: bool,
+    exit_on_arrival: bool,
     /// Print one JSON object a line
     #[arg(long)]
     json: bool,
@@ -54,7 +54,7 @@ fn delta(text: &str) -> Result<(String, f64), String> {
 
 /// What is told at the end of a way.
 #[derive(Debug, Serialize)]
-struct Arrived<'a> {
+struct ArrivedEvent<'a> {
     event: &'static str,
     joints: &'a [String],
     /// Where it was headed for, and where the joints say they are, rad or m.
@@ -84,14 +84,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         mover.arm.recover()?;
         log::info!("the arm is switched on again");
     }
-    let at_first = mover.read()?;
+    let initial = mover.read()?;
     if args.to.is_some() || !args.by.is_empty() {
-        let wanted = target(args, &rig.arm.joints, &at_first);
-        check_range(&rig, &wanted, &at_first)?;
-        let target = mover.command(&wanted)?;
-        for (joint, (wanted, taken)) in rig.arm.joints.iter().zip(wanted.position.iter().zip(&target.position)) {
-            if (wanted - taken).abs() > TOLD_RAD {
-                log::warn!("joint {joint:?} is sent to {taken:.4}, the end of its range, rather than {wanted:.4}");
+        let requested = target(args, &rig.arm.joints, &initial);
+        check_range(&rig, &requested, &initial)?;
+        let target = mover.command(&requested)?;
+        for (joint, (requested, accepted)) in rig.arm.joints.iter().zip(requested.position.iter().zip(&target.position))
+        {
+            if (requested - accepted).abs() > TOLERANCE_RAD {
+                log::warn!(
+                    "joint {joint:?} is sent to {accepted:.4}, the end of its range, rather than {requested:.4}"
+                );
             }
         }
         let began = clock::now();
@@ -101,9 +104,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                 let _ = print::report_json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
             }
         })?;
-        tell(args, &rig.arm.joints, &target, &last, began)?;
+        report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
-    if motion.on_loss != OnLoss::Hold && !args.leave {
+    if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
         log::info!("the arm is held until Ctrl-C; its motors let go of it then: support it first");
         mover.hold()?;
     }
@@ -119,23 +122,25 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
         return Err(BadArgument(format!("--to has {n} positions, the arm has {} joints: {names}", joints.len())));
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
-        let there = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };
-        return Err(BadArgument(format!("--by: there is no joint {joint:?}; there are: {there}")));
+        let available = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };
+        return Err(BadArgument(format!("--by: there is no joint {joint:?}; there are: {available}")));
     }
     Ok(())
 }
 
 /// Refuses a target outside the ranges of the arm's description: a slip of the pen is not to swing an arm to the end of its range. A
 /// joint that is outside already may stay.
-fn check_range(rig: &Rig, wanted: &JointTarget, now: &JointState) -> anyhow::Result<()> {
+fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
     let chain = open::chain_of(rig)?;
     for (ix, joint) in rig.arm.joints.iter().enumerate() {
-        let Some(place) = chain.joint_names().iter().position(|known| known == joint) else { continue };
-        let (lower, upper) = (chain.limits()[place].lower, chain.limits()[place].upper);
-        let (wanted, now) = (wanted.position[ix], now.position[ix]);
-        if (wanted - now).abs() > TOLD_RAD && !(lower - TOLD_RAD..=upper + TOLD_RAD).contains(&wanted) {
+        let Some(joint_ix) = chain.joint_names().iter().position(|known| known == joint) else { continue };
+        let (lower, upper) = (chain.limits()[joint_ix].lower, chain.limits()[joint_ix].upper);
+        let (requested, now) = (requested.position[ix], now.position[ix]);
+        if (requested - now).abs() > TOLERANCE_RAD
+            && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
+        {
             return Err(BadArgument(format!(
-                "joint {joint:?} would go to {wanted:.4}, outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
+                "joint {joint:?} would go to {requested:.4}, outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
             ))
             .into());
         }
@@ -154,18 +159,27 @@ fn target(args: &Args, joints: &[String], now: &JointState) -> JointTarget {
     JointTarget { position }
 }
 
-fn tell(args: &Args, joints: &[String], target: &JointTarget, last: &JointState, began: Stamp) -> anyhow::Result<()> {
-    let apart = target.position.iter().zip(&last.position).map(|(target, is)| (target - is).abs());
-    let (error, seconds) = (apart.fold(0.0, f64::max), clock::now().secs_since(began));
+fn report_arrival(
+    args: &Args,
+    joints: &[String],
+    target: &JointTarget,
+    last: &JointState,
+    began: Stamp,
+) -> anyhow::Result<()> {
+    let errors = target.position.iter().zip(&last.position).map(|(target, actual)| (target - actual).abs());
+    let (error, seconds) = (errors.fold(0.0, f64::max), clock::now().secs_since(began));
     if args.json {
         let (target, position) = (&target.position[..], &last.position[..]);
-        return print::report_json(&Arrived { event: "done", joints, target, position, error, seconds });
+        return print::report_json(&ArrivedEvent { event: "done", joints, target, position, error, seconds });
     }
-    print::report(format_args!("arrived after {seconds:.1} s at {}, maximum error {error:.5}", told(&last.position)));
+    print::report(format_args!(
+        "arrived after {seconds:.1} s at {}, maximum error {error:.5}",
+        format_positions(&last.position)
+    ));
     Ok(())
 }
 
-fn told(position: &[f64]) -> String {
+fn format_positions(position: &[f64]) -> String {
     position.iter().map(|position| format!("{position:.4}")).collect::<Vec<_>>().join(", ")
 }
 
@@ -181,14 +195,14 @@ struct Mover {
 impl Mover {
     /// The next joint state; an arm that stopped by itself, or says nothing, is an error.
     fn read(&mut self) -> anyhow::Result<JointState> {
-        let until = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
+        let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
         loop {
             let state = self.arm.read(POLL);
             if let Motion::Stopped { reason } = self.arm.motion() {
                 bail!("the arm stopped: {reason}. Look at it, then switch it on again with --recover");
             }
             match state {
-                Err(Error::NoJoints { .. }) if clock::now() < until => {}
+                Err(Error::NoJoints { .. }) if clock::now() < deadline => {}
                 state => {
                     let mut state = state?;
                     state.position.iter_mut().zip(&self.offsets).for_each(|(position, offset)| *position += offset);
@@ -199,8 +213,8 @@ impl Mover {
     }
 
     /// Heads for a target; what is truly headed for comes back.
-    fn command(&mut self, wanted: &JointTarget) -> Result<JointTarget, Error> {
-        let shifted = |target: &JointTarget, sign: f64| JointTarget {
+    fn command(&mut self, requested: &JointTarget) -> Result<JointTarget, Error> {
+        let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
             position: target
                 .position
                 .iter()
@@ -208,33 +222,37 @@ impl Mover {
                 .map(|(position, offset)| position + sign * offset)
                 .collect(),
         };
-        let taken = self.arm.command(&shifted(wanted, -1.0))?;
-        Ok(shifted(&taken, 1.0))
+        let accepted = self.arm.command(&with_offsets(requested, -1.0))?;
+        Ok(with_offsets(&accepted, 1.0))
     }
 
     /// Waits until it has arrived; Ctrl-C brings it to rest on the way, which is an error.
     fn follow(&mut self, target: &JointTarget) -> anyhow::Result<JointState> {
         loop {
             let state = self.read()?;
-            if self.arm.motion() == Motion::Held {
+            if self.arm.motion() == Motion::Holding {
                 return Ok(state);
             }
-            self.bar.set_message(format!("at {} of {}", told(&state.position), told(&target.position)));
-            if self.stop.asked() {
+            self.bar.set_message(format!(
+                "at {} of {}",
+                format_positions(&state.position),
+                format_positions(&target.position)
+            ));
+            if self.stop.requested() {
                 self.arm.stop().context("the arm could not be stopped")?;
                 while self.arm.motion() == Motion::Moving {
                     self.read()?;
                 }
-                bail!("stopped on the way, at {}", told(&self.read()?.position));
+                bail!("stopped on the way, at {}", format_positions(&self.read()?.position));
             }
         }
     }
 
     /// Keeps it where it is until Ctrl-C.
     fn hold(&mut self) -> anyhow::Result<()> {
-        while !self.stop.asked() {
+        while !self.stop.requested() {
             let state = self.read()?;
-            self.bar.set_message(format!("held at {}", told(&state.position)));
+            self.bar.set_message(format!("held at {}", format_positions(&state.position)));
         }
         Ok(())
     }

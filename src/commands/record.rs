@@ -1,8 +1,8 @@
 //! `fieldrig record`: what the devices say, into a file, and nothing else.
 
-use super::within;
+use super::number_in_range;
 use crate::config::{ArmDriver, BaseDriver, Override, Rig};
-use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::open::{self, Devices, Opened};
 use crate::print;
 use crate::stop::Stop;
@@ -29,7 +29,7 @@ pub(crate) struct Args {
     lockstep: bool,
     /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end; needed with --lockstep, unless
     /// the rig file says when the simulation ends]
-    #[arg(long, value_name = "S", value_parser = within(0.1..=1e7))]
+    #[arg(long, value_name = "S", value_parser = number_in_range(0.1..=1e7))]
     seconds: Option<f64>,
     /// Print one JSON object a line
     #[arg(long)]
@@ -45,8 +45,8 @@ struct Recorded {
     images: u64,
     depth_images: u64,
     /// Colour images that the devices lost, or that a slow disk made them lose; then by camera.
-    images_lost_by_devices: u64,
-    lost: BTreeMap<String, Lost>,
+    images_dropped_by_devices: u64,
+    dropped: BTreeMap<String, DroppedImages>,
     joint_states: u64,
     base_poses: u64,
     range_scans: u64,
@@ -56,7 +56,7 @@ struct Recorded {
 
 /// Images of one camera that did not come.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-struct Lost {
+struct DroppedImages {
     images: u64,
     depth_images: u64,
 }
@@ -67,7 +67,7 @@ impl Recorded {
             Sample::Image(image) => {
                 self.depth_images += u64::from(image.is_depth());
                 self.images += u64::from(!image.is_depth());
-                self.count_lost(image);
+                self.count_dropped(image);
             }
             Sample::Joints(_) => self.joint_states += 1,
             Sample::Base(_) => self.base_poses += 1,
@@ -78,21 +78,21 @@ impl Recorded {
         }
     }
 
-    fn count_lost(&mut self, next: &Image) {
+    fn count_dropped(&mut self, next: &Image) {
         if next.n_skipped == 0 {
             return;
         }
-        let lost = self.lost.entry(next.camera.to_string()).or_default();
+        let dropped = self.dropped.entry(next.camera.to_string()).or_default();
         if next.is_depth() {
-            lost.depth_images += next.n_skipped;
+            dropped.depth_images += next.n_skipped;
         } else {
-            lost.images += next.n_skipped;
-            self.images_lost_by_devices += next.n_skipped;
+            dropped.images += next.n_skipped;
+            self.images_dropped_by_devices += next.n_skipped;
         }
     }
 
     /// Counts what can be read from the file after writing failed; images that devices lost stay counted.
-    fn recounted(self) -> Self {
+    fn recount_from_file(self) -> Self {
         let mut found = Self { event: self.event, out: self.out, ..Self::default() };
         let mut first: Option<Stamp> = None;
         if let Ok(mut recording) = Recording::open(&found.out) {
@@ -102,22 +102,22 @@ impl Recorded {
                 found.count(&sample);
             }
         }
-        Self { lost: self.lost, images_lost_by_devices: self.images_lost_by_devices, ..found }
+        Self { dropped: self.dropped, images_dropped_by_devices: self.images_dropped_by_devices, ..found }
     }
 
     fn summary(&self) -> String {
         let Self { images, depth_images, joint_states, base_poses, range_scans, .. } = self;
-        let mut told = format!("{images} color images, {depth_images} depth images, {joint_states} joint states");
+        let mut message = format!("{images} color images, {depth_images} depth images, {joint_states} joint states");
         for (n, what) in [(base_poses, "base poses"), (range_scans, "range scans")] {
             if *n > 0 {
-                told.push_str(&format!(", {n} {what}"));
+                message.push_str(&format!(", {n} {what}"));
             }
         }
-        told
+        message
     }
 
     /// Devices of the rig that told nothing at all.
-    fn silent(&self, rig: &Rig) -> Vec<String> {
+    fn missing_devices(&self, rig: &Rig) -> Vec<String> {
         let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0).then_some("joint state of the arm");
         let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0).then_some("pose of the base");
         let images = (self.images == 0).then_some("image");
@@ -125,11 +125,11 @@ impl Recorded {
     }
 
     /// What did not come, a sentence a camera.
-    fn losses(&self) -> Vec<String> {
-        let sentence = |(camera, lost): (&String, &Lost)| {
-            format!("camera {camera:?} lost {} color and {} depth images", lost.images, lost.depth_images)
+    fn dropped_messages(&self) -> Vec<String> {
+        let sentence = |(camera, dropped): (&String, &DroppedImages)| {
+            format!("camera {camera:?} lost {} color and {} depth images", dropped.images, dropped.depth_images)
         };
-        self.lost.iter().map(sentence).collect()
+        self.dropped.iter().map(sentence).collect()
     }
 }
 
@@ -160,8 +160,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     let mut input_error = None;
-    let mut losses = Vec::new();
-    while !stop.asked() {
+    let mut dropped_messages = Vec::new();
+    while !stop.requested() {
         let sample = match source.next_sample() {
             Ok(Some(sample)) => sample,
             Ok(None) => break,
@@ -176,41 +176,42 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             break;
         }
         if let Err(error) = recorder.write(&sample) {
-            losses.push(format!("{:#}", anyhow::Error::new(error)));
-            recorded = recorded.recounted();
+            dropped_messages.push(format!("{:#}", anyhow::Error::new(error)));
+            recorded = recorded.recount_from_file();
             break;
         }
         recorded.count(&sample);
         bar.set_message(recorded.summary());
     }
     bar.finish_and_clear();
-    let kept = losses.is_empty().then(|| recorder.finish());
-    let n_kept = match kept {
-        Some(Ok(kept)) => Some(kept.n_samples),
+    let finished = dropped_messages.is_empty().then(|| recorder.finish());
+    let n_written = match finished {
+        Some(Ok(finished)) => Some(finished.n_samples),
         Some(Err(error)) => {
-            losses.push(format!("{:#}", anyhow::Error::new(error)));
-            recorded = recorded.recounted();
+            dropped_messages.push(format!("{:#}", anyhow::Error::new(error)));
+            recorded = recorded.recount_from_file();
             None
         }
         None => None,
     };
     if let Some(error) = input_error {
-        let kept = format!("the devices broke off; {} keeps what came before", args.out.display());
-        return Err(anyhow::Error::new(error).context(kept));
+        let finished = format!("the devices broke off; {} keeps what came before", args.out.display());
+        return Err(anyhow::Error::new(error).context(finished));
     }
-    if n_kept == Some(0) {
-        return Err(LackOfEvidence(format!("no sample came, so {} was not written", args.out.display())).into());
+    if n_written == Some(0) {
+        return Err(InsufficientData(format!("no sample came, so {} was not written", args.out.display())).into());
     }
     if args.json {
         print::report_json(&recorded)?;
     } else {
         print::report(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()));
     }
-    losses.extend(recorded.losses());
-    losses.extend(recorded.silent(&rig));
-    let n_dropped = source.n_others_dropped();
+    dropped_messages.extend(recorded.dropped_messages());
+    dropped_messages.extend(recorded.missing_devices(&rig));
+    let n_dropped = source.n_other_samples_dropped();
     if n_dropped > 0 {
-        losses.push(format!("{n_dropped} joint states, base poses and range scans, because the disk was too slow"));
+        dropped_messages
+            .push(format!("{n_dropped} joint states, base poses and range scans, because the disk was too slow"));
     }
-    Ok(exit::after(&losses))
+    Ok(exit::from_losses(&dropped_messages))
 }

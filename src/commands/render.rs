@@ -1,7 +1,7 @@
 //! `fieldrig render`: pictures from a saved model.
 
-use crate::camera_path::{CameraPath, Stand};
-use crate::evaluate::{seen_frac, warn_of_other_place};
+use crate::camera_path::{CameraPath, PathCamera};
+use crate::evaluate::{covered_frac, warn_if_hardly_covered};
 use crate::exit::{BadArgument, Exit};
 use crate::partial::{self, Partial};
 use crate::run_folder::expect_model;
@@ -13,7 +13,7 @@ use std::time::Instant;
 use trainer::{Aabb, Picture, Projection, RenderRequest};
 
 /// Size of a picture where nobody says one.
-const USUAL_SIZE_PX: [u32; 2] = [1280, 720];
+const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
 /// Largest side of a picture: 16 k.
 const MAX_SIDE_PX: u32 = 16_384;
 
@@ -85,7 +85,7 @@ fn size(text: &str) -> Result<[u32; 2], String> {
 
 /// What was drawn.
 #[derive(Debug, Serialize)]
-struct Drawn {
+struct RenderedPicture {
     picture: PathBuf,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth: Option<PathBuf>,
@@ -101,29 +101,29 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         (None, Some(pose)) => CameraPath::of_pose(&pose.0)?,
         (None, None) => return Err(BadArgument("either --camera-path or --pose is needed".into()).into()),
     };
-    let size_px = args.size.or(path.size_px).unwrap_or(USUAL_SIZE_PX);
-    let requests = path.stands.iter().map(|stand| args.request(stand, size_px)).collect::<Result<Vec<_>, _>>()?;
+    let size_px = args.size.or(path.size_px).unwrap_or(DEFAULT_SIZE_PX);
+    let requests = path.cameras.iter().map(|camera| args.request(camera, size_px)).collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;
-    refuse_pictures(&args.out, requests.len())?;
+    check_no_overwrite(&args.out, requests.len())?;
     partial::remove_on_signals()?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
-    let mut seen_fracs = Vec::new();
+    let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
         let picture = model.render(request)?;
         let draw_ms = since.elapsed().as_secs_f64() * 1e3;
-        seen_fracs.push(seen_frac(&picture));
+        covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
-        let drawn = Drawn { picture, depth, size_px, draw_ms };
+        let rendered = RenderedPicture { picture, depth, size_px, draw_ms };
         bar.inc(1);
         if args.json {
-            print::report_json(&drawn)?;
+            print::report_json(&rendered)?;
         }
     }
     bar.finish_and_clear();
-    warn_of_other_place(&seen_fracs);
+    warn_if_hardly_covered(&covered_fracs);
     if !args.json {
         let n_pictures = print::counted(requests.len() as u64, "picture");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
@@ -132,9 +132,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 impl Args {
-    fn request(&self, stand: &Stand, size_px: [u32; 2]) -> Result<RenderRequest, BadArgument> {
-        const USUAL_FOV_DEGREES: f64 = 60.0;
-        let fov_y_rad = self.fov.map(f64::to_radians).or(stand.fov_y_rad).unwrap_or(USUAL_FOV_DEGREES.to_radians());
+    fn request(&self, camera: &PathCamera, size_px: [u32; 2]) -> Result<RenderRequest, BadArgument> {
+        const DEFAULT_FOV_DEGREES: f64 = 60.0;
+        let fov_y_rad = self.fov.map(f64::to_radians).or(camera.fov_y_rad).unwrap_or(DEFAULT_FOV_DEGREES.to_radians());
         if !(fov_y_rad > 0.0 && fov_y_rad < std::f64::consts::PI) {
             return Err(BadArgument(format!(
                 "field of view {} degrees: must be above 0 and below 180",
@@ -145,7 +145,7 @@ impl Args {
         let focal_px = 0.5 * height / (0.5 * fov_y_rad).tan();
         let pinhole = Projection::Pinhole { focal_px: [focal_px; 2], principal_px: [0.5 * width, 0.5 * height] };
         Ok(RenderRequest {
-            world_from_camera: stand.world_from_camera,
+            world_from_camera: camera.world_from_camera,
             size_px,
             projection: if self.equirect { Projection::Equirectangular } else { pinhole },
             shutter: None,
@@ -157,7 +157,7 @@ impl Args {
                 max_m: [to_x, to_y, to_z],
             }),
             background_srgb: [0.0; 3],
-            light_of: None,
+            appearance_of: None,
             depth: self.depth,
         })
     }
@@ -169,7 +169,7 @@ fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
 }
 
 /// Refuses a folder that holds any of so many pictures: none is replaced.
-fn refuse_pictures(folder: &Path, n: usize) -> Result<(), BadArgument> {
+fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadArgument> {
     match (0..n).flat_map(|ix| files(folder, ix)).find(|file| file.exists()) {
         Some(file) => Err(BadArgument(format!("--out: {} is there already, name another folder", file.display()))),
         None => Ok(()),
@@ -208,22 +208,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_and_numbers_are_read_or_refused() {
+    fn sizes_and_numbers_are_parsed() {
         assert_eq!(size("640x480"), Ok([640, 480]));
-        for wrong in ["640", "640x", "0x480", "99999x1", "640x480x3"] {
-            assert!(size(wrong).is_err(), "{wrong}");
+        for invalid in ["640", "640x", "0x480", "99999x1", "640x480x3"] {
+            assert!(size(invalid).is_err(), "{invalid}");
         }
         assert_eq!(numbers::<3>("1, -2 3.5").map(|Numbers(values)| values), Ok([1.0, -2.0, 3.5]));
         assert!(numbers::<3>("1 2").is_err_and(|error| error.contains("got 2")));
         assert!(numbers::<1>("one").is_err());
         assert!(corners("0 0 0 1 1 1").is_ok());
-        for wrong in ["0 0 1 1 1 0", "0 0 0 1 1 nan", "0 0 0 1 0 1", "-inf 0 0 1 1 1", "0 0 0"] {
-            assert!(corners(wrong).is_err(), "{wrong}");
+        for invalid in ["0 0 1 1 1 0", "0 0 0 1 1 nan", "0 0 0 1 0 1", "-inf 0 0 1 1 1", "0 0 0"] {
+            assert!(corners(invalid).is_err(), "{invalid}");
         }
     }
 
     #[test]
-    fn depth_files_hold_what_was_drawn() {
+    fn depth_files_hold_the_rendered_depth() {
         let folder = tempfile::tempdir().expect("folder");
         let picture =
             Picture { size_px: [2, 3], rgba_srgb: vec![255; 24], depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5] };
@@ -233,8 +233,8 @@ mod tests {
         assert_eq!(read.shape(), [3, 2]);
         assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
         assert!(file.ends_with("00007.png"));
-        refuse_pictures(folder.path(), 7).expect("the eighth is not among them");
-        let told = refuse_pictures(folder.path(), 8).expect_err("it is there").0;
-        assert!(told.contains("00007.png is there already"), "{told}");
+        check_no_overwrite(folder.path(), 7).expect("the eighth is not among them");
+        let message = check_no_overwrite(folder.path(), 8).expect_err("it is there").0;
+        assert!(message.contains("00007.png is there already"), "{message}");
     }
 }

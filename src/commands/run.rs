@@ -3,24 +3,24 @@
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
 use crate::config::{ArmDriver, Override, Rig};
-use crate::decisions::{About, DecisionLog, Settings};
+use crate::decisions::{DecisionLog, RunDescription, Settings};
 use crate::evaluate::Evaluator;
-use crate::exit::{self, BadArgument, Exit, LackOfEvidence};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::feed::{Feed, Input};
-use crate::join::{Counts, Join, Refusal, Use};
-use crate::kept_keyframes::KeptKeyframes;
+use crate::join::{Counts, Join, Refusal, SampleUse};
 use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, Kind, Recipe, Resumed};
+use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
 use crate::open::{self, Devices, Opened};
 use crate::print;
-use crate::recovery::{self, GpuGone, Recovery};
-use crate::run_folder::{self, MadeFolders};
-use crate::session::{self, Ending, Evaluators, Finished, Limits, Session, Tell};
-use crate::stands::{StandReport, Stands};
+use crate::recovery::{self, GpuUnrecoverable, Recovery};
+use crate::run_folder::{self, CreatedFolders};
+use crate::session::{self, EndingSession, Evaluators, FinishedModel, Limits, OutputMode, Session};
+use crate::stations::{StationReport, Stations};
 use crate::stop::Stop;
-use crate::training_args::{Evidence, HowMany, REALIGN, Refine, TrainingArgs};
-use crate::viewer::{ShownModel, Viewer};
+use crate::stored_keyframes::StoredKeyframes;
+use crate::training_args::{AvailableData, CountArg, REALIGN, Refine, TrainingArgs};
+use crate::viewer::{ModelViewer, ServedModel};
 use anyhow::Context;
 use drivers::Source;
 use kinematics::Stamp;
@@ -35,7 +35,7 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
-use viz::{Ended, Hub, Server, ServerConfig};
+use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.
 #[derive(Clone, Debug, clap::Args)]
@@ -111,15 +111,15 @@ const LOCKSTEP: &str = "lockstep";
 const RECORD: &str = "record";
 
 /// Time in which connected clients receive the last status.
-const LAST_STATUS: Duration = Duration::from_millis(400);
+const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
 /// Steps between two keyframes where no flag says.
-const USUAL_STEPS_PER_KEYFRAME: u64 = 10;
+const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
 /// People look on while a mark is scored: it must not take long.
-const MOST_SCORED_AT_MARKS: usize = 12;
+const MAX_IMAGES_SCORED_LIVE: usize = 12;
 
 /// What the report says beside scores.
 #[derive(Debug, Serialize)]
-struct Particulars {
+struct RunDetails {
     method: &'static str,
     seed: u64,
     keyframes: usize,
@@ -129,36 +129,36 @@ struct Particulars {
     /// Turns of range scanners in the list beside the keyframes, and their points.
     range_scans: usize,
     range_points: usize,
-    losses: Vec<String>,
+    dropped_messages: Vec<String>,
     /// What was found of the base's pose at each stand after the first.
-    stands: Vec<StandReport>,
+    stations: Vec<StationReport>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
-    worst_position_error_m: Option<f64>,
+    max_position_error_m: Option<f64>,
 }
 
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let mut made = MadeFolders::default();
-    let ended = drive(args, &mut made);
-    made.after(ended)
+    let mut created = CreatedFolders::default();
+    let ended = drive(args, &mut created);
+    created.keep_or_remove(ended)
 }
 
-fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
-    let earlier = args.resume.as_deref().map(Earlier::read).transpose()?;
-    if let Some(earlier) = &earlier
-        && args.is_finished(earlier)
+fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
+    let previous = args.resume.as_deref().map(PreviousRun::read).transpose()?;
+    if let Some(previous) = &previous
+        && args.is_finished(previous)
     {
-        return args.report_finished(earlier);
+        return args.report_finished(previous);
     }
-    if let Some(earlier) = &earlier {
-        let whose = format!("the checkpoint in {}", earlier.folder.display());
-        checkpoints::refuse_over(args.seconds, &earlier.checkpoint, &whose)?;
+    if let Some(previous) = &previous {
+        let subject = format!("the checkpoint in {}", previous.folder.display());
+        checkpoints::check_limit_not_passed(args.seconds, &previous.checkpoint, &subject)?;
     }
-    let args = &earlier.as_ref().map_or_else(|| args.clone(), |earlier| args.with_flags_of(earlier));
-    let mut running = start(args, earlier.as_ref(), made)?;
+    let args = &previous.as_ref().map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
+    let mut running = start(args, previous.as_ref(), created)?;
     let ended = loop {
-        match running.take_turn() {
+        match running.run_time_slice() {
             Ok(true) => {}
             Ok(false) => match running.live.wait() {
                 Ok(false) => break Ok(()),
@@ -171,8 +171,8 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
     let Running { live, rig, folders, damage, stop, server, .. } = running;
     let hub = live.hub();
     if let Err(error) = ended {
-        stop.ask();
-        if recovery::is_of_gpu(&error) || error.is::<GpuGone>() {
+        stop.request();
+        if recovery::is_gpu_error(&error) || error.is::<GpuUnrecoverable>() {
             return Err(keep_input(live, &folders, error));
         }
         log::error!("training broke off, saving what was learned: {error:#}");
@@ -181,26 +181,26 @@ fn drive(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         }
         return Err(error);
     }
-    if live.is_through() {
+    if live.has_exhausted_input() {
         log::info!("the devices ended and all their data is in the model: no training steps are left");
     }
-    stop.ask();
+    stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
-    if args.stays() && !models.is_empty() && !stop.signaled() {
+    if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
         print::report(format_args!("the page remains at {} until Ctrl-C", server.url()));
-        let shown = |Finished { kind, method, .. }| ShownModel { kind, method };
-        Viewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
+        let shown = |FinishedModel { kind, method, .. }| ServedModel { kind, method };
+        ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
     Ok(exit)
 }
 
 /// Reports the end of a run to its page.
-fn publish_end(hub: &Hub, models: &[Finished]) {
-    let name = |model: &Finished| match models.len() {
+fn publish_end(hub: &Hub, models: &[FinishedModel]) {
+    let name = |model: &FinishedModel| match models.len() {
         1 => model.scores.to_string(),
         _ => format!("{} {}", model.kind.name(), model.scores),
     };
-    let folder = |model: &Finished| {
+    let folder = |model: &FinishedModel| {
         match models.len() {
             1 => model.folder.as_path(),
             _ => model.folder.parent().unwrap_or(&model.folder),
@@ -208,13 +208,13 @@ fn publish_end(hub: &Hub, models: &[Finished]) {
         .display()
         .to_string()
     };
-    hub.set_ended(Ended {
+    hub.set_run_result(RunResult {
         folder: models.first().map(folder),
         scores: models.iter().map(name).collect::<Vec<_>>().join("; "),
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
     });
     if hub.n_clients() > 0 {
-        std::thread::sleep(LAST_STATUS); // Clients keep showing it after the server has stopped.
+        std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing it after the server has stopped.
     }
 }
 
@@ -231,8 +231,8 @@ pub(super) struct Running {
 
 impl Running {
     /// Takes keyframes, trains a slice, draws and publishes the status; returns `false` when the run is over or interrupted.
-    pub(super) fn take_turn(&mut self) -> anyhow::Result<bool> {
-        if self.stop.asked() || self.live.is_over() {
+    pub(super) fn run_time_slice(&mut self) -> anyhow::Result<bool> {
+        if self.stop.requested() || self.live.is_over() {
             return Ok(false);
         }
         self.live.advance()?;
@@ -241,67 +241,73 @@ impl Running {
 
     /// Closes the devices without saving anything; returns why they ended too early, if they did.
     pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
-        self.stop.ask();
-        let (mut sessions, leftover) = self.live.finish();
+        self.stop.request();
+        let (mut sessions, input_result) = self.live.finish();
         // Checkpoints in progress are written into folders that the caller may remove.
         sessions.iter_mut().for_each(Session::wait_for_checkpoint);
-        Ok(leftover?.input_error)
+        Ok(input_result?.input_error)
     }
 }
 
-/// Opens the devices, the GPU and the page; with `earlier`, to continue that run.
-pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolders) -> anyhow::Result<Running> {
+/// Opens the devices, the GPU and the page; with `previous`, to continue that run.
+pub(super) fn start(
+    args: &Args,
+    previous: Option<&PreviousRun>,
+    created: &mut CreatedFolders,
+) -> anyhow::Result<Running> {
     if let Some(out) = &args.out {
-        run_folder::refuse_model(out)?;
+        run_folder::check_no_model(out)?;
         if args.resume.as_ref() != Some(out) {
-            run_folder::refuse_unfinished(out)?;
+            run_folder::check_no_unfinished_run(out)?;
         }
     }
     let stop = Stop::on_ctrl_c()?;
     let mut overrides = args.overrides();
-    overrides.extend(earlier.map(Earlier::overrides).into_iter().flatten());
+    overrides.extend(previous.map(PreviousRun::overrides).into_iter().flatten());
     let rig = Rig::load(&args.rig_file, &overrides)?;
     let kinds = rig.train.methods.clone();
     args.training.check_for(&kinds)?;
-    let evidence = Evidence { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
-    args.training.check_learned(&kinds, evidence)?;
-    let cameras = args.training.refining(evidence, Refine::None)?.learn;
-    let count = args.training.count(HowMany::ToCap);
+    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
+    args.training.check_learned(&kinds, available)?;
+    let cameras = args.training.refining(available, Refine::None)?.with_scene;
+    let count = args.training.count(CountArg::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let pace = args.pace(&rig)?;
     let gpu = super::open_gpu()?;
-    let models: Vec<Resumed> = match earlier {
-        Some(earlier) => vec![method::resume(gpu.clone(), &earlier.checkpoint, &earlier.keyframes)?],
+    let models: Vec<Resumed> = match previous {
+        Some(previous) => vec![method::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
-            let start = |kind: &Kind| {
-                let recipe = Recipe { kind: *kind, options: options.clone() };
-                let method = recipe.clone().start(gpu.clone())?;
-                Ok(Resumed { recipe, method, rest: Vec::new() })
+            let start = |kind: &ModelKind| {
+                let model_spec = ModelSpec { kind: *kind, options: options.clone() };
+                let method = model_spec.clone().start(gpu.clone())?;
+                Ok(Resumed { model_spec, method, untrained: Vec::new() })
             };
             kinds.iter().map(start).collect::<anyhow::Result<_>>()?
         }
     };
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
-    args.tell_address(&server.url())?;
+    args.print_address(&server.url())?;
 
     let Opened { rig, source, damage } = args.open(rig)?;
-    let folders = made.make_each(args.out(), &kinds, Some(&rig))?;
-    let held = earlier.map_or(&[][..], |earlier| &earlier.keyframes);
+    let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
+    let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, source, held)?;
     let feed = Feed::start(input, hub.clone(), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
-        at_marks: Evaluator::psnr_only(),
-        most_at_marks: MOST_SCORED_AT_MARKS,
+        during_training: Evaluator::psnr_only(),
+        max_images_during_training: MAX_IMAGES_SCORED_LIVE,
         at_end: Evaluator::thorough(None)?,
     };
     let limits = Limits { seconds: args.seconds, steps: args.steps };
     let clock = Clock::default();
     let mut sessions = Vec::new();
-    for (Resumed { recipe: Recipe { kind, options }, mut method, rest }, folder) in models.into_iter().zip(&folders) {
-        let from_step = earlier.is_some().then(|| method.n_taken()).transpose()?;
-        let about = About {
+    for (Resumed { model_spec: ModelSpec { kind, options }, mut method, untrained }, folder) in
+        models.into_iter().zip(&folders)
+    {
+        let from_step = previous.is_some().then(|| method.n_total_steps()).transpose()?;
+        let description = RunDescription {
             method: kind.name(),
             data: args.record.as_deref().or(args.from.as_deref()),
             adapter: gpu.describe(),
@@ -310,34 +316,34 @@ pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolde
             from_step,
             options: options.clone(),
         };
-        let settings = Settings::new(about);
+        let settings = Settings::new(description);
         let mut decisions = DecisionLog::create(folder, settings.clone())?;
-        let is_new = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
+        let is_new = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
         for keyframe in held.iter().filter(|keyframe| !is_new(keyframe)) {
-            decisions.had(from_step.unwrap_or_default(), keyframe);
+            decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
         let recovery = Recovery {
-            recipe: Recipe { kind, options },
+            model_spec: ModelSpec { kind, options },
             folder: folder.clone(),
-            resumed: earlier.map(|earlier| earlier.folder.clone()),
+            resumed: previous.map(|previous| previous.folder.clone()),
             known: Vec::new(), // The session holds all of them.
             settings,
             resume_command: args.resume_command(folder),
         };
-        let tell = Tell::of_command(args.json);
+        let output = OutputMode::of_command(args.json);
         let checkpoints = Checkpoints::new(folder, args.checkpoints);
         let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
             .with_stop(&stop)
             .with_stepwise_scoring()
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
             .with_decisions(decisions)
             .with_data(args.data_source(folder))
             .with_recovery(recovery);
-        let mut session = match earlier {
-            Some(earlier) => session.going_on_after(earlier.checkpoint.seconds),
+        let mut session = match previous {
+            Some(previous) => session.with_elapsed_secs(previous.checkpoint.seconds),
             None if kinds.len() == 1 => session,
-            None => session.among_others(clock.clone()),
+            None => session.with_shared_clock(clock.clone()),
         };
         for keyframe in held {
             if is_new(keyframe) { session.push(keyframe)? } else { session.hold(keyframe) }
@@ -350,30 +356,30 @@ pub(super) fn start(args: &Args, earlier: Option<&Earlier>, made: &mut MadeFolde
     let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes };
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
-    let live = Live::new(sessions, feed, hub, options).after(held);
+    let live = Live::new(sessions, feed, hub, options).resume_from(held);
     Ok(Running { live, gpu, server, stop, rig, folders, damage })
 }
 
 /// Closes the recording and writes the lists of keyframes when training cannot continue; the error names what was saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
-    let left = live.what_is_left();
-    let (sessions, leftover) = live.finish();
+    let recoverable = live.describe_recoverable();
+    let (sessions, input_result) = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
         if let Err(error) = run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes()) {
             log::error!("{error:#}");
         }
     }
-    match leftover {
-        Ok(leftover) => {
-            log::info!("{}", leftover.join.counts());
-            if let Some(error) = leftover.recording_error {
+    match input_result {
+        Ok(input_result) => {
+            log::info!("{}", input_result.join.counts());
+            if let Some(error) = input_result.recording_error {
                 log::error!("the recording is cut off: {error:#}");
             }
         }
         Err(error) => log::error!("{error:#}"),
     }
-    let is_said = left.is_empty() || error.is::<GpuGone>();
-    if is_said { error } else { error.context(format!("the run stopped early; {left}")) }
+    let is_already_reported = recoverable.is_empty() || error.is::<GpuUnrecoverable>();
+    if is_already_reported { error } else { error.context(format!("the run stopped early; {recoverable}")) }
 }
 
 /// Saves what there is, then tells what went wrong on the way.
@@ -383,19 +389,19 @@ fn save(
     rig: &Rig,
     folders: Vec<PathBuf>,
     damage: &OnceLock<String>,
-) -> anyhow::Result<(Exit, Vec<Finished>)> {
+) -> anyhow::Result<(Exit, Vec<FinishedModel>)> {
     let hub = live.hub();
     let n_keyframes = live.keyframes().len();
     let n_train = live.keyframes().iter().filter(|keyframe| keyframe.split == Split::Train).count();
-    let live_error_m = worst_position_error_m(live.keyframes());
-    let left = live.what_is_left();
-    let (sessions, leftover) = live.finish();
-    let leftover = match leftover {
-        Ok(leftover) => leftover,
+    let position_error_m = max_position_error_m(live.keyframes());
+    let recoverable = live.describe_recoverable();
+    let (sessions, input_result) = live.finish();
+    let input_result = match input_result {
+        Ok(input_result) => input_result,
         Err(error) => {
             // A bug of the input does not cost the models.
-            let particulars = || serde_json::json!({ "losses": [error.to_string()] });
-            let ending = |(session, out): (Session, PathBuf)| Ending { particulars: particulars(), session, out };
+            let details = || serde_json::json!({ "losses": [error.to_string()] });
+            let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
             if n_train > 0 {
                 session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
             }
@@ -407,28 +413,31 @@ fn save(
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
     };
     let listed = sessions.iter().zip(&folders).try_for_each(list);
-    let counts = leftover.join.counts();
+    let counts = input_result.join.counts();
     log::info!("{counts}");
-    let mut losses =
-        counts.losses(if args.record.is_some() && args.from.is_none() { Use::Recorded } else { Use::Watched });
+    let mut dropped_messages = counts.dropped_messages(if args.record.is_some() && args.from.is_none() {
+        SampleUse::Recorded
+    } else {
+        SampleUse::Watched
+    });
     // Keyframes that the recording does not hold cannot be scored on it again.
-    let is_recorded = leftover.recording_error.is_none();
-    losses.extend(leftover.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
-    losses.extend(damage.get().cloned());
-    let stands = leftover.stands.as_ref().map_or(Vec::new(), |stands| stands.reports().to_vec());
-    let ending = |(session, out): (Session, PathBuf)| Ending {
-        particulars: Particulars {
+    let is_recorded = input_result.recording_error.is_none();
+    dropped_messages.extend(input_result.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
+    dropped_messages.extend(damage.get().cloned());
+    let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
+    let ending = |(session, out): (Session, PathBuf)| EndingSession {
+        details: RunDetails {
             method: session.kind().name(),
             seed: rig.train.seed,
             keyframes: session.keyframes().len(),
             evicted: counts.evicted,
             refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
             device_skipped: counts.device_skipped,
-            range_scans: leftover.join.range_scans().count(),
-            range_points: leftover.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
-            losses: losses.clone(),
-            stands: stands.clone(),
-            worst_position_error_m: live_error_m,
+            range_scans: input_result.join.range_scans().count(),
+            range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
+            dropped_messages: dropped_messages.clone(),
+            stations: stations.clone(),
+            max_position_error_m: position_error_m,
         },
         session: if is_recorded { session } else { session.with_data(DataSource::default()) },
         out,
@@ -436,35 +445,35 @@ fn save(
     let mut models = Vec::new();
     if n_train > 0 {
         let finished = session::finish(sessions.into_iter().zip(folders).map(ending).collect());
-        models = finished.map_err(|error| recovery::with_what_is_left(error, &left))?;
+        models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     }
     publish_end(&hub, &models);
     listed?;
-    if let Some(error) = leftover.input_error {
+    if let Some(error) = input_result.input_error {
         return Err(anyhow::Error::new(error).context("the devices broke off"));
     }
     if n_train == 0 {
-        return Err(LackOfEvidence(nothing_to_train(n_keyframes, counts, rig)).into());
+        return Err(InsufficientData(no_model_reason(n_keyframes, counts, rig)).into());
     }
-    Ok((exit::after(&losses), models))
+    Ok((exit::from_losses(&dropped_messages), models))
 }
 
 /// Camera and stamp of a keyframe for which there was no room.
 type Evicted = (Arc<str>, Stamp);
 
 /// A run to be continued.
-pub(super) struct Earlier {
+pub(super) struct PreviousRun {
     folder: PathBuf,
     checkpoint: Checkpoint,
     /// The keyframes it held, ordered by stamp.
     keyframes: Vec<Arc<Keyframe>>,
 }
 
-impl Earlier {
+impl PreviousRun {
     fn read(folder: &Path) -> anyhow::Result<Self> {
         let checkpoint = checkpoints::read(folder)?;
-        let kept = KeptKeyframes::of_run(folder).read();
-        let keyframes = kept.with_context(|| {
+        let stored = StoredKeyframes::of_run(folder).read();
+        let keyframes = stored.with_context(|| {
             format!(
                 "the run in {} has no keyframes that can be used; `train` continues from a recording",
                 folder.display()
@@ -482,7 +491,8 @@ impl Earlier {
     /// The rig file settings that the flags of that run set.
     fn overrides(&self) -> Vec<Override> {
         let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
-        let method = Kind::named(&self.checkpoint.method).map(|kind| Override::new("train.method", kind.name()));
+        let method =
+            ModelKind::from_name(&self.checkpoint.method).map(|kind| Override::new("train.method", kind.name()));
         realign.into_iter().chain(method).collect()
     }
 }
@@ -497,7 +507,7 @@ impl Args {
     }
 
     /// Whether the page stays after the run.
-    fn stays(&self) -> bool {
+    fn keeps_serving(&self) -> bool {
         let is_watched = !self.json && std::io::stdout().is_terminal();
         self.when_done.map_or(is_watched, |when_done| when_done == WhenDone::Stay)
     }
@@ -519,8 +529,8 @@ impl Args {
     }
 
     /// These flags, completed by those of the earlier run.
-    fn with_flags_of(&self, earlier: &Earlier) -> Self {
-        let flag = |name: &str| earlier.checkpoint.flags.get(name);
+    fn with_flags_of(&self, previous: &PreviousRun) -> Self {
+        let flag = |name: &str| previous.checkpoint.flags.get(name);
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         if let (Some(file), None) = (flag(RECORD), &self.record) {
@@ -532,20 +542,20 @@ impl Args {
             steps_per_keyframe: self.steps_per_keyframe.or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
             sim: self.sim || flag(SIM).is_some(),
             lockstep: self.lockstep || flag(LOCKSTEP).is_some(),
-            checkpoints: self.checkpoints.or_earlier(&earlier.checkpoint.flags),
+            checkpoints: self.checkpoints.or_previous(&previous.checkpoint.flags),
             ..self.clone()
         }
     }
 
     /// Whether the earlier run reached its limit and saved its model, and no flag asks for more.
-    fn is_finished(&self, earlier: &Earlier) -> bool {
+    fn is_finished(&self, previous: &PreviousRun) -> bool {
         let asks_for_more = self.seconds.is_some() || self.steps.is_some();
-        let has_model = || run_folder::refuse_model(&earlier.folder).is_err();
-        earlier.checkpoint.is_finished && !asks_for_more && has_model()
+        let has_model = || run_folder::check_no_model(&previous.folder).is_err();
+        previous.checkpoint.is_finished && !asks_for_more && has_model()
     }
 
-    fn report_finished(&self, earlier: &Earlier) -> anyhow::Result<Exit> {
-        let (folder, seconds) = (&earlier.folder, earlier.checkpoint.seconds);
+    fn report_finished(&self, previous: &PreviousRun) -> anyhow::Result<Exit> {
+        let (folder, seconds) = (&previous.folder, previous.checkpoint.seconds);
         if self.json {
             print::report_json(&serde_json::json!({ "event": "finished", "seconds": seconds, "out": folder }))?;
         } else {
@@ -560,7 +570,7 @@ impl Args {
 
     /// The given folder; an unfinished run continues in its own folder.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
+        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
     }
 
@@ -578,7 +588,7 @@ impl Args {
         DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
     }
 
-    fn tell_address(&self, url: &str) -> anyhow::Result<()> {
+    fn print_address(&self, url: &str) -> anyhow::Result<()> {
         if self.json {
             return print::report_json(&serde_json::json!({ "event": "serving", "url": url }));
         }
@@ -598,16 +608,16 @@ impl Args {
         &self,
         rig: &Rig,
         source: Box<dyn Source>,
-        earlier: &[Arc<Keyframe>],
+        previous: &[Arc<Keyframe>],
     ) -> anyhow::Result<(Input, Vec<Evicted>)> {
-        let (join, evicted) = Join::new(rig)?.after(earlier);
+        let (join, evicted) = Join::new(rig)?.resume_from(previous);
         let input = Input {
             source,
             join,
-            stands: Stands::new(rig).map(|stands| stands.after(earlier)),
+            stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
             is_live: self.from.is_none(),
-            lenses: rig
+            camera_intrinsics: rig
                 .cameras
                 .iter()
                 .map(|camera| (camera.name.clone(), (camera.intrinsics.focal_px, camera.intrinsics.principal_px)))
@@ -620,7 +630,7 @@ impl Args {
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
         let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
         if self.from.is_some() || (simulated && rig.sim.lockstep) {
-            let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(USUAL_STEPS_PER_KEYFRAME);
+            let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }
         match self.steps_per_keyframe {
@@ -634,7 +644,7 @@ impl Args {
 }
 
 /// Why a run ended without a model, as one sentence.
-fn nothing_to_train(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
+fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
     let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
@@ -652,7 +662,7 @@ fn nothing_to_train(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
 }
 
 /// How far off the worst pose is, where a simulator tells the true ones.
-fn worst_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
+fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
     let error_m = |keyframe: &Arc<Keyframe>| {
         let truth = keyframe.truth.as_ref()?.world_from_camera.translation.vector;
         Some((keyframe.world_from_camera.translation.vector - truth).norm())
@@ -670,7 +680,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_without_a_model_says_why() {
+    fn run_without_a_model_reports_the_reason() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
         let counts = |images, accepted, refused: &[(Refusal, u64)]| Counts {
@@ -691,8 +701,8 @@ mod tests {
                 "0 keyframes of 7 images; 7 no joint readings or pose of the base",
             ),
         ] {
-            let told = nothing_to_train(n_keyframes, &counts, &rig);
-            assert!(told.contains(expected), "{told}");
+            let message = no_model_reason(n_keyframes, &counts, &rig);
+            assert!(message.contains(expected), "{message}");
         }
     }
 }

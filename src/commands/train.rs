@@ -5,18 +5,18 @@ use crate::clock::Clock;
 use crate::config::{Override, Rig};
 use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
-use crate::decisions::{About, DecisionLog, Settings};
-use crate::depth_from::{self, DepthSource, DrawnDepth};
+use crate::decisions::{DecisionLog, RunDescription, Settings};
+use crate::depth_from::{self, DepthSource, RenderedDepth};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, Kind, Recipe, Resumed};
+use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
 use crate::print;
 use crate::recovery::{self, Recovery};
 use crate::replay::Replay;
-use crate::run_folder::{self, MadeFolders};
-use crate::session::{self, Ending, Evaluators, Limits, Session, Tell};
-use crate::stands::StandReport;
+use crate::run_folder::{self, CreatedFolders};
+use crate::session::{self, EndingSession, Evaluators, Limits, OutputMode, Session};
+use crate::stations::StationReport;
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::{REALIGN, TrainingArgs};
@@ -31,7 +31,7 @@ use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
 /// Length of a training where no flag says.
-const USUAL_SECONDS: f64 = 120.0;
+const DEFAULT_SECONDS: f64 = 120.0;
 /// Names of the flags in checkpoints.
 const SECONDS: &str = "seconds";
 const STEPS: &str = "steps";
@@ -91,7 +91,7 @@ pub(crate) struct Args {
 
 /// What the report says beside scores.
 #[derive(Debug, Serialize)]
-struct Particulars<'a> {
+struct TrainDetails<'a> {
     method: &'static str,
     data: &'a Path,
     seed: u64,
@@ -99,70 +99,70 @@ struct Particulars<'a> {
     n_train: usize,
     n_selection: usize,
     n_test: usize,
-    losses: &'a [String],
+    dropped_messages: &'a [String],
     /// What was found of the base's pose at each stand after the first.
-    stands: &'a [StandReport],
+    stations: &'a [StationReport],
     /// How much depth came from a model.
     #[serde(skip_serializing_if = "Option::is_none")]
-    drawn_depth: Option<&'a DrawnDepth>,
+    rendered_depth: Option<&'a RenderedDepth>,
     /// What was found about cameras by laying images over each other.
     alignment: Option<Alignment>,
 }
 
 /// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let mut made = MadeFolders::default();
-    let ended = train(args, &mut made);
-    made.after(ended)
+    let mut created = CreatedFolders::default();
+    let ended = train(args, &mut created);
+    created.keep_or_remove(ended)
 }
 
-fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
+fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
-    training::limits(args.seconds, args.steps, USUAL_SECONDS)?; // Checked before anything is read.
+    training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
     if let Some(out) = &args.out {
-        run_folder::refuse_model(out)?;
-        run_folder::refuse_data(out, &args.data)?;
+        run_folder::check_no_model(out)?;
+        run_folder::check_not_data_folder(out, &args.data)?;
         if args.resume.as_ref() != Some(out) {
-            run_folder::refuse_unfinished(out)?;
+            run_folder::check_no_unfinished_run(out)?;
         }
     }
     let stop = Stop::on_ctrl_c()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
-    let whose = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
-    if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
+    let subject = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
+    if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
         if args.is_finished(checkpoint) {
             if let Some(model) = &args.depth_from {
                 let sha256 = DepthSource::find(model)?.sha256;
-                depth_from::check_same(whose, checkpoint.depth_from.as_deref(), Some(&sha256))?;
+                depth_from::check_same(subject, checkpoint.depth_from.as_deref(), Some(&sha256))?;
             }
             return args.report_finished(checkpoint);
         }
-        checkpoints::refuse_over(args.seconds, checkpoint, whose)?;
+        checkpoints::check_limit_not_passed(args.seconds, checkpoint, subject)?;
     }
     let given_steps = args.steps;
     let args = &checkpoint.as_ref().map_or_else(|| args.clone(), |checkpoint| args.with_flags_of(checkpoint));
     let limits = match (&replay, &checkpoint) {
         (Some(_), _) => Limits::default(),
         (None, checkpoint) => {
-            let earlier_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
-            training::limits(args.seconds, args.steps, earlier_secs + USUAL_SECONDS)?
+            let previous_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
+            training::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
         }
     };
     let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
-    let depth_sum = depth_from.as_ref().map(|source| source.sha256.as_str());
+    let depth_model_sha256 = depth_from.as_ref().map(|source| source.sha256.as_str());
     if let Some(replay) = &replay {
-        replay.check_depth_from(depth_sum)?;
+        replay.check_depth_from(depth_model_sha256)?;
     }
     let (mut images, mut overrides) = (args.images.clone(), args.training.overrides());
     let mut realign = args.training.realign();
     if let Some(replay) = &replay {
         images.scale = Some(replay.decisions.settings.scale);
     }
-    if let (Some(checkpoint), Some(whose)) = (&checkpoint, &whose) {
-        depth_from::check_same(whose, checkpoint.depth_from.as_deref(), depth_sum)?;
+    if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
+        depth_from::check_same(subject, checkpoint.depth_from.as_deref(), depth_model_sha256)?;
         if replay.is_none() {
-            images = images.after(whose, &checkpoint.flags)?;
+            images = images.completed_with(subject, &checkpoint.flags)?;
         }
         realign = checkpoint.flags.get(REALIGN).map(|is_on| is_on == "true");
         overrides.extend(realign.map(|is_on| Override::new(REALIGN, is_on)));
@@ -170,7 +170,8 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         training::check_before_data(&args.training, &args.data, &images)?;
     }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    let evaluators = Evaluators { at_marks: evaluator.clone(), most_at_marks: usize::MAX, at_end: evaluator };
+    let evaluators =
+        Evaluators { during_training: evaluator.clone(), max_images_during_training: usize::MAX, at_end: evaluator };
     let mut data = match &replay {
         Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
         None => Data::load(&args.data, &images, Purpose::Training, &overrides, args.json)?,
@@ -180,44 +181,46 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             let data = args.data.display();
             return Err(BadArgument(format!("--write-rig: {data} holds no rig file; recordings do")).into());
         };
-        corrected_rig::refuse_place(rig, file)?; // Not after all the training.
+        corrected_rig::check_target_file(rig, file)?; // Not after all the training.
     }
     let gpu = super::open_gpu()?;
     if let Some(source) = &depth_from {
-        data.draw_depth(gpu.clone(), source, args.json)?;
+        data.render_depth(gpu.clone(), source, args.json)?;
     }
     if let Some(replay) = &replay {
         replay.check_data(&args.data, &data)?;
     }
     let mut models = args.models(&gpu, &data, replay.as_ref(), checkpoint.as_ref())?;
-    let from_step = checkpoint.is_some().then(|| models[0].method.n_taken()).transpose()?;
-    if let (Some(steps), Some(from_step), Some(whose)) = (given_steps, from_step, &whose)
+    let from_step = checkpoint.is_some().then(|| models[0].method.n_total_steps()).transpose()?;
+    if let (Some(steps), Some(from_step), Some(subject)) = (given_steps, from_step, &subject)
         && steps < from_step
     {
-        return Err(BadArgument(format!("--steps {steps}: {whose} is of step {from_step}, name at least that")).into());
+        return Err(
+            BadArgument(format!("--steps {steps}: {subject} is of step {from_step}, name at least that")).into()
+        );
     }
     if let Some(replay) = &replay {
         replay.check_start(from_step)?;
         replay.check_adapter(&gpu.describe());
     }
     models.iter_mut().try_for_each(|model| model.method.prepare())?;
-    let kinds: Vec<Kind> = models.iter().map(|model| model.recipe.kind).collect();
-    let folders = made.make_each(args.out(), &kinds, data.rig.as_ref())?;
+    let kinds: Vec<ModelKind> = models.iter().map(|model| model.model_spec.kind).collect();
+    let folders = created.make_each(args.out(), &kinds, data.rig.as_ref())?;
     let mut flags = images.flags();
     flags.extend(realign.map(|is_on| (REALIGN.to_owned(), is_on.to_string())));
     flags.extend(args.flags(limits));
     let source =
         DataSource { path: Some(args.data.clone()), flags: images.flags_of_images(), image_names: data.image_names() };
-    let run_flags = RunFlags { depth_from: depth_sum.map(str::to_owned), flags };
+    let run_flags = RunFlags { depth_from: depth_model_sha256.map(str::to_owned), flags };
 
-    let rest = models[0].rest.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
-    let is_rest = |keyframe: &Arc<Keyframe>| rest.iter().any(|other| Arc::ptr_eq(other, keyframe));
+    let untrained = models[0].untrained.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
+    let is_untrained = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
     let clock = Clock::default();
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
-    for (Resumed { recipe: Recipe { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
+    for (Resumed { model_spec: ModelSpec { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
         seeds.push(options.seed);
-        let about = About {
+        let description = RunDescription {
             method: kind.name(),
             data: Some(&args.data),
             adapter: gpu.describe(),
@@ -227,20 +230,20 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
             options,
         };
         let recovery = Recovery {
-            recipe: Recipe { kind, options: about.options.clone() },
+            model_spec: ModelSpec { kind, options: description.options.clone() },
             folder: folder.clone(),
             resumed: args.resume.clone(),
-            known: data.keyframes.iter().filter(|keyframe| !is_rest(keyframe)).cloned().collect(),
-            settings: Settings::new(about),
+            known: data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)).cloned().collect(),
+            settings: Settings::new(description),
             resume_command: args.resume_command(folder),
         };
         let mut decisions = DecisionLog::create(folder, recovery.settings.clone())?;
-        for keyframe in data.keyframes.iter().filter(|keyframe| !is_rest(keyframe)) {
-            decisions.had(from_step.unwrap_or_default(), keyframe);
+        for keyframe in data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)) {
+            decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
-        let tell = Tell::of_command(args.json);
+        let output = OutputMode::of_command(args.json);
         let checkpoints = Checkpoints::new(folder, args.checkpoints);
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, tell)
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
             .with_stop(&stop)
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
@@ -249,54 +252,54 @@ fn train(args: &Args, made: &mut MadeFolders) -> anyhow::Result<Exit> {
         // A replay runs on one device: its log counts steps.
         let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
         sessions.push(match (&kinds[..], &checkpoint) {
-            ([_], Some(checkpoint)) => session.going_on_after(checkpoint.seconds),
+            ([_], Some(checkpoint)) => session.with_elapsed_secs(checkpoint.seconds),
             ([_], None) => session,
-            _ => session.among_others(clock.clone()),
+            _ => session.with_shared_clock(clock.clone()),
         });
     }
     // What was found of the base's stands and drawn for depth counts once.
-    let learning = if checkpoint.is_some() { Duration::ZERO } else { data.learning };
+    let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
     match &replay {
-        Some(replay) => replay.drive(&mut sessions[0], &rest, &stop)?,
-        None => training::drive(&mut sessions, &rest, learning, &stop)?,
+        Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
+        None => training::drive(&mut sessions, &untrained, preparation_time, &stop)?,
     }
 
     let alignment = sessions.iter().find_map(Session::alignment).cloned();
     let startup_secs = sessions[0].clock_started().map_or(0.0, |at| (at - started).as_secs_f64());
-    let ending = |((session, out), seed): ((Session, PathBuf), u64)| Ending {
-        particulars: Particulars {
+    let ending = |((session, out), seed): ((Session, PathBuf), u64)| EndingSession {
+        details: TrainDetails {
             method: session.kind().name(),
             data: &args.data,
             seed,
             startup_secs,
             n_train: data.of_split(Split::Train).len(),
-            n_selection: data.of_split(Split::Selection).len(),
+            n_selection: data.of_split(Split::Validation).len(),
             n_test: data.of_split(Split::Test).len(),
-            losses: &data.losses,
-            stands: &data.stands,
-            drawn_depth: data.drawn_depth.as_ref(),
+            dropped_messages: &data.dropped_messages,
+            stations: &data.stations,
+            rendered_depth: data.rendered_depth.as_ref(),
             alignment: session.alignment().cloned(),
         },
         session,
         out,
     };
-    let left = recovery::what_is_left(&mut sessions);
+    let recoverable = recovery::describe_recoverable(&mut sessions);
     let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
-    finished.map_err(|error| recovery::with_what_is_left(error, &left))?;
+    finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
-    Ok(exit::after(&data.losses))
+    Ok(exit::from_losses(&data.dropped_messages))
 }
 
 /// Writes the rig file, and says where nothing changed in it.
 fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
     match alignment {
         None => log::warn!("images were not laid over each other: the rig file is written as it was"),
-        Some(alignment) if !alignment.is_judged() => {
+        Some(alignment) if !alignment.has_enough_validation_images() => {
             log::warn!("too few images to judge by were held back: the rig file is written as it was");
         }
-        Some(alignment) if !alignment.is_any() => log::info!("the rig file needs no correction"),
+        Some(alignment) if !alignment.has_corrections() => log::info!("the rig file needs no correction"),
         Some(_) => {}
     }
     let rig = alignment.map_or_else(|| Ok(rig.clone()), |alignment| corrected_rig::corrected(rig, alignment))?;
@@ -317,28 +320,28 @@ impl Args {
         if let Some(checkpoint) = checkpoint {
             return Ok(vec![self.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
         }
-        let recipes = match replay {
-            Some(replay) => vec![replay.recipe()],
-            None => training::recipes(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
+        let model_specs = match replay {
+            Some(replay) => vec![replay.model_spec()],
+            None => training::model_specs(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
         };
-        let begin = |recipe: Recipe| {
-            let method = recipe.clone().start(gpu.clone())?;
-            Ok(Resumed { recipe, method, rest: data.keyframes.clone() })
+        let start = |model_spec: ModelSpec| {
+            let method = model_spec.clone().start(gpu.clone())?;
+            Ok(Resumed { model_spec, method, untrained: data.keyframes.clone() })
         };
-        recipes.into_iter().map(begin).collect()
+        model_specs.into_iter().map(start).collect()
     }
 
     /// The flags to store in the checkpoint, besides those of the images, by name.
     fn flags(&self, limits: Limits) -> BTreeMap<String, String> {
-        let whole = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone()).display().to_string();
+        let canonical = |file: &PathBuf| file.canonicalize().unwrap_or_else(|_| file.clone()).display().to_string();
         // The file does not exist yet, so it cannot be canonicalized.
         let to_write =
             |file: &PathBuf| std::path::absolute(file).unwrap_or_else(|_| file.clone()).display().to_string();
         let given = [
             (SECONDS, limits.seconds.map(|seconds| seconds.to_string())),
             (STEPS, limits.steps.map(|steps| steps.to_string())),
-            (DEPTH_FROM, self.depth_from.as_ref().map(whole)),
-            (LPIPS_WEIGHTS, self.lpips_weights.as_ref().map(whole)),
+            (DEPTH_FROM, self.depth_from.as_ref().map(canonical)),
+            (LPIPS_WEIGHTS, self.lpips_weights.as_ref().map(canonical)),
             (WRITE_RIG, self.write_rig.as_ref().map(to_write)),
             (PROFILE, self.profile.then(|| true.to_string())),
         ];
@@ -348,18 +351,18 @@ impl Args {
 
     /// These flags, completed by those of the earlier run.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
-        let earlier = |name: &str| checkpoint.flags.get(name);
-        let path = |name: &str| earlier(name).map(PathBuf::from);
+        let flag = |name: &str| checkpoint.flags.get(name);
+        let path = |name: &str| flag(name).map(PathBuf::from);
         let has_limit = self.seconds.is_some() || self.steps.is_some();
-        let limit = |name: &str| earlier(name).filter(|_| !has_limit);
+        let limit = |name: &str| flag(name).filter(|_| !has_limit);
         Self {
             seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),
             steps: self.steps.or_else(|| limit(STEPS)?.parse().ok()),
             depth_from: self.depth_from.clone().or_else(|| path(DEPTH_FROM)),
             lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
             write_rig: self.write_rig.clone().or_else(|| path(WRITE_RIG)),
-            profile: self.profile || earlier(PROFILE).is_some(),
-            checkpoints: self.checkpoints.or_earlier(&checkpoint.flags),
+            profile: self.profile || flag(PROFILE).is_some(),
+            checkpoints: self.checkpoints.or_previous(&checkpoint.flags),
             ..self.clone()
         }
     }
@@ -376,7 +379,7 @@ impl Args {
             || self.steps.is_some()
             || self.replay_decisions.is_some()
             || !self.images.flags().is_empty();
-        let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::refuse_model(folder).is_err());
+        let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::check_no_model(folder).is_err());
         checkpoint.is_finished && !asks_for_more && has_model()
     }
 
@@ -400,18 +403,18 @@ impl Args {
 
     /// The folder asked for; a run that was cut off goes on in its own.
     fn out(&self) -> Option<&Path> {
-        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::refuse_model(folder).is_ok());
+        let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
     }
 
     /// Says what is not as the caller may expect.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.recipe.options.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (resumed.model_spec.options.n_planned_steps, resumed.method.progress().step);
         log::info!("going on from step {step} of {planned} planned ones");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!("learning was planned to slow down over {planned} steps: those past them change little");
         }
-        let n_new = resumed.rest.iter().filter(|keyframe| keyframe.split != Split::Test).count();
+        let n_new = resumed.untrained.iter().filter(|keyframe| keyframe.split != Split::Test).count();
         if n_new > 0 {
             log::warn!("{} that the checkpoint does not know", print::counted(n_new as u64, "new image"));
         }

@@ -2,10 +2,10 @@
 
 use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
-use crate::method::{self, Loaded};
+use crate::method::{self, LoadedModel};
 use crate::model_bounds::Bounds;
 use crate::stop::Stop;
-use crate::viewer::{ShownModel, Viewer};
+use crate::viewer::{ModelViewer, ServedModel};
 use crate::{camera_list, data, print, run_folder, scene_hint};
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
@@ -58,7 +58,7 @@ impl Up {
 
 /// Serves the page until Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    refuse_other_than_model(&args.model)?;
+    check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
     let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = super::open_gpu()?;
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
     let models = paths.iter().map(|path| method::load_with_bounds(gpu.clone(), path, cameras.is_empty()));
-    let models = models.collect::<anyhow::Result<Vec<Loaded>>>()?;
+    let models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
     let mut statuses =
         paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind.name(), &model.method.progress()));
     let report = report(&paths[0]);
@@ -90,13 +90,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     hub.set_status(status);
 
     args.print_url(&server.url(), &models)?;
-    let models = models.into_iter().map(|Loaded { kind, method, .. }| ShownModel { kind, method }).collect();
-    Viewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
+    let models = models.into_iter().map(|LoadedModel { kind, method, .. }| ServedModel { kind, method }).collect();
+    ModelViewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
     Ok(Exit::Done)
 }
 
 impl Args {
-    fn print_url(&self, url: &str, models: &[Loaded]) -> anyhow::Result<()> {
+    fn print_url(&self, url: &str, models: &[LoadedModel]) -> anyhow::Result<()> {
         if self.json {
             let methods: Vec<&str> = models.iter().map(|model| model.kind.name()).collect();
             return print::report_json(&json!({ "event": "serving", "url": url, "methods": methods }));
@@ -108,11 +108,11 @@ impl Args {
 
 /// Starts the server at the given address; without one, at the default address or, if that is in use, at a free port.
 fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Error> {
-    let usual = ServerConfig::default();
-    match (listen, Server::start(listen.map_or(usual, |listen| ServerConfig { listen }), hub.clone())) {
+    let default_config = ServerConfig::default();
+    match (listen, Server::start(listen.map_or(default_config, |listen| ServerConfig { listen }), hub.clone())) {
         (None, Err(viz::Error::AddressInUse { address })) => {
             log::info!("{address} is in use by another program; using a free port");
-            let mut listen = usual.listen;
+            let mut listen = default_config.listen;
             listen.set_port(0);
             Server::start(ServerConfig { listen }, hub.clone())
         }
@@ -121,7 +121,7 @@ fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Er
 }
 
 /// Refuses paths that are often mistaken for a model, and names the command to use instead.
-fn refuse_other_than_model(model: &Path) -> Result<(), BadArgument> {
+fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
     if ["http://", "https://", "ws://", "wss://"].into_iter().any(is_url) {
@@ -181,8 +181,8 @@ fn report(model: &Path) -> Value {
 /// Size and scores of a model when its training ended.
 fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus {
     let report = report(model);
-    let (done, marks) = (&report["done"], report["marks"].as_array());
-    let point = |mark: &Value| Some((mark["seconds"].as_f64()?, mark["psnr"].as_f64()?));
+    let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
+    let point = |evaluation: &Value| Some((evaluation["seconds"].as_f64()?, evaluation["psnr"].as_f64()?));
     ModelStatus {
         method: method.to_owned(),
         step: done["steps"].as_u64().unwrap_or(progress.step),
@@ -190,7 +190,7 @@ fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus 
         primitives: progress.primitives,
         bytes: progress.bytes,
         psnr: done["psnr"].as_f64(),
-        psnr_history: marks.into_iter().flatten().chain([done]).filter_map(point).collect(),
+        psnr_history: evaluations.into_iter().flatten().chain([done]).filter_map(point).collect(),
     }
 }
 
@@ -200,8 +200,8 @@ mod tests {
     use nalgebra::Point3;
 
     #[test]
-    fn the_up_axis_of_a_model_is_up_on_the_page() {
-        const ABS: f64 = 1e-12;
+    fn up_axis_is_up_on_the_page() {
+        const TOLERANCE: f64 = 1e-12;
         for (text, up) in [
             ("z", [0.0, 0.0, 1.0]),
             ("-z", [0.0, 0.0, -1.0]),
@@ -212,22 +212,22 @@ mod tests {
             let Up(axis) = up_axis(text).expect("an axis");
             assert_eq!(axis, Vector3::from(up), "{text}");
             let in_page = Up(axis).model_from_page().inverse() * Point3::from(up);
-            assert!((in_page - Point3::new(0.0, 0.0, 1.0)).norm() < ABS, "{text}: {in_page}");
+            assert!((in_page - Point3::new(0.0, 0.0, 1.0)).norm() < TOLERANCE, "{text}: {in_page}");
         }
-        for wrong in ["", "up", "--z", "Z", "xy"] {
-            assert!(up_axis(wrong).is_err(), "{wrong}");
+        for invalid in ["", "up", "--z", "Z", "xy"] {
+            assert!(up_axis(invalid).is_err(), "{invalid}");
         }
     }
 
     #[test]
-    fn the_score_is_the_reports() {
+    fn model_status_uses_the_report_scores() {
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress { primitives: 5, bytes: 80, ..Progress::default() };
         let status = model_status(folder.path(), "splat", &progress);
         assert_eq!((status.psnr, status.step, status.primitives, status.bytes), (None, 0, 5, 80));
         let text = json!({
             "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
-            "marks": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
+            "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
         std::fs::write(folder.path().join("report.json"), text.to_string()).expect("room on the disk");
         let status = model_status(folder.path(), "splat", &progress);

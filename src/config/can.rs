@@ -9,7 +9,7 @@ use toml::{Table, Value};
 
 /// A family without its numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Kind {
+enum FamilyKind {
     Damiao,
     Robstride,
     TMotor,
@@ -17,12 +17,12 @@ enum Kind {
     Cia402,
 }
 
-const FAMILIES: [(&str, Kind); 5] = [
-    ("damiao", Kind::Damiao),
-    ("robstride", Kind::Robstride),
-    ("tmotor", Kind::TMotor),
-    ("odrive", Kind::Odrive),
-    ("cia402", Kind::Cia402),
+const FAMILIES: [(&str, FamilyKind); 5] = [
+    ("damiao", FamilyKind::Damiao),
+    ("robstride", FamilyKind::Robstride),
+    ("tmotor", FamilyKind::TMotor),
+    ("odrive", FamilyKind::Odrive),
+    ("cia402", FamilyKind::Cia402),
 ];
 
 /// The models whose counts the driver knows, of both families whose motors do not tell.
@@ -48,7 +48,7 @@ const MODELS: [(&str, Model); 13] = [
     ("ak80-64", Model::TMotor(tmotor::Model::Ak80x64)),
 ];
 /// Gears beyond these are slips of the pen.
-const GEARS: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
+const GEAR_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
 
 /// Buses and motors, in the order of their names.
 pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>) {
@@ -66,7 +66,7 @@ fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
         && !interface.contains(|letter: char| letter == '/' || letter.is_whitespace());
     if !is_name {
         let allowed = "the name of an interface, up to 15 letters without blanks and slashes, as the table's name";
-        keys.wrong::<()>("interface", &Value::from(interface.as_str()), allowed);
+        keys.invalid::<()>("interface", &Value::from(interface.as_str()), allowed);
     }
     let rate = |value: Option<u64>| value.and_then(|rate| u32::try_from(rate).ok());
     let bus = BusConfig {
@@ -93,70 +93,73 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
         let found = buses.iter().position(|known| known.interface == bus);
         let names: Vec<_> = buses.iter().map(|bus| format!("{:?}", bus.interface)).collect();
         let allowed = if names.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { names.join(", ") };
-        found.or_else(|| keys.wrong("bus", &Value::String(bus), &allowed))
+        found.or_else(|| keys.invalid("bus", &Value::String(bus), &allowed))
     });
-    let most = match kind {
-        Some(Kind::Damiao) => 0x7FE,
-        Some(Kind::Odrive) => 62,
-        Some(Kind::Cia402) => 127,
+    let max_id = match kind {
+        Some(FamilyKind::Damiao) => 0x7FE,
+        Some(FamilyKind::Odrive) => 62,
+        Some(FamilyKind::Cia402) => 127,
         _ => 255,
     };
-    let id = keys.whole("id", u64::from(kind == Some(Kind::Cia402))..=most);
+    let id = keys.whole("id", u64::from(kind == Some(FamilyKind::Cia402))..=max_id);
     if id.is_none() {
         keys.missing("id", "the number of the motor, axis or node");
     }
     // Keys of other families are unknown here; where it is not known which it is, all are known.
-    let is = |own: &[Kind]| kind.is_none_or(|kind| own.contains(&kind));
-    let feedback = is(&[Kind::Damiao]).then(|| keys.whole("feedback_id", 0..=0x7FE)).flatten();
-    let model = is(&[Kind::Robstride, Kind::TMotor]).then(|| keys.choice("model", &MODELS)).flatten();
-    let counts_per_turn = is(&[Kind::Cia402]).then(|| keys.number("counts_per_turn", 1.0..=1e12)).flatten();
-    let rated_torque_nm = is(&[Kind::Cia402]).then(|| keys.number("rated_torque_nm", 0.0..=1e6)).flatten();
+    let applies = |own: &[FamilyKind]| kind.is_none_or(|kind| own.contains(&kind));
+    let feedback = applies(&[FamilyKind::Damiao]).then(|| keys.whole("feedback_id", 0..=0x7FE)).flatten();
+    let model = applies(&[FamilyKind::Robstride, FamilyKind::TMotor]).then(|| keys.choice("model", &MODELS)).flatten();
+    let counts_per_turn = applies(&[FamilyKind::Cia402]).then(|| keys.number("counts_per_turn", 1.0..=1e12)).flatten();
+    let rated_torque_nm = applies(&[FamilyKind::Cia402]).then(|| keys.number("rated_torque_nm", 0.0..=1e6)).flatten();
     let rated_torque_nm = rated_torque_nm.unwrap_or(0.0);
-    let gains = is(&[Kind::Damiao, Kind::Robstride, Kind::TMotor]).then(|| gains(&mut keys)).flatten();
-    let gear_ratio = keys.number("gear_ratio", GEARS).unwrap_or(1.0);
+    let gains =
+        applies(&[FamilyKind::Damiao, FamilyKind::Robstride, FamilyKind::TMotor]).then(|| gains(&mut keys)).flatten();
+    let gear_ratio = keys.number("gear_ratio", GEAR_RATIO_RANGE).unwrap_or(1.0);
     let is_reversed = keys.flag("reversed").unwrap_or(false);
     let offset_rad = keys.number("offset_rad", -100.0..=100.0).unwrap_or(0.0);
-    let narrow = |id: u64| u8::try_from(id).ok();
+    let to_u8 = |id: u64| u8::try_from(id).ok();
     let Some(kind) = kind else {
         keys.end();
         return None;
     };
     let family = match (kind, id) {
-        (Kind::Damiao, id) => {
+        (FamilyKind::Damiao, id) => {
             if feedback.is_none() {
                 keys.missing("feedback_id", "the identifier of the motor's answers, its register MST_ID");
             }
-            let short = |id: u64| u16::try_from(id).ok();
-            id.and_then(short).zip(feedback.and_then(short)).map(|(motor, feedback)| Family::Damiao { motor, feedback })
+            let to_u16 = |id: u64| u16::try_from(id).ok();
+            id.and_then(to_u16)
+                .zip(feedback.and_then(to_u16))
+                .map(|(motor, feedback)| Family::Damiao { motor, feedback })
         }
-        (kind @ (Kind::Robstride | Kind::TMotor), id) => {
-            let family = match (kind, model, id.and_then(narrow)) {
-                (Kind::Robstride, Some(Model::Robstride(model)), Some(motor)) => {
+        (kind @ (FamilyKind::Robstride | FamilyKind::TMotor), id) => {
+            let family = match (kind, model, id.and_then(to_u8)) {
+                (FamilyKind::Robstride, Some(Model::Robstride(model)), Some(motor)) => {
                     Some(Family::Robstride { motor, model })
                 }
-                (Kind::TMotor, Some(Model::TMotor(model)), Some(motor)) => Some(Family::TMotor { motor, model }),
+                (FamilyKind::TMotor, Some(Model::TMotor(model)), Some(motor)) => Some(Family::TMotor { motor, model }),
                 _ => None,
             };
-            let of_family = match (kind, model) {
-                (Kind::TMotor, Some(Model::Robstride(_))) => Some("ak10-9 to ak80-64, as the family is tmotor"),
-                (Kind::Robstride, Some(Model::TMotor(_))) => Some("rs00 to rs06, as the family is robstride"),
+            let expected_models = match (kind, model) {
+                (FamilyKind::TMotor, Some(Model::Robstride(_))) => Some("ak10-9 to ak80-64, as the family is tmotor"),
+                (FamilyKind::Robstride, Some(Model::TMotor(_))) => Some("rs00 to rs06, as the family is robstride"),
                 _ => None,
             };
-            if let (Some(allowed), Some(value)) = (of_family, model.and_then(|model| name_of(&MODELS, &model))) {
-                keys.wrong::<()>("model", &value, allowed);
+            if let (Some(allowed), Some(value)) = (expected_models, model.and_then(|model| name_of(&MODELS, &model))) {
+                keys.invalid::<()>("model", &value, allowed);
             } else if family.is_none() && id.is_some() {
                 keys.missing("model", "what is on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor");
             }
             family
         }
-        (Kind::Odrive, id) => {
-            id.and_then(narrow).and_then(|id| odrive::Node::new(id).ok()).map(|node| Family::Odrive { node })
+        (FamilyKind::Odrive, id) => {
+            id.and_then(to_u8).and_then(|id| odrive::Node::new(id).ok()).map(|node| Family::Odrive { node })
         }
-        (Kind::Cia402, id) => {
+        (FamilyKind::Cia402, id) => {
             if counts_per_turn.is_none() {
                 keys.missing("counts_per_turn", "counts of the drive's position in a turn of what it measures");
             }
-            let node = id.and_then(narrow).and_then(|id| canopen::Node::new(id).ok());
+            let node = id.and_then(to_u8).and_then(|id| canopen::Node::new(id).ok());
             let units = counts_per_turn.map(|counts_per_turn| Units { counts_per_turn, rated_torque_nm });
             node.zip(units).map(|(node, units)| Family::Cia402 { node, units })
         }
@@ -202,20 +205,20 @@ fn motor_table(motor: &MotorConfig, bus: &str) -> Table {
     let (kind, id) = match motor.family {
         Family::Damiao { motor, feedback: answers } => {
             feedback = Some(answers);
-            (Kind::Damiao, motor)
+            (FamilyKind::Damiao, motor)
         }
         Family::Robstride { motor, model: own } => {
             model = Some(Model::Robstride(own));
-            (Kind::Robstride, motor.into())
+            (FamilyKind::Robstride, motor.into())
         }
         Family::TMotor { motor, model: own } => {
             model = Some(Model::TMotor(own));
-            (Kind::TMotor, motor.into())
+            (FamilyKind::TMotor, motor.into())
         }
-        Family::Odrive { node } => (Kind::Odrive, node.number().into()),
+        Family::Odrive { node } => (FamilyKind::Odrive, node.number().into()),
         Family::Cia402 { node, units: own } => {
             units = Some(own);
-            (Kind::Cia402, node.number().into())
+            (FamilyKind::Cia402, node.number().into())
         }
     };
     table([

@@ -7,20 +7,20 @@ use std::path::PathBuf;
 #[non_exhaustive]
 pub(crate) enum ConfigError {
     /// A file is missing or unreadable.
-    #[error("cannot read {what} {path:?}")]
-    Read { what: &'static str, path: PathBuf, source: std::io::Error },
+    #[error("cannot read {description} {path:?}")]
+    Read { description: &'static str, path: PathBuf, source: std::io::Error },
     /// The text is not TOML.
     #[error("{file} line {line}: {message}")]
     Syntax { file: String, line: usize, message: String },
     /// A key that no rig file has.
-    #[error("{at}: unknown key {key:?}{}", .nearest.as_ref().map(|near| format!(", did you mean {near:?}?")).unwrap_or_default())]
-    UnknownKey { at: Place, key: String, nearest: Option<String> },
+    #[error("{at}: unknown key {key:?}{}", .nearest.as_ref().map(|nearest_key| format!(", did you mean {nearest_key:?}?")).unwrap_or_default())]
+    UnknownKey { at: SourceLocation, key: String, nearest: Option<String> },
     /// A key that every rig file needs.
     #[error("{file}: the key {key:?} is missing: {meaning}")]
     Missing { file: String, key: String, meaning: &'static str },
     /// A value that is not allowed.
     #[error("{at}: {key} is {got}, allowed: {allowed}")]
-    Wrong { at: Place, key: String, got: String, allowed: String },
+    InvalidValue { at: SourceLocation, key: String, got: String, allowed: String },
     /// The robot's description does not fit the rig.
     #[error("{file}: {key}: {reason}")]
     Robot { file: String, key: &'static str, reason: String },
@@ -28,14 +28,14 @@ pub(crate) enum ConfigError {
 
 /// Where a value comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Place {
+pub(crate) enum SourceLocation {
     /// A line of the rig file, from 1.
     Line { file: String, line: usize },
     /// A flag that overrides the key.
     Flag,
 }
 
-impl std::fmt::Display for Place {
+impl std::fmt::Display for SourceLocation {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Line { file, line } => write!(f, "{file} line {line}"),

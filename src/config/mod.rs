@@ -15,10 +15,10 @@ pub(crate) use error::ConfigError;
 pub(crate) use motion::ArmMotion;
 pub(crate) use write::methods;
 
-use crate::method::Kind;
+use crate::method::ModelKind;
 use drivers::can::{BusConfig, MotorConfig};
 use drivers::realsense::{Filter, Pace, Stream};
-use drivers::tags::{Family, PlacedTag};
+use drivers::tags::{Family, TagPlacement};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::collections::BTreeMap;
@@ -28,13 +28,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Most splats, as a key and as a flag.
-pub(crate) const MAX_SPLATS: RangeInclusive<u64> = 1..=100_000_000;
+pub(crate) const MAX_SPLATS_RANGE: RangeInclusive<u64> = 1..=100_000_000;
 /// Most bytes of a model, as a key and as a flag.
-pub(crate) const MAX_BYTES: RangeInclusive<u64> = 1_000_000..=1 << 50;
+pub(crate) const MAX_BYTES_RANGE: RangeInclusive<u64> = 1_000_000..=1 << 50;
 /// Seeds, as keys and as a flag: TOML has no larger integers.
-pub(crate) const SEED: RangeInclusive<u64> = 0..=i64::MAX.cast_unsigned();
+pub(crate) const SEED_RANGE: RangeInclusive<u64> = 0..=i64::MAX.cast_unsigned();
 /// The seed where nothing says one.
-pub(crate) const USUAL_SEED: u64 = 1;
+pub(crate) const DEFAULT_SEED: u64 = 1;
 
 /// A checked rig.
 #[derive(Clone, Debug, PartialEq)]
@@ -101,7 +101,7 @@ pub(crate) struct Base {
     pub(crate) max_sigma_rad: f64,
     /// The tags that the driver `tags` looks for, by their numbers in the family.
     pub(crate) tag_family: Family,
-    pub(crate) tags: BTreeMap<u32, PlacedTag>,
+    pub(crate) tags: BTreeMap<u32, TagPlacement>,
     /// Error of a simulated base's poses at the end of its walk, root mean square, metres and radians.
     pub(crate) drift_m: f64,
     pub(crate) drift_rad: f64,
@@ -144,8 +144,8 @@ pub(crate) enum ScannerDriver {
 pub(crate) struct ScannerSim {
     pub(crate) rings: u32,
     pub(crate) columns: u32,
-    pub(crate) lowest_rad: f64,
-    pub(crate) highest_rad: f64,
+    pub(crate) min_elevation_rad: f64,
+    pub(crate) max_elevation_rad: f64,
     pub(crate) noise_sigma_m: f64,
     pub(crate) dropped_frac: f64,
 }
@@ -163,7 +163,7 @@ pub(crate) struct Camera {
     /// First row to last row; `None` is unknown, 0 a global shutter.
     pub(crate) readout_micros: Option<f64>,
     /// What is added to a stamp to reach mid-exposure; `None` is unknown.
-    pub(crate) stamp_to_mid_exposure: Option<Measured>,
+    pub(crate) stamp_to_mid_exposure: Option<TimeOffset>,
     pub(crate) parent: Parent,
     pub(crate) parent_from_camera: Transform,
     pub(crate) intrinsics: Intrinsics,
@@ -222,12 +222,12 @@ pub(crate) struct Realsense {
     /// How long a camera that was unplugged is looked for.
     pub(crate) reconnect_secs: f64,
     /// What the rig file leaves to the camera until it is opened.
-    pub(crate) unknown: Unknown,
+    pub(crate) unknown: UnknownCalibration,
 }
 
 /// Which numbers of a camera only the camera knows yet; what stands in their place is not to be used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Unknown {
+pub(crate) struct UnknownCalibration {
     pub(crate) intrinsics: bool,
     pub(crate) depth_intrinsics: bool,
     pub(crate) camera_from_depth: bool,
@@ -243,7 +243,7 @@ pub(crate) enum Parent {
 
 /// A measured time, milliseconds.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Measured {
+pub(crate) struct TimeOffset {
     pub(crate) value_millis: f64,
     pub(crate) sigma_millis: f64,
     /// What measured it.
@@ -256,7 +256,7 @@ pub(crate) struct Depth {
     /// Where depth is read with the driver `v4l2`; empty where the driver needs none.
     pub(crate) device: String,
     /// Metres per count where the device does not tell it.
-    pub(crate) metres_per_count: Option<f64>,
+    pub(crate) meters_per_count: Option<f64>,
     pub(crate) intrinsics: Intrinsics,
     /// Pose of the depth images' optical frame in that of the colour images.
     pub(crate) camera_from_depth: Transform,
@@ -278,7 +278,7 @@ pub(crate) struct CameraSim {
     pub(crate) supersample: u32,
     pub(crate) depth_noise_sigma_m: f64,
     pub(crate) depth_hole_frac: f64,
-    pub(crate) metres_per_count: f64,
+    pub(crate) meters_per_count: f64,
 }
 
 /// Which images become keyframes, and how many are kept.
@@ -307,7 +307,7 @@ pub(crate) struct JoinConfig {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Train {
     /// At least one, all different.
-    pub(crate) methods: Vec<Kind>,
+    pub(crate) methods: Vec<ModelKind>,
     pub(crate) max_splats: Option<u64>,
     pub(crate) max_bytes: Option<u64>,
     pub(crate) seed: u64,
@@ -366,7 +366,7 @@ impl Rig {
             // Wherever the settled file lies, it names the same file.
             let path = folder.join(&motion.odrive_endpoints);
             let path = std::path::absolute(&path).map_err(|source| ConfigError::Read {
-                what: "ODrive's endpoints",
+                description: "ODrive's endpoints",
                 path,
                 source,
             })?;
@@ -391,14 +391,14 @@ impl Rig {
     }
 
     /// Whether its cameras see the same of the same readings: where they sit, their lenses, delays and depth, and the joints' zeros.
-    pub(crate) fn sees_like(&self, other: &Self) -> bool {
-        const SAME: f64 = 1e-9; // Reading a pose back may turn its last bit.
+    pub(crate) fn has_same_calibration(&self, other: &Self) -> bool {
+        const TOLERANCE: f64 = 1e-9; // Reading a pose back may turn its last bit.
         let is_same = |one: &Camera, other: &Camera| {
-            let apart = one.parent_from_camera.inverse() * other.parent_from_camera;
+            let difference = one.parent_from_camera.inverse() * other.parent_from_camera;
             one.name == other.name
                 && one.parent == other.parent
-                && apart.translation.vector.norm() < SAME
-                && apart.rotation.angle() < SAME
+                && difference.translation.vector.norm() < TOLERANCE
+                && difference.rotation.angle() < TOLERANCE
                 && one.intrinsics == other.intrinsics
                 && one.stamp_to_mid_exposure == other.stamp_to_mid_exposure
                 && one.readout_micros == other.readout_micros
@@ -410,12 +410,12 @@ impl Rig {
     }
 
     /// The same rig for one scene model.
-    pub(crate) fn with_method(&self, method: Kind) -> Self {
+    pub(crate) fn with_method(&self, method: ModelKind) -> Self {
         Self { train: Train { methods: vec![method], ..self.train.clone() }, ..self.clone() }
     }
 
     /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.
-    pub(crate) fn write_settled(&self, folder: &Path) -> std::io::Result<PathBuf> {
+    pub(crate) fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
         std::fs::write(folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;
         std::fs::write(&path, self.to_toml())?;
@@ -423,6 +423,6 @@ impl Rig {
     }
 }
 
-fn read_file(what: &'static str, path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { what, path: path.to_owned(), source })
+fn read_file(description: &'static str, path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { description, path: path.to_owned(), source })
 }

@@ -1,15 +1,15 @@
 //! From the text of a rig file to the checked rig: every key, its default and its range.
 
-use super::section::{Reading, Section};
+use super::section::{ParseContext, Section};
 use super::{
-    Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, Depth, JoinConfig, MAX_BYTES,
-    MAX_SPLATS, Measured, Override, Parent, Realsense, Rig, SEED, Scanner, ScannerDriver, ScannerSim, Sim, Train,
-    USUAL_SEED, Unknown, V4l2,
+    Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, DEFAULT_SEED, Depth, JoinConfig,
+    MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, Parent, Realsense, Rig, SEED_RANGE, Scanner, ScannerDriver,
+    ScannerSim, Sim, TimeOffset, Train, UnknownCalibration, V4l2,
 };
-use crate::method::Kind;
+use crate::method::ModelKind;
 use drivers::can::MotorConfig;
 use drivers::realsense::{Filter, Pace, Stream};
-use drivers::tags::{Family, PlacedTag};
+use drivers::tags::{Family, TagPlacement};
 use drivers::v4l2::{Delivery, V4l2Format};
 use kinematics::{Chain, Intrinsics, Lens, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -55,16 +55,16 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
 /// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
-const USUAL_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
-const USUAL_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
+const DEFAULT_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
+const DEFAULT_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
 /// The description of a robot without an arm, where the rig file names none.
-const NO_ROBOT: &str = r#"<robot name="none"><link name="base"/></robot>"#;
+const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
 /// Poses and lens coefficients beyond this are slips of the pen.
-const FAR: f64 = 1e4;
+const MAX_COORDINATE: f64 = 1e4;
 /// Offsets of joints beyond this, rad or m, are not offsets.
-const MOST_OFFSET: f64 = 1.0;
+const MAX_JOINT_OFFSET: f64 = 1.0;
 /// A quaternion this close to length one is taken as it is, so that a settled file gives the same bits again.
-const UNIT_CLOSE: f64 = 1e-12;
+const UNIT_NORM_TOLERANCE: f64 = 1e-12;
 
 /// Reads a rig; `read_urdf` gives the robot's description for the path in the file.
 pub(super) fn rig(
@@ -73,25 +73,25 @@ pub(super) fn rig(
     overrides: &[Override],
     read_urdf: impl FnOnce(&str) -> Result<String, ConfigError>,
 ) -> Result<Rig, ConfigError> {
-    let (mut rig, urdf_path, reading) = keys(file, text, overrides)?;
-    if let Some(problem) = reading.into_problem() {
+    let (mut rig, urdf_path, context) = keys(file, text, overrides)?;
+    if let Some(problem) = context.into_problem() {
         return Err(problem);
     }
-    rig.arm.urdf_text = if urdf_path.is_empty() { NO_ROBOT.to_owned() } else { read_urdf(&urdf_path)? };
-    settle_joints(file, &mut rig.arm)?;
+    rig.arm.urdf_text = if urdf_path.is_empty() { EMPTY_URDF.to_owned() } else { read_urdf(&urdf_path)? };
+    resolve_joints(file, &mut rig.arm)?;
     Ok(rig)
 }
 
 /// Reads all keys: the rig without its robot, the path of the robot's description, and what is wrong.
-pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Rig, String, Reading), ConfigError> {
-    let reading = Reading::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
+pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Rig, String, ParseContext), ConfigError> {
+    let context = ParseContext::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
     let syntax =
         |e: toml::de::Error| ConfigError::Syntax { file: file.to_owned(), line: 1, message: e.message().to_owned() };
     let mut table: Table = toml::from_str(text).map_err(syntax)?;
     for flag in overrides {
         set(&mut table, flag.key, flag.value.clone());
     }
-    let mut root = Section::root(&reading, table);
+    let mut root = Section::root(&context, table);
     let (arm, urdf_path) = arm(root.section("arm"));
     let base = base(root.section("base"));
     let cameras = cameras(&mut root);
@@ -100,7 +100,7 @@ pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Ri
     let train = train(root.section("train"));
     let sim = sim(root.section("sim"));
     root.end();
-    Ok((Rig { arm, base, cameras, scanners, join, train, sim }, urdf_path, reading))
+    Ok((Rig { arm, base, cameras, scanners, join, train, sim }, urdf_path, context))
 }
 
 /// Replaces the value of a dotted key, making tables on the way.
@@ -119,7 +119,7 @@ fn set(table: &mut Table, key: &str, value: Value) {
 }
 
 /// Checks links and joints against the robot's description and fills in the joints that were not named.
-fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
+fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
     if arm.base_link.is_empty() {
         let description = kinematics::urdf::Robot::parse(&arm.urdf_text).map_err(|e| robot("arm.urdf", e))?;
@@ -131,38 +131,38 @@ fn settle_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         arm.joints = chain.joint_names().to_vec();
     }
     chain.order_in(&arm.joints).map_err(|e| robot("arm.joints", e))?;
-    settle_motors(file, arm)?;
+    resolve_motors(file, arm)?;
     let (n, n_joints) = (arm.joint_offsets.len(), arm.joints.len());
-    if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MOST_OFFSET)) {
+    if n == 0 || (n == n_joints && arm.joint_offsets.iter().all(|offset| offset.abs() <= MAX_JOINT_OFFSET)) {
         return Ok(());
     }
-    let reason = format!("{n} numbers; must be {n_joints} from -{MOST_OFFSET} to {MOST_OFFSET}, or none");
+    let reason = format!("{n} numbers; must be {n_joints} from -{MAX_JOINT_OFFSET} to {MAX_JOINT_OFFSET}, or none");
     Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
 }
 
 /// Brings the motors into the order of the joints; an arm on CAN buses has one for each, and none besides.
-fn settle_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
+fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     if arm.driver != ArmDriver::Can {
         return Ok(());
     }
     let problem = |reason| ConfigError::Robot { file: file.to_owned(), key: "arm.motor", reason };
-    let place = |name: &String| arm.joints.iter().position(|joint| joint == name);
-    if let Some(lost) = arm.motors.iter().find(|motor| place(&motor.joint).is_none()) {
-        return Err(problem(format!("{:?} is none of the joints {}", lost.joint, arm.joints.join(", "))));
+    let index_of = |name: &String| arm.joints.iter().position(|joint| joint == name);
+    if let Some(unknown_motor) = arm.motors.iter().find(|motor| index_of(&motor.joint).is_none()) {
+        return Err(problem(format!("{:?} is none of the joints {}", unknown_motor.joint, arm.joints.join(", "))));
     }
     if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
         return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
     }
     for (ix, motor) in arm.motors.iter().enumerate() {
-        let is_same = |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.family.clashes(&motor.family);
+        let is_same = |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.family.conflicts_with(&motor.family);
         if let Some(same) = arm.motors[..ix].iter().find(is_same) {
             let interface = &arm.buses[motor.bus_ix].interface;
-            let told = format!("{:?} and {:?} have the same number on {interface:?}", same.joint, motor.joint);
-            return Err(problem(told));
+            let message = format!("{:?} and {:?} have the same number on {interface:?}", same.joint, motor.joint);
+            return Err(problem(message));
         }
     }
     let mut motors = std::mem::take(&mut arm.motors);
-    motors.sort_by_key(|motor| place(&motor.joint));
+    motors.sort_by_key(|motor| index_of(&motor.joint));
     arm.motors = motors;
     Ok(())
 }
@@ -205,16 +205,16 @@ fn base(mut keys: Section<'_>) -> Base {
     let tag_family = keys.choice("tag_family", &TAG_FAMILIES).unwrap_or(Family::Tag36h11);
     let tags = keys.named_sections("tag").into_iter().filter_map(|(id, keys)| tag(&id, tag_family, keys));
     let tags: BTreeMap<_, _> = tags.collect();
-    let mut flaws = keys.section("sim");
-    let (drift_m, drift_rad) = (flaws.number("drift_m", 0.0..=10.0), flaws.number("drift_rad", 0.0..=1.0));
-    flaws.end();
+    let mut sim_keys = keys.section("sim");
+    let (drift_m, drift_rad) = (sim_keys.number("drift_m", 0.0..=10.0), sim_keys.number("drift_rad", 0.0..=1.0));
+    sim_keys.end();
     let driver = keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed);
     if driver == BaseDriver::Tags && tags.is_empty() {
         keys.missing("tag", "a table [base.tag.ID] for each tag: its size_m and world_from_tag");
     }
     let base = Base {
         driver,
-        address: keys.address("address").unwrap_or(USUAL_BASE_ADDRESS),
+        address: keys.address("address").unwrap_or(DEFAULT_BASE_ADDRESS),
         world_from_base: pose(&mut keys, "world_from_base").unwrap_or_else(Transform::identity),
         rate_hz: keys.number("rate_hz", 1.0..=1000.0).unwrap_or(100.0),
         realign: keys.flag("realign").unwrap_or(true),
@@ -230,17 +230,17 @@ fn base(mut keys: Section<'_>) -> Base {
 }
 
 /// A tag with its number; `None` where something is wrong, which has been told.
-fn tag(id: &str, family: Family, mut keys: Section<'_>) -> Option<(u32, PlacedTag)> {
+fn tag(id: &str, family: Family, mut keys: Section<'_>) -> Option<(u32, TagPlacement)> {
     let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
     let allowed = format!("the number of a tag in its family, 0 to {}, as the table's name", family.n_tags() - 1);
-    let id = number.or_else(|| keys.wrong("id", &Value::from(id), &allowed));
+    let id = number.or_else(|| keys.invalid("id", &Value::from(id), &allowed));
     let size_m = keys.number("size_m", 0.001..=10.0);
     if size_m.is_none() {
         keys.missing("size_m", "the side of the tag's border, where black meets white, m");
     }
     let world_from_tag = pose(&mut keys, "world_from_tag").unwrap_or_else(Transform::identity);
     keys.end();
-    Some((id?, PlacedTag { size_m: size_m?, world_from_tag }))
+    Some((id?, TagPlacement { size_m: size_m?, world_from_tag }))
 }
 
 fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
@@ -250,12 +250,14 @@ fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
         keys.missing("driver", "udp or sim");
     }
     let mut sim = keys.section("sim");
-    let lowest_rad = sim.number("lowest_rad", -1.57..=1.57).unwrap_or(-0.2618);
+    let min_elevation_rad = sim.number("min_elevation_rad", -1.57..=1.57).unwrap_or(-0.2618);
     let scanner_sim = ScannerSim {
-        rings: sim.whole("rings", 1..=256).map_or(16, small),
-        columns: sim.whole("columns", 4..=4096).map_or(900, small),
-        lowest_rad,
-        highest_rad: sim.number("highest_rad", lowest_rad..=1.57).unwrap_or(lowest_rad.max(0.2618)),
+        rings: sim.whole("rings", 1..=256).map_or(16, to_u32),
+        columns: sim.whole("columns", 4..=4096).map_or(900, to_u32),
+        min_elevation_rad,
+        max_elevation_rad: sim
+            .number("max_elevation_rad", min_elevation_rad..=1.57)
+            .unwrap_or(min_elevation_rad.max(0.2618)),
         noise_sigma_m: sim.number("noise_sigma_m", 0.0..=1.0).unwrap_or(0.02),
         dropped_frac: sim.number("dropped_frac", 0.0..=0.9).unwrap_or(0.01),
     };
@@ -264,7 +266,7 @@ fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
     let scanner = Scanner {
         name: name.into(),
         driver: driver.unwrap_or(ScannerDriver::Sim),
-        address: keys.address("address").unwrap_or(USUAL_SCANNER_ADDRESS),
+        address: keys.address("address").unwrap_or(DEFAULT_SCANNER_ADDRESS),
         rate_hz: keys.number("rate_hz", 0.1..=50.0).unwrap_or(10.0),
         base_from_scanner: pose(&mut keys, "base_from_scanner").unwrap_or_else(Transform::identity),
         min_m,
@@ -279,7 +281,7 @@ fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
 fn check_name(name: &str, keys: &Section<'_>) {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if name.is_empty() || !name.chars().all(plain) {
-        keys.wrong::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
+        keys.invalid::<()>("name", &Value::String(name.to_owned()), "letters, digits, _ and -");
     }
 }
 
@@ -312,14 +314,14 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     let rectified = keys.flag("rectified").unwrap_or(false);
     let intrinsics = intrinsics(&mut keys, size_px.unwrap_or([1, 1]), rectified);
     // RealSense cameras know their own.
-    let mut unknown = Unknown { intrinsics: intrinsics.is_none(), ..Unknown::default() };
+    let mut unknown = UnknownCalibration { intrinsics: intrinsics.is_none(), ..UnknownCalibration::default() };
     if unknown.intrinsics && driver != Some(CameraDriver::Realsense) {
         keys.missing("intrinsics", "focal_px, principal_px and, if the lens distorts, lens and distortion");
     }
-    let intrinsics = intrinsics.unwrap_or(Intrinsics { size_px: size_px.unwrap_or([1, 1]), ..UNKNOWN_LENS });
+    let intrinsics = intrinsics.unwrap_or(Intrinsics { size_px: size_px.unwrap_or([1, 1]), ..PLACEHOLDER_INTRINSICS });
     let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
     if driver != Some(CameraDriver::Realsense) {
-        unknown = Unknown::default();
+        unknown = UnknownCalibration::default();
     }
     let period_micros = 1e6 / rate_hz.unwrap_or(1.0);
     let camera = Camera {
@@ -329,7 +331,7 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
         rate_hz: rate_hz.unwrap_or(1.0),
         exposure_micros: keys.number("exposure_micros", 0.0..=period_micros),
         readout_micros: keys.number("readout_micros", 0.0..=period_micros),
-        stamp_to_mid_exposure: keys.optional_section("stamp_to_mid_exposure_millis").map(measured),
+        stamp_to_mid_exposure: keys.optional_section("stamp_to_mid_exposure_millis").map(time_offset),
         parent: parent.unwrap_or(Parent::Flange),
         parent_from_camera: pose(&mut keys, "parent_from_camera").unwrap_or_else(Transform::identity),
         depth,
@@ -343,13 +345,13 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
 }
 
 /// Stands in until the missing key is told, or the camera tells its own.
-const UNKNOWN_LENS: Intrinsics =
+const PLACEHOLDER_INTRINSICS: Intrinsics =
     Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
 
 fn size_px(keys: &mut Section<'_>) -> Option<[u32; 2]> {
     let [width, height] = keys.numbers::<2>("size_px", 8.0..=16384.0)?;
     if width.fract() != 0.0 || height.fract() != 0.0 {
-        return keys.wrong("size_px", &Value::from(vec![width, height]), "whole numbers");
+        return keys.invalid("size_px", &Value::from(vec![width, height]), "whole numbers");
     }
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole numbers up to 16384")]
     Some([width as u32, height as u32])
@@ -363,7 +365,7 @@ fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Opt
     if focal_px.is_none() {
         keys.missing("focal_px", "focal length along x and y in pixels");
     }
-    let principal_px = keys.numbers::<2>("principal_px", -FAR..=3.0 * FAR);
+    let principal_px = keys.numbers::<2>("principal_px", -MAX_COORDINATE..=3.0 * MAX_COORDINATE);
     if principal_px.is_none() {
         keys.missing("principal_px", "principal point in pixels; the centre of the first pixel is (0.5, 0.5)");
     }
@@ -372,14 +374,14 @@ fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Opt
     let lens = match (name, &distortion[..]) {
         // Drivers print a pinhole as five zeros.
         ("pinhole", coefficients) if coefficients.iter().all(|k| *k == 0.0) => Some(Lens::Pinhole),
-        ("pinhole", _) => keys.wrong(
+        ("pinhole", _) => keys.invalid(
             "distortion",
             &Value::from(distortion.clone()),
             "none with lens = \"pinhole\"; set lens to brown_conrady or kannala_brandt",
         ),
         ("brown_conrady", [k1, k2, p1, p2, k3]) => Some(Lens::BrownConrady([*k1, *k2, *p1, *p2, *k3])),
         ("kannala_brandt", [k1, k2, k3, k4]) => Some(Lens::KannalaBrandt([*k1, *k2, *k3, *k4])),
-        _ => keys.wrong(
+        _ => keys.invalid(
             "distortion",
             &Value::from(distortion.clone()),
             "5 (k1, k2, p1, p2, k3) for brown_conrady, 4 (k1, k2, k3, k4) for kannala_brandt",
@@ -389,21 +391,21 @@ fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Opt
     Some(Intrinsics { size_px, focal_px: focal_px?, principal_px: principal_px?, lens: lens?, rectified })
 }
 
-fn measured(mut keys: Section<'_>) -> Measured {
+fn time_offset(mut keys: Section<'_>) -> TimeOffset {
     let value_millis = keys.number("value", -1000.0..=1000.0);
     if value_millis.is_none() {
         keys.missing("value", "milliseconds from the stamp to mid-exposure");
     }
-    let measured = Measured {
+    let time_offset = TimeOffset {
         value_millis: value_millis.unwrap_or_default(),
         sigma_millis: keys.number("sigma", 0.0..=1000.0).unwrap_or(0.0),
         source: keys.text("source").unwrap_or_default(),
     };
     keys.end();
-    measured
+    time_offset
 }
 
-fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut Unknown) -> Depth {
+fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibration) -> Depth {
     let size_px = size_px(&mut keys).unwrap_or(color.size_px);
     let rectified = keys.flag("rectified").unwrap_or(color.rectified);
     // Depth of the size of the colour is registered to it; of another size it is taken to show the same field of view.
@@ -418,7 +420,7 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut Unknown) -> De
     let min_m = keys.number("min_m", 0.0..=100.0).unwrap_or(0.1);
     let depth = Depth {
         device: keys.text("device").unwrap_or_default(),
-        metres_per_count: keys.number("metres_per_count", 1e-6..=0.1),
+        meters_per_count: keys.number("meters_per_count", 1e-6..=0.1),
         intrinsics,
         camera_from_depth: camera_from_depth.unwrap_or_else(Transform::identity),
         factor: keys.number("factor", 0.5..=2.0).unwrap_or(1.0),
@@ -430,21 +432,21 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut Unknown) -> De
 }
 
 /// Counts of controls are 32 bits wide; what a camera takes of them it tells when it is opened.
-const ANY: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
+const CONTROL_RANGE: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
 
-fn counts(number: i64) -> i32 {
+fn to_i32(number: i64) -> i32 {
     i32::try_from(number).expect("the range was checked")
 }
 
-fn realsense(mut keys: Section<'_>, unknown: Unknown) -> Realsense {
+fn realsense(mut keys: Section<'_>, unknown: UnknownCalibration) -> Realsense {
     let realsense = Realsense {
         file: keys.text("file").unwrap_or_default().into(),
         pace: keys.choice("pace", &PACES).unwrap_or_default(),
         clock_offset_nanos: keys.integer("clock_offset_nanos", -i64::MAX..=i64::MAX).unwrap_or(0),
         stream: keys.choice("stream", &STREAMS).unwrap_or_default(),
-        gain: keys.integer("gain", ANY).map(counts),
-        brightness: keys.integer("brightness", ANY).map(counts),
-        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(counts),
+        gain: keys.integer("gain", CONTROL_RANGE).map(to_i32),
+        brightness: keys.integer("brightness", CONTROL_RANGE).map(to_i32),
+        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(to_i32),
         preset: keys.text("preset"),
         laser_power: keys.number("laser_power", 0.0..=1000.0),
         filters: keys.choices_or_none("filters", &FILTERS).unwrap_or_default(),
@@ -457,10 +459,10 @@ fn realsense(mut keys: Section<'_>, unknown: Unknown) -> Realsense {
 
 fn v4l2(mut keys: Section<'_>) -> V4l2 {
     let v4l2 = V4l2 {
-        format: keys.choice("format", &V4l2Format::OF_COLOR),
-        gain: keys.integer("gain", ANY).map(counts),
-        brightness: keys.integer("brightness", ANY).map(counts),
-        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(counts),
+        format: keys.choice("format", &V4l2Format::COLOR_FORMATS),
+        gain: keys.integer("gain", CONTROL_RANGE).map(to_i32),
+        brightness: keys.integer("brightness", CONTROL_RANGE).map(to_i32),
+        white_balance_kelvin: keys.integer("white_balance_kelvin", 1000..=20_000).map(to_i32),
         delivery: keys.choice("delivery", &DELIVERIES).unwrap_or(Delivery::Every),
         reconnect_secs: keys.number("reconnect_secs", 0.0..=86_400.0).unwrap_or(30.0),
     };
@@ -472,13 +474,13 @@ fn camera_sim(mut keys: Section<'_>) -> CameraSim {
     let sim = CameraSim {
         noise_sigma: keys.number("noise_sigma", 0.0..=100.0).unwrap_or(2.0),
         shot_frac: keys.number("shot_frac", 0.0..=1.0).unwrap_or(0.7),
-        blur_samples: keys.whole("blur_samples", 1..=64).map_or(1, small),
+        blur_samples: keys.whole("blur_samples", 1..=64).map_or(1, to_u32),
         latency_millis: keys.number("latency_millis", 0.0..=10_000.0).unwrap_or(20.0),
         dropped_frac: keys.number("dropped_frac", 0.0..=0.9).unwrap_or(0.0),
-        supersample: keys.whole("supersample", 1..=4).map_or(1, small),
+        supersample: keys.whole("supersample", 1..=4).map_or(1, to_u32),
         depth_noise_sigma_m: keys.number("depth_noise_sigma_m", 0.0..=1.0).unwrap_or(0.0015),
         depth_hole_frac: keys.number("depth_hole_frac", 0.0..=0.9).unwrap_or(0.02),
-        metres_per_count: keys.number("metres_per_count", 1e-6..=0.1).unwrap_or(1e-4),
+        meters_per_count: keys.number("meters_per_count", 1e-6..=0.1).unwrap_or(1e-4),
     };
     keys.end();
     sim
@@ -486,13 +488,13 @@ fn camera_sim(mut keys: Section<'_>) -> CameraSim {
 
 fn join(mut keys: Section<'_>) -> JoinConfig {
     let join = JoinConfig {
-        start_keyframes: keys.whole("start_keyframes", 1..=100_000).map_or(5, count),
-        max_keyframes: keys.whole("max_keyframes", 8..=1_000_000).map_or(400, count),
+        start_keyframes: keys.whole("start_keyframes", 1..=100_000).map_or(5, to_usize),
+        max_keyframes: keys.whole("max_keyframes", 8..=1_000_000).map_or(400, to_usize),
         max_bytes: keys.whole("max_bytes", 1_000_000..=1 << 50).unwrap_or(4_000_000_000),
         min_translation_m: keys.number("min_translation_m", 1e-6..=100.0).unwrap_or(0.02),
         min_rotation_rad: keys.number("min_rotation_rad", 1e-6..=3.2).unwrap_or(0.05),
         fixed_interval_millis: keys.number("fixed_interval_millis", 0.0..=1e9).unwrap_or(1000.0),
-        fixed_keyframes: keys.whole("fixed_keyframes", 1..=1_000_000).map_or(16, count),
+        fixed_keyframes: keys.whole("fixed_keyframes", 1..=1_000_000).map_or(16, to_usize),
         min_sharpness_frac: keys.number("min_sharpness_frac", 0.0..=1.0).unwrap_or(0.35),
         max_blur_px: keys.number("max_blur_px", 0.0..=1000.0).unwrap_or(1.5),
         max_shear_px: keys.number("max_shear_px", 0.0..=1000.0).unwrap_or(40.0),
@@ -502,7 +504,7 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
         default_depth_m: keys.number("default_depth_m", 0.01..=1000.0).unwrap_or(0.5),
         max_gap_millis: keys.number("max_gap_millis", 0.1..=10_000.0).unwrap_or(50.0),
         max_wait_millis: keys.number("max_wait_millis", 1.0..=60_000.0).unwrap_or(500.0),
-        max_range_scans: keys.whole("max_range_scans", 0..=1_000_000).map_or(200, count),
+        max_range_scans: keys.whole("max_range_scans", 0..=1_000_000).map_or(200, to_usize),
     };
     keys.end();
     join
@@ -511,12 +513,12 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
         methods: keys
-            .choices("method", &Kind::ALL.map(|kind| (kind.name(), kind)))
-            .unwrap_or_else(|| vec![Kind::Splat]),
-        max_splats: keys.whole("max_splats", MAX_SPLATS),
-        max_bytes: keys.whole("max_bytes", MAX_BYTES),
-        seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),
-        sh_degree: keys.whole("sh_degree", 0..=3).map_or(3, small),
+            .choices("method", &ModelKind::ALL.map(|kind| (kind.name(), kind)))
+            .unwrap_or_else(|| vec![ModelKind::Splat]),
+        max_splats: keys.whole("max_splats", MAX_SPLATS_RANGE),
+        max_bytes: keys.whole("max_bytes", MAX_BYTES_RANGE),
+        seed: keys.whole("seed", SEED_RANGE).unwrap_or(DEFAULT_SEED),
+        sh_degree: keys.whole("sh_degree", 0..=3).map_or(3, to_u32),
         scale: keys.number("scale", 0.05..=1.0).unwrap_or(1.0),
     };
     keys.end();
@@ -526,7 +528,7 @@ fn train(mut keys: Section<'_>) -> Train {
 fn sim(mut keys: Section<'_>) -> Sim {
     let sim = Sim {
         scene: keys.text("scene").unwrap_or_else(|| "static-arm".to_owned()),
-        seed: keys.whole("seed", SEED).unwrap_or(USUAL_SEED),
+        seed: keys.whole("seed", SEED_RANGE).unwrap_or(DEFAULT_SEED),
         ideal: keys.flag("ideal").unwrap_or(false),
         lockstep: keys.flag("lockstep").unwrap_or(false),
         speed: keys.number("speed", 0.01..=2.0).unwrap_or(1.0),
@@ -543,25 +545,25 @@ fn sim(mut keys: Section<'_>) -> Sim {
 
 fn pose(keys: &mut Section<'_>, key: &'static str) -> Option<Transform> {
     let mut keys = keys.optional_section(key)?;
-    let [x, y, z] = keys.numbers::<3>("xyz_m", -FAR..=FAR).unwrap_or_default();
+    let [x, y, z] = keys.numbers::<3>("xyz_m", -MAX_COORDINATE..=MAX_COORDINATE).unwrap_or_default();
     let [i, j, k, w] = keys.numbers::<4>("quat_xyzw", -1.001..=1.001).unwrap_or([0.0, 0.0, 0.0, 1.0]);
     let quaternion = Quaternion::new(w, i, j, k);
     let norm = quaternion.norm();
     if (norm - 1.0).abs() > 1e-3 {
-        keys.wrong::<()>("quat_xyzw", &Value::from(vec![i, j, k, w]), "numbers whose squares sum to 1");
+        keys.invalid::<()>("quat_xyzw", &Value::from(vec![i, j, k, w]), "numbers whose squares sum to 1");
     }
     keys.end();
-    let rotation = match (norm - 1.0).abs() < UNIT_CLOSE {
+    let rotation = match (norm - 1.0).abs() < UNIT_NORM_TOLERANCE {
         true => UnitQuaternion::new_unchecked(quaternion),
         false => UnitQuaternion::new_normalize(quaternion),
     };
     Some(Transform::from_parts(Translation3::new(x, y, z), rotation))
 }
 
-fn small(number: u64) -> u32 {
+fn to_u32(number: u64) -> u32 {
     u32::try_from(number).expect("the range was checked")
 }
 
-fn count(number: u64) -> usize {
+fn to_usize(number: u64) -> usize {
     usize::try_from(number).expect("the range was checked")
 }

@@ -2,7 +2,7 @@
 //!
 //! Problems are collected, so that a misspelt key is told as such and not as a missing one.
 
-use super::error::{ConfigError, Place};
+use super::error::{ConfigError, SourceLocation};
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -12,17 +12,17 @@ use toml::{Table, Value};
 
 /// What is known about the rig file while it is read.
 #[derive(Debug)]
-pub(super) struct Reading {
+pub(super) struct ParseContext {
     file: String,
     /// Line of every key in the file, by dotted path.
     lines: BTreeMap<String, usize>,
     flags: BTreeSet<String>,
     problems: RefCell<Vec<ConfigError>>,
     /// Every key asked for, by dotted path with `NAME` for a camera's name.
-    asked: RefCell<BTreeSet<String>>,
+    accessed: RefCell<BTreeSet<String>>,
 }
 
-impl Reading {
+impl ParseContext {
     /// Notes the lines of all keys; fails when the text is not TOML.
     pub(super) fn new(file: &str, text: &str, flags: BTreeSet<String>) -> Result<Self, ConfigError> {
         let mut lines = BTreeMap::new();
@@ -32,7 +32,7 @@ impl Reading {
             message: e.message().to_owned(),
         })?;
         note_lines(text, table.get_ref(), "", &mut lines);
-        Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), asked: RefCell::default() })
+        Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
     }
 
     /// The problem to tell, if there is any: unknown keys first, for they explain missing ones.
@@ -44,27 +44,27 @@ impl Reading {
 
     /// Every key asked for so far.
     #[cfg(test)]
-    pub(super) fn asked(&self) -> BTreeSet<String> {
-        self.asked.borrow().clone()
+    pub(super) fn accessed(&self) -> BTreeSet<String> {
+        self.accessed.borrow().clone()
     }
 
-    fn tell(&self, problem: ConfigError) {
+    fn report(&self, problem: ConfigError) {
         self.problems.borrow_mut().push(problem);
     }
 
-    fn place(&self, key: &str) -> Place {
+    fn location(&self, key: &str) -> SourceLocation {
         // A flag may replace a whole table, and a key inside an inline table is where that table is.
         let mut path = key;
         loop {
             if self.flags.contains(path) {
-                return Place::Flag;
+                return SourceLocation::Flag;
             }
             if let Some(line) = self.lines.get(path) {
-                return Place::Line { file: self.file.clone(), line: *line };
+                return SourceLocation::Line { file: self.file.clone(), line: *line };
             }
             match path.rsplit_once('.') {
                 Some((parent, _)) => path = parent,
-                None => return Place::Line { file: self.file.clone(), line: 1 },
+                None => return SourceLocation::Line { file: self.file.clone(), line: 1 },
             }
         }
     }
@@ -91,7 +91,7 @@ fn join(path: &str, key: &str) -> String {
 /// One table of the rig file while its keys are read.
 #[derive(Debug)]
 pub(super) struct Section<'a> {
-    reading: &'a Reading,
+    context: &'a ParseContext,
     /// Dotted path, as in the file and as in the documentation.
     path: String,
     documented_path: String,
@@ -101,8 +101,8 @@ pub(super) struct Section<'a> {
 
 impl<'a> Section<'a> {
     /// The whole file.
-    pub(super) fn root(reading: &'a Reading, table: Table) -> Self {
-        Self { reading, path: String::new(), documented_path: String::new(), table, known: Vec::new() }
+    pub(super) fn root(context: &'a ParseContext, table: Table) -> Self {
+        Self { context, path: String::new(), documented_path: String::new(), table, known: Vec::new() }
     }
 
     /// Ends the section: keys that nobody asked for are unknown.
@@ -112,8 +112,8 @@ impl<'a> Section<'a> {
             let nearest = self.known.iter().max_by(|a, b| close(a).total_cmp(&close(b)));
             let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > 0.7);
             let path = join(&self.path, key);
-            self.reading.tell(ConfigError::UnknownKey {
-                at: self.reading.place(&path),
+            self.context.report(ConfigError::UnknownKey {
+                at: self.context.location(&path),
                 key: path,
                 nearest: nearest.map(|known| join(&self.path, known)),
             });
@@ -130,7 +130,7 @@ impl<'a> Section<'a> {
         self.known.push(key);
         match self.table.remove(key)? {
             Value::Table(table) => Some(self.inner(key, key, table)),
-            other => self.wrong(key, &other, "a table"),
+            other => self.invalid(key, &other, "a table"),
         }
     }
 
@@ -141,7 +141,7 @@ impl<'a> Section<'a> {
         for (name, value) in std::mem::take(&mut parent.table) {
             match value {
                 Value::Table(table) => sections.push((name.clone(), parent.inner(&name, "NAME", table))),
-                other => parent.wrong(&name, &other, "a table").unwrap_or_default(),
+                other => parent.invalid(&name, &other, "a table").unwrap_or_default(),
             }
         }
         sections
@@ -149,7 +149,7 @@ impl<'a> Section<'a> {
 
     fn inner(&self, key: &str, documented: &str, table: Table) -> Self {
         Section {
-            reading: self.reading,
+            context: self.context,
             path: join(&self.path, key),
             documented_path: join(&self.documented_path, documented),
             table,
@@ -162,7 +162,7 @@ impl<'a> Section<'a> {
         let value = self.take(key)?;
         match as_number(&value).filter(|number| range.contains(number)) {
             Some(number) => Some(number),
-            None => self.wrong(key, &value, &format!("{} to {}", range.start(), range.end())),
+            None => self.invalid(key, &value, &format!("{} to {}", range.start(), range.end())),
         }
     }
 
@@ -171,7 +171,7 @@ impl<'a> Section<'a> {
         let value = self.take(key)?;
         match value.as_integer().and_then(|number| u64::try_from(number).ok()).filter(|number| range.contains(number)) {
             Some(number) => Some(number),
-            None => self.wrong(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
+            None => self.invalid(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
         }
     }
 
@@ -180,21 +180,21 @@ impl<'a> Section<'a> {
         let value = self.take(key)?;
         match value.as_integer().filter(|number| range.contains(number)) {
             Some(number) => Some(number),
-            None => self.wrong(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
+            None => self.invalid(key, &value, &format!("whole numbers from {} to {}", range.start(), range.end())),
         }
     }
 
     /// `true` or `false`, if the key is there.
     pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
         let value = self.take(key)?;
-        value.as_bool().or_else(|| self.wrong(key, &value, "true or false"))
+        value.as_bool().or_else(|| self.invalid(key, &value, "true or false"))
     }
 
     /// Text, if the key is there.
     pub(super) fn text(&mut self, key: &'static str) -> Option<String> {
         match self.take(key)? {
             Value::String(text) => Some(text),
-            other => self.wrong(key, &other, "text in quotes"),
+            other => self.invalid(key, &other, "text in quotes"),
         }
     }
 
@@ -202,7 +202,7 @@ impl<'a> Section<'a> {
     pub(super) fn address(&mut self, key: &'static str) -> Option<SocketAddr> {
         let text = self.text(key)?;
         let allowed = "an IP address and a port in quotes, like \"127.0.0.1:7010\"";
-        text.parse().ok().or_else(|| self.wrong(key, &Value::String(text), allowed))
+        text.parse().ok().or_else(|| self.invalid(key, &Value::String(text), allowed))
     }
 
     /// A list of texts, if the key is there.
@@ -210,7 +210,7 @@ impl<'a> Section<'a> {
         let value = self.take(key)?;
         let texts =
             value.as_array().and_then(|list| list.iter().map(|text| text.as_str().map(str::to_owned)).collect());
-        texts.or_else(|| self.wrong(key, &value, "a list of texts in quotes"))
+        texts.or_else(|| self.invalid(key, &value, "a list of texts in quotes"))
     }
 
     /// Exactly `N` numbers within a range, if the key is there.
@@ -225,7 +225,7 @@ impl<'a> Section<'a> {
             .and_then(|list| list.iter().map(|item| as_number(item).filter(|n| range.contains(n))).collect());
         match numbers.and_then(|numbers| <[f64; N]>::try_from(numbers).ok()) {
             Some(numbers) => Some(numbers),
-            None => self.wrong(key, &value, &format!("{N} numbers from {} to {}", range.start(), range.end())),
+            None => self.invalid(key, &value, &format!("{N} numbers from {} to {}", range.start(), range.end())),
         }
     }
 
@@ -233,7 +233,7 @@ impl<'a> Section<'a> {
     pub(super) fn number_list(&mut self, key: &'static str) -> Option<Vec<f64>> {
         let value = self.take(key)?;
         let numbers = value.as_array().and_then(|list| list.iter().map(as_number).collect());
-        numbers.or_else(|| self.wrong(key, &value, "a list of numbers"))
+        numbers.or_else(|| self.invalid(key, &value, "a list of numbers"))
     }
 
     /// One of a few words, if the key is there.
@@ -242,7 +242,7 @@ impl<'a> Section<'a> {
         let found = choices.iter().find(|(name, _)| value.as_str() == Some(name));
         if found.is_none() {
             let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
-            return self.wrong(key, &value, &names.join(", "));
+            return self.invalid(key, &value, &names.join(", "));
         }
         found.map(|(_, choice)| *choice)
     }
@@ -256,7 +256,7 @@ impl<'a> Section<'a> {
         let is_repeated = (1..found.len()).any(|ix| found[..ix].contains(&found[ix]));
         if found.is_empty() || found.len() < words.len() || is_repeated {
             let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
-            return self.wrong(key, &value, &format!("{}, or a list of different ones", names.join(", ")));
+            return self.invalid(key, &value, &format!("{}, or a list of different ones", names.join(", ")));
         }
         Some(found)
     }
@@ -277,17 +277,17 @@ impl<'a> Section<'a> {
     /// Says that a needed key is absent, unless its value was just found wrong.
     pub(super) fn missing(&self, key: &str, meaning: &'static str) {
         let key = join(&self.path, key);
-        let told = |problem: &ConfigError| matches!(problem, ConfigError::Wrong { key: wrong, .. } if *wrong == key);
-        if !self.reading.problems.borrow().iter().any(told) {
-            self.reading.tell(ConfigError::Missing { file: self.reading.file.clone(), key, meaning });
+        let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: invalid, .. } if *invalid == key);
+        if !self.context.problems.borrow().iter().any(is_reported) {
+            self.context.report(ConfigError::Missing { file: self.context.file.clone(), key, meaning });
         }
     }
 
     /// Says that the value of a key is not allowed.
-    pub(super) fn wrong<T>(&self, key: &str, got: &Value, allowed: &str) -> Option<T> {
+    pub(super) fn invalid<T>(&self, key: &str, got: &Value, allowed: &str) -> Option<T> {
         let key = join(&self.path, key);
-        let at = self.reading.place(&key);
-        self.reading.tell(ConfigError::Wrong {
+        let at = self.context.location(&key);
+        self.context.report(ConfigError::InvalidValue {
             at,
             key,
             got: got.to_string().trim().to_owned(),
@@ -298,7 +298,7 @@ impl<'a> Section<'a> {
 
     fn take(&mut self, key: &'static str) -> Option<Value> {
         self.known.push(key);
-        self.reading.asked.borrow_mut().insert(join(&self.documented_path, key));
+        self.context.accessed.borrow_mut().insert(join(&self.documented_path, key));
         self.table.remove(key)
     }
 }

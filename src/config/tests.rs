@@ -134,8 +134,8 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("range.lidar.max_m", "30", "0.1"),
     ("range.lidar.sim.rings", "32", "0"),
     ("range.lidar.sim.columns", "360", "3"),
-    ("range.lidar.sim.lowest_rad", "-0.4", "-2"),
-    ("range.lidar.sim.highest_rad", "0.4", "2"),
+    ("range.lidar.sim.min_elevation_rad", "-0.4", "-2"),
+    ("range.lidar.sim.max_elevation_rad", "0.4", "2"),
     ("range.lidar.sim.noise_sigma_m", "0.01", "-1"),
     ("range.lidar.sim.dropped_frac", "0.1", "1"),
     ("camera.wrist.driver", "'realsense'", "'webcam'"),
@@ -173,7 +173,7 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("camera.wrist.v4l2.delivery", "'newest'", "'some'"),
     ("camera.wrist.v4l2.reconnect_secs", "5", "-1"),
     ("camera.wrist.depth.device", "'/dev/video9'", "9"),
-    ("camera.wrist.depth.metres_per_count", "0.001", "0"),
+    ("camera.wrist.depth.meters_per_count", "0.001", "0"),
     ("camera.wrist.depth.size_px", "[640, 480]", "[4, 4]"),
     ("camera.wrist.depth.intrinsics.focal_px", "[301, 300]", "[300]"),
     ("camera.wrist.depth.intrinsics.principal_px", "[161, 120]", "160"),
@@ -193,7 +193,7 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("camera.wrist.sim.supersample", "2", "2.5"),
     ("camera.wrist.sim.depth_noise_sigma_m", "0.01", "2"),
     ("camera.wrist.sim.depth_hole_frac", "0.1", "1"),
-    ("camera.wrist.sim.metres_per_count", "0.001", "0"),
+    ("camera.wrist.sim.meters_per_count", "0.001", "0"),
     ("join.start_keyframes", "8", "0"),
     ("join.max_keyframes", "50", "7"),
     ("join.max_bytes", "50_000_000", "-5"),
@@ -241,27 +241,27 @@ const KEYS: [(&str, &str, &str); 163] = [
 ];
 
 #[test]
-fn every_key_takes_effect_and_refuses_what_is_not_allowed() {
+fn every_key_takes_effect_and_rejects_invalid_values() {
     let rig = parse(RIG, &[]).expect("a good rig file");
-    let mut wrong = Vec::new();
+    let mut invalid = Vec::new();
     for (key, good, bad) in KEYS {
         match with(key, good) {
             // The path of the robot's description is read, not kept; another family needs other keys too.
             Ok(changed) if changed == rig && !["arm.urdf", "arm.motor.first.family"].contains(&key) => {
-                wrong.push(format!("{key} = {good} changes nothing"))
+                invalid.push(format!("{key} = {good} changes nothing"))
             }
             Ok(_) => {}
-            Err(e) => wrong.push(format!("{key} = {good} is refused: {e}")),
+            Err(e) => invalid.push(format!("{key} = {good} is refused: {e}")),
         }
         match with(key, bad) {
-            Ok(_) => wrong.push(format!("{key} = {bad} is accepted")),
+            Ok(_) => invalid.push(format!("{key} = {bad} is accepted")),
             Err(e) if !names(&e.to_string(), key) => {
-                wrong.push(format!("{key} = {bad}: the message does not name it: {e}"))
+                invalid.push(format!("{key} = {bad}: the message does not name it: {e}"))
             }
             Err(_) => {}
         }
     }
-    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(invalid.is_empty(), "{}", invalid.join("\n"));
 }
 
 /// Whether a message names the key; links are told by the key that asked for them.
@@ -271,7 +271,7 @@ fn names(message: &str, key: &str) -> bool {
 }
 
 #[test]
-fn the_settled_file_gives_the_same_rig() {
+fn resolved_file_gives_the_same_rig() {
     for (key, good, _) in KEYS {
         let rig = with(key, good).expect("a good value");
         let again = parse(&rig.to_toml(), &[]).unwrap_or_else(|e| panic!("{key}: {e}\n{}", rig.to_toml()));
@@ -281,12 +281,12 @@ fn the_settled_file_gives_the_same_rig() {
 }
 
 #[test]
-fn the_documentation_lists_exactly_the_keys_there_are() {
+fn documentation_lists_exactly_the_existing_keys() {
     let page = include_str!("../../docs/reference/rig.md");
     let documented: BTreeMap<String, &str> =
         page.lines().filter_map(|line| Some((line.strip_prefix("| `")?.split_once('`')?.0.to_owned(), line))).collect();
-    let (_, _, reading) = read::keys("rig.toml", &full(), &[]).expect("TOML");
-    let known = reading.asked();
+    let (_, _, context) = read::keys("rig.toml", &full(), &[]).expect("TOML");
+    let known = context.accessed();
     let listed: BTreeSet<String> = documented.keys().cloned().collect();
     assert_eq!(listed.difference(&known).collect::<Vec<_>>(), Vec::<&String>::new(), "documented, but not read");
     assert_eq!(known.difference(&listed).collect::<Vec<_>>(), Vec::<&String>::new(), "read, but not documented");
@@ -315,15 +315,15 @@ fn full() -> String {
 }
 
 #[test]
-fn the_defaults_of_the_documentation_are_the_defaults() {
+fn documented_defaults_match_the_code() {
     let page = include_str!("../../docs/reference/rig.md");
     let rig = parse(RIG, &[]).expect("a good rig file");
-    let settled: toml::Table = toml::from_str(&rig.to_toml()).expect("TOML");
+    let resolved: toml::Table = toml::from_str(&rig.to_toml()).expect("TOML");
     let mut n_checked = 0;
     for line in page.lines().filter(|line| line.starts_with("| `join.") || line.starts_with("| `camera.NAME.sim.")) {
         let cells: Vec<&str> = line.split('|').map(str::trim).collect();
         let key = cells[1].trim_matches('`').replace("NAME", "wrist");
-        let value = key.split('.').fold(&Value::Table(settled.clone()), |table, part| &table[part]).clone();
+        let value = key.split('.').fold(&Value::Table(resolved.clone()), |table, part| &table[part]).clone();
         let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)).expect("a number");
         assert_eq!(cells[3].parse::<f64>().expect("a number in the documentation"), number, "{key}");
         n_checked += 1;
@@ -332,7 +332,7 @@ fn the_defaults_of_the_documentation_are_the_defaults() {
 }
 
 #[test]
-fn an_unknown_key_is_named_with_its_line_and_the_nearest_known_key() {
+fn unknown_key_error_gives_line_and_nearest_key() {
     let cases = [
         ("flange_lnk = \"c\"", "flange_link = \"c\"", 5, "arm.flange_lnk", Some("arm.flange_link")),
         ("rate_herz = 30", "rate_hz = 30", 9, "camera.wrist.rate_herz", Some("camera.wrist.rate_hz")),
@@ -346,21 +346,21 @@ fn an_unknown_key_is_named_with_its_line_and_the_nearest_known_key() {
         ),
         ("[sim]\nzebra = 1", "[sim]", 22, "sim.zebra", None),
     ];
-    for (wrong, right, expected_line, expected_key, expected_nearest) in cases {
-        let error = parse(&RIG.replacen(right, wrong, 1), &[]).expect_err(wrong);
+    for (invalid, right, expected_line, expected_key, expected_nearest) in cases {
+        let error = parse(&RIG.replacen(right, invalid, 1), &[]).expect_err(invalid);
         let message = error.to_string();
         match error {
             ConfigError::UnknownKey { key, nearest, .. } => {
                 assert_eq!((key.as_str(), nearest.as_deref()), (expected_key, expected_nearest), "{message}");
             }
-            other => panic!("{wrong}: {other}"),
+            other => panic!("{invalid}: {other}"),
         }
         assert!(message.starts_with(&format!("rig.toml line {expected_line}: ")), "{message}");
     }
 }
 
 #[test]
-fn missing_keys_and_broken_text_are_told() {
+fn missing_keys_and_syntax_errors_are_reported() {
     for key in ["driver", "urdf", "flange_link", "size_px", "rate_hz", "parent"] {
         let without: String =
             RIG.lines().filter(|line| !line.starts_with(&format!("{key} ="))).map(|line| format!("{line}\n")).collect();
@@ -377,7 +377,7 @@ fn missing_keys_and_broken_text_are_told() {
 }
 
 #[test]
-fn wrong_values_name_their_line_or_the_flag() {
+fn invalid_value_error_names_line_or_flag() {
     let message = parse(&RIG.replace("rate_hz = 30", "rate_hz = 3000"), &[]).expect_err("too fast").to_string();
     assert_eq!(message, "rig.toml line 9: camera.wrist.rate_hz is 3000, allowed: 0.01 to 1000");
     let message = parse(RIG, &[Override::new("train.sh_degree", 9)]).expect_err("no such degree").to_string();
@@ -385,7 +385,7 @@ fn wrong_values_name_their_line_or_the_flag() {
 }
 
 #[test]
-fn the_rig_files_that_come_along_are_good_and_settle() {
+fn bundled_rig_files_are_valid_and_round_trip() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let mut n_rigs = 0;
     for entry in std::fs::read_dir(&folder).expect("the folder rigs") {
@@ -395,19 +395,19 @@ fn the_rig_files_that_come_along_are_good_and_settle() {
         }
         n_rigs += 1;
         let rig = Rig::load(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
-        let settled = tempfile::tempdir().expect("a folder");
-        let again = Rig::load(&rig.write_settled(settled.path()).expect("room on the disk"), &[]);
+        let resolved = tempfile::tempdir().expect("a folder");
+        let again = Rig::load(&rig.write_resolved(resolved.path()).expect("room on the disk"), &[]);
         assert_eq!(again.unwrap_or_else(|e| panic!("{e}")), rig, "{path:?}");
     }
     assert!(n_rigs >= 3, "{n_rigs} rig files");
 }
 
 #[test]
-fn a_pinhole_with_coefficients_is_refused_and_one_with_zeros_is_not() {
+fn pinhole_with_nonzero_coefficients_is_rejected() {
     let pinhole = RIG.replace("brown_conrady", "pinhole");
     assert!(parse(&pinhole, &[]).is_ok());
-    let bent = pinhole.replacen("[0, 0, 0, 0, 0]", "[0.1, 0, 0, 0, 0]", 1);
-    let message = parse(&bent, &[]).expect_err("a bent pinhole").to_string();
+    let distorted = pinhole.replacen("[0, 0, 0, 0, 0]", "[0.1, 0, 0, 0, 0]", 1);
+    let message = parse(&distorted, &[]).expect_err("a bent pinhole").to_string();
     assert!(
         message.contains("camera.wrist.intrinsics.distortion") && message.contains("lens = \"pinhole\""),
         "{message}"
@@ -415,7 +415,7 @@ fn a_pinhole_with_coefficients_is_refused_and_one_with_zeros_is_not() {
 }
 
 #[test]
-fn tags_have_numbers_of_their_family() {
+fn tag_ids_are_limited_by_family() {
     let numbered = |id: u32| parse(&RIG.replace("[base.tag.7]", &format!("[base.tag.{id}]")), &[]);
     assert!(numbered(586).is_ok());
     let refused = numbered(587).expect_err("tag36h11 ends before").to_string();
@@ -423,7 +423,7 @@ fn tags_have_numbers_of_their_family() {
 }
 
 #[test]
-fn an_arm_on_can_buses_has_a_motor_for_each_joint() {
+fn can_arm_needs_one_motor_per_joint() {
     let text = |joints: [&str; 2]| {
         let [first, second] = joints;
         format!(
@@ -450,9 +450,9 @@ fn an_arm_on_can_buses_has_a_motor_for_each_joint() {
         parse(&text.replace("\"can0\"", &format!("{interface:?}")), &[])
     };
     assert!(named("can-first").is_ok());
-    for wrong in ["", "can/0", "can 0", "a_name_of_sixteen"] {
-        let refused = named(wrong).expect_err("no such interface can be").to_string();
-        assert!(refused.contains("up to 15 letters"), "{wrong}: {refused}");
+    for invalid in ["", "can/0", "can 0", "a_name_of_sixteen"] {
+        let refused = named(invalid).expect_err("no such interface can be").to_string();
+        assert!(refused.contains("up to 15 letters"), "{invalid}: {refused}");
     }
     let other = text(["j1", "j2"]).replace("odrive\"", "robstride\"\nmodel = \"ak80-9\"");
     let refused = parse(&other, &[]).expect_err("of another maker").to_string();

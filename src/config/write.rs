@@ -4,9 +4,11 @@ use super::read::{
     ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, FILTERS, PACES, PARENTS, SCANNER_DRIVERS, STREAMS,
     TAG_FAMILIES,
 };
-use super::{Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, Unknown, V4l2};
-use crate::method::Kind;
-use drivers::tags::PlacedTag;
+use super::{
+    Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, UnknownCalibration, V4l2,
+};
+use crate::method::ModelKind;
+use drivers::tags::TagPlacement;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
 
@@ -64,8 +66,8 @@ fn arm(arm: &Arm) -> Table {
 }
 
 fn base(base: &Base) -> Table {
-    let tag = |tag: &PlacedTag| table([("size_m", is(tag.size_m)), ("world_from_tag", pose(&tag.world_from_tag))]);
-    let tags: Table = base.tags.iter().map(|(id, placed)| (id.to_string(), Value::Table(tag(placed)))).collect();
+    let tag = |tag: &TagPlacement| table([("size_m", is(tag.size_m)), ("world_from_tag", pose(&tag.world_from_tag))]);
+    let tags: Table = base.tags.iter().map(|(id, placement)| (id.to_string(), Value::Table(tag(placement)))).collect();
     let sim = table([("drift_m", is(base.drift_m)), ("drift_rad", is(base.drift_rad))]);
     table([
         ("driver", name_of(&BASE_DRIVERS, &base.driver)),
@@ -85,8 +87,8 @@ fn scanner(scanner: &Scanner) -> Table {
     let sim = table([
         ("rings", whole(scanner.sim.rings.into())),
         ("columns", whole(scanner.sim.columns.into())),
-        ("lowest_rad", is(scanner.sim.lowest_rad)),
-        ("highest_rad", is(scanner.sim.highest_rad)),
+        ("min_elevation_rad", is(scanner.sim.min_elevation_rad)),
+        ("max_elevation_rad", is(scanner.sim.max_elevation_rad)),
         ("noise_sigma_m", is(scanner.sim.noise_sigma_m)),
         ("dropped_frac", is(scanner.sim.dropped_frac)),
     ]);
@@ -102,11 +104,11 @@ fn scanner(scanner: &Scanner) -> Table {
 }
 
 fn camera(camera: &Camera) -> Table {
-    let measured = camera.stamp_to_mid_exposure.as_ref().map(|measured| {
+    let time_offset = camera.stamp_to_mid_exposure.as_ref().map(|time_offset| {
         Value::Table(table([
-            ("value", is(measured.value_millis)),
-            ("sigma", is(measured.sigma_millis)),
-            ("source", is(measured.source.as_str())),
+            ("value", is(time_offset.value_millis)),
+            ("sigma", is(time_offset.sigma_millis)),
+            ("source", is(time_offset.source.as_str())),
         ]))
     });
     let unknown = camera.realsense.unknown;
@@ -117,7 +119,7 @@ fn camera(camera: &Camera) -> Table {
         ("rate_hz", is(camera.rate_hz)),
         ("exposure_micros", camera.exposure_micros.map(Value::from)),
         ("readout_micros", camera.readout_micros.map(Value::from)),
-        ("stamp_to_mid_exposure_millis", measured),
+        ("stamp_to_mid_exposure_millis", time_offset),
         ("parent", name_of(&PARENTS, &camera.parent)),
         ("parent_from_camera", pose(&camera.parent_from_camera)),
         ("intrinsics", intrinsics(&camera.intrinsics).filter(|_| !unknown.intrinsics)),
@@ -158,10 +160,10 @@ fn realsense(realsense: &Realsense) -> Table {
 }
 
 /// What only the camera knows is left out.
-fn depth(depth: &Depth, unknown: Unknown) -> Table {
+fn depth(depth: &Depth, unknown: UnknownCalibration) -> Table {
     table([
         ("device", is(depth.device.as_str())),
-        ("metres_per_count", depth.metres_per_count.map(Value::from)),
+        ("meters_per_count", depth.meters_per_count.map(Value::from)),
         ("size_px", size_px(depth.intrinsics.size_px)),
         ("intrinsics", intrinsics(&depth.intrinsics).filter(|_| !unknown.depth_intrinsics)),
         ("rectified", is(depth.intrinsics.rectified)),
@@ -182,7 +184,7 @@ fn camera_sim(sim: &CameraSim) -> Table {
         ("supersample", whole(sim.supersample.into())),
         ("depth_noise_sigma_m", is(sim.depth_noise_sigma_m)),
         ("depth_hole_frac", is(sim.depth_hole_frac)),
-        ("metres_per_count", is(sim.metres_per_count)),
+        ("meters_per_count", is(sim.meters_per_count)),
     ])
 }
 
@@ -220,7 +222,7 @@ fn train(train: &Train) -> Table {
 }
 
 /// The value of `train.method`: a word, or a list of words where there are several.
-pub(crate) fn methods(methods: &[Kind]) -> Value {
+pub(crate) fn methods(methods: &[ModelKind]) -> Value {
     match methods {
         [one] => one.name().into(),
         several => several.iter().map(|kind| kind.name()).collect::<Vec<_>>().into(),

@@ -23,25 +23,25 @@ fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
     folder
 }
 
-fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<Loaded> {
+fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<LoadedDataset> {
     load(&drivers::dataset::read(folder)?, &Holdout::default(), scale_frac, &|_| ())
 }
 
 #[test]
 fn fox_becomes_undistorted_keyframes() {
     let Some(folder) = test_data::folder("fox") else { return };
-    let most_done = AtomicUsize::new(0);
+    let max_done = AtomicUsize::new(0);
     let dataset = drivers::dataset::read(&folder).unwrap();
-    let told = |n_done| _ = most_done.fetch_max(n_done, Ordering::Relaxed);
-    let loaded = load(&dataset, &Holdout::default(), 0.25, &told).unwrap();
-    assert_eq!((loaded.keyframes.len(), most_done.into_inner()), (50, 50));
+    let on_progress = |n_done| _ = max_done.fetch_max(n_done, Ordering::Relaxed);
+    let loaded = load(&dataset, &Holdout::default(), 0.25, &on_progress).unwrap();
+    assert_eq!((loaded.keyframes.len(), max_done.into_inner()), (50, 50));
     assert!(loaded.notes[0].starts_with("17 images"), "{:?}", loaded.notes);
     let of = |split| loaded.keyframes.iter().filter(|keyframe| keyframe.split == split).count();
-    assert_eq!([of(Split::Test), of(Split::Selection), of(Split::Train)], [7, 6, 37]);
+    assert_eq!([of(Split::Test), of(Split::Validation), of(Split::Train)], [7, 6, 37]);
     let first = &loaded.keyframes[0];
     assert_eq!((first.size_px, first.focal_px), ([135, 240], [687.76 / 4.0, 687.245 / 4.0]));
-    let unseen = first.rgba_srgb.chunks_exact(4).filter(|pixel| pixel[3] == 0).count();
-    assert!(unseen < 135 * 240 / 20, "{unseen}");
+    let n_masked = first.rgba_srgb.chunks_exact(4).filter(|pixel| pixel[3] == 0).count();
+    assert!(n_masked < 135 * 240 / 20, "{n_masked}");
 }
 
 #[test]
@@ -54,7 +54,7 @@ fn redkitchen_keeps_its_depth() {
 }
 
 #[test]
-fn a_fisheye_photo_is_undistorted_and_what_it_lacks_is_masked() {
+fn fisheye_photo_is_undistorted_and_masked() {
     let folder = folder_of(3, &json!({ "camera_model": "OPENCV_FISHEYE", "k1": 0.3 }));
     let keyframe = load_at(folder.path(), 1.0).unwrap().keyframes[0].clone();
     let pixel = |x: usize, y: usize| &keyframe.rgba_srgb[4 * (y * 64 + x)..][..4];
@@ -68,7 +68,7 @@ fn a_fisheye_photo_is_undistorted_and_what_it_lacks_is_masked() {
 }
 
 #[test]
-fn scaling_averages_areas_and_masks_what_is_partly_masked() {
+fn scaling_averages_areas_and_propagates_masks() {
     let folder = folder_of(2, &json!({ "mask_path": null }));
     let text = std::fs::read_to_string(folder.path().join("transforms.json")).unwrap();
     let mut document: Value = serde_json::from_str(&text).unwrap();
@@ -88,7 +88,7 @@ fn scaling_averages_areas_and_masks_what_is_partly_masked() {
 }
 
 #[test]
-fn photos_that_break_off_are_left_out_with_their_names() {
+fn truncated_photos_are_skipped_and_named() {
     let folder = folder_of(10, &json!({}));
     let truncate = |name: &str| {
         let path = folder.path().join(name);
@@ -98,7 +98,9 @@ fn photos_that_break_off_are_left_out_with_their_names() {
     truncate("03.png");
     let loaded = load_at(folder.path(), 1.0).unwrap();
     assert_eq!((loaded.keyframes.len(), loaded.names.contains(&"03.png".to_owned())), (9, false));
-    assert!(loaded.losses[0].contains("1 image cannot be used") && loaded.losses[0].contains("03.png"));
+    assert!(
+        loaded.dropped_messages[0].contains("1 image cannot be used") && loaded.dropped_messages[0].contains("03.png")
+    );
     // The others keep the split they had.
     assert_eq!(loaded.keyframes[7].split, Split::Test);
     (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
@@ -107,7 +109,7 @@ fn photos_that_break_off_are_left_out_with_their_names() {
 }
 
 #[test]
-fn broken_depth_is_a_loss_and_the_photo_stays() {
+fn unreadable_depth_is_a_loss_but_photo_is_kept() {
     let folder = folder_of(3, &json!({}));
     let path = folder.path().join("transforms.json");
     let mut document: Value = serde_json::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
@@ -115,6 +117,9 @@ fn broken_depth_is_a_loss_and_the_photo_stays() {
     std::fs::write(&path, document.to_string()).unwrap();
     std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
     let loaded = load_at(folder.path(), 1.0).unwrap();
-    assert_eq!((loaded.keyframes.len(), loaded.losses.len()), (3, 1));
-    assert!(loaded.losses[0].starts_with("1 depth image cannot be used") && loaded.losses[0].contains("depth.png"));
+    assert_eq!((loaded.keyframes.len(), loaded.dropped_messages.len()), (3, 1));
+    assert!(
+        loaded.dropped_messages[0].starts_with("1 depth image cannot be used")
+            && loaded.dropped_messages[0].contains("depth.png")
+    );
 }

@@ -2,8 +2,8 @@
 //!
 //! The tests go from cheap to dear: motion, then predicted blur and shear, then the pixels.
 
-use super::motion::{self, Posed};
-use super::pixels::{PixelFacts, SharpnessMemory};
+use super::motion::{self, CameraPose};
+use super::pixels::{PixelStatistics, SharpnessHistory};
 use super::refusal::Refusal;
 use super::spacing::Spacing;
 use crate::config::{self, JoinConfig};
@@ -19,7 +19,7 @@ pub(super) struct Acceptance {
     /// views again and again. The spacing bounds their number by the space that the camera can reach.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
-    sharpness: SharpnessMemory,
+    sharpness: SharpnessHistory,
 }
 
 impl Acceptance {
@@ -32,7 +32,7 @@ impl Acceptance {
             readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
             accepted: Vec::new(),
             last: None,
-            sharpness: SharpnessMemory::default(),
+            sharpness: SharpnessHistory::default(),
         }
     }
 
@@ -41,7 +41,7 @@ impl Acceptance {
     }
 
     /// Moved since the nearest keyframe? A camera that stands still is asked instead whether enough time has passed.
-    pub(super) fn judge_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Refusal> {
+    pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Refusal> {
         let moved = if self.is_fixed {
             let waited = self.last.is_none_or(|last| stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis);
             waited && self.accepted.len() < self.config.fixed_keyframes
@@ -52,14 +52,14 @@ impl Acceptance {
     }
 
     /// Slow enough for its exposure and readout? `depth_m` is how far away the scene is.
-    pub(super) fn judge_speed(
+    pub(super) fn check_speed(
         &self,
-        posed: &Posed,
+        camera_pose: &CameraPose,
         pinhole: &Intrinsics,
         exposure_secs: Option<f64>,
         depth_m: f64,
     ) -> Result<(), Refusal> {
-        let Some(twist) = &posed.twist else {
+        let Some(twist) = &camera_pose.twist else {
             return if self.readout_secs > 0.0 { Err(Refusal::ShearUnknown) } else { Ok(()) };
         };
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
@@ -74,19 +74,19 @@ impl Acceptance {
     }
 
     /// Well exposed and sharp? `rgb` is `[height, width, 3]`.
-    pub(super) fn judge_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Refusal> {
-        let facts = PixelFacts::of(rgb, size_px);
-        let lit = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&facts.luma_frac);
-        if !lit || facts.clipped_frac > self.config.max_clipped_frac {
+    pub(super) fn check_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Refusal> {
+        let statistics = PixelStatistics::of(rgb, size_px);
+        let is_well_exposed = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&statistics.luma_frac);
+        if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
             return Err(Refusal::Exposure);
         }
-        let relative = self.sharpness.relative(facts.sharpness);
+        let relative = self.sharpness.relative(statistics.sharpness);
         if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Refusal::NotSharp) }
     }
 
     /// Remembers a keyframe of the run that is resumed. Its stamp may be of another clock: the wait of a camera that stands still
     /// begins anew.
-    pub(super) fn accept_earlier(&mut self, pose: &Transform) {
+    pub(super) fn accept_resumed(&mut self, pose: &Transform) {
         self.accepted.push(*pose);
     }
 
@@ -105,7 +105,7 @@ mod tests {
     use std::path::Path;
 
     #[test]
-    fn a_still_camera_of_a_resumed_run_does_not_wait_for_the_clock_of_the_earlier_one() {
+    fn stationary_camera_of_a_resumed_run_ignores_earlier_stamps() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
         let fixed = || {
@@ -114,29 +114,29 @@ mod tests {
         };
         let (mut running, mut resumed, pose) = (fixed(), fixed(), Transform::identity());
         running.accept(Stamp(3_600_000_000_000), &pose);
-        assert_eq!(running.judge_motion(Stamp(0), &pose), Err(Refusal::NotMoved));
-        resumed.accept_earlier(&pose);
-        assert_eq!(resumed.judge_motion(Stamp(0), &pose), Ok(()));
+        assert_eq!(running.check_motion(Stamp(0), &pose), Err(Refusal::NotMoved));
+        resumed.accept_resumed(&pose);
+        assert_eq!(resumed.check_motion(Stamp(0), &pose), Ok(()));
     }
 
     #[test]
-    fn a_velocity_that_is_not_known_counts_only_where_the_shutter_rolls() {
+    fn unknown_velocity_is_rejected_only_for_rolling_shutters() {
         for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Refusal::ShearUnknown))] {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
             let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
             let camera = &rig.cameras[0];
             let acceptance =
                 Acceptance::new(&rig.join, camera, false, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
-            let judge = |twist| {
-                let posed =
-                    Posed { world_from_camera: Transform::identity(), twist, joint_twists: [].into(), base: None };
-                acceptance.judge_speed(&posed, &camera.intrinsics, Some(0.01), 0.5)
+            let check = |twist| {
+                let camera_pose =
+                    CameraPose { world_from_camera: Transform::identity(), twist, joint_twists: [].into(), base: None };
+                acceptance.check_speed(&camera_pose, &camera.intrinsics, Some(0.01), 0.5)
             };
-            assert_eq!(judge(None), expected);
-            assert_eq!(judge(Some(Twist::zero())), Ok(()));
+            assert_eq!(check(None), expected);
+            assert_eq!(check(Some(Twist::zero())), Ok(()));
             let mut broken = Twist::zero();
             broken.linear_m_s.x = f64::NAN;
-            assert_eq!(judge(Some(broken)), Err(Refusal::Blur));
+            assert_eq!(check(Some(broken)), Err(Refusal::Blur));
         }
     }
 }

@@ -1,9 +1,9 @@
 //! From device images to the plain arrays of a keyframe: decoded, undistorted, depth in metres.
 
-use super::motion::Posed;
+use super::motion::CameraPose;
 use crate::config;
+use crate::downscale;
 use crate::exit::BadArgument;
-use crate::shrink;
 use anyhow::Context;
 use drivers::{Image, TruthImage};
 use kinematics::{Intrinsics, Undistortion};
@@ -11,18 +11,18 @@ use std::sync::Arc;
 use trainer::{DepthMap, Truth};
 
 /// How the images of one camera become pinhole images of the size for training; computed once.
-pub(super) struct Lens {
+pub(super) struct Undistorter {
     full: Intrinsics,
     pinhole: Intrinsics,
     undistortion: Option<Undistortion>,
 }
 
-impl Lens {
-    /// `share` shrinks the width and height of the undistorted images.
-    pub(super) fn new(intrinsics: &Intrinsics, share: f64) -> Result<Self, BadArgument> {
+impl Undistorter {
+    /// `scale` shrinks the width and height of the undistorted images.
+    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> Result<Self, BadArgument> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
-        Ok(Self { pinhole: shrink::lens(&full, share)?, full, undistortion })
+        Ok(Self { pinhole: downscale::intrinsics(&full, scale)?, full, undistortion })
     }
 
     /// The pinhole camera of the undistorted images at the size that the device delivers.
@@ -36,14 +36,14 @@ impl Lens {
     }
 
     /// Whether the keyframes' images are smaller than the device's.
-    pub(super) fn shrinks(&self) -> bool {
+    pub(super) fn is_downscaled(&self) -> bool {
         self.pinhole.size_px != self.full.size_px
     }
 
     /// `[height, width, 3]` to `[height, width, 4]`, undistorted and shrunk; alpha tells what was seen.
     pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
         let opaque = || rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]);
-        if !self.shrinks() {
+        if !self.is_downscaled() {
             return match &self.undistortion {
                 Some(undistortion) => Ok(undistortion.apply_rgb(rgb)?.into()),
                 None => Ok(opaque().collect()),
@@ -53,7 +53,7 @@ impl Lens {
             Some(undistortion) => undistortion.apply_rgb(rgb)?,
             None => opaque().collect(),
         };
-        Ok(shrink::rgba(rgba, self.full.size_px, self.pinhole.size_px).into())
+        Ok(downscale::rgba(rgba, self.full.size_px, self.pinhole.size_px).into())
     }
 
     fn depth_m(&self, depth_m: Vec<f32>) -> anyhow::Result<Vec<f32>> {
@@ -65,9 +65,14 @@ impl Lens {
 }
 
 /// Depth of a camera, decoded and undistorted; readings out of the sensor's range count as nothing seen.
-pub(super) fn depth_map(image: &Image, depth: &config::Depth, lens: &Lens, posed: &Posed) -> anyhow::Result<DepthMap> {
+pub(super) fn depth_map(
+    image: &Image,
+    depth: &config::Depth,
+    undistorter: &Undistorter,
+    camera_pose: &CameraPose,
+) -> anyhow::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
-    let mut depth_m = lens.depth_m(image.decode_depth_m()?)?;
+    let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
     #[expect(clippy::cast_possible_truncation, reason = "a range in metres needs no more digits")]
     let (factor, min_m, max_m) = (depth.factor as f32, depth.min_m as f32, depth.max_m as f32);
     for depth_m in &mut depth_m {
@@ -77,11 +82,11 @@ pub(super) fn depth_map(image: &Image, depth: &config::Depth, lens: &Lens, posed
         }
     }
     Ok(DepthMap {
-        size_px: lens.pinhole.size_px,
-        focal_px: lens.pinhole.focal_px,
-        principal_px: lens.pinhole.principal_px,
+        size_px: undistorter.pinhole.size_px,
+        focal_px: undistorter.pinhole.focal_px,
+        principal_px: undistorter.pinhole.principal_px,
         depth_m: depth_m.into(),
-        world_from_camera: posed.world_from_camera * depth.camera_from_depth,
+        world_from_camera: camera_pose.world_from_camera * depth.camera_from_depth,
     })
 }
 
@@ -92,10 +97,10 @@ pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<
 }
 
 /// What a simulator knows about a keyframe, in the same undistorted pixels.
-pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, lens: &Lens) -> anyhow::Result<Truth> {
-    let rgba_srgb = lens.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
+pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> anyhow::Result<Truth> {
+    let rgba_srgb = undistorter.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
     // The ceiling is that of the noise at full size; averaging areas takes away much of it.
-    let psnr_ceiling = if lens.shrinks() { None } else { truth.psnr_ceiling };
+    let psnr_ceiling = if undistorter.is_downscaled() { None } else { truth.psnr_ceiling };
     Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling })
 }
 
@@ -103,13 +108,13 @@ pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, lens: &Lens) ->
 pub(super) fn median_depth_m(map: &DepthMap) -> Option<f64> {
     let width = map.size_px[0] as usize;
     let rows = map.depth_m.chunks(width.max(1)).step_by(8);
-    let mut seen: Vec<f32> =
+    let mut valid_depths: Vec<f32> =
         rows.flat_map(|row| row.iter().step_by(8).copied()).filter(|depth_m| *depth_m > 0.0).collect();
-    if seen.is_empty() {
+    if valid_depths.is_empty() {
         return None;
     }
-    let middle = seen.len() / 2;
-    let (_, median, _) = seen.select_nth_unstable_by(middle, f32::total_cmp);
+    let middle_ix = valid_depths.len() / 2;
+    let (_, median, _) = valid_depths.select_nth_unstable_by(middle_ix, f32::total_cmp);
     Some(f64::from(*median))
 }
 

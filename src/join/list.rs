@@ -1,6 +1,6 @@
 //! Lists of keyframes: one line each with camera, stamp in nanoseconds, and split.
 
-use crate::exit::LackOfEvidence;
+use crate::exit::InsufficientData;
 use anyhow::{Context, bail};
 use kinematics::Stamp;
 use std::collections::{BTreeMap, BTreeSet};
@@ -9,14 +9,14 @@ use std::path::Path;
 use std::sync::Arc;
 use trainer::{Keyframe, Split};
 
-const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Selection, "selection"), (Split::Test, "test")];
+const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "selection"), (Split::Test, "test")];
 
 /// Exactly these keyframes, with these splits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct KeyframeList(BTreeMap<(String, i64), SplitName>);
+pub(crate) struct KeyframeList(BTreeMap<(String, i64), SplitIx>);
 
 /// A split as its place in [`SPLITS`].
-type SplitName = usize;
+type SplitIx = usize;
 
 impl KeyframeList {
     /// Reads a `keyframes.txt`.
@@ -32,25 +32,26 @@ impl KeyframeList {
 
     /// What of the list is not among these cameras and stamps: one sentence, an error when that is all of it.
     ///
-    /// `there` is one image of the data, listed or not.
+    /// `example_image` is one image of the data, listed or not.
     pub(crate) fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,
-        there: Option<(&str, Stamp)>,
-    ) -> Result<Option<String>, LackOfEvidence> {
+        example_image: Option<(&str, Stamp)>,
+    ) -> Result<Option<String>, InsufficientData> {
         let found: BTreeSet<(&str, i64)> = found.map(|(camera, stamp)| (camera, stamp.0)).collect();
-        let mut lost = self.0.keys().filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
-        let Some((camera, stamp)) = lost.next() else { return Ok(None) };
-        let n_lost = 1 + lost.count();
-        if n_lost < self.len() {
+        let mut missing = self.0.keys().filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
+        let Some((camera, stamp)) = missing.next() else { return Ok(None) };
+        let n_missing = 1 + missing.count();
+        if n_missing < self.len() {
             return Ok(Some(format!(
-                "{n_lost} of {} listed keyframes cannot be had from the data, the first is {camera} {stamp}",
+                "{n_missing} of {} listed keyframes cannot be had from the data, the first is {camera} {stamp}",
                 self.len()
             )));
         }
-        let there = there.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
-        Err(LackOfEvidence(format!(
-            "the keyframe list fits nothing in the data: it names {camera} {stamp}, the data has {there}"
+        let example_image =
+            example_image.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
+        Err(InsufficientData(format!(
+            "the keyframe list fits nothing in the data: it names {camera} {stamp}, the data has {example_image}"
         )))
     }
 
@@ -92,8 +93,8 @@ impl KeyframeList {
 
 impl FromIterator<(String, Stamp, Split)> for KeyframeList {
     fn from_iter<T: IntoIterator<Item = (String, Stamp, Split)>>(keyframes: T) -> Self {
-        let place = |split| SPLITS.iter().position(|(known, _)| *known == split).unwrap_or_default();
-        Self(keyframes.into_iter().map(|(camera, stamp, split)| ((camera, stamp.0), place(split))).collect())
+        let index_of = |split| SPLITS.iter().position(|(known, _)| *known == split).unwrap_or_default();
+        Self(keyframes.into_iter().map(|(camera, stamp, split)| ((camera, stamp.0), index_of(split))).collect())
     }
 }
 
@@ -103,12 +104,12 @@ pub(crate) fn split_name(split: Split) -> &'static str {
 }
 
 /// The split of a name in files.
-pub(crate) fn split_named(name: &str) -> Option<Split> {
+pub(crate) fn split_from_name(name: &str) -> Option<Split> {
     SPLITS.iter().find(|(_, known)| *known == name).map(|(split, _)| *split)
 }
 
 /// The text of a `keyframes.txt`.
-pub(crate) fn text_of<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
+pub(crate) fn list_text<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
     let mut text = String::from("# camera stamp_nanos split\n");
     for keyframe in keyframes {
         let split = split_name(keyframe.split);
@@ -122,27 +123,27 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_listed_and_not_there_is_told() {
+    fn missing_listed_keyframes_are_reported() {
         let list = KeyframeList::parse("wrist 17 test\nwrist 18 train\n").expect("a list");
         let check = |found: &[(&'static str, i64)]| {
             let found = found.iter().map(|(camera, nanos)| (*camera, Stamp(*nanos)));
             list.check_found(found, Some(("front", Stamp(5))))
         };
         assert_eq!(check(&[("wrist", 17), ("wrist", 18)]).expect("all"), None);
-        let some = check(&[("wrist", 18)]).expect("one").expect("a loss");
-        assert!(some.starts_with("1 of 2 listed") && some.ends_with("wrist 17"), "{some}");
-        let none = check(&[("wrist", 16)]).expect_err("nothing").to_string();
-        assert!(none.contains("wrist 17") && none.contains("the data has front 5"), "{none}");
+        let partial = check(&[("wrist", 18)]).expect("one").expect("a loss");
+        assert!(partial.starts_with("1 of 2 listed") && partial.ends_with("wrist 17"), "{partial}");
+        let disjoint = check(&[("wrist", 16)]).expect_err("nothing").to_string();
+        assert!(disjoint.contains("wrist 17") && disjoint.contains("the data has front 5"), "{disjoint}");
     }
 
     #[test]
-    fn a_list_is_read_and_mistakes_are_named_with_their_line() {
+    fn list_is_parsed_and_errors_give_the_line() {
         let list = KeyframeList::parse("# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 selection\n")
             .expect("a list");
         assert_eq!(list.len(), 3);
         assert_eq!(list.split_of("wrist", Stamp(17)), Some(Split::Test));
         assert_eq!(list.split_of("wrist", Stamp(-3)), Some(Split::Train));
-        assert_eq!(list.split_of("side", Stamp(17)), Some(Split::Selection));
+        assert_eq!(list.split_of("side", Stamp(17)), Some(Split::Validation));
         assert_eq!(list.split_of("side", Stamp(18)), None);
         for (text, expected) in [
             ("wrist 17\n", "line 1"),

@@ -11,24 +11,24 @@ mod pixels;
 mod ranges;
 mod refusal;
 mod spacing;
-mod standing;
+mod station_detector;
 mod store;
 #[cfg(test)]
 mod tests;
 mod waiting;
 
-pub(crate) use list::{KeyframeList, split_name, split_named, text_of as keyframe_list};
-pub(crate) use motion::{Motion, Posed};
-pub(crate) use refusal::{Counts, Refusal, Use};
+pub(crate) use list::{KeyframeList, list_text as keyframe_list, split_from_name, split_name};
+pub(crate) use motion::{CameraPose, Motion};
+pub(crate) use refusal::{Counts, Refusal, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
-use crate::exit::LackOfEvidence;
+use crate::exit::InsufficientData;
 use accept::Acceptance;
 use anyhow::Context;
-use assemble::Lens;
+use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
 use kinematics::{HistoryError, Stamp, Transform};
-use ranges::Ranges;
+use ranges::RangeScans;
 use spacing::Spacing;
 use std::sync::Arc;
 use store::KeyframeStore;
@@ -40,21 +40,21 @@ pub(crate) struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
     store: KeyframeStore,
-    ranges: Ranges,
+    ranges: RangeScans,
     list: Option<KeyframeList>,
     /// The first image that was asked about the list.
-    first_seen: Option<(Arc<str>, Stamp)>,
+    first_image: Option<(Arc<str>, Stamp)>,
     counts: Counts,
     /// That a joint is where it cannot be was told.
-    told_strange: bool,
+    warned_joint_limits: bool,
     max_wait_secs: f64,
     default_depth_m: f64,
     /// The latest stamp of all samples: the only clock there is.
     newest: Stamp,
     /// The latest stamp among the keyframes of the resumed run.
-    newest_earlier: Option<Stamp>,
+    newest_resumed: Option<Stamp>,
     /// Nanoseconds added to the stamps of new keyframes so that they follow the earlier ones; none before the first keyframe.
-    shift_nanos: Option<i64>,
+    stamp_offset_nanos: Option<i64>,
 }
 
 /// What a sample led to.
@@ -65,14 +65,14 @@ pub(crate) enum JoinEvent {
     /// A keyframe left the full store.
     Evicted { camera: Arc<str>, stamp: Stamp },
     /// A colour image whose pose is known, keyframe or not.
-    Seen(Seen),
+    PosedImage(PosedImage),
     /// A colour image that became no keyframe.
     Refused { why: Refusal },
 }
 
 /// A colour image and where it was taken.
 #[derive(Clone, Debug)]
-pub(crate) struct Seen {
+pub(crate) struct PosedImage {
     /// As the device sent it; not undistorted.
     pub(crate) image: Image,
     pub(crate) world_from_camera: Transform,
@@ -81,20 +81,20 @@ pub(crate) struct Seen {
 /// One camera of the rig.
 struct CameraState {
     config: config::Camera,
-    color_lens: Lens,
-    depth_lens: Option<Lens>,
+    color_undistorter: Undistorter,
+    depth_undistorter: Option<Undistorter>,
     acceptance: Acceptance,
     waiting: Waiting,
     n_accepted: usize,
-    warned: bool,
+    warned_undecodable: bool,
 }
 
 /// A colour image about which everything is known that will be.
-struct Ripe {
+struct ReadyImage {
     image: Image,
     stamp: Stamp,
-    posed: Posed,
-    depth: Option<(Image, Posed)>,
+    camera_pose: CameraPose,
+    depth: Option<(Image, CameraPose)>,
     truth: Option<TruthImage>,
 }
 
@@ -111,16 +111,16 @@ impl Join {
                 .map(|camera| CameraState::new(camera, rig, spacing))
                 .collect::<Result<_, _>>()?,
             store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
-            ranges: Ranges::new(rig),
+            ranges: RangeScans::new(rig),
             list: None,
-            first_seen: None,
+            first_image: None,
             counts: Counts::default(),
-            told_strange: false,
+            warned_joint_limits: false,
             max_wait_secs: join.max_wait_millis * 1e-3,
             default_depth_m: join.default_depth_m,
             newest: Stamp(i64::MIN),
-            newest_earlier: None,
-            shift_nanos: None,
+            newest_resumed: None,
+            stamp_offset_nanos: None,
         })
     }
 
@@ -135,22 +135,22 @@ impl Join {
     ///
     /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, the stamps of
     /// all new keyframes are shifted.
-    pub(crate) fn after(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
+    pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
             if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
-                camera.acceptance.accept_earlier(&keyframe.world_from_camera);
+                camera.acceptance.accept_resumed(&keyframe.world_from_camera);
                 camera.n_accepted += 1;
             }
             evicted.extend(self.store.push(Arc::clone(keyframe)));
         }
-        self.newest_earlier = keyframes.iter().map(|keyframe| keyframe.stamp).max();
+        self.newest_resumed = keyframes.iter().map(|keyframe| keyframe.stamp).max();
         (self, evicted)
     }
 
     /// The stamp of a sample on the clock of keyframes.
     pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
-        Stamp(stamp.0.saturating_add(self.shift_nanos.unwrap_or_default()))
+        Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
     }
 
     /// Takes in one sample; tells what followed from it.
@@ -159,22 +159,22 @@ impl Join {
         self.newest = self.newest.max(sample.stamp());
         match sample {
             Sample::Joints(state) => {
-                if !self.told_strange
-                    && let Some(strange) = self.motion.strange(&state)
+                if !self.warned_joint_limits
+                    && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
                 {
-                    log::warn!("{strange}");
-                    self.told_strange = true;
+                    log::warn!("{joint_limit_warning}");
+                    self.warned_joint_limits = true;
                 }
-                let sensible = self.motion.push_joints(state);
-                self.counts.joints_refused += u64::from(!sensible);
+                let is_valid = self.motion.push_joints(state);
+                self.counts.joints_refused += u64::from(!is_valid);
             }
             Sample::Base(pose) => {
-                let sensible = self.motion.push_base(&pose);
-                self.counts.base_poses_refused += u64::from(!sensible);
+                let is_valid = self.motion.push_base(&pose);
+                self.counts.base_poses_refused += u64::from(!is_valid);
             }
             Sample::Range(scan) => {
-                let kept_all = self.ranges.push(scan);
-                self.counts.range_scans_refused += u64::from(!kept_all);
+                let is_queued = self.ranges.push(scan);
+                self.counts.range_scans_refused += u64::from(!is_queued);
             }
             Sample::BaseTruth(truth) => self.motion.push_base_truth(&truth),
             Sample::Image(image) => self.push_image(image, &mut events),
@@ -184,14 +184,14 @@ impl Join {
                 }
             }
         }
-        self.settle(false, &mut events);
+        self.process_ready(false, &mut events);
         events
     }
 
     /// Ends the stream: decides about the images that still wait.
     pub(crate) fn finish(&mut self) -> Vec<JoinEvent> {
         let mut events = Vec::new();
-        self.settle(true, &mut events);
+        self.process_ready(true, &mut events);
         events
     }
 
@@ -211,10 +211,10 @@ impl Join {
     }
 
     /// What of the list could not be had, as [`KeyframeList::check_found`] tells it.
-    pub(crate) fn check_list(&self) -> Result<Option<String>, LackOfEvidence> {
+    pub(crate) fn check_list(&self) -> Result<Option<String>, InsufficientData> {
         let Some(list) = &self.list else { return Ok(None) };
         let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        list.check_found(found, self.first_seen.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))
+        list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))
     }
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
@@ -230,24 +230,27 @@ impl Join {
         if image.is_depth() {
             let stamp = camera.config.mid_exposure(image.stamp);
             camera.waiting.push_depth(stamp, image);
-        } else if let Some(crowded) = camera.waiting.push_color(image) {
-            let stamp = camera.config.mid_exposure(crowded.stamp);
-            self.refuse(&crowded.camera, stamp, Refusal::Crowded, events);
+        } else if let Some(dropped_image) = camera.waiting.push_color(image) {
+            let stamp = camera.config.mid_exposure(dropped_image.stamp);
+            self.refuse(&dropped_image.camera, stamp, Refusal::QueueFull, events);
         }
     }
 
     /// Places the turns of scanners, then decides about every image that is ripe, oldest first, camera by camera.
-    fn settle(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
-        let settled = self.ranges.settle(&self.motion, self.newest, at_end, self.max_wait_secs);
-        self.counts.range_scans += settled.n_placed;
-        self.counts.range_scans_refused += settled.n_refused;
+    fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
+        let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
+        self.counts.range_scans += counts_placed.n_placed;
+        self.counts.range_scans_refused += counts_placed.n_refused;
         for camera_ix in 0..self.cameras.len() {
-            while let Some(ripe) = self.next_ripe(camera_ix, at_end) {
-                match ripe {
-                    Ok(ripe) => {
-                        let seen = Seen { image: ripe.image.clone(), world_from_camera: ripe.posed.world_from_camera };
-                        events.push(JoinEvent::Seen(seen));
-                        self.decide(camera_ix, ripe, events);
+            while let Some(ready) = self.next_ready(camera_ix, at_end) {
+                match ready {
+                    Ok(ready) => {
+                        let posed_image = PosedImage {
+                            image: ready.image.clone(),
+                            world_from_camera: ready.camera_pose.world_from_camera,
+                        };
+                        events.push(JoinEvent::PosedImage(posed_image));
+                        self.decide(camera_ix, ready, events);
                     }
                     Err((camera, stamp)) => self.refuse(&camera, stamp, Refusal::NoPose, events),
                 }
@@ -256,18 +259,18 @@ impl Join {
     }
 
     /// The oldest waiting image of a camera once all is known about it; an error names one that will never have a pose.
-    fn next_ripe(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<Ripe, (Arc<str>, Stamp)>> {
+    fn next_ready(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
         let stamp = camera.config.mid_exposure(device_stamp);
         let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
-        let posed = match self.motion.at(&camera.config, stamp) {
+        let camera_pose = match self.motion.at(&camera.config, stamp) {
             Err(HistoryError::NotYet { .. }) if !overdue => return None,
-            posed => posed,
+            camera_pose => camera_pose,
         };
         let period_secs = 1.0 / camera.config.rate_hz;
         let mut depth = None;
-        if camera.config.depth.is_some() && posed.is_ok() {
+        if camera.config.depth.is_some() && camera_pose.is_ok() {
             let (depth_stamp, is_final) = camera.waiting.depth_near(stamp, 0.5 * period_secs);
             if !is_final && !overdue {
                 return None;
@@ -275,50 +278,50 @@ impl Join {
             if let Some(depth_stamp) = depth_stamp {
                 match self.motion.at(&camera.config, depth_stamp) {
                     Err(HistoryError::NotYet { .. }) if !overdue => return None,
-                    Ok(posed) => depth = camera.waiting.depth_at(depth_stamp).cloned().zip(Some(posed)),
+                    Ok(camera_pose) => depth = camera.waiting.depth_at(depth_stamp).cloned().zip(Some(camera_pose)),
                     Err(_) => {}
                 }
             }
         }
         let truth = match camera.waiting.truth_of(device_stamp) {
-            Partner::NotYet if !overdue && posed.is_ok() => return None,
-            Partner::Here(truth) => Some(truth.clone()),
+            Partner::NotYet if !overdue && camera_pose.is_ok() => return None,
+            Partner::Available(truth) => Some(truth.clone()),
             Partner::NotYet | Partner::Never => None,
         };
-        if truth.is_none() && overdue && posed.is_ok() {
-            camera.waiting.give_up_truth();
+        if truth.is_none() && overdue && camera_pose.is_ok() {
+            camera.waiting.stop_waiting_for_truth();
         }
         let image = camera.waiting.take_oldest()?;
         camera.waiting.forget_before(stamp, device_stamp, period_secs);
-        match posed {
-            Ok(posed) => Some(Ok(Ripe { image, stamp, posed, depth, truth })),
+        match camera_pose {
+            Ok(camera_pose) => Some(Ok(ReadyImage { image, stamp, camera_pose, depth, truth })),
             Err(_) => Some(Err((image.camera, stamp))),
         }
     }
 
-    fn decide(&mut self, camera_ix: usize, ripe: Ripe, events: &mut Vec<JoinEvent>) {
-        let listed = self.list.as_ref().map(|list| list.split_of(&ripe.image.camera, ripe.stamp));
-        let (name, stamp) = (Arc::clone(&ripe.image.camera), ripe.stamp);
-        self.first_seen.get_or_insert_with(|| (Arc::clone(&name), stamp));
+    fn decide(&mut self, camera_ix: usize, ready: ReadyImage, events: &mut Vec<JoinEvent>) {
+        let listed = self.list.as_ref().map(|list| list.split_of(&ready.image.camera, ready.stamp));
+        let (name, stamp) = (Arc::clone(&ready.image.camera), ready.stamp);
+        self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
             Some(None) => return, // Not asked for, which is no refusal.
             Some(Some(split)) => split,
             None => Split::of(camera.n_accepted),
         };
-        let keyframe = match camera.keyframe(ripe, split, listed.is_none(), self.default_depth_m) {
+        let keyframe = match camera.keyframe(ready, split, listed.is_none(), self.default_depth_m) {
             Ok(keyframe) => keyframe,
             Err(why) => return self.refuse(&name, stamp, why, events),
         };
         camera.n_accepted += 1;
         self.counts.accepted += 1;
-        let of_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
-        let shift_nanos = *self.shift_nanos.get_or_insert_with(|| match self.newest_earlier {
+        let depth_from_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
+        let stamp_offset_nanos = *self.stamp_offset_nanos.get_or_insert_with(|| match self.newest_resumed {
             Some(earlier) if stamp <= earlier => earlier.plus_secs(1.0).0.saturating_sub(stamp.0),
             _ => 0,
         });
-        let stamp = Stamp(keyframe.stamp.0.saturating_add(shift_nanos));
-        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(of_ranges), stamp, ..keyframe });
+        let stamp = Stamp(keyframe.stamp.0.saturating_add(stamp_offset_nanos));
+        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(depth_from_ranges), stamp, ..keyframe });
         self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
         events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
         for (camera, stamp) in self.store.push(keyframe) {
@@ -349,71 +352,81 @@ impl CameraState {
             log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; taken for 0", camera.name);
         }
         // Depth keeps its size: it has its own lens, and means of distances at edges would lie in the air.
-        let depth_lens = camera.depth.as_ref().map(|depth| Lens::new(&depth.intrinsics, 1.0)).transpose()?;
+        let depth_undistorter =
+            camera.depth.as_ref().map(|depth| Undistorter::new(&depth.intrinsics, 1.0)).transpose()?;
         Ok(Self {
             config: camera.clone(),
-            color_lens: Lens::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
-            depth_lens,
+            color_undistorter: Undistorter::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
+            depth_undistorter,
             acceptance: Acceptance::new(&rig.join, camera, is_fixed, spacing),
             waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
             n_accepted: 0,
-            warned: false,
+            warned_undecodable: false,
         })
     }
 
-    /// The keyframe of an image, or why it becomes none; `judge` is off where a list has decided already.
-    fn keyframe(&mut self, ripe: Ripe, split: Split, judge: bool, default_depth_m: f64) -> Result<Keyframe, Refusal> {
-        let pose = &ripe.posed.world_from_camera;
+    /// The keyframe of an image, or why it becomes none; `run_checks` is off where a list has decided already.
+    fn keyframe(
+        &mut self,
+        ready: ReadyImage,
+        split: Split,
+        run_checks: bool,
+        default_depth_m: f64,
+    ) -> Result<Keyframe, Refusal> {
+        let pose = &ready.camera_pose.world_from_camera;
         if !kinematics::transform::is_finite(pose) {
             return Err(Refusal::PoseNotFinite);
         }
-        if judge {
-            self.acceptance.judge_motion(ripe.stamp, pose)?;
+        if run_checks {
+            self.acceptance.check_motion(ready.stamp, pose)?;
         }
-        let depth = self.depth_of(&ripe);
-        if judge {
+        let depth = self.depth_of(&ready);
+        if run_checks {
             let depth_m = depth.as_ref().and_then(assemble::median_depth_m).unwrap_or(default_depth_m);
-            let exposure_secs = ripe.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
-            self.acceptance.judge_speed(&ripe.posed, self.color_lens.full(), exposure_secs, depth_m)?;
+            let exposure_secs = ready.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
+            self.acceptance.check_speed(&ready.camera_pose, self.color_undistorter.full(), exposure_secs, depth_m)?;
         }
-        let rgb = assemble::rgb(&ripe.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
-        if judge {
-            self.acceptance.judge_pixels(&rgb, self.config.intrinsics.size_px)?;
-            self.acceptance.accept(ripe.stamp, pose);
+        let rgb = assemble::rgb(&ready.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
+        if run_checks {
+            self.acceptance.check_pixels(&rgb, self.config.intrinsics.size_px)?;
+            self.acceptance.accept(ready.stamp, pose);
         }
-        let rgba_srgb = self.color_lens.rgba(&rgb).map_err(|e| self.undecodable(&e))?;
-        let truth = ripe.truth.and_then(|truth| {
-            assemble::truth(&truth, &self.config.intrinsics, &self.color_lens).map_err(|e| self.undecodable(&e)).ok()
+        let rgba_srgb = self.color_undistorter.rgba(&rgb).map_err(|e| self.undecodable(&e))?;
+        let truth = ready.truth.and_then(|truth| {
+            assemble::truth(&truth, &self.config.intrinsics, &self.color_undistorter)
+                .map_err(|e| self.undecodable(&e))
+                .ok()
         });
-        let pinhole = self.color_lens.pinhole();
+        let pinhole = self.color_undistorter.pinhole();
         Ok(Keyframe {
-            camera: ripe.image.camera,
-            stamp: ripe.stamp,
+            camera: ready.image.camera,
+            stamp: ready.stamp,
             size_px: pinhole.size_px,
             focal_px: pinhole.focal_px,
             principal_px: pinhole.principal_px,
             rgba_srgb,
             depth,
-            world_from_camera: ripe.posed.world_from_camera,
-            twist: ripe.posed.twist,
+            world_from_camera: ready.camera_pose.world_from_camera,
+            twist: ready.camera_pose.twist,
             readout_secs: self.acceptance.readout_secs(),
-            joint_twists: ripe.posed.joint_twists,
-            base: ripe.posed.base,
+            joint_twists: ready.camera_pose.joint_twists,
+            base: ready.camera_pose.base,
             split,
             truth,
         })
     }
 
     /// Depth that does not decode costs the depth, not the keyframe.
-    fn depth_of(&mut self, ripe: &Ripe) -> Option<trainer::DepthMap> {
-        let (image, posed) = ripe.depth.as_ref()?;
-        let map = assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_lens.as_ref()?, posed);
+    fn depth_of(&mut self, ready: &ReadyImage) -> Option<trainer::DepthMap> {
+        let (image, camera_pose) = ready.depth.as_ref()?;
+        let map =
+            assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_undistorter.as_ref()?, camera_pose);
         map.map_err(|e| self.undecodable(&e)).ok()
     }
 
     /// Says once a camera what is wrong with its images; the count tells how often.
     fn undecodable(&mut self, error: &anyhow::Error) -> Refusal {
-        if !std::mem::replace(&mut self.warned, true) {
+        if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");
         }
         Refusal::Undecodable

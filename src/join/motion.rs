@@ -1,6 +1,6 @@
 //! Where the cameras are at a stamp, and what their velocity does to an image.
 
-use super::standing::Standing;
+use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
 use anyhow::Context;
 use drivers::BasePose;
@@ -8,14 +8,14 @@ use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, Pose
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::BasePlace;
+use trainer::BaseState;
 
 /// Readings kept: 20 s at 1 kHz, more than any image waits.
 const MAX_READINGS: usize = 20_000;
 /// How far beyond its range a joint may be found: calibrations and soft ends do less, radians or metres.
-const MAX_BEYOND: f64 = 0.2;
+const MAX_LIMIT_EXCESS: f64 = 0.2;
 /// Images of a camera between whose poses by tags the base's pose is interpolated: one may be without.
-const MAX_IMAGES_BETWEEN: f64 = 2.5;
+const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
 /// The robot's recent motion.
 pub(crate) struct Motion {
@@ -31,26 +31,26 @@ pub(crate) struct Motion {
 /// Where the base is.
 enum BaseMotion {
     Fixed(Transform),
-    Told(Box<Told>),
+    ReportedPoses(Box<ReportedPoses>),
 }
 
 /// What a base that moves told.
-struct Told {
+struct ReportedPoses {
     poses: PoseHistory,
-    standing: Standing,
+    station_detector: StationDetector,
     /// Its true poses, from a simulator.
     truth: PoseHistory,
 }
 
 /// A camera's pose and velocity at a stamp.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Posed {
+pub(crate) struct CameraPose {
     pub(crate) world_from_camera: Transform,
     pub(crate) twist: Option<Twist>,
     /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
     pub(super) joint_twists: Arc<[Twist]>,
     /// Where the base was, where one that moves carries the camera.
-    pub(super) base: Option<BasePlace>,
+    pub(super) base: Option<BaseState>,
 }
 
 impl Motion {
@@ -60,14 +60,18 @@ impl Motion {
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
         // Tags tell where the base is in each image, and not between.
-        let slowest_hz = rig.cameras.iter().map(|camera| camera.rate_hz).fold(f64::INFINITY, f64::min);
-        let between_images = Duration::from_secs_f64(MAX_IMAGES_BETWEEN / slowest_hz.max(1.0));
+        let min_rate_hz = rig.cameras.iter().map(|camera| camera.rate_hz).fold(f64::INFINITY, f64::min);
+        let between_images = Duration::from_secs_f64(MAX_IMAGE_INTERVALS / min_rate_hz.max(1.0));
         let max_base_gap = if rig.base.driver == BaseDriver::Tags { max_gap.max(between_images) } else { max_gap };
         let base = match rig.base.driver {
             BaseDriver::Fixed => BaseMotion::Fixed(rig.base.world_from_base),
             BaseDriver::Tags | BaseDriver::Rgbd | BaseDriver::Udp | BaseDriver::Sim => {
                 let poses = || PoseHistory::new(max_base_gap, MAX_READINGS);
-                BaseMotion::Told(Box::new(Told { poses: poses(), standing: Standing::default(), truth: poses() }))
+                BaseMotion::ReportedPoses(Box::new(ReportedPoses {
+                    poses: poses(),
+                    station_detector: StationDetector::default(),
+                    truth: poses(),
+                }))
             }
         };
         let offsets = order.iter().map(|ix| rig.arm.joint_offsets.get(*ix).copied().unwrap_or(0.0)).collect();
@@ -75,12 +79,12 @@ impl Motion {
     }
 
     /// A sentence on the first joint that is told to be where the robot's description says that it cannot be.
-    pub(super) fn strange(&self, state: &JointState) -> Option<String> {
+    pub(super) fn joint_limit_warning(&self, state: &JointState) -> Option<String> {
         let joints = self.chain.joint_names().iter().zip(self.chain.limits()).zip(self.order.iter().zip(&self.offsets));
         joints.into_iter().find_map(|((name, limits), (ix, offset))| {
             let position = state.position.get(*ix)? + offset;
-            let is_far = position < limits.lower - MAX_BEYOND || position > limits.upper + MAX_BEYOND;
-            is_far.then(|| {
+            let is_beyond_limits = position < limits.lower - MAX_LIMIT_EXCESS || position > limits.upper + MAX_LIMIT_EXCESS;
+            is_beyond_limits.then(|| {
                 format!(
                     "joint {name:?} is told to be at {position:.3}, and its range is {:.3} to {:.3}: is it told in degrees, or has an \
                      offset?",
@@ -112,21 +116,21 @@ impl Motion {
     pub(super) fn push_base(&mut self, pose: &BasePose) -> bool {
         match &mut self.base {
             BaseMotion::Fixed(_) => true,
-            BaseMotion::Told(told) => {
-                let is_sensible = told.poses.push(pose.stamp, pose.world_from_base).is_ok();
-                if is_sensible {
-                    told.standing.push(pose.stamp, &pose.world_from_base);
+            BaseMotion::ReportedPoses(reported) => {
+                let is_valid = reported.poses.push(pose.stamp, pose.world_from_base).is_ok();
+                if is_valid {
+                    reported.station_detector.push(pose.stamp, &pose.world_from_base);
                 }
-                is_sensible
+                is_valid
             }
         }
     }
 
     /// Takes what a simulator knows of the base.
     pub(super) fn push_base_truth(&mut self, truth: &BasePose) {
-        if let BaseMotion::Told(told) = &mut self.base {
+        if let BaseMotion::ReportedPoses(reported) = &mut self.base {
             // Only told to people: what is refused here is missing there.
-            let _ = told.truth.push(truth.stamp, truth.world_from_base);
+            let _ = reported.truth.push(truth.stamp, truth.world_from_base);
         }
     }
 
@@ -134,35 +138,35 @@ impl Motion {
     pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
         match &self.base {
             BaseMotion::Fixed(pose) => Ok(*pose),
-            BaseMotion::Told(told) => told.poses.at(stamp),
+            BaseMotion::ReportedPoses(reported) => reported.poses.at(stamp),
         }
     }
 
     /// A camera at a stamp; `NotYet` when the readings do not reach so far.
-    pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<Posed, HistoryError> {
+    pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
-            BaseMotion::Told(told) if camera.parent != Parent::World => {
-                let (world_from_base, twist) = told.poses.with_twist_at(stamp)?;
-                let place = BasePlace {
-                    stand: told.standing.at(stamp),
+            BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
+                let (world_from_base, twist) = reported.poses.with_twist_at(stamp)?;
+                let base_place = BaseState {
+                    station: reported.station_detector.at(stamp),
                     world_from_base,
-                    world_from_told: Transform::identity(),
-                    truth: told.truth.at(stamp).ok(),
+                    map_from_odom: Transform::identity(),
+                    truth: reported.truth.at(stamp).ok(),
                 };
-                (world_from_base, twist, Some(place))
+                (world_from_base, twist, Some(base_place))
             }
-            BaseMotion::Told(_) => (Transform::identity(), Twist::zero(), None),
+            BaseMotion::ReportedPoses(_) => (Transform::identity(), Twist::zero(), None),
         };
-        let carried = |world_from_camera, twist| Posed {
+        let pose_with_base = |world_from_camera, twist| CameraPose {
             world_from_camera,
             twist: Some(twist),
             joint_twists: [].into(),
             base: base.clone(),
         };
         match camera.parent {
-            Parent::World => Ok(carried(camera.parent_from_camera, Twist::zero())),
-            Parent::Base => Ok(carried(
+            Parent::World => Ok(pose_with_base(camera.parent_from_camera, Twist::zero())),
+            Parent::Base => Ok(pose_with_base(
                 world_from_base * camera.parent_from_camera,
                 base_twist.of_attached(&camera.parent_from_camera),
             )),
@@ -179,7 +183,7 @@ impl Motion {
                     angular_rad_s: by_arm.angular_rad_s + by_base.angular_rad_s,
                 });
                 let by_joint = self.chain.tip_twists_by_joint(&joints.position).unwrap_or_default();
-                Ok(Posed {
+                Ok(CameraPose {
                     world_from_camera: world_from_base * base_from_flange * camera.parent_from_camera,
                     twist: flange_twist.map(|twist| twist.of_attached(&camera.parent_from_camera)),
                     joint_twists: by_joint.iter().map(|twist| twist.of_attached(&camera.parent_from_camera)).collect(),
@@ -195,7 +199,7 @@ pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: 
     let [width, height] = intrinsics.size_px.map(f64::from);
     let [fx, fy] = intrinsics.focal_px;
     let [cx, cy] = intrinsics.principal_px;
-    let spots = [[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]];
+    let sample_points = [[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]];
     let speed = |[x_frac, y_frac]: [f64; 2]| {
         let ray = Vector3::new((x_frac * width - cx) / fx, (y_frac * height - cy) / fy, 1.0);
         let velocity = twist.apparent_velocity(&(ray * depth_m));
@@ -203,7 +207,7 @@ pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: 
             (fx * (velocity.x - ray.x * velocity.z) / depth_m, fy * (velocity.y - ray.y * velocity.z) / depth_m);
         du.hypot(dv)
     };
-    spots.into_iter().map(speed).sum::<f64>() / 5.0
+    sample_points.into_iter().map(speed).sum::<f64>() / 5.0
 }
 
 #[cfg(test)]
@@ -212,7 +216,7 @@ mod tests {
     use kinematics::Lens;
 
     #[test]
-    fn the_predicted_speed_is_that_of_projected_points() {
+    fn predicted_image_speed_matches_projected_points() {
         let intrinsics = Intrinsics {
             size_px: [1280, 720],
             focal_px: [915.0, 914.0],

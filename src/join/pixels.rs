@@ -3,13 +3,13 @@
 /// The reduced image is about this wide, so that sharpness means the same for every camera and noise averages out.
 const REDUCED_WIDTH: usize = 320;
 /// Sharpness is compared with the median of this many images: few enough that they show much the same.
-const MEMORY: usize = 9;
+const SHARPNESS_WINDOW: usize = 9;
 /// Brightness at and beyond which a pixel is clipped, of 255.
 const CLIPPED: [u8; 2] = [1, 254];
 
 /// Brightness and sharpness of one image.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct PixelFacts {
+pub(super) struct PixelStatistics {
     /// Mean brightness, 0 to 1.
     pub(super) luma_frac: f64,
     /// Share of the pixels that are black or white.
@@ -19,17 +19,17 @@ pub(super) struct PixelFacts {
     pub(super) sharpness: f64,
 }
 
-impl PixelFacts {
+impl PixelStatistics {
     /// `rgb` is `[height, width, 3]`, sRGB.
     pub(super) fn of(rgb: &[u8], size_px: [u32; 2]) -> Self {
         let [width, height] = size_px.map(|side| side as usize);
         let block = (width / REDUCED_WIDTH).max(1);
         let reduced = Reduced::of(rgb, [width, height], block);
         #[expect(clippy::cast_precision_loss, reason = "counts of pixels stay far below 2^53")]
-        let share = |n: u64| n as f64 / (reduced.n_pixels as f64).max(1.0);
+        let fraction = |n: u64| n as f64 / (reduced.n_pixels as f64).max(1.0);
         Self {
-            luma_frac: share(reduced.luma_sum) / 255.0,
-            clipped_frac: share(reduced.n_clipped),
+            luma_frac: fraction(reduced.luma_sum) / 255.0,
+            clipped_frac: fraction(reduced.n_clipped),
             sharpness: reduced.sharpness(),
         }
     }
@@ -75,8 +75,9 @@ impl Reduced {
         for row in 1..height.saturating_sub(1) {
             for column in 1..width.saturating_sub(1) {
                 let at = row * width + column;
-                let around = self.luma[at - 1] + self.luma[at + 1] + self.luma[at - width] + self.luma[at + width];
-                laplacian.add(around - 4.0 * self.luma[at]);
+                let neighbor_sum =
+                    self.luma[at - 1] + self.luma[at + 1] + self.luma[at - width] + self.luma[at + width];
+                laplacian.add(neighbor_sum - 4.0 * self.luma[at]);
                 luma.add(self.luma[at]);
             }
         }
@@ -111,12 +112,12 @@ fn luma([red, green, blue]: [u8; 3]) -> u32 {
 
 /// The sharpness of a camera's last images.
 #[derive(Clone, Debug, Default)]
-pub(super) struct SharpnessMemory(std::collections::VecDeque<f64>);
+pub(super) struct SharpnessHistory(std::collections::VecDeque<f64>);
 
-impl SharpnessMemory {
+impl SharpnessHistory {
     /// Sharpness relative to the median of the last images, this one included; then remembers it.
     pub(super) fn relative(&mut self, sharpness: f64) -> f64 {
-        if self.0.len() == MEMORY {
+        if self.0.len() == SHARPNESS_WINDOW {
             self.0.pop_front();
         }
         self.0.push_back(sharpness);
@@ -134,31 +135,33 @@ mod tests {
     /// Stripes of a period in pixels, softened over `blur` pixels.
     fn stripes(size_px: [u32; 2], period: u32, blur: u32) -> Vec<u8> {
         let level = |x: u32| if (x / period).is_multiple_of(2) { 40_u32 } else { 200 };
-        let soft = |x: u32| u8::try_from((0..=blur).map(|dx| level(x + dx)).sum::<u32>() / (blur + 1)).expect("a mean");
-        (0..size_px[1]).flat_map(|_| (0..size_px[0]).flat_map(|x| [soft(x); 3])).collect()
+        let blurred =
+            |x: u32| u8::try_from((0..=blur).map(|dx| level(x + dx)).sum::<u32>() / (blur + 1)).expect("a mean");
+        (0..size_px[1]).flat_map(|_| (0..size_px[0]).flat_map(|x| [blurred(x); 3])).collect()
     }
 
     #[test]
     fn blur_lowers_sharpness_and_leaves_brightness() {
         for size_px in [[160, 120], [640, 480], [1280, 720]] {
-            let facts = [0, 8, 24]
-                .map(|blur| PixelFacts::of(&stripes(size_px, size_px[0] / 10, blur * size_px[0] / 640), size_px));
+            let statistics = [0, 8, 24]
+                .map(|blur| PixelStatistics::of(&stripes(size_px, size_px[0] / 10, blur * size_px[0] / 640), size_px));
             assert!(
-                facts[0].sharpness >= facts[1].sharpness && facts[1].sharpness > 1.3 * facts[2].sharpness,
-                "{size_px:?}: {facts:?}"
+                statistics[0].sharpness >= statistics[1].sharpness
+                    && statistics[1].sharpness > 1.3 * statistics[2].sharpness,
+                "{size_px:?}: {statistics:?}"
             );
             assert!(
-                (facts[0].luma_frac - facts[2].luma_frac).abs() < 0.02 && facts[0].clipped_frac == 0.0,
-                "{facts:?}"
+                (statistics[0].luma_frac - statistics[2].luma_frac).abs() < 0.02 && statistics[0].clipped_frac == 0.0,
+                "{statistics:?}"
             );
         }
     }
 
     #[test]
-    fn contrast_is_no_sharpness() {
+    fn contrast_does_not_change_sharpness() {
         let strong = stripes([640, 480], 32, 8);
         let weak: Vec<u8> = strong.iter().map(|level| 100 + level / 4).collect();
-        let [strong, weak] = [strong, weak].map(|rgb| PixelFacts::of(&rgb, [640, 480]).sharpness);
+        let [strong, weak] = [strong, weak].map(|rgb| PixelStatistics::of(&rgb, [640, 480]).sharpness);
         assert!((strong - weak).abs() < 0.05 * strong, "{strong} {weak}");
     }
 
@@ -167,25 +170,25 @@ mod tests {
         let mut rgb = vec![255; 30 * 20 * 3];
         rgb[..30 * 5 * 3].fill(0);
         rgb[30 * 5 * 3..30 * 10 * 3].fill(128);
-        let facts = PixelFacts::of(&rgb, [30, 20]);
-        assert!((facts.clipped_frac - 0.75).abs() < 1e-12, "{facts:?}");
-        assert_eq!(PixelFacts::of(&[77; 8 * 8 * 3], [8, 8]).sharpness, 0.0, "flat");
-        assert_eq!(PixelFacts::of(&[77; 3], [1, 1]).sharpness, 0.0, "too small for a Laplacian");
+        let statistics = PixelStatistics::of(&rgb, [30, 20]);
+        assert!((statistics.clipped_frac - 0.75).abs() < 1e-12, "{statistics:?}");
+        assert_eq!(PixelStatistics::of(&[77; 8 * 8 * 3], [8, 8]).sharpness, 0.0, "flat");
+        assert_eq!(PixelStatistics::of(&[77; 3], [1, 1]).sharpness, 0.0, "too small for a Laplacian");
     }
 
     #[test]
-    fn sharpness_is_relative_to_what_the_camera_usually_gives() {
+    fn sharpness_is_relative_to_the_recent_median() {
         for scale in [1.0, 1e4] {
-            let mut memory = SharpnessMemory::default();
-            assert_eq!(memory.relative(5.0 * scale), 1.0, "the first image has nothing to be compared with");
+            let mut history = SharpnessHistory::default();
+            assert_eq!(history.relative(5.0 * scale), 1.0, "the first image has nothing to be compared with");
             for _ in 0..40 {
-                memory.relative(10.0 * scale);
+                history.relative(10.0 * scale);
             }
-            assert!((memory.relative(2.0 * scale) - 0.2).abs() < 1e-12);
+            assert!((history.relative(2.0 * scale) - 0.2).abs() < 1e-12);
             for _ in 0..20 {
-                memory.relative(2.0 * scale);
+                history.relative(2.0 * scale);
             }
-            assert!(memory.relative(2.0 * scale) > 0.9, "a dull scene becomes the new measure");
+            assert!(history.relative(2.0 * scale) > 0.9, "a dull scene becomes the new measure");
         }
     }
 }

@@ -15,12 +15,12 @@ const MAX_WAITING: usize = 64;
 /// Pixels along each side of a cell of depth: the rings of a scanner are some ten pixels apart.
 const CELL_PX: u32 = 8;
 /// Turns this near in time to an image tell its depth: from far away other things are hidden.
-const AROUND_SECS: f64 = 1.0;
+const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
 /// With fewer cells there is no depth.
-const FEWEST_CELLS: usize = 16;
+const MIN_CELLS: usize = 16;
 
 /// The turns that wait for poses, and the newest of those that have them.
-pub(super) struct Ranges {
+pub(super) struct RangeScans {
     scanners: Vec<Scanner>,
     waiting: VecDeque<RangeScan>,
     kept: VecDeque<Arc<RangePoints>>,
@@ -29,12 +29,12 @@ pub(super) struct Ranges {
 
 /// What became of turns.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct Settled {
+pub(super) struct PlacementCounts {
     pub(super) n_placed: u64,
     pub(super) n_refused: u64,
 }
 
-impl Ranges {
+impl RangeScans {
     pub(super) fn new(rig: &Rig) -> Self {
         let max_kept = rig.join.max_range_scans;
         Self { scanners: rig.scanners.clone(), waiting: VecDeque::new(), kept: VecDeque::new(), max_kept }
@@ -53,7 +53,8 @@ impl Ranges {
         let camera_from_world = keyframe.world_from_camera.inverse();
         let [focal_px, principal_px] = [keyframe.focal_px, keyframe.principal_px].map(|of| of.map(|px| px / per_cell));
         let mut depth_m = vec![f32::INFINITY; (size_px[0] * size_px[1]) as usize];
-        let near_in_time = |scan: &&Arc<RangePoints>| keyframe.stamp.secs_since(scan.stamp).abs() <= AROUND_SECS;
+        let near_in_time =
+            |scan: &&Arc<RangePoints>| keyframe.stamp.secs_since(scan.stamp).abs() <= MAX_TIME_DIFFERENCE_SECS;
         for point in self.kept.iter().filter(near_in_time).flat_map(|scan| scan.points_in_world_m.iter()) {
             let point = camera_from_world * Point3::from(*point).cast::<f64>();
             let cell = [0, 1].map(|axis| focal_px[axis] * point[axis] / point.z + principal_px[axis]);
@@ -67,13 +68,13 @@ impl Ranges {
                 depth_m[ix] = depth_m[ix].min(z);
             }
         }
-        let mut n_seen = 0;
+        let mut n_filled = 0;
         for depth_m in &mut depth_m {
-            n_seen += usize::from(depth_m.is_finite());
+            n_filled += usize::from(depth_m.is_finite());
             *depth_m = if depth_m.is_finite() { *depth_m } else { 0.0 };
         }
         let world_from_camera = keyframe.world_from_camera;
-        (n_seen >= FEWEST_CELLS).then(|| DepthMap {
+        (n_filled >= MIN_CELLS).then(|| DepthMap {
             size_px,
             focal_px,
             principal_px,
@@ -84,8 +85,8 @@ impl Ranges {
 
     /// Queues a turn; false where it, or an older one, is lost.
     pub(super) fn push(&mut self, scan: RangeScan) -> bool {
-        let is_known = self.scanners.iter().any(|scanner| scanner.name == scan.scanner);
-        if !is_known {
+        let is_known_scanner = self.scanners.iter().any(|scanner| scanner.name == scan.scanner);
+        if !is_known_scanner {
             return false;
         }
         self.waiting.push_back(scan);
@@ -97,26 +98,32 @@ impl Ranges {
     }
 
     /// Places every turn whose poses are known, in order; gives up one that waited longer than `max_wait_secs`.
-    pub(super) fn settle(&mut self, motion: &Motion, newest: Stamp, at_end: bool, max_wait_secs: f64) -> Settled {
-        let mut settled = Settled::default();
+    pub(super) fn process_ready(
+        &mut self,
+        motion: &Motion,
+        newest: Stamp,
+        at_end: bool,
+        max_wait_secs: f64,
+    ) -> PlacementCounts {
+        let mut counts_placed = PlacementCounts::default();
         while let Some(scan) = self.waiting.front() {
-            match self.placed(scan, motion) {
-                Ok(placed) => {
-                    settled.n_placed += 1;
-                    self.kept.push_back(Arc::new(placed));
+            match self.in_world(scan, motion) {
+                Ok(in_world) => {
+                    counts_placed.n_placed += 1;
+                    self.kept.push_back(Arc::new(in_world));
                     while self.kept.len() > self.max_kept {
                         self.kept.pop_front();
                     }
                 }
                 Err(HistoryError::NotYet { .. }) if !at_end && newest.secs_since(scan.stamp) <= max_wait_secs => break,
-                Err(_) => settled.n_refused += 1,
+                Err(_) => counts_placed.n_refused += 1,
             }
             self.waiting.pop_front();
         }
-        settled
+        counts_placed
     }
 
-    fn placed(&self, scan: &RangeScan, motion: &Motion) -> Result<RangePoints, HistoryError> {
+    fn in_world(&self, scan: &RangeScan, motion: &Motion) -> Result<RangePoints, HistoryError> {
         let scanner = self.scanners.iter().find(|scanner| scanner.name == scan.scanner);
         let scanner = scanner.expect("only turns of known scanners wait");
         let world_from_scanner = |stamp: Stamp| Ok(motion.world_from_base(stamp)? * scanner.base_from_scanner);
@@ -170,7 +177,7 @@ mod tests {
         }
     }
 
-    fn ranges_of(scans: Vec<(Stamp, Vec<[f32; 3]>)>) -> Ranges {
+    fn ranges_of(scans: Vec<(Stamp, Vec<[f32; 3]>)>) -> RangeScans {
         let kept = scans.into_iter().map(|(stamp, points)| {
             Arc::new(RangePoints {
                 scanner: "lidar".into(),
@@ -179,7 +186,7 @@ mod tests {
                 points_in_world_m: points.into(),
             })
         });
-        Ranges { scanners: Vec::new(), waiting: VecDeque::new(), kept: kept.collect(), max_kept: 9 }
+        RangeScans { scanners: Vec::new(), waiting: VecDeque::new(), kept: kept.collect(), max_kept: 9 }
     }
 
     /// A wall 4 m before the camera, a row of points every 16 pixels.
@@ -188,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn the_nearest_point_of_a_cell_is_its_depth() {
+    fn cell_depth_is_that_of_its_nearest_point() {
         let now = Stamp(10_000_000_000);
         let pole = [[0.1, 0.5, 3.0], [0.0, 0.0, -2.0]]; // Before the wall's point at (0.2, 1.0), and behind the camera.
         let ranges = ranges_of(vec![(Stamp(9_500_000_000), wall()), (now, pole.to_vec())]);
@@ -203,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_of_another_time_tell_nothing() {
+    fn scans_from_other_times_give_no_depth() {
         let ranges = ranges_of(vec![(Stamp(0), wall())]);
         assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_000))).is_some());
         assert!(ranges.depth_of(&keyframe(Stamp(1_000_000_001))).is_none());

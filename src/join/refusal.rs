@@ -10,7 +10,7 @@ pub(crate) enum Refusal {
     /// The rig file has no camera of this name.
     UnknownCamera,
     /// Too many images waited for joint readings.
-    Crowded,
+    QueueFull,
     /// No joint readings around the stamp, or no base pose.
     NoPose,
     /// The pose holds NaN or infinity.
@@ -36,7 +36,7 @@ impl Refusal {
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::UnknownCamera => "unknown_camera",
-            Self::Crowded => "crowded",
+            Self::QueueFull => "queue_full",
             Self::NoPose => "no_pose",
             Self::PoseNotFinite => "pose_not_finite",
             Self::NotMoved => "not_moved",
@@ -54,7 +54,7 @@ impl std::fmt::Display for Refusal {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::UnknownCamera => "camera not in the rig file",
-            Self::Crowded => "too many waited for joint readings",
+            Self::QueueFull => "too many waited for joint readings",
             Self::NoPose => "no joint readings or pose of the base around the stamp",
             Self::PoseNotFinite => "pose is not a number",
             Self::NotMoved => "not moved",
@@ -97,7 +97,7 @@ pub(crate) struct Counts {
 
 /// What becomes of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Use {
+pub(crate) enum SampleUse {
     /// They are recorded: every image counts.
     Recorded,
     /// They are looked at: live, an image that comes too fast is replaced by the next; in a replay, what the devices
@@ -107,15 +107,15 @@ pub(crate) enum Use {
 
 impl Counts {
     /// What was lost of what should have been kept, one sentence each.
-    pub(crate) fn losses(&self, use_: Use) -> Vec<String> {
-        let mut losses = Vec::new();
-        if use_ == Use::Recorded && self.device_skipped > 0 {
-            losses.push(lost_by_devices(self.device_skipped));
+    pub(crate) fn dropped_messages(&self, sample_use: SampleUse) -> Vec<String> {
+        let mut dropped_messages = Vec::new();
+        if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
+            dropped_messages.push(dropped_by_devices(self.device_skipped));
         }
-        if let Some(n_broken) = self.refused.get(&Refusal::Undecodable) {
-            losses.push(format!("{} did not decode", counted(*n_broken, "image")));
+        if let Some(n_undecodable) = self.refused.get(&Refusal::Undecodable) {
+            dropped_messages.push(format!("{} did not decode", counted(*n_undecodable, "image")));
         }
-        losses
+        dropped_messages
     }
 
     pub(super) fn refuse(&mut self, why: Refusal) {
@@ -124,7 +124,7 @@ impl Counts {
 }
 
 /// The loss of images before they came here.
-fn lost_by_devices(n_images: u64) -> String {
+fn dropped_by_devices(n_images: u64) -> String {
     let what = counted(n_images, "image");
     format!("{what} lost by the devices, or dropped because we were too slow for them")
 }
@@ -158,16 +158,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_devices_lost_is_lost_once() {
+    fn dropped_images_are_counted_once() {
         let mut counts = Counts { device_skipped: 2, ..Counts::default() };
         counts.refuse(Refusal::Undecodable);
         counts.refuse(Refusal::NotMoved);
-        assert_eq!(counts.losses(Use::Recorded).len(), 2);
-        assert_eq!(counts.losses(Use::Watched), ["1 image did not decode"]);
+        assert_eq!(counts.dropped_messages(SampleUse::Recorded).len(), 2);
+        assert_eq!(counts.dropped_messages(SampleUse::Watched), ["1 image did not decode"]);
     }
 
     #[test]
-    fn the_summary_tells_what_happened_and_nothing_else() {
+    fn summary_lists_only_nonzero_counts() {
         let mut counts = Counts { images: 9, accepted: 4, device_skipped: 2, ..Counts::default() };
         counts.refuse(Refusal::NotMoved);
         counts.refuse(Refusal::NotMoved);

@@ -23,11 +23,11 @@ mod tests {
     use nalgebra::Vector3;
 
     #[test]
-    fn the_larger_motion_counts() {
+    fn spacing_is_the_larger_of_translation_and_rotation() {
         let spacing = Spacing { translation_m: 0.02, rotation_rad: 0.1 };
-        let at = |x, turn| Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::new(0.0, turn, 0.0));
-        for (x, turn, expected) in [(0.0, 0.0, 0.0), (0.01, 0.0, 0.5), (0.01, 0.2, 2.0), (0.06, 0.2, 3.0)] {
-            assert!((spacing.between(&at(1.0, 1.0), &at(1.0 + x, 1.0 + turn)) - expected).abs() < 1e-9);
+        let at = |x, angle_rad| Transform::new(Vector3::new(x, 0.0, 0.0), Vector3::new(0.0, angle_rad, 0.0));
+        for (x, angle_rad, expected) in [(0.0, 0.0, 0.0), (0.01, 0.0, 0.5), (0.01, 0.2, 2.0), (0.06, 0.2, 3.0)] {
+            assert!((spacing.between(&at(1.0, 1.0), &at(1.0 + x, 1.0 + angle_rad)) - expected).abs() < 1e-9);
         }
     }
 }

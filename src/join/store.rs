@@ -10,7 +10,7 @@ use std::sync::Arc;
 use trainer::{Keyframe, Split};
 
 /// Shares of the splits: every 8th is test, every 8th selection.
-const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Selection, 1.0), (Split::Test, 1.0)];
+const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Validation, 1.0), (Split::Test, 1.0)];
 
 /// Keyframes in the order of their acceptance.
 #[derive(Debug)]
@@ -18,12 +18,12 @@ pub(super) struct KeyframeStore {
     max_keyframes: usize,
     max_bytes: u64,
     spacing: Spacing,
-    kept: Vec<Kept>,
+    kept: Vec<StoreEntry>,
     bytes: u64,
 }
 
 #[derive(Debug)]
-struct Kept {
+struct StoreEntry {
     keyframe: Arc<Keyframe>,
     bytes: u64,
     /// Distance to the nearest other keyframe of the same camera.
@@ -49,13 +49,13 @@ impl KeyframeStore {
         }
         let bytes = keyframe.bytes();
         self.bytes += bytes;
-        self.kept.push(Kept { keyframe, bytes, nearest });
-        let mut gone = Vec::new();
+        self.kept.push(StoreEntry { keyframe, bytes, nearest });
+        let mut evicted = Vec::new();
         while self.kept.len() > 1 && (self.kept.len() > self.max_keyframes || self.bytes > self.max_bytes) {
             let keyframe = self.remove(self.most_redundant());
-            gone.push((Arc::clone(&keyframe.camera), keyframe.stamp));
+            evicted.push((Arc::clone(&keyframe.camera), keyframe.stamp));
         }
-        gone
+        evicted
     }
 
     fn most_redundant(&self) -> usize {
@@ -68,14 +68,16 @@ impl KeyframeStore {
     }
 
     fn remove(&mut self, ix: usize) -> Arc<Keyframe> {
-        let gone = self.kept.remove(ix);
-        self.bytes -= gone.bytes;
+        let evicted = self.kept.remove(ix);
+        self.bytes -= evicted.bytes;
         let same_camera: Vec<usize> =
-            (0..self.kept.len()).filter(|ix| self.kept[*ix].keyframe.camera == gone.keyframe.camera).collect();
+            (0..self.kept.len()).filter(|ix| self.kept[*ix].keyframe.camera == evicted.keyframe.camera).collect();
         let pose = |ix: usize| &self.kept[ix].keyframe.world_from_camera;
         let orphaned: Vec<(usize, f64)> = same_camera
             .iter()
-            .filter(|ix| self.spacing.between(pose(**ix), &gone.keyframe.world_from_camera) <= self.kept[**ix].nearest)
+            .filter(|ix| {
+                self.spacing.between(pose(**ix), &evicted.keyframe.world_from_camera) <= self.kept[**ix].nearest
+            })
             .map(|ix| {
                 let others = same_camera.iter().filter(|other| *other != ix);
                 let distances = others.map(|other| self.spacing.between(pose(*ix), pose(*other)));
@@ -85,7 +87,7 @@ impl KeyframeStore {
         for (ix, nearest) in orphaned {
             self.kept[ix].nearest = nearest;
         }
-        gone.keyframe
+        evicted.keyframe
     }
 }
 
@@ -123,17 +125,17 @@ mod tests {
     }
 
     #[test]
-    fn the_most_redundant_goes_first_whatever_bound_is_met() {
+    fn most_redundant_keyframe_is_evicted_at_either_bound() {
         for mut store in [store(7, u64::MAX), store(usize::MAX, 7 * 16)] {
-            let mut gone = Vec::new();
+            let mut evicted = Vec::new();
             // 2 and 6 are close to each other, 1 and 8 the same close but of two cameras.
             for (ix, camera, x_m) in
                 [(1, "a", 0.0), (2, "a", 9.0), (3, "a", 20.0), (5, "a", 30.0), (6, "a", 9.1), (7, "a", 40.0)]
             {
-                gone.extend(store.push(keyframe(ix, camera, x_m)));
+                evicted.extend(store.push(keyframe(ix, camera, x_m)));
             }
-            gone.extend(store.push(keyframe(9, "b", 0.0)));
-            assert_eq!(gone, []);
+            evicted.extend(store.push(keyframe(9, "b", 0.0)));
+            assert_eq!(evicted, []);
             assert_eq!(store.push(keyframe(10, "a", 50.0)), [("a".into(), Stamp(2))]);
             assert_eq!(stamps(&store), [1, 3, 5, 6, 7, 9, 10]);
             // With 2 gone, 6 stands alone and the closest pair is the next one.
@@ -142,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_long_run_keeps_the_shares_of_the_splits_and_the_bounds() {
+    fn long_run_keeps_split_proportions_and_bounds() {
         let mut store = store(40, u64::MAX);
         for ix in 0..2000 {
             #[expect(clippy::cast_precision_loss, reason = "small numbers")]
@@ -151,7 +153,7 @@ mod tests {
             assert!(store.kept.len() <= 40 && store.bytes == store.kept.len() as u64 * 16);
         }
         let count = |split| store.iter().filter(|keyframe| keyframe.split == split).count();
-        assert_eq!([count(Split::Train), count(Split::Selection), count(Split::Test)], [30, 5, 5]);
+        assert_eq!([count(Split::Train), count(Split::Validation), count(Split::Test)], [30, 5, 5]);
         // The cached distances are the true ones.
         for (ix, kept) in store.kept.iter().enumerate() {
             let others = store.kept.iter().enumerate().filter(|(other, _)| *other != ix);

@@ -51,8 +51,8 @@ fn reading(nanos: i64) -> Sample {
 
 /// A chequered picture, different for every stamp.
 fn color(camera: &str, nanos: i64) -> Image {
-    let shift = nanos / 7_000_003;
-    let level = |x: i64, y: i64| if ((x + shift) / 3 + (y + shift) / 4) % 2 == 0 { 60 } else { 190 };
+    let offset = nanos / 7_000_003;
+    let level = |x: i64, y: i64| if ((x + offset) / 3 + (y + offset) / 4) % 2 == 0 { 60 } else { 190 };
     let [width, height] = SIZE_PX.map(i64::from);
     let data: Vec<u8> =
         (0..height).flat_map(|y| (0..width).flat_map(move |x| [level(x, y), 90, level(x, y)])).collect();
@@ -72,7 +72,7 @@ fn depth(nanos: i64) -> Image {
     let mut data = 10_000_u16.to_le_bytes().repeat((SIZE_PX[0] * SIZE_PX[1]) as usize);
     data[0..2].copy_from_slice(&65_000_u16.to_le_bytes());
     data[2..4].fill(0);
-    Image { format: PixelFormat::DepthU16 { metres_per_count: 1e-4 }, data: data.into(), ..color("wrist", nanos) }
+    Image { format: PixelFormat::DepthU16 { meters_per_count: 1e-4 }, data: data.into(), ..color("wrist", nanos) }
 }
 
 fn truth(nanos: i64) -> Sample {
@@ -99,22 +99,22 @@ fn samples(secs: i64) -> Vec<Sample> {
 }
 
 #[derive(Default)]
-struct Outcome {
+struct JoinOutcome {
     keyframes: Vec<Arc<Keyframe>>,
     refused: Vec<Refusal>,
     evicted: Vec<i64>,
-    n_seen: usize,
+    n_posed: usize,
 }
 
-fn play(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> Outcome {
-    let mut outcome = Outcome::default();
+fn run_join(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> JoinOutcome {
+    let mut outcome = JoinOutcome::default();
     let mut take = |events: Vec<JoinEvent>| {
         for event in events {
             match event {
                 JoinEvent::Accepted(keyframe) => outcome.keyframes.push(keyframe),
                 JoinEvent::Refused { why } => outcome.refused.push(why),
                 JoinEvent::Evicted { stamp, .. } => outcome.evicted.push(stamp.0),
-                JoinEvent::Seen(_) => outcome.n_seen += 1,
+                JoinEvent::PosedImage(_) => outcome.n_posed += 1,
             }
         }
     };
@@ -141,8 +141,8 @@ fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
             numbers.map(|number| number.to_bits()).collect::<Vec<_>>()
         });
         let depth = keyframe.depth.as_ref().map(|depth| {
-            let metres: Vec<u32> = depth.depth_m.iter().map(|metres| metres.to_bits()).collect();
-            (metres, pose(&depth.world_from_camera), depth.size_px)
+            let meters: Vec<u32> = depth.depth_m.iter().map(|meters| meters.to_bits()).collect();
+            (meters, pose(&depth.world_from_camera), depth.size_px)
         });
         let truth = keyframe.truth.as_ref().map(|truth| (truth.rgba_srgb.to_vec(), pose(&truth.world_from_camera)));
         let image = (keyframe.camera.to_string(), keyframe.stamp, keyframe.size_px, keyframe.rgba_srgb.to_vec());
@@ -162,10 +162,10 @@ fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
 }
 
 #[test]
-fn poses_are_those_of_the_shutter_time_of_color_and_of_depth() {
-    const CLOSE: f64 = 1e-7; // A cubic through readings 5 ms apart, of sines of 8 s.
+fn color_and_depth_poses_match_their_exposure_times() {
+    const TOLERANCE: f64 = 1e-7; // A cubic through readings 5 ms apart, of sines of 8 s.
     let rig = rig(&[]);
-    let outcome = play(&mut join(&rig), samples(8));
+    let outcome = run_join(&mut join(&rig), samples(8));
     let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
     let pose_at = |stamp: Stamp| {
         chain.forward(&joints_rad(stamp.secs())).expect("seven joints") * rig.cameras[0].parent_from_camera
@@ -173,17 +173,20 @@ fn poses_are_those_of_the_shutter_time_of_color_and_of_depth() {
     let distance = |a: &Transform, b: &Transform| (a.to_homogeneous() - b.to_homogeneous()).abs().max();
     assert!(outcome.keyframes.len() > 20, "{} keyframes", outcome.keyframes.len());
     for keyframe in &outcome.keyframes {
-        assert!(distance(&keyframe.world_from_camera, &pose_at(keyframe.stamp)) < CLOSE);
+        assert!(distance(&keyframe.world_from_camera, &pose_at(keyframe.stamp)) < TOLERANCE);
         let depth = keyframe.depth.as_ref().expect("depth came with every image");
-        assert!(distance(&depth.world_from_camera, &pose_at(keyframe.stamp.plus_secs(0.005))) < CLOSE);
-        assert!(distance(&depth.world_from_camera, &keyframe.world_from_camera) > 100.0 * CLOSE, "a pose of its own");
+        assert!(distance(&depth.world_from_camera, &pose_at(keyframe.stamp.plus_secs(0.005))) < TOLERANCE);
+        assert!(
+            distance(&depth.world_from_camera, &keyframe.world_from_camera) > 100.0 * TOLERANCE,
+            "a pose of its own"
+        );
         assert_eq!((depth.depth_m[0], depth.depth_m[1], depth.depth_m[2]), (0.0, 0.0, 1.0));
         let (before, after) = (pose_at(keyframe.stamp.plus_secs(-1e-4)), pose_at(keyframe.stamp.plus_secs(1e-4)));
         let twist = kinematics::transform::log(&(before.inverse() * after), 2e-4);
-        let told = keyframe.twist.expect("velocities are told");
+        let reported = keyframe.twist.expect("velocities are told");
         assert!(
-            (told.linear_m_s - twist.linear_m_s).norm() < 1e-4
-                && (told.angular_rad_s - twist.angular_rad_s).norm() < 1e-4
+            (reported.linear_m_s - twist.linear_m_s).norm() < 1e-4
+                && (reported.angular_rad_s - twist.angular_rad_s).norm() < 1e-4
         );
         assert_eq!(keyframe.readout_secs, 0.015);
     }
@@ -192,21 +195,21 @@ fn poses_are_those_of_the_shutter_time_of_color_and_of_depth() {
 }
 
 #[test]
-fn a_clock_offset_of_the_rig_file_moves_stamp_and_pose() {
+fn configured_time_offset_changes_stamp_and_pose() {
     let offset = Value::Table([("value".to_owned(), Value::from(-12.5))].into_iter().collect());
     let moved = rig(&[Override::new("camera.wrist.stamp_to_mid_exposure_millis", offset)]);
-    let outcome = play(&mut join(&moved), samples(4));
+    let outcome = run_join(&mut join(&moved), samples(4));
     let first = &outcome.keyframes[0];
     assert_eq!(first.stamp.0, 50_000_000 - 23_456_789 - 12_500_000);
-    let plain = play(&mut join(&rig(&[])), samples(4));
+    let plain = run_join(&mut join(&rig(&[])), samples(4));
     assert_ne!(first.world_from_camera, plain.keyframes[0].world_from_camera);
 }
 
 #[test]
-fn ground_truth_and_depth_are_attached_whatever_comes_first() {
+fn ground_truth_and_depth_are_matched_in_any_order() {
     let rig = rig(&[Override::new("sim.truth", true)]);
     let in_order = samples(6);
-    let plain = play(&mut join(&rig), in_order.clone());
+    let plain = run_join(&mut join(&rig), in_order.clone());
     assert!(plain.keyframes.iter().all(|keyframe| {
         let truth = keyframe.truth.as_ref().expect("truth came with every image");
         truth.rgba_srgb[0] == 99
@@ -221,12 +224,12 @@ fn ground_truth_and_depth_are_attached_whatever_comes_first() {
     let mut early = in_order;
     early.sort_by_key(|sample| sample.stamp().0 - if matches!(sample, Sample::Joints(_)) { 0 } else { 300_000_000 });
     for other in [shuffled, early] {
-        assert_eq!(differences(&plain.keyframes, &play(&mut join(&rig), other).keyframes), Vec::<String>::new());
+        assert_eq!(differences(&plain.keyframes, &run_join(&mut join(&rig), other).keyframes), Vec::<String>::new());
     }
 }
 
 #[test]
-fn recording_and_replay_give_the_same_keyframes_bit_for_bit() {
+fn replay_reproduces_keyframes_bit_for_bit() {
     let rig = rig(&[
         Override::new("camera.wrist.intrinsics.lens", "brown_conrady"),
         Override::new("camera.wrist.intrinsics.distortion", Value::from(vec![0.1, -0.05, 0.001, 0.002, 0.0])),
@@ -234,7 +237,7 @@ fn recording_and_replay_give_the_same_keyframes_bit_for_bit() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let mut recorder = open::recorder(&path, &rig).expect("a new file");
-    let live = play(
+    let live = run_join(
         &mut join(&rig),
         samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("room on the disk")),
     );
@@ -243,7 +246,7 @@ fn recording_and_replay_give_the_same_keyframes_bit_for_bit() {
         let opened = open::recording(&path, None, &[]).expect("a recording");
         let mut source = opened.source;
         let replayed = std::iter::from_fn(|| source.next_sample().expect("readable"));
-        let replay = play(&mut join(&opened.rig), replayed);
+        let replay = run_join(&mut join(&opened.rig), replayed);
         assert_eq!(differences(&live.keyframes, &replay.keyframes), Vec::<String>::new());
         assert_eq!(live.refused, replay.refused);
     }
@@ -260,20 +263,20 @@ fn recording_and_replay_give_the_same_keyframes_bit_for_bit() {
 }
 
 #[test]
-fn images_without_joints_wait_and_are_dropped_with_a_count() {
+fn images_without_joint_readings_are_dropped_and_counted() {
     let rig = rig(&[]);
     // The joints fall silent from 2 s to 4 s, and for good at 6 s.
-    let silent = |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
+    let in_gap = |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
     let kept =
-        samples(8).into_iter().filter(|sample| !(matches!(sample, Sample::Joints(_)) && silent(sample.stamp().0)));
+        samples(8).into_iter().filter(|sample| !(matches!(sample, Sample::Joints(_)) && in_gap(sample.stamp().0)));
     let mut join = join(&rig);
-    let outcome = play(&mut join, kept);
+    let outcome = run_join(&mut join, kept);
     assert_eq!(
         outcome.refused.iter().filter(|why| **why == Refusal::NoPose).count(),
         40,
         "as many as came in the silence"
     );
-    assert!(outcome.keyframes.iter().all(|keyframe| !silent(keyframe.stamp.0)));
+    assert!(outcome.keyframes.iter().all(|keyframe| !in_gap(keyframe.stamp.0)));
     assert_eq!(join.counts().refused[&Refusal::NoPose], 40);
     assert_eq!(join.counts().images, 80);
     assert_eq!(
@@ -281,11 +284,11 @@ fn images_without_joints_wait_and_are_dropped_with_a_count() {
         80,
         "every image is accounted for"
     );
-    assert_eq!(outcome.n_seen, 40);
+    assert_eq!(outcome.n_posed, 40);
 }
 
 #[test]
-fn readings_that_are_no_numbers_cost_the_images_around_them() {
+fn non_finite_readings_reject_nearby_images() {
     let rig = rig(&[]);
     let broken = samples(4).into_iter().map(|sample| match sample {
         Sample::Joints(mut state) if (1_000_000_000..2_000_000_000).contains(&state.stamp.0) => {
@@ -295,7 +298,7 @@ fn readings_that_are_no_numbers_cost_the_images_around_them() {
         other => other,
     });
     let mut join = join(&rig);
-    let outcome = play(&mut join, broken);
+    let outcome = run_join(&mut join, broken);
     assert_eq!(join.counts().joints_refused, 200);
     assert!(join.counts().refused[&Refusal::NoPose] >= 9, "{}", join.counts());
     assert!(outcome.keyframes.iter().all(|keyframe| kinematics::transform::is_finite(&keyframe.world_from_camera)));
@@ -310,21 +313,21 @@ fn readings_that_are_no_numbers_cost_the_images_around_them() {
 }
 
 #[test]
-fn a_base_that_moves_carries_the_cameras_and_a_broken_pose_is_refused() {
+fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
     let rig = rig(&[Override::new("base.driver", "udp"), Override::new("join.max_gap_millis", 150)]);
     let base = |nanos: i64, x_m: f64| {
         let world_from_base = Transform::translation(x_m, 0.0, 0.0);
         Sample::Base(BasePose { stamp: Stamp(nanos), world_from_base })
     };
     // A metre per second, told at 10 Hz; one pose is no number.
-    let told = (0..41_i64).map(|tick| {
+    let reported = (0..41_i64).map(|tick| {
         let secs = Stamp(tick * 100_000_000).secs();
         base(tick * 100_000_000, if tick == 20 { f64::NAN } else { secs })
     });
-    let mut mixed: Vec<Sample> = samples(4).into_iter().chain(told).collect();
+    let mut mixed: Vec<Sample> = samples(4).into_iter().chain(reported).collect();
     mixed.sort_by_key(Sample::stamp);
     let mut moving = join(&rig);
-    let outcome = play(&mut moving, mixed);
+    let outcome = run_join(&mut moving, mixed);
     assert_eq!(moving.counts().base_poses_refused, 1);
     assert!(outcome.keyframes.len() > 20, "{}", moving.counts());
     let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
@@ -338,14 +341,14 @@ fn a_base_that_moves_carries_the_cameras_and_a_broken_pose_is_refused() {
 }
 
 #[test]
-fn every_reason_to_refuse_is_found() {
-    let spoil = |how: fn(Image) -> Image, overrides: &[Override]| {
-        let spoilt = samples(4).into_iter().map(|sample| match sample {
+fn every_refusal_reason_is_reachable() {
+    let counts_with = |how: fn(Image) -> Image, overrides: &[Override]| {
+        let corrupted = samples(4).into_iter().map(|sample| match sample {
             Sample::Image(image) if !image.is_depth() && image.stamp.0 > 2_000_000_000 => Sample::Image(how(image)),
             other => other,
         });
         let mut join = join(&rig(overrides));
-        play(&mut join, spoilt);
+        run_join(&mut join, corrupted);
         join.counts().clone()
     };
     type Case = (Refusal, fn(Image) -> Image, Vec<Override>);
@@ -364,35 +367,35 @@ fn every_reason_to_refuse_is_found() {
         (Refusal::NotSharp, |image| Image { data: vec![128; image.data.len()].into(), ..image }, vec![]),
     ];
     for (why, how, overrides) in cases {
-        let counts = spoil(how, &overrides);
+        let counts = counts_with(how, &overrides);
         assert!(counts.refused.get(&why).is_some_and(|n| *n >= 3), "{why}: {counts}");
         assert!(counts.to_string().contains(&why.to_string()));
     }
     assert_eq!(
-        spoil(|image| image, &[]).refused.keys().collect::<Vec<_>>(),
+        counts_with(|image| image, &[]).refused.keys().collect::<Vec<_>>(),
         [&Refusal::NotMoved],
         "nothing else when all is well"
     );
 }
 
 #[test]
-fn depth_that_is_missing_costs_the_depth_and_not_the_keyframe() {
+fn keyframe_is_kept_without_missing_depth() {
     let without = samples(4)
         .into_iter()
         .filter(|sample| !matches!(sample, Sample::Image(image) if image.is_depth() && image.stamp.0 > 2_000_000_000));
     let mut join = join(&rig(&[]));
-    let outcome = play(&mut join, without);
+    let outcome = run_join(&mut join, without);
     let missing = outcome.keyframes.iter().filter(|keyframe| keyframe.depth.is_none()).count();
     assert!(missing > 3 && missing < outcome.keyframes.len());
     assert_eq!(join.counts().without_depth, missing as u64);
 }
 
 #[test]
-fn a_list_takes_exactly_its_keyframes() {
+fn list_selects_exactly_its_keyframes() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("keyframes.txt");
     let mut first = join(&rig(&[]));
-    let chosen = play(&mut first, samples(6));
+    let chosen = run_join(&mut first, samples(6));
     std::fs::write(&path, keyframe_list(first.keyframes())).expect("room on the disk");
     // A rig that would refuse them all.
     let strict = rig(&[
@@ -401,7 +404,7 @@ fn a_list_takes_exactly_its_keyframes() {
         Override::new("join.max_keyframes", 8),
     ]);
     let mut second = join(&strict).taking_only(KeyframeList::load(&path).expect("a list"));
-    let listed = play(&mut second, samples(6));
+    let listed = run_join(&mut second, samples(6));
     assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
     assert_eq!((listed.refused, listed.evicted), (vec![], vec![]));
     let again = folder.path().join("again.txt");
@@ -410,16 +413,16 @@ fn a_list_takes_exactly_its_keyframes() {
 }
 
 #[test]
-fn a_camera_that_stands_still_gives_a_few_keyframes_over_time() {
+fn stationary_camera_gives_few_keyframes_over_time() {
     let fixed = rig(&[Override::new("camera.wrist.parent", "world"), Override::new("join.fixed_keyframes", 3)]);
-    let outcome = play(&mut join(&fixed), samples(8));
+    let outcome = run_join(&mut join(&fixed), samples(8));
     let stamps: Vec<i64> = outcome.keyframes.iter().map(|keyframe| keyframe.stamp.0 / 1_000_000_000).collect();
     assert_eq!(stamps, [0, 1, 2]);
     assert!(outcome.keyframes.iter().all(|keyframe| keyframe.world_from_camera == fixed.cameras[0].parent_from_camera));
 }
 
 #[test]
-fn an_hour_leaves_nothing_behind_but_the_store() {
+fn one_hour_run_keeps_only_the_store_in_memory() {
     let rig = rig(&[Override::new("join.max_keyframes", 24), Override::new("join.min_translation_m", 0.0005)]);
     let mut join = join(&rig);
     let (color, depth) = (color("wrist", 0), depth(0));
@@ -445,10 +448,10 @@ fn an_hour_leaves_nothing_behind_but_the_store() {
 }
 
 #[test]
-fn shrunk_keyframes_are_area_means_with_the_lens_of_their_size() {
-    let whole = play(&mut join(&rig(&[])), samples(4));
-    let half = play(&mut join(&rig(&[Override::new("train.scale", 0.5)])), samples(4));
-    let stamps = |outcome: &Outcome| outcome.keyframes.iter().map(|keyframe| keyframe.stamp).collect::<Vec<_>>();
+fn downscaled_keyframes_are_area_means_with_scaled_intrinsics() {
+    let whole = run_join(&mut join(&rig(&[])), samples(4));
+    let half = run_join(&mut join(&rig(&[Override::new("train.scale", 0.5)])), samples(4));
+    let stamps = |outcome: &JoinOutcome| outcome.keyframes.iter().map(|keyframe| keyframe.stamp).collect::<Vec<_>>();
     assert_eq!(stamps(&whole), stamps(&half), "the size of the training images decides nothing");
     let (full, small) = (&whole.keyframes[1], &half.keyframes[1]);
     assert_eq!((small.size_px, small.focal_px, small.principal_px), ([32, 24], [30.5, 30.75], [16.0, 12.0]));

@@ -24,7 +24,7 @@ pub(super) struct Waiting {
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Partner<T> {
     /// It is here.
-    Here(T),
+    Available(T),
     /// It may still come.
     NotYet,
     /// There will be none.
@@ -38,9 +38,9 @@ impl Waiting {
 
     /// Queues a colour image; gives back the oldest where too many wait.
     pub(super) fn push_color(&mut self, image: Image) -> Option<Image> {
-        let crowded = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
+        let dropped_image = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
         self.color.push_back(image);
-        crowded
+        dropped_image
     }
 
     /// Queues a depth image; `stamp` is its mid-exposure.
@@ -61,12 +61,12 @@ impl Waiting {
         self.color.pop_front()
     }
 
-    /// Mid-exposure of the depth image nearest to a stamp, at most `within_secs` away, and whether that is final.
-    pub(super) fn depth_near(&self, stamp: Stamp, within_secs: f64) -> (Option<Stamp>, bool) {
+    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether that is final.
+    pub(super) fn depth_near(&self, stamp: Stamp, max_difference_secs: f64) -> (Option<Stamp>, bool) {
         let nearest = self.depth.iter().map(|(at, _)| *at).min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
         // Depth comes in order, so after one at or past the stamp no nearer one follows.
         let is_final = self.depth.back().is_some_and(|(newest, _)| *newest >= stamp);
-        (nearest.filter(|at| at.secs_since(stamp).abs() <= within_secs), is_final)
+        (nearest.filter(|at| at.secs_since(stamp).abs() <= max_difference_secs), is_final)
     }
 
     /// The depth image of a mid-exposure, for one more colour image may want it too.
@@ -77,14 +77,14 @@ impl Waiting {
     /// The ground truth of a colour image, by the stamp the device gave it.
     pub(super) fn truth_of(&self, device_stamp: Stamp) -> Partner<&TruthImage> {
         match self.truth.iter().find(|truth| truth.image.stamp == device_stamp) {
-            Some(truth) => Partner::Here(truth),
+            Some(truth) => Partner::Available(truth),
             None if self.expects_truth => Partner::NotYet,
             None => Partner::Never,
         }
     }
 
     /// Says that ground truth was waited for in vain.
-    pub(super) fn give_up_truth(&mut self) {
+    pub(super) fn stop_waiting_for_truth(&mut self) {
         self.expects_truth = false;
     }
 

@@ -6,13 +6,13 @@ use std::sync::Arc;
 use trainer::align::Alignment;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::PassTiming;
-use trainer::splat::PosedLens;
-use trainer::{Error, Keyframe, Method, Part, Picture, Progress, RenderRequest};
+use trainer::splat::CalibratedCamera;
+use trainer::{Error, Keyframe, Method, Picture, Progress, RenderRequest, TrialReport};
 
 /// No model: every operation fails.
-pub(crate) struct Absent;
+pub(crate) struct FailedModel;
 
-impl Method for Absent {
+impl Method for FailedModel {
     fn push(&mut self, _: Arc<Keyframe>) -> Result<(), Error> {
         Err(Error::DeviceLost)
     }
@@ -35,7 +35,7 @@ impl Method for Absent {
         "primitive"
     }
 
-    fn n_taken(&mut self) -> Result<u64, Error> {
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
         Err(Error::DeviceLost)
     }
 
@@ -51,7 +51,7 @@ impl Method for Absent {
         Err(Error::DeviceLost)
     }
 
-    fn posed_lens(&mut self, _: &Keyframe) -> Result<PosedLens, Error> {
+    fn calibrated_camera(&mut self, _: &Keyframe) -> Result<CalibratedCamera, Error> {
         Err(Error::DeviceLost)
     }
 
@@ -67,7 +67,7 @@ impl Method for Absent {
         Progress::default()
     }
 
-    fn report(&self) -> Vec<Part> {
+    fn report(&self) -> Vec<TrialReport> {
         Vec::new()
     }
 

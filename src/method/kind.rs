@@ -2,7 +2,7 @@
 
 /// The scene models there are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Kind {
+pub(crate) enum ModelKind {
     /// 3D Gaussians.
     Splat,
     /// A distance field with a mesh, from depth.
@@ -11,12 +11,12 @@ pub(crate) enum Kind {
     Nerf,
 }
 
-impl Kind {
+impl ModelKind {
     /// All there are.
     pub(crate) const ALL: [Self; 3] = [Self::Splat, Self::Tsdf, Self::Nerf];
 
     /// The kind of a name.
-    pub(crate) fn named(name: &str) -> Option<Self> {
+    pub(crate) fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 

@@ -14,15 +14,15 @@ pub(crate) use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use anyhow::{Context, anyhow, bail};
-use drivers::recording::{About, RIG_FILE, Recorder, Recording, URDF_FILE};
+use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::{Error, Live, Sample, Source};
 use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
-use tags::WithTags;
+use tags::TagBaseSource;
 
 /// What helps where a device is not there.
-const WAY_OUT: &str = "--sim replaces every device by its simulated twin";
+const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
 pub(crate) const FCI_PORT: u16 = 1337;
@@ -61,17 +61,17 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
             camera.driver = CameraDriver::Sim;
         }
     }
-    if let Some(device) = absent_device(&rig) {
-        bail!("{device} cannot be opened by this version; {WAY_OUT}");
+    if let Some(device) = unsupported_device(&rig) {
+        bail!("{device} cannot be opened by this version; {SIM_HINT}");
     }
     check_arm(&rig)?;
     if devices == Devices::Sim {
-        check_lenses(&rig)?;
+        check_intrinsics(&rig)?;
     }
-    let real = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {WAY_OUT}"))?;
+    let real = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {SIM_HINT}"))?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     let source = match rig.base.driver {
-        BaseDriver::Tags => Box::new(WithTags::new(&rig, source)?),
+        BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
     Ok(Opened { rig, source, damage: Arc::default() })
@@ -93,22 +93,22 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
         }
         rig.arm.joints = recorded.to_vec();
     }
-    check_lenses(&rig)?;
+    check_intrinsics(&rig)?;
     let damage = Arc::default();
-    let source = Box::new(Replay { recording, damage: Arc::clone(&damage) });
+    let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
     Ok(Opened { rig, source, damage })
 }
 
 /// Begins a recording of a rig; rig file and robot's description go into it.
 pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
-    let settled = rig.to_toml();
-    let about = About {
-        files: &[(RIG_FILE, settled.as_bytes()), (URDF_FILE, rig.arm.urdf_text.as_bytes())],
+    let resolved = rig.to_toml();
+    let description = RecordingMetadata {
+        files: &[(RIG_FILE, resolved.as_bytes()), (URDF_FILE, rig.arm.urdf_text.as_bytes())],
         cameras: &cameras,
         joint_names: &rig.arm.joints,
     };
-    Ok(Recorder::create(path, &about)?)
+    Ok(Recorder::create(path, &description)?)
 }
 
 /// The joints from the robot's base to its flange.
@@ -138,7 +138,7 @@ fn check_arm(rig: &Rig) -> anyhow::Result<()> {
 }
 
 /// What only a camera knows about its lens is not known without the camera.
-fn check_lenses(rig: &Rig) -> anyhow::Result<()> {
+fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
     if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
         bail!(
             "camera.{}.intrinsics is missing: only the camera knows it, and the camera is not asked here",
@@ -157,7 +157,7 @@ pub(crate) fn is_any_simulated(rig: &Rig) -> bool {
 }
 
 /// The first device of a rig that has no driver yet.
-fn absent_device(rig: &Rig) -> Option<String> {
+fn unsupported_device(rig: &Rig) -> Option<String> {
     let has_none = rig.base.driver == BaseDriver::Rgbd;
     has_none.then(|| format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()))
 }
@@ -183,12 +183,12 @@ fn simulate(_rig: &Rig, _real: drivers::Devices) -> anyhow::Result<Box<dyn Sourc
 }
 
 /// A recording that says at its end what was wrong with it.
-struct Replay {
+struct RecordingSource {
     recording: Recording,
     damage: Arc<OnceLock<String>>,
 }
 
-impl Source for Replay {
+impl Source for RecordingSource {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
         let sample = self.recording.next_sample()?;
         if sample.is_none()
@@ -211,41 +211,41 @@ mod tests {
     }
 
     #[test]
-    fn devices_without_a_driver_are_named_together_with_the_way_out() {
+    fn unsupported_driver_error_suggests_sim() {
         let rig = load("static-arm.toml", &[Override::new("base.driver", "rgbd")]);
         let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
         assert!(message.contains("rgbd") && message.contains("--sim"), "{message}");
     }
 
     #[test]
-    fn a_v4l2_camera_that_is_not_there_or_hangs_on_nothing_is_an_error() {
+    fn missing_or_unattached_v4l2_camera_is_an_error() {
         let absent = [
             Override::new("arm.driver", "none"),
             Override::new("camera.wrist.driver", "v4l2"),
             Override::new("camera.wrist.device", "no such serial"),
             Override::new("camera.wrist.depth.device", "no such serial"),
-            Override::new("camera.wrist.depth.metres_per_count", 0.001),
+            Override::new("camera.wrist.depth.meters_per_count", 0.001),
         ];
-        let refused = |overrides: &[Override]| {
+        let error_of = |overrides: &[Override]| {
             let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
             format!("{:#}", opened.err().expect("nothing is plugged in"))
         };
-        let message = refused(&absent);
+        let message = error_of(&absent);
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
-        let standing = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
-        let message = refused(&standing);
+        let on_base = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
+        let message = error_of(&on_base);
         assert!(
             message.contains("no V4L2 camera goes by \"no such serial\"") && message.contains("--sim"),
             "{message}"
         );
-        let without_scale = [&standing[..3], &standing[5..]].concat();
-        let message = refused(&without_scale);
+        let without_scale = [&on_base[..3], &on_base[5..]].concat();
+        let message = error_of(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");
     }
 
     #[cfg(feature = "nokhwa")]
     #[test]
-    fn what_nokhwa_cannot_do_is_told_before_it_is_asked() {
+    fn unsupported_nokhwa_settings_are_rejected() {
         let of = |more: &[Override]| {
             let driver = [("arm.driver", "none"), ("camera.wrist.driver", "nokhwa"), ("camera.wrist.parent", "base")];
             let overrides =
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_realsense_camera_that_is_not_there_is_an_error_that_says_what_to_do() {
+    fn missing_realsense_camera_error_suggests_a_remedy() {
         let overrides = [
             Override::new("arm.driver", "none"),
             Override::new("camera.wrist.parent", "base"),
@@ -268,33 +268,33 @@ mod tests {
         ];
         let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
         let message = format!("{:#}", opened.err().expect("nothing is plugged in"));
-        let wanted = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
-        assert!(message.contains(wanted) && message.contains("--sim"), "{message}");
+        let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
+        assert!(message.contains(expected) && message.contains("--sim"), "{message}");
     }
 
     #[test]
-    fn an_arm_on_the_network_that_is_not_there_is_an_error_that_says_what_to_do() {
-        let refused = |driver: &str, address: &str| {
+    fn unreachable_network_arm_error_suggests_a_remedy() {
+        let error_of = |driver: &str, address: &str| {
             let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
             let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
             format!("{:#}", opened.err().expect("no such arm"))
         };
-        for (driver, address, named) in
+        for (driver, address, expected) in
             [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
         {
-            let message = refused(driver, address);
-            assert!(message.contains(named), "{driver} {address}: {message}");
+            let message = error_of(driver, address);
+            assert!(message.contains(expected), "{driver} {address}: {message}");
         }
-        let taken = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
-        let address = taken.local_addr().expect("bound").to_string();
-        assert!(refused("udp", &address).contains(&address));
+        let occupied = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let address = occupied.local_addr().expect("bound").to_string();
+        assert!(error_of("udp", &address).contains(&address));
     }
 
     #[cfg(all(feature = "sim", target_os = "linux"))]
     #[test]
-    fn a_franka_arm_is_read_beside_simulated_cameras() {
+    fn franka_arm_is_read_with_simulated_cameras() {
         use drivers::franka::FciVersion;
-        use drivers::franka::played::{Joints, Limits, PlayedRobot, RobotConfig};
+        use drivers::franka::emulated::{EmulatedRobot, Joints, Limits, RobotConfig};
         const REST_RAD: [f64; 7] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
         // An arm that stands somewhere on a walking base is compared from its own foot on.
         for name in ["static-arm.toml", "mobile-arm.toml"] {
@@ -308,8 +308,8 @@ mod tests {
                 limits: Limits::panda(),
             };
             let rest = Joints { position_rad: REST_RAD, ..Joints::default() };
-            let played = PlayedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
-            let address = played.address().to_string();
+            let emulated = EmulatedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
+            let address = emulated.address().to_string();
             let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
             let mut opened = super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{e:#}"));
             let joints = loop {
@@ -323,13 +323,13 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_recording_is_refused() {
+    fn missing_recording_is_an_error() {
         let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
         assert!(format!("{missing:#}").contains("no/such.mcap"));
     }
 
     #[test]
-    fn a_recording_holds_the_rig_that_made_it() {
+    fn recording_stores_its_rig() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let rig = load("two-cameras.toml", &[Override::new("sim.seed", 77)]);
@@ -353,8 +353,8 @@ mod tests {
         assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
         let mut renamed = rig;
         renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
-        let refused = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
-        assert!(refused.contains("run.mcap") && refused.contains("\"elbow\""), "{refused}");
+        let error_of = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
+        assert!(error_of.contains("run.mcap") && error_of.contains("\"elbow\""), "{error_of}");
         let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
         assert_eq!(overridden.rig.train.seed, 9);
     }

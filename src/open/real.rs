@@ -21,7 +21,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
 /// Where joint states are listened for where nothing says otherwise: of this computer only.
-const USUAL_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
+const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Opens them; a rig may have none. What only a camera knew is in the rig afterwards.
 pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
@@ -87,8 +87,9 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> 
     let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
     for (ix, name) in arm.joints.iter().enumerate() {
-        let place = chain.joint_names().iter().position(|known| known == name);
-        let joint = place.map(|place| chain.limits()[place]).context("a joint of the rig is not in its URDF")?;
+        let joint_ix = chain.joint_names().iter().position(|known| known == name);
+        let joint =
+            joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
         let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, motion.acceleration_secs, motion.jerk_secs);
         // The description's angles are those told plus the offset.
         let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
@@ -147,11 +148,11 @@ fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
 /// A Franka arm that may be moved, over FCI.
 #[cfg(target_os = "linux")]
 fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
-    let usual = franka::ContactConfig::default();
+    let defaults = franka::ContactConfig::default();
     let contact = franka::ContactConfig {
-        torque_nm: motion.contact_torque_nm.unwrap_or(usual.torque_nm),
-        force_n: motion.contact_force_n.unwrap_or(usual.force_n),
-        moment_nm: motion.contact_moment_nm.unwrap_or(usual.moment_nm),
+        torque_nm: motion.contact_torque_nm.unwrap_or(defaults.torque_nm),
+        force_n: motion.contact_force_n.unwrap_or(defaults.force_n),
+        moment_nm: motion.contact_moment_nm.unwrap_or(defaults.moment_nm),
         stiffness_nm_rad: motion.stiffness_nm_rad,
     };
     let arm = MovableFrankaArm::open(&franka_config(rig)?, &motion_config(rig, motion)?, &contact)?;
@@ -180,8 +181,8 @@ pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
     let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
     // That is the one that its first joint turns against, wherever on the base that is.
     let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
-    let foot_link = first.map_or(&arm.base_link, |joint| &joint.parent);
-    kinematics::Chain::new(&robot, foot_link, &arm.flange_link).context("the arm's URDF")
+    let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
+    kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
 }
 
 #[cfg(not(target_os = "linux"))]
@@ -199,9 +200,9 @@ fn udp_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
 /// Where its joint states are listened for.
 pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
     match &*rig.arm.address {
-        "" => Ok(USUAL_ARM_ADDRESS),
+        "" => Ok(DEFAULT_ARM_ADDRESS),
         text => text.parse().with_context(|| {
-            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {USUAL_ARM_ADDRESS}")
+            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {DEFAULT_ARM_ADDRESS}")
         }),
     }
 }
@@ -260,7 +261,7 @@ fn v4l2_color(camera: &Camera) -> Config {
         format: camera.v4l2.format,
         intrinsics: camera.intrinsics.clone(),
         rate_hz: camera.rate_hz,
-        metres_per_count: None,
+        meters_per_count: None,
         settings: Settings {
             exposure_micros: camera.exposure_micros,
             gain: camera.v4l2.gain,
@@ -275,17 +276,17 @@ fn v4l2_color(camera: &Camera) -> Config {
 /// The depth images of a camera, which come from a device of their own; its exposure is left to itself.
 #[cfg(target_os = "linux")]
 fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
-    let Some(metres_per_count) = depth.metres_per_count.filter(|_| !depth.device.is_empty()) else {
+    let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {
         let name = &camera.name;
         bail!(
-            "camera {name:?}: depth by V4L2 needs camera.{name}.depth.device and camera.{name}.depth.metres_per_count"
+            "camera {name:?}: depth by V4L2 needs camera.{name}.depth.device and camera.{name}.depth.meters_per_count"
         );
     };
     Ok(Config {
         device: depth.device.clone(),
         format: Some(V4l2Format::Z16),
         intrinsics: depth.intrinsics.clone(),
-        metres_per_count: Some(metres_per_count),
+        meters_per_count: Some(meters_per_count),
         settings: Settings::default(),
         ..v4l2_color(camera)
     })

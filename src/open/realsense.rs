@@ -15,22 +15,23 @@ pub(super) use with_sdk::open;
 
 #[cfg(feature = "realsense")]
 mod with_sdk {
-    use crate::config::{Camera, Unknown};
+    use crate::config::{Camera, UnknownCalibration};
     use drivers::realsense::{Config, RealsenseCamera, Settings};
     use kinematics::{Intrinsics, Lens};
     use std::time::Duration;
 
     /// Where the lens of a rig file sees something this much elsewhere than the camera says, one of the two is of another camera.
-    const MAX_OFF_PX: f64 = 5.0;
+    const MAX_DIFFERENCE_PX: f64 = 5.0;
 
     /// Opens a camera and takes from it what the rig file does not say; where both say something the rig file counts.
     pub(in crate::open) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();
-        let Unknown { intrinsics, depth_intrinsics, camera_from_depth } = std::mem::take(&mut camera.realsense.unknown);
-        settle("intrinsics", &camera.name, intrinsics, &mut camera.intrinsics, &known.intrinsics);
+        let UnknownCalibration { intrinsics, depth_intrinsics, camera_from_depth } =
+            std::mem::take(&mut camera.realsense.unknown);
+        apply_known("intrinsics", &camera.name, intrinsics, &mut camera.intrinsics, &known.intrinsics);
         if let (Some(depth), Some(known)) = (&mut camera.depth, &known.depth) {
-            settle("depth.intrinsics", &camera.name, depth_intrinsics, &mut depth.intrinsics, &known.intrinsics);
+            apply_known("depth.intrinsics", &camera.name, depth_intrinsics, &mut depth.intrinsics, &known.intrinsics);
             if camera_from_depth {
                 depth.camera_from_depth = known.camera_from_depth;
             }
@@ -63,17 +64,17 @@ mod with_sdk {
         }
     }
 
-    fn settle(key: &str, camera: &str, is_unknown: bool, rig: &mut Intrinsics, known: &Intrinsics) {
+    fn apply_known(key: &str, camera: &str, is_unknown: bool, rig: &mut Intrinsics, known: &Intrinsics) {
         let line = toml_line(known);
         if is_unknown {
             log::info!("camera {camera:?}: {key} = {line}, by the camera itself");
             *rig = known.clone();
             return;
         }
-        let off_px = difference_px(rig, known);
-        if off_px > MAX_OFF_PX {
+        let max_difference_px = difference_px(rig, known);
+        if max_difference_px > MAX_DIFFERENCE_PX {
             log::warn!(
-                "camera {camera:?}: its rig file sees things up to {off_px:.1} px elsewhere than the camera itself, whose {key} is {line}; \
+                "camera {camera:?}: its rig file sees things up to {max_difference_px:.1} px elsewhere than the camera itself, whose {key} is {line}; \
                  leave the key out to take that"
             );
         }
@@ -83,13 +84,13 @@ mod with_sdk {
     fn difference_px(rig: &Intrinsics, known: &Intrinsics) -> f64 {
         const STEPS: u32 = 8;
         let pixels = (0..=STEPS).flat_map(|row| (0..=STEPS).map(move |column| [column, row]));
-        let offs = pixels.filter_map(|steps| {
+        let differences = pixels.filter_map(|steps| {
             let side = |axis: usize| f64::from(rig.size_px[axis] * steps[axis]) / f64::from(STEPS);
             let pixel = [side(0), side(1)];
-            let seen = known.project(&rig.unproject(pixel)?)?;
-            Some((seen[0] - pixel[0]).hypot(seen[1] - pixel[1]))
+            let projected = known.project(&rig.unproject(pixel)?)?;
+            Some((projected[0] - pixel[0]).hypot(projected[1] - pixel[1]))
         });
-        offs.fold(0.0, f64::max)
+        differences.fold(0.0, f64::max)
     }
 
     fn toml_line(intrinsics: &Intrinsics) -> String {

@@ -63,8 +63,8 @@ impl Source for RealTime {
         Ok(sample.filter(|sample| !past_end(sample)))
     }
 
-    fn n_others_dropped(&self) -> u64 {
-        self.live.n_others_dropped()
+    fn n_other_samples_dropped(&self) -> u64 {
+        self.live.n_other_samples_dropped()
     }
 }
 
@@ -106,7 +106,7 @@ fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
         rate_hz: scanner.rate_hz,
         base_from_scanner: scanner.base_from_scanner,
         n_rings: scanner.sim.rings,
-        elevation_rad: [scanner.sim.lowest_rad, scanner.sim.highest_rad],
+        elevation_rad: [scanner.sim.min_elevation_rad, scanner.sim.max_elevation_rad],
         n_columns: scanner.sim.columns,
         min_m: scanner.min_m,
         max_m: scanner.max_m,
@@ -148,7 +148,7 @@ fn camera_of(camera: &Camera) -> sim::CameraConfig {
             hole_frac: camera.sim.depth_hole_frac,
             min_m: depth.min_m,
             max_m: depth.max_m,
-            metres_per_count: camera.sim.metres_per_count,
+            meters_per_count: camera.sim.meters_per_count,
         }),
     }
 }

@@ -3,9 +3,9 @@
 use super::{Devices, Opened};
 use crate::config::{Override, Rig};
 use crate::join::{Join, JoinEvent};
-use crate::stands::Stands;
-use drivers::tags::{Family, Spotter};
-use drivers::wire::datagram::{Clock, Head, PoseDatagram, ScanPart, encode_pose, encode_scan};
+use crate::stations::Stations;
+use drivers::tags::{Family, TagDetector};
+use drivers::wire::datagram::{Clock, DatagramHeader, PoseDatagram, ScanPart, encode_pose, encode_scan};
 use drivers::{RangePoint, Sample};
 use kinematics::Transform;
 use std::net::{SocketAddr, UdpSocket};
@@ -30,8 +30,8 @@ fn small(name: &str, overrides: &[Override]) -> Rig {
         .expect("a rig file that comes along")
 }
 
-/// Plays a source to its end; `tap` sees every sample.
-fn keyframes(opened: Opened, mut tap: impl FnMut(&Sample)) -> (Vec<Arc<Keyframe>>, Join) {
+/// Plays a source to its end; `on_sample` sees every sample.
+fn keyframes(opened: Opened, mut on_sample: impl FnMut(&Sample)) -> (Vec<Arc<Keyframe>>, Join) {
     let mut source = opened.source;
     let mut join = Join::new(&opened.rig).expect("a good rig");
     let mut keyframes = Vec::new();
@@ -42,7 +42,7 @@ fn keyframes(opened: Opened, mut tap: impl FnMut(&Sample)) -> (Vec<Arc<Keyframe>
         }));
     };
     while let Some(sample) = source.next_sample().expect("the rig works") {
-        tap(&sample);
+        on_sample(&sample);
         take(join.push(sample));
     }
     take(join.finish());
@@ -56,7 +56,7 @@ fn bits(keyframes: &[Arc<Keyframe>]) -> Vec<String> {
 }
 
 #[test]
-fn live_recorded_and_replayed_keyframes_are_the_same_bits() {
+fn live_and_replayed_keyframes_are_identical() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 24)]);
@@ -73,34 +73,42 @@ fn live_recorded_and_replayed_keyframes_are_the_same_bits() {
 }
 
 #[test]
-fn forward_kinematics_agrees_with_the_simulator() {
-    const CLOSE_M: f64 = 1e-4; // What the whole road from joint readings to keyframes may cost.
-    const CLOSE_RAD: f64 = 1e-4;
+fn forward_kinematics_matches_the_simulator() {
+    const TOLERANCE_M: f64 = 1e-4; // What the whole road from joint readings to keyframes may cost.
+    const TOLERANCE_RAD: f64 = 1e-4;
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 40), Override::new("sim.ideal", true)]);
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
-    let mut worst = [0.0_f64; 2];
+    let mut max_error = [0.0_f64; 2];
     for keyframe in &keyframes {
         let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
-        let apart = truth.world_from_camera.inverse() * keyframe.world_from_camera;
-        worst[0] = worst[0].max(apart.translation.vector.norm());
-        worst[1] = worst[1].max(apart.rotation.angle());
+        let difference = truth.world_from_camera.inverse() * keyframe.world_from_camera;
+        max_error[0] = max_error[0].max(difference.translation.vector.norm());
+        max_error[1] = max_error[1].max(difference.rotation.angle());
         assert!(truth.psnr_ceiling.is_none(), "an ideal camera has no noise");
     }
-    assert!(keyframes.len() > 10 && worst[0] < CLOSE_M && worst[1] < CLOSE_RAD, "{worst:?}; {}", join.counts());
+    assert!(
+        keyframes.len() > 10 && max_error[0] < TOLERANCE_M && max_error[1] < TOLERANCE_RAD,
+        "{max_error:?}; {}",
+        join.counts()
+    );
 }
 
 #[test]
-fn readings_come_in_the_order_of_the_rig_file() {
-    const CLOSE_M: f64 = 1e-4; // As with joints in their own order.
+fn joint_readings_follow_rig_file_order() {
+    const TOLERANCE_M: f64 = 1e-4; // As with joints in their own order.
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 12), Override::new("sim.ideal", true)]);
     let reversed: Vec<String> = rig.arm.joints.iter().rev().cloned().collect();
     let rig = Rig { arm: crate::config::Arm { joints: reversed, ..rig.arm.clone() }, ..rig };
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
-    let apart_m = |keyframe: &Arc<Keyframe>| {
+    let difference_m = |keyframe: &Arc<Keyframe>| {
         let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
         (truth.world_from_camera.translation.vector - keyframe.world_from_camera.translation.vector).norm()
     };
-    assert!(keyframes.len() > 3 && keyframes.iter().all(|keyframe| apart_m(keyframe) < CLOSE_M), "{}", join.counts());
+    assert!(
+        keyframes.len() > 3 && keyframes.iter().all(|keyframe| difference_m(keyframe) < TOLERANCE_M),
+        "{}",
+        join.counts()
+    );
 }
 
 #[test]
@@ -121,7 +129,7 @@ fn two_cameras_keep_their_own_size_rate_and_kind() {
 }
 
 #[test]
-fn a_rig_in_real_time_ends_when_its_time_is_over() {
+fn real_time_rig_ends_after_its_duration() {
     let rig =
         small("static-arm.toml", &[Override::new("sim.lockstep", false), Override::new("sim.duration_secs", 1.5)]);
     let mut n_images = 0;
@@ -145,7 +153,7 @@ fn mobile(name: &str, overrides: &[Override]) -> Rig {
 }
 
 #[test]
-fn keyframes_and_scans_of_moving_bases_are_the_same_bits_live_recorded_and_replayed() {
+fn moving_base_keyframes_and_scans_replay_identically() {
     for (name, secs) in [("mobile-base-small.toml", 4.0), ("mobile-arm.toml", 3.0)] {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
@@ -177,16 +185,19 @@ fn keyframes_and_scans_of_moving_bases_are_the_same_bits_live_recorded_and_repla
 }
 
 #[test]
-fn poses_velocities_and_scans_of_moving_bases_agree_with_the_simulator() {
-    const CLOSE: f64 = 1e-4; // Metres and radians: joints every 1 ms and base poses every 10 ms, interpolated.
+fn moving_base_poses_and_scans_match_the_simulator() {
+    const TOLERANCE: f64 = 1e-4; // Metres and radians: joints every 1 ms and base poses every 10 ms, interpolated.
     for (name, secs) in [("mobile-base-small.toml", 6.0), ("mobile-arm.toml", 6.0)] {
         let rig = mobile(name, &[Override::new("sim.duration_secs", secs), Override::new("sim.ideal", true)]);
         let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
         assert!(keyframes.len() > 4, "{name}: {}", join.counts());
         for keyframe in &keyframes {
             let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
-            let apart = truth.world_from_camera.inverse() * keyframe.world_from_camera;
-            assert!(apart.translation.vector.norm() < CLOSE && apart.rotation.angle() < CLOSE, "{name}: {apart}");
+            let difference = truth.world_from_camera.inverse() * keyframe.world_from_camera;
+            assert!(
+                difference.translation.vector.norm() < TOLERANCE && difference.rotation.angle() < TOLERANCE,
+                "{name}: {difference}"
+            );
             let twist = keyframe.twist.expect("poses come all the time");
             let is_moving = twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 1e-3;
             assert!(is_moving || keyframe.stamp.0 < 1_000_000_000, "{name}: {twist:?} at {:?}", keyframe.stamp);
@@ -205,7 +216,7 @@ fn free_address() -> SocketAddr {
 }
 
 #[test]
-fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
+fn network_samples_are_registered_recorded_and_replayed() {
     const POINT: RangePoint = RangePoint { position_m: [2.0, 0.0, 0.0], ring: 1, offset_micros: 300 };
     let [to_base, to_lidar] = [free_address(), free_address()];
     let text = |key, value: &str| Override::new(key, value);
@@ -226,18 +237,18 @@ fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
     let mut join = Join::new(&opened.rig).expect("a good rig");
     let mut source = opened.source;
     let stop = AtomicBool::new(false);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     std::thread::scope(|scope| {
         scope.spawn(|| {
             let socket = UdpSocket::bind("127.0.0.1:0").expect("a free port");
             for seq in 0.. {
-                let head = Head { seq, clock: Clock::Monotonic, stamp_nanos: drivers::clock::now().0 };
+                let header = DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: drivers::clock::now().0 };
                 let world_from_base = Transform::translation(0.5, 0.0, 0.0);
                 socket
-                    .send_to(&encode_pose(&PoseDatagram { head, world_from_base, covariance: None }), to_base)
+                    .send_to(&encode_pose(&PoseDatagram { header, world_from_base, covariance: None }), to_base)
                     .expect("loopback");
                 if seq % 10 == 0 {
-                    let part = ScanPart { head, frame: "lidar".into(), part: 0, n_parts: 1, points: vec![POINT] };
+                    let part = ScanPart { header, frame: "lidar".into(), part: 0, n_parts: 1, points: vec![POINT] };
                     socket.send_to(&encode_scan(&part), to_lidar).expect("loopback");
                 }
                 std::thread::sleep(Duration::from_millis(10));
@@ -246,11 +257,11 @@ fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
                 }
             }
         });
-        while join.range_scans().count() < 5 || !told.iter().any(|sample| matches!(sample, Sample::Image(_))) {
+        while join.range_scans().count() < 5 || !reported.iter().any(|sample| matches!(sample, Sample::Image(_))) {
             let sample = source.next_sample().expect("the rig works").expect("it has no end");
             recorder.write(&sample).expect("room on the disk");
             join.push(sample.clone());
-            told.push(sample);
+            reported.push(sample);
         }
         stop.store(true, Ordering::Relaxed);
     });
@@ -261,23 +272,23 @@ fn what_comes_over_the_network_is_placed_recorded_and_replayed() {
     assert!((x - 2.5).abs() < 1e-6 && y.abs() < 1e-6 && z.abs() < 1e-6, "{x} {y} {z}");
     let mut replay = super::recording(&path, None, &[]).expect("a recording").source;
     let replayed: Vec<Sample> = std::iter::from_fn(|| replay.next_sample().expect("readable")).collect();
-    assert!(replayed == told, "the replay differs");
+    assert!(replayed == reported, "the replay differs");
 }
 
 #[test]
-fn lockstep_and_the_network_are_refused_together() {
+fn lockstep_with_network_devices_is_rejected() {
     let rig = small(
         "static-arm.toml",
         &[Override::new("base.driver", "udp"), Override::new("base.address", free_address().to_string())],
     );
-    let refused = super::rig(rig, Devices::Real).err().expect("one waits, the other does not").to_string();
-    assert!(refused.contains("sim.lockstep") && refused.contains("real devices"), "{refused}");
+    let error_message = super::rig(rig, Devices::Real).err().expect("one waits, the other does not").to_string();
+    assert!(error_message.contains("sim.lockstep") && error_message.contains("real devices"), "{error_message}");
 }
 
 #[test]
-fn a_base_that_drifts_on_its_way_is_found_again_live_and_from_its_recording() {
-    const LEFT_M: f64 = 1.5e-3; // Of images of 320x180: a pixel of the first stand is 7 mm of the cabinet.
-    const LEFT_RAD: f64 = 1.5e-3;
+fn drifting_base_is_corrected_live_and_in_replay() {
+    const MAX_REMAINING_M: f64 = 1.5e-3; // Of images of 320x180: a pixel of the first stand is 7 mm of the cabinet.
+    const MAX_REMAINING_RAD: f64 = 1.5e-3;
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let list = |key, numbers: [f64; 2]| Override::new(key, Value::from(numbers.to_vec()));
@@ -293,96 +304,103 @@ fn a_base_that_drifts_on_its_way_is_found_again_live_and_from_its_recording() {
     );
     let live = super::rig(rig, Devices::Sim).expect("the simulator");
     let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
-    let mut stands = Stands::new(&live.rig).expect("its base walks");
-    let (told, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
+    let mut stations = Stations::new(&live.rig).expect("its base walks");
+    let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
     recorder.finish().expect("room on the disk");
-    let first = stands.corrected(told.clone());
+    let first = stations.corrected(reported.clone());
     let recorded = super::recording(&path, None, &[]).expect("a recording");
-    let mut again = Stands::new(&recorded.rig).expect("its base walks");
+    let mut again = Stations::new(&recorded.rig).expect("its base walks");
     let replayed = again.corrected(keyframes(recorded, |_| {}).0);
     assert!(bits(&first) == bits(&replayed), "the replay differs");
-    assert_eq!(stands.reports(), again.reports());
+    assert_eq!(stations.reports(), again.reports());
 
-    let off = |keyframe: &Keyframe| {
+    let error_of = |keyframe: &Keyframe| {
         let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images").world_from_camera;
-        let apart = truth.inverse() * keyframe.world_from_camera;
-        [apart.translation.vector.norm(), apart.rotation.angle()]
+        let difference = truth.inverse() * keyframe.world_from_camera;
+        [difference.translation.vector.norm(), difference.rotation.angle()]
     };
-    let at_second = |keyframe: &&Arc<Keyframe>| keyframe.base.as_ref().is_some_and(|base| base.stand == Some(1));
-    let worst = |keyframes: &[Arc<Keyframe>]| {
-        let off = keyframes.iter().filter(at_second).map(|keyframe| off(keyframe));
-        off.fold([0.0_f64; 2], |worst, off| [worst[0].max(off[0]), worst[1].max(off[1])])
+    let is_at_second_station =
+        |keyframe: &&Arc<Keyframe>| keyframe.base.as_ref().is_some_and(|base| base.station == Some(1));
+    let max_error = |keyframes: &[Arc<Keyframe>]| {
+        let error_of = keyframes.iter().filter(is_at_second_station).map(|keyframe| error_of(keyframe));
+        error_of
+            .fold([0.0_f64; 2], |max_error, error_of| [max_error[0].max(error_of[0]), max_error[1].max(error_of[1])])
     };
-    assert!(told.iter().filter(at_second).count() >= 14, "{}", join.counts());
-    let [before, after] = [worst(&told), worst(&first)];
+    assert!(reported.iter().filter(is_at_second_station).count() >= 14, "{}", join.counts());
+    let [before, after] = [max_error(&reported), max_error(&first)];
     assert!(before[0] > 0.015 && before[1] > 0.005, "{before:?} m and rad to begin with");
-    assert!(after[0] < LEFT_M && after[1] < LEFT_RAD, "{after:?} m and rad left: {:?}", stands.reports());
+    assert!(
+        after[0] < MAX_REMAINING_M && after[1] < MAX_REMAINING_RAD,
+        "{after:?} m and rad left: {:?}",
+        stations.reports()
+    );
 }
 
 #[test]
-fn tags_tell_where_a_base_stands_that_nobody_measured() {
+fn tags_localize_an_unmeasured_base() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/tags.toml");
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 40)];
     let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
     for (id, tag) in &rig.base.tags {
         let truth = sim::layout::world_from_tag(*id as usize);
-        let off = tag.world_from_tag.inverse() * truth;
-        assert!(off.translation.vector.norm() < 1e-6 && off.rotation.angle() < 1e-6, "tag {id}: {off}");
+        let error_of = tag.world_from_tag.inverse() * truth;
+        assert!(error_of.translation.vector.norm() < 1e-6 && error_of.rotation.angle() < 1e-6, "tag {id}: {error_of}");
     }
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |sample| {
         if let Sample::Base(pose) = sample {
-            told.push(pose.world_from_base);
+            reported.push(pose.world_from_base);
         }
     });
-    assert!(told.len() >= 20, "{}", told.len());
-    let mut off: Vec<[f64; 2]> =
-        told.iter().map(|pose| [pose.translation.vector.norm(), pose.rotation.angle()]).collect();
-    off.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    assert!(reported.len() >= 20, "{}", reported.len());
+    let mut error_of: Vec<[f64; 2]> =
+        reported.iter().map(|pose| [pose.translation.vector.norm(), pose.rotation.angle()]).collect();
+    error_of.sort_by(|a, b| a[0].total_cmp(&b[0]));
     eprintln!(
         "{} poses; base off by {:?} in the median, {:?} at worst",
-        off.len(),
-        off[off.len() / 2],
-        off[off.len() - 1]
+        error_of.len(),
+        error_of[error_of.len() / 2],
+        error_of[error_of.len() - 1]
     );
-    let last = &told[told.len() - 1];
+    let last = &reported[reported.len() - 1];
     assert!(last.translation.vector.norm() < 1e-3 && last.rotation.angle() < 1e-3, "{last}");
-    assert!(off[off.len() / 2][0] < 1e-3, "{off:?}");
+    assert!(error_of[error_of.len() / 2][0] < 1e-3, "{error_of:?}");
     assert!(keyframes.len() >= 8, "{}", join.counts());
-    let worst = keyframes.iter().filter_map(|keyframe| {
+    let max_error = keyframes.iter().filter_map(|keyframe| {
         let truth = keyframe.truth.as_ref()?;
         Some((keyframe.world_from_camera.inverse() * truth.world_from_camera).translation.vector.norm())
     });
-    let worst = worst.fold(0.0, f64::max);
-    assert!(worst > 0.0 && worst < 5e-3, "{worst} m");
+    let max_error = max_error.fold(0.0, f64::max);
+    assert!(max_error > 0.0 && max_error < 5e-3, "{max_error} m");
 }
 
 #[test]
-fn corners_of_tags_are_seen_where_the_simulator_puts_them() {
+fn tag_corners_match_the_simulator() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
     let at_once = Override::new("camera.wrist.readout_micros", 0);
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 30), at_once];
     let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
-    let mut spotter = Spotter::start(Family::Tag36h11).expect("a thread");
+    let mut detector = TagDetector::start(Family::Tag36h11).expect("a thread");
     let mut source = super::rig(rig.clone(), Devices::Sim).expect("the simulator").source;
-    let (mut sightings, mut off_px) = (Vec::new(), Vec::new());
+    let (mut detections, mut off_px) = (Vec::new(), Vec::new());
     while let Some(sample) = source.next_sample().expect("the rig works") {
         match sample {
             Sample::Image(image) if !image.is_depth() => {
-                sightings.extend(spotter.look_now(image).into_iter().map(|sighting| sighting.expect("an image")));
+                detections
+                    .extend(detector.detect_blocking(image).into_iter().map(|detection| detection.expect("an image")));
             }
             Sample::Truth(truth) => {
-                let Some(ix) = sightings.iter().position(|sighting| sighting.stamp == truth.image.stamp) else {
+                let Some(ix) = detections.iter().position(|detection| detection.stamp == truth.image.stamp) else {
                     continue;
                 };
-                for tag in sightings.swap_remove(ix).tags {
+                for tag in detections.swap_remove(ix).tags {
                     let camera_from_tag =
                         truth.world_from_camera.inverse() * sim::layout::world_from_tag(tag.id as usize);
                     let corners = [[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]];
-                    for ([x, y], seen) in corners.into_iter().zip(tag.corners_px) {
+                    for ([x, y], detected) in corners.into_iter().zip(tag.corners_px) {
                         let corner = camera_from_tag * nalgebra::Point3::new(0.024 * x, 0.024 * y, 0.0);
                         let at = rig.cameras[0].intrinsics.project(&corner.coords).expect("before the camera");
-                        off_px.push([seen[0] - at[0], seen[1] - at[1]]);
+                        off_px.push([detected[0] - at[0], detected[1] - at[1]]);
                     }
                 }
             }
@@ -394,7 +412,7 @@ fn corners_of_tags_are_seen_where_the_simulator_puts_them() {
         numbers.sort_by(f64::total_cmp);
         numbers[numbers.len() / 2]
     };
-    let along = |axis: usize| median(off_px.iter().map(|off| off[axis]).collect());
+    let along = |axis: usize| median(off_px.iter().map(|error_of| error_of[axis]).collect());
     let spread = median(off_px.iter().map(|[x, y]| x.hypot(*y)).collect());
     // Half a pixel would be a corner counted from the middle of the first one.
     let n = off_px.len();

@@ -1,9 +1,11 @@
 //! A base whose place is told by tags that its cameras see: its poses are made of the images and join the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
-use crate::join::{Motion, Posed};
+use crate::join::{CameraPose, Motion};
 use anyhow::bail;
-use drivers::tags::{PlacedTag, Seeing, Sighting, Spotter, Steady, Unlocated, locate};
+use drivers::tags::{
+    LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector, TagPlacement, locate,
+};
 use drivers::{BasePose, Error, Image, Sample, Source};
 use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
@@ -12,48 +14,48 @@ use std::collections::{BTreeMap, VecDeque};
 /// Sightings that wait for joint states; more are of a rig whose arm is silent, which is told elsewhere.
 const MAX_WAITING: usize = 64;
 /// So many images in which no pose fits the tags are no chance: one of the tags is not where the rig file has it.
-const SURELY_WRONG: u64 = 3;
+const MIN_MISFIT_IMAGES: u64 = 3;
 /// After so long without a pose a person is told why, seconds.
-const UNTIL_TOLD_SECS: f64 = 5.0;
+const WARN_AFTER_SECS: f64 = 5.0;
 
 /// A source with the poses of the base added.
-pub(super) struct WithTags {
+pub(super) struct TagBaseSource {
     source: Box<dyn Source>,
-    spotter: Spotter,
+    detector: TagDetector,
     /// Every image is looked at, however long that takes.
-    is_patient: bool,
+    is_lockstep: bool,
     cameras: Vec<Camera>,
-    tags: BTreeMap<u32, PlacedTag>,
+    tags: BTreeMap<u32, TagPlacement>,
     /// The arm alone: on a base in the world's origin.
     arm: Motion,
-    waiting: VecDeque<Sighting>,
+    pending: VecDeque<TagDetections>,
     ready: VecDeque<Sample>,
     max_sigma: [f64; 2],
-    steady: Steady,
+    pose_filter: StationaryPoseFilter,
     newest: Option<Stamp>,
-    told: Option<Stamp>,
-    counts: Counts,
+    no_pose_since: Option<Stamp>,
+    counts: TagCounts,
 }
 
 /// What became of the images.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counts {
+struct TagCounts {
     n_images: u64,
-    n_busy: u64,
+    n_skipped: u64,
     n_poses: u64,
     n_without_tag: u64,
     n_ambiguous: u64,
-    n_far_off: u64,
-    n_unsure: u64,
+    n_misfit: u64,
+    n_uncertain: u64,
     n_without_joints: u64,
 }
 
-impl WithTags {
+impl TagBaseSource {
     pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Self> {
         let mut arm = rig.clone();
         (arm.base.driver, arm.base.world_from_base) = (BaseDriver::Fixed, Transform::identity());
-        let is_carried = |camera: &&Camera| camera.parent != Parent::World;
-        let cameras: Vec<_> = rig.cameras.iter().filter(is_carried).cloned().collect();
+        let is_on_robot = |camera: &&Camera| camera.parent != Parent::World;
+        let cameras: Vec<_> = rig.cameras.iter().filter(is_on_robot).cloned().collect();
         if cameras.is_empty() {
             bail!(
                 "base.driver is tags, and no camera is on the base or the arm (camera.NAME.parent): none would see them move"
@@ -61,32 +63,32 @@ impl WithTags {
         }
         Ok(Self {
             source,
-            spotter: Spotter::start(rig.base.tag_family)?,
-            is_patient: rig.sim.lockstep,
+            detector: TagDetector::start(rig.base.tag_family)?,
+            is_lockstep: rig.sim.lockstep,
             cameras,
             tags: rig.base.tags.clone(),
             arm: Motion::new(&arm)?,
-            waiting: VecDeque::new(),
+            pending: VecDeque::new(),
             ready: VecDeque::new(),
             max_sigma: [rig.base.max_sigma_m, rig.base.max_sigma_rad],
-            steady: Steady::default(),
+            pose_filter: StationaryPoseFilter::default(),
             newest: None,
-            told: None,
-            counts: Counts::default(),
+            no_pose_since: None,
+            counts: TagCounts::default(),
         })
     }
 
     /// Has an image of a camera that the base carries looked at.
-    fn look(&mut self, image: &Image) {
+    fn detect(&mut self, image: &Image) {
         if image.is_depth() || self.camera(&image.camera).is_none() {
             return;
         }
         self.counts.n_images += 1;
-        if self.is_patient {
-            let found = self.spotter.look_now(image.clone());
-            self.wait(found);
-        } else if !self.spotter.look(image.clone()) {
-            self.counts.n_busy += 1;
+        if self.is_lockstep {
+            let new_detections = self.detector.detect_blocking(image.clone());
+            self.enqueue(new_detections);
+        } else if !self.detector.detect(image.clone()) {
+            self.counts.n_skipped += 1;
         }
     }
 
@@ -94,133 +96,141 @@ impl WithTags {
         self.cameras.iter().find(|camera| &*camera.name == name)
     }
 
-    fn wait(&mut self, found: Vec<Result<Sighting, Error>>) {
-        for sighting in found {
-            match sighting {
-                Ok(sighting) => self.waiting.push_back(sighting),
+    fn enqueue(&mut self, new_detections: Vec<Result<TagDetections, Error>>) {
+        for detection in new_detections {
+            match detection {
+                Ok(detection) => self.pending.push_back(detection),
                 Err(error) => log::debug!("base: {error}"),
             }
         }
-        while self.waiting.len() > MAX_WAITING {
-            self.waiting.pop_front();
+        while self.pending.len() > MAX_WAITING {
+            self.pending.pop_front();
             self.counts.n_without_joints += 1;
         }
     }
 
     /// Makes poses of the sightings for which the joints are known.
-    fn settle(&mut self) {
-        while let Some(sighting) = self.waiting.front() {
-            let Some(camera) = self.camera(&sighting.camera) else { return };
-            let stamp = camera.mid_exposure(sighting.stamp);
+    fn process_ready(&mut self) {
+        while let Some(detection) = self.pending.front() {
+            let Some(camera) = self.camera(&detection.camera) else { return };
+            let stamp = camera.mid_exposure(detection.stamp);
             match self.arm.at(camera, stamp) {
-                Ok(posed) => self.locate(stamp, &posed),
+                Ok(camera_pose) => self.locate(stamp, &camera_pose),
                 Err(HistoryError::NotYet { .. }) => return,
                 Err(_) => self.counts.n_without_joints += 1,
             }
-            self.waiting.pop_front();
+            self.pending.pop_front();
         }
     }
 
-    fn locate(&mut self, stamp: Stamp, posed: &Posed) {
-        let base_from_camera = &posed.world_from_camera;
-        let Some(sighting) = self.waiting.front() else { return };
-        let Some(camera) = self.camera(&sighting.camera) else { return };
-        let known = sighting.tags.iter().filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
-        let seeing = Seeing {
+    fn locate(&mut self, stamp: Stamp, camera_pose: &CameraPose) {
+        let base_from_camera = &camera_pose.world_from_camera;
+        let Some(detection) = self.pending.front() else { return };
+        let Some(camera) = self.camera(&detection.camera) else { return };
+        let known = detection.tags.iter().filter_map(|tag| Some((self.tags.get(&tag.id)?, tag.corners_px)));
+        let rolling_camera = RollingShutterCamera {
             intrinsics: &camera.intrinsics,
-            twist: posed.twist.unwrap_or_else(Twist::zero),
+            twist: camera_pose.twist.unwrap_or_else(Twist::zero),
             readout_secs: camera.readout_micros.unwrap_or(0.0) * 1e-6,
         };
-        let located = locate(&seeing, &known.collect::<Vec<_>>());
-        match located {
-            Ok(located) if self.newest.is_none_or(|newest| stamp > newest) => {
-                let world_from_base = located.world_from_camera * base_from_camera.inverse();
-                let covariance = of_base(&located.covariance, base_from_camera);
-                if !self.is_sure(&covariance) {
-                    self.counts.n_unsure += 1;
+        let estimate = locate(&rolling_camera, &known.collect::<Vec<_>>());
+        match estimate {
+            Ok(estimate) if self.newest.is_none_or(|newest| stamp > newest) => {
+                let world_from_base = estimate.world_from_camera * base_from_camera.inverse();
+                let covariance = of_base(&estimate.covariance, base_from_camera);
+                if !self.is_certain(&covariance) {
+                    self.counts.n_uncertain += 1;
                     return;
                 }
-                let world_from_base = self.steady.push(&world_from_base, &covariance);
+                let world_from_base = self.pose_filter.push(&world_from_base, &covariance);
                 self.ready.push_back(Sample::Base(BasePose { stamp, world_from_base }));
-                (self.newest, self.told) = (Some(stamp), None);
+                (self.newest, self.no_pose_since) = (Some(stamp), None);
                 self.counts.n_poses += 1;
             }
             // Two cameras at once: the other one was first.
             Ok(_) => {}
             Err(why) => {
                 let name = camera.name.clone();
-                let seen: Vec<_> = sighting.tags.iter().map(|tag| tag.id.to_string()).collect();
-                self.miss(stamp, &name, &seen, why);
+                let visible_ids: Vec<_> = detection.tags.iter().map(|tag| tag.id.to_string()).collect();
+                self.count_miss(stamp, &name, &visible_ids, why);
             }
         }
     }
 
     /// Whether a covariance is what the rig file asks for.
-    fn is_sure(&self, covariance: &Matrix6<f64>) -> bool {
+    fn is_certain(&self, covariance: &Matrix6<f64>) -> bool {
         let sigma = |first: usize| covariance.diagonal().fixed_rows::<3>(first).sum().sqrt();
         sigma(0) <= self.max_sigma[0] && sigma(3) <= self.max_sigma[1]
     }
 
     /// Counts an image without a pose, and tells of a long time without any.
-    fn miss(&mut self, stamp: Stamp, camera: &str, seen: &[String], why: Unlocated) {
+    fn count_miss(&mut self, stamp: Stamp, camera: &str, visible_ids: &[String], why: LocateError) {
         match why {
-            Unlocated::NoTag => self.counts.n_without_tag += 1,
-            Unlocated::Ambiguous => self.counts.n_ambiguous += 1,
-            Unlocated::FarOff { .. } => {
-                self.counts.n_far_off += 1;
-                if self.counts.n_far_off == SURELY_WRONG {
+            LocateError::NoTag => self.counts.n_without_tag += 1,
+            LocateError::Ambiguous => self.counts.n_ambiguous += 1,
+            LocateError::LargeReprojectionError { .. } => {
+                self.counts.n_misfit += 1;
+                if self.counts.n_misfit == MIN_MISFIT_IMAGES {
                     log::warn!(
-                        "base: camera {camera:?}: {SURELY_WRONG} images fit no pose: {why}; what single tags told before may be wrong, too"
+                        "base: camera {camera:?}: {MIN_MISFIT_IMAGES} images fit no pose: {why}; what single tags told before may be wrong, too"
                     );
                 }
             }
         }
-        let since = *self.told.get_or_insert(self.newest.unwrap_or(stamp));
-        if stamp.secs_since(since) >= UNTIL_TOLD_SECS {
+        let since = *self.no_pose_since.get_or_insert(self.newest.unwrap_or(stamp));
+        if stamp.secs_since(since) >= WARN_AFTER_SECS {
             let others = match why {
-                Unlocated::NoTag if !seen.is_empty() => format!(", but the tags {}", seen.join(", ")),
+                LocateError::NoTag if !visible_ids.is_empty() => format!(", but the tags {}", visible_ids.join(", ")),
                 _ => String::new(),
             };
             log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}{others}", stamp.secs_since(since));
-            self.told = Some(stamp);
+            self.no_pose_since = Some(stamp);
         }
     }
 }
 
-impl Source for WithTags {
+impl Source for TagBaseSource {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-        let found = self.spotter.found();
-        self.wait(found);
-        self.settle();
+        let new_detections = self.detector.new_detections();
+        self.enqueue(new_detections);
+        self.process_ready();
         if let Some(pose) = self.ready.pop_front() {
             return Ok(Some(pose));
         }
         let Some(sample) = self.source.next_sample()? else {
-            let found = self.spotter.finish();
-            self.wait(found);
-            self.settle();
+            let new_detections = self.detector.finish();
+            self.enqueue(new_detections);
+            self.process_ready();
             return Ok(self.ready.pop_front());
         };
         match &sample {
             Sample::Joints(state) => drop(self.arm.push_joints(state.clone())),
-            Sample::Image(image) => self.look(image),
+            Sample::Image(image) => self.detect(image),
             _ => {}
         }
         Ok(Some(sample))
     }
 
-    fn n_others_dropped(&self) -> u64 {
-        self.source.n_others_dropped()
+    fn n_other_samples_dropped(&self) -> u64 {
+        self.source.n_other_samples_dropped()
     }
 }
 
-impl Drop for WithTags {
+impl Drop for TagBaseSource {
     fn drop(&mut self) {
-        let Counts { n_images, n_busy, n_poses, n_without_tag, n_ambiguous, n_far_off, n_unsure, n_without_joints } =
-            self.counts;
+        let TagCounts {
+            n_images,
+            n_skipped,
+            n_poses,
+            n_without_tag,
+            n_ambiguous,
+            n_misfit,
+            n_uncertain,
+            n_without_joints,
+        } = self.counts;
         log::info!(
-            "base: {n_poses} poses by tags in {n_images} images ({n_busy} not looked at, {n_without_tag} without a known tag, \
-             {n_ambiguous} ambiguous, {n_far_off} that fit no pose, {n_unsure} too unsure, {n_without_joints} without joint states)"
+            "base: {n_poses} poses by tags in {n_images} images ({n_skipped} not looked at, {n_without_tag} without a known tag, \
+             {n_ambiguous} ambiguous, {n_misfit} that fit no pose, {n_uncertain} too unsure, {n_without_joints} without joint states)"
         );
     }
 }
@@ -242,18 +252,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_base_far_from_its_camera_is_known_worse_across_the_line_between_them() {
+    fn base_position_uncertainty_grows_with_lever_arm() {
         let base_from_camera = Transform::translation(0.0, 0.0, 2.0);
         let of_camera = Matrix6::from_diagonal(&Vector6::new(1e-6, 1e-6, 1e-6, 1e-4, 0.0, 0.0));
         let of_base = of_base(&of_camera, &base_from_camera);
         // Turned by 10 mrad about x, 2 m away: 20 mm along y.
         assert!((of_base[(1, 1)] - (1e-6 + 4e-4)).abs() < 1e-12, "{of_base}");
         assert!((of_base[(0, 0)] - 1e-6).abs() < 1e-12 && (of_base[(2, 2)] - 1e-6).abs() < 1e-12, "{of_base}");
-        let off = kinematics::transform::exp(
+        let rotation_error = kinematics::transform::exp(
             &Twist { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::new(1e-2, 0.0, 0.0) },
             1.0,
         );
-        let moved = base_from_camera * off * base_from_camera.inverse();
+        let moved = base_from_camera * rotation_error * base_from_camera.inverse();
         assert!((moved.translation.y.abs() - 2e-2).abs() < 1e-5, "{moved}");
     }
 }

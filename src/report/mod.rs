@@ -9,7 +9,7 @@ pub(crate) use pictures::{Comparison, Scored, compare};
 use crate::bench::page::Table;
 use crate::chart::drawing::escaped;
 use crate::chart::{Axis, Chart, Line, Point, Scale};
-use crate::marks;
+use crate::evaluation_schedule;
 use crate::next_commands::NextCommand;
 use crate::run_folder;
 use serde_json::{Map, Value};
@@ -39,7 +39,7 @@ pub(crate) struct Page<'a> {
 impl Page<'_> {
     /// Writes the page into the folder.
     pub(crate) fn write(&self) -> anyhow::Result<()> {
-        run_folder::write_whole(&self.folder.join(FILE), &self.html())
+        run_folder::write_atomic(&self.folder.join(FILE), &self.html())
     }
 
     fn html(&self) -> String {
@@ -55,12 +55,12 @@ impl Page<'_> {
             escaped(&self.subtitle())
         );
         page.push_str(&figures(done, self.primitive));
-        page.push_str(&losses(&report["losses"]));
+        page.push_str(&dropped_messages(&report["losses"]));
         page.push_str(&commands(self.next));
-        page.push_str(&shots(self.comparisons, array(&report["per_image"]).len()));
+        page.push_str(&comparison_section(self.comparisons, array(&report["per_image"]).len()));
         page.push_str(&curve(report, method));
-        page.push_str(&folded(&scores_of_images(report), "Scores of all test images"));
-        page.push_str(&folded(&marks_table(report, self.primitive), "Scores during training"));
+        page.push_str(&collapsible(&scores_of_images(report), "Scores of all test images"));
+        page.push_str(&collapsible(&evaluations_table(report, self.primitive), "Scores during training"));
         page.push_str(&parts(&report["parts"]));
         page.push_str(&self.settings_tables());
         page.push_str("</main></body></html>\n");
@@ -75,11 +75,11 @@ impl Page<'_> {
     }
 
     fn settings_tables(&self) -> String {
-        let shown_above = ["done", "losses", "marks", "parts", "passes", "per_image"];
-        let own = self.report.as_object().into_iter().flatten();
-        let own = own.filter(|(key, _)| !shown_above.contains(&key.as_str()));
+        let excluded_keys = ["done", "losses", "evaluations", "parts", "passes", "per_image"];
+        let extra = self.report.as_object().into_iter().flatten();
+        let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
         let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
-        run.extend(own.flat_map(|(key, value)| rows_of(key, value)));
+        run.extend(extra.flat_map(|(key, value)| rows_of(key, value)));
         run.extend(rows_of("model sha256", &self.report["done"]["checkpoint_sha256"]));
         let passes = array(&self.report["passes"]).iter().filter_map(|pass| {
             Some(vec![format!("GPU time of {}", pass[0].as_str()?), format!("{:.3} ms", pass[1].as_f64()?)])
@@ -128,9 +128,12 @@ fn figures(done: &Value, primitive: &str) -> String {
     html
 }
 
-fn losses(losses: &Value) -> String {
-    let items: String =
-        array(losses).iter().filter_map(Value::as_str).map(|loss| format!("<li>{}</li>", escaped(loss))).collect();
+fn dropped_messages(dropped_messages: &Value) -> String {
+    let items: String = array(dropped_messages)
+        .iter()
+        .filter_map(Value::as_str)
+        .map(|loss| format!("<li>{}</li>", escaped(loss)))
+        .collect();
     match items.is_empty() {
         true => String::new(),
         false => format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n"),
@@ -149,17 +152,17 @@ fn commands(next: &[NextCommand]) -> String {
 }
 
 /// Test images beside renders.
-fn shots(comparisons: &[Comparison], n_tests: usize) -> String {
+fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     if comparisons.is_empty() {
-        let why = if n_tests == 0 { "no image was held out for testing" } else { "no test image could be drawn" };
-        return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {why}.</p>\n");
+        let reason = if n_tests == 0 { "no image was held out for testing" } else { "no test image could be drawn" };
+        return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {reason}.</p>\n");
     }
-    let of_all = match comparisons.len() == n_tests {
+    let count_note = match comparisons.len() == n_tests {
         true => String::new(),
         false => format!("{} of {n_tests} test images, with the best and the worst among them. ", comparisons.len()),
     };
     let mut html = format!(
-        "<h2>Test images</h2>\n<p class=\"legend\">{of_all}Left the image from the camera, then the model's render from the same pose. \
+        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left the image from the camera, then the model's render from the same pose. \
          None of these images was used for training.</p>\n<div class=\"shots\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
@@ -172,13 +175,13 @@ fn shots(comparisons: &[Comparison], n_tests: usize) -> String {
             _ if is(best) => "<span class=\"tag\">best</span>",
             _ => "",
         };
-        html.push_str(&shot(comparison, tag));
+        html.push_str(&comparison_card(comparison, tag));
     }
     html.push_str("</div>\n");
     html
 }
 
-fn shot(comparison: &Comparison, tag: &str) -> String {
+fn comparison_card(comparison: &Comparison, tag: &str) -> String {
     let Comparison { name, psnr, ssim, size_px: [width, height], image, render, error, depth } = comparison;
     let name = escaped(name);
     let ssim = ssim.map_or(String::new(), |ssim| format!("<span>SSIM {ssim:.4}</span>"));
@@ -204,8 +207,10 @@ fn shot(comparison: &Comparison, tag: &str) -> String {
 
 /// Accuracy over time.
 fn curve(report: &Value, method: &str) -> String {
-    let point = |mark: &Value| Some((mark["seconds"].as_f64().filter(|secs| *secs > 0.0)?, mark["psnr"].as_f64()?));
-    let mut points: Vec<(f64, f64)> = array(&report["marks"]).iter().filter_map(point).collect();
+    let point = |evaluation: &Value| {
+        Some((evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?, evaluation["psnr"].as_f64()?))
+    };
+    let mut points: Vec<(f64, f64)> = array(&report["evaluations"]).iter().filter_map(point).collect();
     let last_secs = points.last().map_or(0.0, |(secs, _)| *secs);
     points.extend(point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
     if points.len() < 2 {
@@ -217,13 +222,14 @@ fn curve(report: &Value, method: &str) -> String {
         x: Axis {
             label: "seconds of training (log)".into(),
             scale: Scale::Log,
-            ticks: marks::up_to(1.1 * last_secs.max(points.last().map_or(0.0, |(secs, _)| *secs))).collect(),
+            ticks: evaluation_schedule::up_to(1.1 * last_secs.max(points.last().map_or(0.0, |(secs, _)| *secs)))
+                .collect(),
         },
         y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
         lines: vec![Line {
             label: method.to_owned(),
             points: points.iter().map(|(x, y)| Point { x: *x, y: *y, low: *y, high: *y }).collect(),
-            is_foreign: false,
+            is_peer: false,
         }],
         floors: Vec::new(),
         rules: Vec::new(),
@@ -243,7 +249,7 @@ fn scores_of_images(report: &Value) -> Table {
     table("Scores of all test images", &report["per_image"], ("name", "image"), &columns)
 }
 
-fn marks_table(report: &Value, primitive: &str) -> Table {
+fn evaluations_table(report: &Value, primitive: &str) -> Table {
     let primitives = format!("{primitive}s");
     let columns = [
         ("step", "step", 1.0, 0),
@@ -256,7 +262,7 @@ fn marks_table(report: &Value, primitive: &str) -> Table {
         ("bytes", "MB", 1e-6, 1),
         ("step_millis", "ms per step", 1.0, 2),
     ];
-    table("Scores during training", &report["marks"], ("seconds", "seconds"), &columns)
+    table("Scores during training", &report["evaluations"], ("seconds", "seconds"), &columns)
 }
 
 /// A column: key, head, factor, digits after the point.
@@ -287,7 +293,7 @@ fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Col
 }
 
 /// A table: collapsed if it is long, left out if it is empty.
-fn folded(table: &Table, title: &str) -> String {
+fn collapsible(table: &Table, title: &str) -> String {
     match table.rows.len() {
         0 => String::new(),
         1..=MAX_OPEN_ROWS => table.html(),
@@ -302,7 +308,7 @@ fn parts(parts: &Value) -> String {
         .map(|part| {
             let number = |key: &str| part[key].as_f64().unwrap_or_default();
             let kept = if part["kept"] == Value::Bool(true) { "kept" } else { "dropped" };
-            let gain = format!("{:+.2} ± {:.2}", number("bought_db"), number("standard_error_db"));
+            let gain = format!("{:+.2} ± {:.2}", number("gain_db"), number("standard_error_db"));
             vec![text_of(&part["part"]), gain, text_of(&part["n_images"]), kept.to_owned()]
         })
         .collect();
@@ -313,14 +319,14 @@ fn parts(parts: &Value) -> String {
     Table { title: "Trials during training".into(), head, rows }.html()
 }
 
-fn settings_table(title: &str, rows: Vec<Vec<String>>, is_folded: bool) -> String {
+fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> String {
     let row = |row: &Vec<String>| {
         let cells: String = row.iter().map(|cell| format!("<td>{}</td>", escaped(cell))).collect();
         format!("<tr>{cells}</tr>\n")
     };
     let rows: String = rows.iter().map(row).collect();
     let table = format!("<div class=\"wide settings\"><table><tbody>\n{rows}</tbody></table></div>\n");
-    match is_folded {
+    match is_collapsed {
         true => format!("<details><summary>{title}</summary>\n{table}</details>\n"),
         false => format!("<h2>{title}</h2>\n{table}"),
     }
@@ -357,7 +363,7 @@ fn text_of(value: &Value) -> String {
     };
     match value {
         Value::Null => "–".to_owned(),
-        Value::Bool(is_so) => String::from(if *is_so { "yes" } else { "no" }),
+        Value::Bool(is_true) => String::from(if *is_true { "yes" } else { "no" }),
         Value::String(text) => text.clone(),
         Value::Number(number) => match number.as_f64() {
             Some(float) if !number.is_i64() && !number.is_u64() => short_float(float),
@@ -427,15 +433,15 @@ mod tests {
     }
 
     #[test]
-    fn a_page_shows_scores_commands_and_settings_and_escapes_names() {
+    fn page_shows_scores_commands_and_settings_escaped() {
         let html = page(&json!({
             "done": { "method": "splat", "psnr": 23.456, "ssim": 0.9, "seconds": 8.0, "steps": 12345, "primitives": 4000000,
                       "bytes": 8000000, "psnr_per_camera": { "wrist": 22.0 } },
             "data": "my data", "adapter": "a GPU",
             "losses": ["1 image <broken>"],
-            "marks": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
+            "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
-            "parts": [{ "part": "joints", "bought_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
+            "parts": [{ "part": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
             "refused": { "blurred": 3 }, "alignment": null,
         }));
         for words in [
@@ -462,16 +468,16 @@ mod tests {
     }
 
     #[test]
-    fn a_page_without_any_score_is_a_page() {
-        let html = page(&json!({ "done": { "method": "tsdf", "psnr": null }, "marks": [], "per_image": [] }));
+    fn page_without_scores_is_valid() {
+        let html = page(&json!({ "done": { "method": "tsdf", "psnr": null }, "evaluations": [], "per_image": [] }));
         assert!(html.contains("no image was held out") && !html.contains("<svg "), "{html}");
     }
 
     #[test]
-    fn values_are_short_and_readable() {
-        let told =
+    fn values_are_formatted_compactly() {
+        let texts =
             [json!(0.000_012_34), json!(0.5), json!(7), json!([1.25, 2]), json!(true), json!({ "a_b": 1, "c": null })];
-        assert_eq!(told.each_ref().map(text_of), ["1.234e-5", "0.5", "7", "1.25, 2", "yes", "a b 1"]);
+        assert_eq!(texts.each_ref().map(text_of), ["1.234e-5", "0.5", "7", "1.25, 2", "yes", "a b 1"]);
         assert_eq!(
             [0.0, 999.0, 1000.0, -1_234_567.0].map(grouped),
             ["0", "999", "1\u{202f}000", "-1\u{202f}234\u{202f}567"]
@@ -479,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_are_those_of_the_newest_log() {
+    fn settings_come_from_the_newest_log() {
         let folder = tempfile::tempdir().expect("a folder");
         assert_eq!(settings_in(folder.path()), Value::Null);
         let write = |name: &str, step: u64| {

@@ -1,7 +1,7 @@
 //! Test images beside the model's renders, small enough to be embedded in a page.
 
+use crate::downscale;
 use crate::evaluate;
-use crate::shrink;
 use anyhow::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
@@ -20,7 +20,7 @@ const SMALL_QUALITY: u8 = 75;
 /// Maximum bytes of all pictures together, in the encoding of the page.
 const MAX_TEXT_BYTES: usize = 2_600_000;
 /// Drawing stops after this time: on a processor, one picture of a neural field may take half a minute.
-const MAX_DRAWING: Duration = Duration::from_secs(10);
+const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
 /// Color difference that is drawn brightest, of 255.
 const MAX_ERROR: u8 = 64;
 
@@ -54,11 +54,11 @@ pub(crate) struct Scored<'a> {
 
 /// Draws test images spread over all of them, including the best and the worst, in the order of `scored`.
 pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> anyhow::Result<Vec<Comparison>> {
-    let begun = Instant::now();
+    let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
-    for ix in chosen(&scored.iter().map(|image| image.psnr).collect::<Vec<_>>()) {
-        if !comparisons.is_empty() && begun.elapsed() > MAX_DRAWING {
+    for ix in selected(&scored.iter().map(|image| image.psnr).collect::<Vec<_>>()) {
+        if !comparisons.is_empty() && started.elapsed() > MAX_RENDER_TIME {
             log::info!("report.html shows {} test images: drawing more takes too long", comparisons.len());
             break;
         }
@@ -74,31 +74,31 @@ pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> anyhow:
 }
 
 /// Indices of the images to show, the most important first: the worst, the best, and others evenly spread.
-fn chosen(psnr: &[f64]) -> Vec<usize> {
+fn selected(psnr: &[f64]) -> Vec<usize> {
     let by_psnr = |a: &usize, b: &usize| psnr[*a].total_cmp(&psnr[*b]);
-    let mut chosen: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
+    let mut selected: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
     let n_spread = MAX_IMAGES.saturating_sub(2).max(1);
     // Neighbors come late, so that the images are spread over all of them wherever drawing stops.
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
     for ix in (0..psnr.len()).max_by(by_psnr).into_iter().chain(spread).chain(0..psnr.len()) {
-        if ix < psnr.len() && chosen.len() < MAX_IMAGES && !chosen.contains(&ix) {
-            chosen.push(ix);
+        if ix < psnr.len() && selected.len() < MAX_IMAGES && !selected.contains(&ix) {
+            selected.push(ix);
         }
     }
-    chosen
+    selected
 }
 
 impl Comparison {
     fn of(method: &mut dyn Method, scored: &Scored<'_>) -> anyhow::Result<Self> {
         let keyframe = scored.keyframe;
-        let drawn = evaluate::draw(method, keyframe, true)?;
-        let [size_px, small_px] = [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fitted(keyframe.size_px, side));
-        let small = |rgba: &[u8], to_px| shrink::rgba(rgba.to_vec(), keyframe.size_px, to_px);
+        let rendered = evaluate::draw(method, keyframe, true)?;
+        let [size_px, small_px] = [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fit_size(keyframe.size_px, side));
+        let small = |rgba: &[u8], to_px| downscale::rgba(rgba.to_vec(), keyframe.size_px, to_px);
         let image = small(&keyframe.rgba_srgb, size_px);
-        let render = shown_where(&small(&opaque(&drawn.rgba_srgb), size_px), &image);
-        let error = errors(&small(&opaque(&drawn.rgba_srgb), small_px), &small(&keyframe.rgba_srgb, small_px));
+        let render = mask_colors(&small(&opaque(&rendered.rgba_srgb), size_px), &image);
+        let error = errors(&small(&opaque(&rendered.rgba_srgb), small_px), &small(&keyframe.rgba_srgb, small_px));
         Ok(Self {
             name: scored.name.clone(),
             psnr: scored.psnr,
@@ -107,7 +107,7 @@ impl Comparison {
             image: data_uri(&rgb(&image), size_px, QUALITY)?,
             render: data_uri(&render, size_px, QUALITY)?,
             error: data_uri(&error, small_px, SMALL_QUALITY)?,
-            depth: DepthPicture::of(&drawn, small_px)?,
+            depth: DepthPicture::of(&rendered, small_px)?,
         })
     }
 
@@ -120,8 +120,8 @@ impl Comparison {
 impl DepthPicture {
     /// `None` if nothing was drawn.
     fn of(picture: &Picture, size_px: [u32; 2]) -> anyhow::Result<Option<Self>> {
-        let thin = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
-        let mut known: Vec<f32> = thin.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
+        let subsampled = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
+        let mut known: Vec<f32> = subsampled.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
         if known.is_empty() {
             return Ok(None);
         }
@@ -129,19 +129,19 @@ impl DepthPicture {
         let range_m = [known[known.len() / 50], known[known.len() - 1 - known.len() / 50]];
         let span_m = (range_m[1] - range_m[0]).max(1e-6);
         let color = |z: f32| if z > 0.0 && z.is_finite() { turbo((z - range_m[0]) / span_m) } else { [0; 3] };
-        let pixels: Vec<u8> = thin.into_iter().flat_map(color).collect();
+        let pixels: Vec<u8> = subsampled.into_iter().flat_map(color).collect();
         Ok(Some(Self { picture: data_uri(&pixels, size_px, SMALL_QUALITY)?, range_m }))
     }
 }
 
 /// The largest size with the same aspect ratio and sides of at most `max_side_px`.
-fn fitted(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
-    let longest = size_px[0].max(size_px[1]).max(1);
-    if longest <= max_side_px {
+fn fit_size(size_px: [u32; 2], max_side_px: u32) -> [u32; 2] {
+    let max_side = size_px[0].max(size_px[1]).max(1);
+    if max_side <= max_side_px {
         return size_px;
     }
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "smaller than the size, above 0")]
-    size_px.map(|side| ((f64::from(side) * f64::from(max_side_px) / f64::from(longest)).round() as u32).max(1))
+    size_px.map(|side| ((f64::from(side) * f64::from(max_side_px) / f64::from(max_side)).round() as u32).max(1))
 }
 
 /// A render over black, as it is scored.
@@ -150,13 +150,13 @@ fn opaque(rgba: &[u8]) -> Vec<u8> {
 }
 
 /// Colors of `rgba`; black where the image is masked.
-fn shown_where(rgba: &[u8], image: &[u8]) -> Vec<u8> {
+fn mask_colors(rgba: &[u8], image: &[u8]) -> Vec<u8> {
     let pixels = rgba.as_chunks::<4>().0.iter().zip(image.as_chunks::<4>().0);
     pixels.flat_map(|([r, g, b, _], [.., alpha])| if *alpha > 0 { [*r, *g, *b] } else { [0; 3] }).collect()
 }
 
 fn rgb(rgba: &[u8]) -> Vec<u8> {
-    shown_where(rgba, rgba)
+    mask_colors(rgba, rgba)
 }
 
 /// The largest channel difference of each pixel, from black over red to light yellow; black where the image is masked.
@@ -170,10 +170,10 @@ fn errors(render: &[u8], image: &[u8]) -> Vec<u8> {
 }
 
 /// A color map of rising brightness: black, purple, red, orange, light yellow, evenly spaced.
-fn heat(share: f32) -> [u8; 3] {
+fn heat(value_frac: f32) -> [u8; 3] {
     const STOPS: [[f32; 3]; 5] =
         [[0.0, 0.0, 4.0], [87.0, 16.0, 110.0], [188.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 164.0]];
-    let at = share.clamp(0.0, 1.0) * 4.0;
+    let at = value_frac.clamp(0.0, 1.0) * 4.0;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 3")]
     let ix = (at.floor() as usize).min(3);
     let frac = at - ix as f32;
@@ -181,11 +181,11 @@ fn heat(share: f32) -> [u8; 3] {
 }
 
 /// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved rainbow colormap", reversed.
-fn turbo(share: f32) -> [u8; 3] {
+fn turbo(value_frac: f32) -> [u8; 3] {
     const RED: [f32; 6] = [0.135_721_4, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38];
     const GREEN: [f32; 6] = [0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_5, 2.829_566];
     const BLUE: [f32; 6] = [0.106_673_3, 12.641_946, -60.582_05, 110.362_77, -89.903_11, 27.348_25];
-    let x = 1.0 - share.clamp(0.0, 1.0);
+    let x = 1.0 - value_frac.clamp(0.0, 1.0);
     [RED, GREEN, BLUE].map(|factors| byte(255.0 * factors.iter().rev().fold(0.0, |sum, factor| sum * x + factor)))
 }
 
@@ -196,13 +196,13 @@ fn byte(value: f32) -> u8 {
 
 /// Samples the values at the pixel centers of a smaller picture. Averages of depth would lie on no surface.
 fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32> {
-    let place = |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
-    let mut thin = Vec::with_capacity(to_px[0] as usize * to_px[1] as usize);
+    let source_ix = |ix: u32, from: u32, to: u32| (2 * ix as usize + 1) * from as usize / (2 * to as usize);
+    let mut subsampled = Vec::with_capacity(to_px[0] as usize * to_px[1] as usize);
     for y in 0..to_px[1] {
-        let row = place(y, from_px[1], to_px[1]) * from_px[0] as usize;
-        thin.extend((0..to_px[0]).map(|x| values[row + place(x, from_px[0], to_px[0])]));
+        let row = source_ix(y, from_px[1], to_px[1]) * from_px[0] as usize;
+        subsampled.extend((0..to_px[0]).map(|x| values[row + source_ix(x, from_px[0], to_px[0])]));
     }
-    thin
+    subsampled
 }
 
 /// A JPEG as a data URI for `<img>`.
@@ -219,9 +219,9 @@ fn write_base64(bytes: &[u8], to: &mut String) {
     const SYMBOLS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
     for group in bytes.chunks(3) {
         let bits = group.iter().fold(0_u32, |bits, byte| bits << 8 | u32::from(*byte)) << (8 * (3 - group.len()));
-        for place in 0..4 {
-            let symbol = SYMBOLS[(bits >> (18 - 6 * place) & 63) as usize];
-            to.push(if place <= group.len() { char::from(symbol) } else { '=' });
+        for source_ix in 0..4 {
+            let symbol = SYMBOLS[(bits >> (18 - 6 * source_ix) & 63) as usize];
+            to.push(if source_ix <= group.len() { char::from(symbol) } else { '=' });
         }
     }
 }
@@ -231,7 +231,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn base64_is_that_of_rfc_4648() {
+    fn base64_matches_rfc_4648() {
         for (bytes, expected) in
             [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg=="), ("foobar", "Zm9vYmFy")]
         {
@@ -242,32 +242,32 @@ mod tests {
     }
 
     #[test]
-    fn the_worst_and_the_best_are_among_those_chosen() {
+    fn worst_and_best_images_are_selected() {
         let mut psnr = vec![20.0; 100];
         (psnr[37], psnr[61]) = (11.0, 30.0);
-        let chosen_of_many = chosen(&psnr);
-        assert_eq!((chosen_of_many[0], chosen_of_many[1], chosen_of_many.len()), (37, 61, MAX_IMAGES));
-        assert!(chosen_of_many.iter().filter(|ix| **ix < 50).count() >= 5, "{chosen_of_many:?}");
-        let mut few = chosen(&psnr[..5]);
+        let selected_of_many = selected(&psnr);
+        assert_eq!((selected_of_many[0], selected_of_many[1], selected_of_many.len()), (37, 61, MAX_IMAGES));
+        assert!(selected_of_many.iter().filter(|ix| **ix < 50).count() >= 5, "{selected_of_many:?}");
+        let mut few = selected(&psnr[..5]);
         few.sort_unstable();
         assert_eq!(few, [0, 1, 2, 3, 4]);
-        assert!(chosen(&[]).is_empty());
+        assert!(selected(&[]).is_empty());
     }
 
     #[test]
-    fn pictures_keep_their_proportions() {
-        assert_eq!(fitted([1280, 720], 640), [640, 360]);
-        assert_eq!(fitted([524, 944], 640), [355, 640]);
-        assert_eq!(fitted([48, 36], 640), [48, 36]);
-        assert_eq!(fitted([9000, 2], 640), [640, 1]);
+    fn pictures_keep_their_aspect_ratio() {
+        assert_eq!(fit_size([1280, 720], 640), [640, 360]);
+        assert_eq!(fit_size([524, 944], 640), [355, 640]);
+        assert_eq!(fit_size([48, 36], 640), [48, 36]);
+        assert_eq!(fit_size([9000, 2], 640), [640, 1]);
     }
 
     #[test]
-    fn errors_are_bright_where_colors_differ_and_black_outside_the_image() {
+    fn error_map_is_masked_outside_the_image() {
         let image = [10, 10, 10, 255, 200, 10, 10, 255, 0, 0, 0, 0];
         let render = [10, 10, 10, 255, 100, 10, 10, 255, 250, 250, 250, 255];
         assert_eq!(errors(&render, &image), [0, 0, 4, 252, 255, 164, 0, 0, 0]);
-        assert_eq!(shown_where(&render, &image)[6..], [0, 0, 0]);
+        assert_eq!(mask_colors(&render, &image)[6..], [0, 0, 0]);
     }
 
     #[test]
@@ -278,13 +278,13 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_taken_and_not_averaged() {
+    fn depth_is_sampled_not_averaged() {
         let depth_m = [1.0, 1.0, 9.0, 9.0, 1.0, 2.0, 9.0, 8.0];
         assert_eq!(nearest_pixels(&depth_m, [4, 2], [2, 1]), [2.0, 8.0]);
         assert_eq!(nearest_pixels(&depth_m, [4, 2], [4, 2]), depth_m);
         let picture = Picture { size_px: [4, 2], rgba_srgb: vec![0; 32], depth_m: depth_m.to_vec() };
-        let drawn = DepthPicture::of(&picture, [4, 2]).expect("a picture").expect("depth");
-        assert_eq!(drawn.range_m, [1.0, 9.0]);
+        let rendered = DepthPicture::of(&picture, [4, 2]).expect("a picture").expect("depth");
+        assert_eq!(rendered.range_m, [1.0, 9.0]);
         let empty = Picture { size_px: [4, 2], rgba_srgb: vec![0; 32], depth_m: vec![0.0; 8] };
         assert!(DepthPicture::of(&empty, [4, 2]).expect("a picture").is_none());
     }

@@ -5,11 +5,11 @@ use kinematics::{Stamp, Transform};
 use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::GpuOptions;
-use trainer::splat::PosedLens;
+use trainer::splat::CalibratedCamera;
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;
-const MAX_AT_MARKS: usize = 3;
+const MAX_IMAGES_DURING_TRAINING: usize = 3;
 
 /// A model that draws pictures of one gray level and counts them.
 #[derive(Default)]
@@ -40,7 +40,7 @@ impl Method for Gray {
         "level"
     }
 
-    fn n_taken(&mut self) -> Result<u64, Error> {
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.level.into())
     }
 
@@ -61,8 +61,8 @@ impl Method for Gray {
         Ok(Picture { size_px: request.size_px, rgba_srgb: vec![self.level; 4 * n], depth_m: Vec::new() })
     }
 
-    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        Ok(PosedLens::of(keyframe))
+    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
+        Ok(CalibratedCamera::of(keyframe))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
@@ -77,7 +77,7 @@ impl Method for Gray {
         Progress { step: self.level.into(), ..Progress::default() }
     }
 
-    fn report(&self) -> Vec<Part> {
+    fn report(&self) -> Vec<TrialReport> {
         Vec::new()
     }
 
@@ -86,7 +86,7 @@ impl Method for Gray {
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        Err(Error::NothingSeen)
+        Err(Error::AllPixelsMasked)
     }
 }
 
@@ -110,57 +110,62 @@ fn test_keyframe(ix: u8) -> Arc<Keyframe> {
 }
 
 /// A session of one second with an evaluation due, and the counter of its pictures.
-fn at_a_mark(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
+fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
     let method = Gray::default();
     let n_drawn = method.n_drawn.clone();
     let quick = Evaluator::psnr_only;
-    let evaluators = Evaluators { at_marks: quick(), most_at_marks: MAX_AT_MARKS, at_end: quick() };
+    let evaluators = Evaluators {
+        during_training: quick(),
+        max_images_during_training: MAX_IMAGES_DURING_TRAINING,
+        at_end: quick(),
+    };
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
-    let mut session = Session::new(gpu, (Kind::Splat, Box::new(method)), evaluators, Limits::default(), Tell::Nothing)
-        .with_stop(stop);
+    let mut session =
+        Session::new(gpu, (ModelKind::Splat, Box::new(method)), evaluators, Limits::default(), OutputMode::Nothing)
+            .with_stop(stop);
     for ix in 0..N_TESTS {
         session.push(&test_keyframe(ix)).expect("held");
     }
     session.start_clock(Instant::now().checked_sub(Duration::from_secs(1)).expect("the machine has run for a second"));
-    session.learn(1).expect("a step");
+    session.train_steps(1).expect("a step");
     (session, n_drawn)
 }
 
 #[test]
-fn a_mark_is_scored_image_by_image_and_gives_the_scores_of_one_scored_at_once() {
+fn stepwise_scoring_equals_scoring_at_once() {
     let stop = Stop::default();
-    let (mut at_once, n_at_once) = at_a_mark(&stop);
-    at_once.tell_due().expect("scored");
+    let (mut at_once, n_at_once) = session_with_evaluation_due(&stop);
+    at_once.evaluate_when_due().expect("scored");
     assert!(!at_once.is_scoring() && n_at_once.get() == 3);
 
-    let (session, n_drawn) = at_a_mark(&stop);
+    let (session, n_drawn) = session_with_evaluation_due(&stop);
     let mut stepwise = session.with_stepwise_scoring();
-    stepwise.tell_due().expect("opened");
-    assert!(stepwise.is_scoring() && stepwise.told.is_empty() && n_drawn.get() == 0, "the caller scores");
+    stepwise.evaluate_when_due().expect("opened");
+    assert!(stepwise.is_scoring() && stepwise.reported.is_empty() && n_drawn.get() == 0, "the caller scores");
     for n in 1..=3 {
         assert!(stepwise.is_scoring());
         stepwise.score_next().expect("scored");
         assert_eq!(n_drawn.get(), n, "one image at a time");
     }
     assert!(!stepwise.is_scoring());
-    let [one, other] = [&at_once, &stepwise].map(|session| &session.told[0]);
+    let [one, other] = [&at_once, &stepwise].map(|session| &session.reported[0]);
     assert_eq!((one.n_images, one.step), (3, 1));
     assert_eq!((other.n_images, other.step), (3, 1));
     assert!(one.scores == other.scores && one.scores.psnr.is_some());
     assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
     assert!(stepwise.psnr() == at_once.psnr());
     stepwise.score_next().expect("nothing to do");
-    assert_eq!((stepwise.told.len(), n_drawn.get()), (1, 3));
+    assert_eq!((stepwise.reported.len(), n_drawn.get()), (1, 3));
 }
 
 #[test]
-fn a_mark_is_dropped_where_the_end_is_asked_for() {
+fn evaluation_is_dropped_when_stopping() {
     let stop = Stop::default();
-    let (session, n_drawn) = at_a_mark(&stop);
+    let (session, n_drawn) = session_with_evaluation_due(&stop);
     let mut session = session.with_stepwise_scoring();
-    session.tell_due().expect("opened");
+    session.evaluate_when_due().expect("opened");
     session.score_next().expect("scored");
-    stop.ask();
+    stop.request();
     session.score_next().expect("dropped");
-    assert!(!session.is_scoring() && session.told.is_empty() && n_drawn.get() == 1);
+    assert!(!session.is_scoring() && session.reported.is_empty() && n_drawn.get() == 1);
 }

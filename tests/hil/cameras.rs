@@ -22,7 +22,7 @@ const REFUSE_STREAM: u32 = 0x00f0_f045;
 const BREAK_STREAM: u32 = 0x00f0_f046;
 /// Drift of stamps against numbers, periods, that no miscount explains: one moves it by a whole period. Vivid stamps when it gets to
 /// it: 0 to 0.25 periods late on an idle machine, up to 0.75 with twice as many busy programs as cores.
-const COUNTED: std::ops::Range<f64> = -0.7..0.95;
+const DRIFT_RANGE: std::ops::Range<f64> = -0.7..0.95;
 /// Gain and brightness by the kernel's numbers, and values that are not the defaults.
 const GAIN: u32 = 0x0098_0913;
 const BRIGHTNESS: u32 = 0x0098_0900;
@@ -42,7 +42,7 @@ pub(crate) fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
             rectified: true,
         },
         rate_hz,
-        metres_per_count: None,
+        meters_per_count: None,
         settings: Settings::default(),
         delivery: Delivery::Every,
         reconnect_for: Duration::from_secs(5),
@@ -55,24 +55,24 @@ pub(crate) fn node(bus: &str) -> PathBuf {
 }
 
 /// What came in a stretch of time.
-struct Seen {
+struct CapturedImages {
     images: Vec<Image>,
     elapsed: Duration,
 }
 
-impl Seen {
+impl CapturedImages {
     /// All images of `seconds`; only the first keeps its pixels.
-    fn during(camera: &mut V4l2Camera, seconds: f64) -> Self {
-        let began = Instant::now();
+    fn capture(camera: &mut V4l2Camera, seconds: f64) -> Self {
+        let start_time = Instant::now();
         let mut images = Vec::new();
-        while began.elapsed().as_secs_f64() < seconds {
+        while start_time.elapsed().as_secs_f64() < seconds {
             let mut image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
             if !images.is_empty() {
                 image.data = [].into();
             }
             images.push(image);
         }
-        Self { images, elapsed: began.elapsed() }
+        Self { images, elapsed: start_time.elapsed() }
     }
 
     /// Delivered and lost after the first image, once the stamps say the same: two counts that share nothing.
@@ -80,42 +80,42 @@ impl Seen {
         let first = self.images[0].stamp;
         let mut number = 0;
         // How late each image is for its number, periods. A miscount moves all that follow by one; a busy machine only adds.
-        let late: Vec<f64> = (self.images.iter().enumerate())
+        let delays: Vec<f64> = (self.images.iter().enumerate())
             .map(|(ix, image)| {
                 number += if ix == 0 { 0 } else { 1 + image.n_skipped };
                 (image.stamp.0 - first.0) as f64 * 1e-9 * rate_hz - number as f64
             })
             .collect();
-        let third = late.len().div_ceil(3);
-        let least = |late: &[f64]| late.iter().copied().fold(f64::INFINITY, f64::min);
-        let drift = least(&late[late.len() - third..]) - least(&late[..third]);
+        let n_third = delays.len().div_ceil(3);
+        let min = |delays: &[f64]| delays.iter().copied().fold(f64::INFINITY, f64::min);
+        let drift = min(&delays[delays.len() - n_third..]) - min(&delays[..n_third]);
         let delivered = self.images.len() as u64 - 1;
-        let lost = number - delivered;
+        let n_lost = number - delivered;
         println!(
-            "{what}: {delivered} images and {lost} lost ones in {:.2?}; by their stamps {drift:+.2} more",
+            "{what}: {delivered} images and {n_lost} lost ones in {:.2?}; by their stamps {drift:+.2} more",
             self.elapsed
         );
-        assert!(COUNTED.contains(&drift), "{what}: a lost image was not counted, or one too many was");
+        assert!(DRIFT_RANGE.contains(&drift), "{what}: a lost image was not counted, or one too many was");
         let in_order = self.images.windows(2).all(|pair| pair[0].stamp < pair[1].stamp);
         assert!(in_order, "{what}: stamps go back");
-        (delivered, lost)
+        (delivered, n_lost)
     }
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn every_lost_image_is_counted_in_ten_seconds() {
+fn every_lost_image_is_counted() {
     // As a webcam vivid is slow at 1080p, as a grabber it is not.
     for (device, size_px) in [(WEBCAM, [640, 360]), (GRABBER, [1920, 1080])] {
         let rate_hz = 25.0;
         let mut camera = V4l2Camera::open(config(device, size_px, rate_hz)).expect("vivid opens");
         let what = format!("{device} {}x{} at {rate_hz} Hz", size_px[0], size_px[1]);
-        let seen = Seen::during(&mut camera, 10.0);
-        let (delivered, lost) = seen.report(&what, rate_hz);
+        let captured = CapturedImages::capture(&mut camera, 10.0);
+        let (delivered, n_lost) = captured.report(&what, rate_hz);
         let Counts { n_images, n_skipped, n_damaged, n_reconnections } = camera.counts();
         assert_eq!((n_images, n_damaged, n_reconnections), (delivered + 1, 0, 0));
-        assert_eq!(n_skipped, lost + seen.images[0].n_skipped);
-        let first = &seen.images[0];
+        assert_eq!(n_skipped, n_lost + captured.images[0].n_skipped);
+        let first = &captured.images[0];
         assert_eq!(
             first.decode_rgb().expect("raw pixels").len(),
             size_px.map(|side| side as usize).iter().product::<usize>() * 3
@@ -129,158 +129,163 @@ fn injected_drops_are_counted_exactly() {
     let rate_hz = 25.0;
     let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect("vivid opens");
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 30).expect("vivid injects faults");
-    let (delivered, lost) = Seen::during(&mut camera, 12.0).report("30 % dropped", rate_hz);
+    let (delivered, n_lost) = CapturedImages::capture(&mut camera, 12.0).report("30 % dropped", rate_hz);
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 0).expect("vivid injects faults");
-    let share = lost as f64 / (delivered + lost) as f64;
+    let share = n_lost as f64 / (delivered + n_lost) as f64;
     // 300 throws of a coin of 30 %: four standard deviations.
     assert!((0.19..0.41).contains(&share), "a share of {share:.2} was lost");
 }
 
 /// Waits for an image after a fault; how long it took.
-fn back_after(camera: &mut V4l2Camera, began: Instant) -> (Image, Duration) {
+fn time_to_recover(camera: &mut V4l2Camera, start_time: Instant) -> (Image, Duration) {
     loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(image) => return (image, began.elapsed()),
+            Ok(image) => return (image, start_time.elapsed()),
             Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
-                assert!(began.elapsed() < Duration::from_secs(5))
+                assert!(start_time.elapsed() < Duration::from_secs(5))
             }
             Err(other) => panic!("{other}"),
         }
     }
 }
 
-pub(crate) fn drive(action: &str) {
+pub(crate) fn write_driver_action(action: &str) {
     fs::write(Path::new("/sys/bus/platform/drivers/vivid").join(action), "vivid.0").expect("vivid can be (un)bound");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn a_pulled_cable_is_survived_with_all_settings() {
+fn unplugging_is_survived_with_all_settings() {
     let rate_hz = 25.0;
     let mut camera =
         V4l2Camera::open(Config { settings: SETTINGS, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
-    let set = |camera: &V4l2Camera| {
-        let told: BTreeMap<_, _> = camera.read_back().iter().copied().collect();
-        assert_eq!((told["v4l2.gain"], told["v4l2.brightness"]), (77, 99), "read back by the driver");
+    let assert_settings = |camera: &V4l2Camera| {
+        let read_back_values: BTreeMap<_, _> = camera.read_back().iter().copied().collect();
+        assert_eq!(
+            (read_back_values["v4l2.gain"], read_back_values["v4l2.brightness"]),
+            (77, 99),
+            "read back by the driver"
+        );
         let node = node(WEBCAM);
         assert_eq!(v4l2::control(&node, GAIN).expect("vivid has gain"), 77);
         assert_eq!(v4l2::control(&node, BRIGHTNESS).expect("vivid has brightness"), 99);
     };
-    Seen::during(&mut camera, 0.5);
-    set(&camera);
+    CapturedImages::capture(&mut camera, 0.5);
+    assert_settings(&camera);
 
     for n_before in 0..3 {
         v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
         // Pictures that were taken before may still come.
-        let began = Instant::now();
+        let start_time = Instant::now();
         let image = loop {
-            let (image, took) = back_after(&mut camera, began);
+            let (image, elapsed) = time_to_recover(&mut camera, start_time);
             if camera.counts().n_reconnections > n_before {
-                println!("disconnected: images again after {took:.0?}, {} counted as lost", image.n_skipped);
-                assert!(took < Duration::from_secs(1), "{took:?}");
+                println!("disconnected: images again after {elapsed:.0?}, {} counted as lost", image.n_skipped);
+                assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
                 break image;
             }
         };
         assert!(image.n_skipped <= 25, "{}", image.n_skipped);
-        set(&camera);
+        assert_settings(&camera);
     }
 
-    drive("unbind");
-    let pulled = Instant::now();
+    write_driver_action("unbind");
+    let unplugged_at = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(pulled.elapsed() < Duration::from_secs(2), "the driver does not notice");
+        assert!(unplugged_at.elapsed() < Duration::from_secs(2), "the driver does not notice");
     }
-    std::thread::sleep(Duration::from_secs(1).saturating_sub(pulled.elapsed()));
-    drive("bind");
-    let (image, took) = back_after(&mut camera, Instant::now());
-    println!("plugged in again: images after {took:.0?}, {} counted as lost", image.n_skipped);
-    assert!(took < Duration::from_secs(1), "{took:?}");
+    std::thread::sleep(Duration::from_secs(1).saturating_sub(unplugged_at.elapsed()));
+    write_driver_action("bind");
+    let (image, elapsed) = time_to_recover(&mut camera, Instant::now());
+    println!("plugged in again: images after {elapsed:.0?}, {} counted as lost", image.n_skipped);
+    assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
     // A second without a camera, and what binding took.
     assert!((20..=60).contains(&image.n_skipped), "{} images counted for the outage", image.n_skipped);
-    set(&camera);
-    Seen::during(&mut camera, 2.0).report("after the replug", rate_hz);
+    assert_settings(&camera);
+    CapturedImages::capture(&mut camera, 2.0).report("after the replug", rate_hz);
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn a_camera_that_stays_away_is_an_error_after_its_time() {
+fn camera_that_stays_away_is_an_error_after_timeout() {
     let wait = Duration::from_secs(1);
     let mut camera =
         V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
-    Seen::during(&mut camera, 0.2);
-    drive("unbind");
-    let began = Instant::now();
+    CapturedImages::capture(&mut camera, 0.2);
+    write_driver_action("unbind");
+    let start_time = Instant::now();
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(_) | Err(Error::Reconnecting { .. }) => assert!(began.elapsed() < 5 * wait, "no end to it"),
+            Ok(_) | Err(Error::Reconnecting { .. }) => assert!(start_time.elapsed() < 5 * wait, "no end to it"),
             Err(error) => break error.to_string(),
         }
     };
-    drive("bind");
+    write_driver_action("bind");
     println!("stays away: {error}");
     assert!(error.contains("\"front\"") && error.contains("not there again after"), "{error}");
-    assert!(began.elapsed() >= wait && began.elapsed() < 2 * wait, "{:?}", began.elapsed());
+    assert!(start_time.elapsed() >= wait && start_time.elapsed() < 2 * wait, "{:?}", start_time.elapsed());
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn a_camera_that_falls_silent_is_begun_anew_and_then_given_up() {
+fn silent_camera_is_restarted_and_then_given_up() {
     let wait = Duration::from_secs(5);
     let mut camera =
         V4l2Camera::open(Config { reconnect_for: wait, ..config(WEBCAM, [320, 180], 25.0) }).expect("vivid opens");
-    Seen::during(&mut camera, 0.2);
-    let drop_all = |percent| v4l2::set_control(&node(WEBCAM), DROP_PERCENT, percent).expect("vivid injects faults");
+    CapturedImages::capture(&mut camera, 0.2);
+    let set_drop_percent =
+        |percent| v4l2::set_control(&node(WEBCAM), DROP_PERCENT, percent).expect("vivid injects faults");
     // Silent for three seconds: begun anew after two, and there again.
-    drop_all(100);
-    let began = Instant::now();
-    while began.elapsed() < Duration::from_secs(3) {
-        let quiet = camera.next_image(Duration::from_millis(100));
-        assert!(matches!(quiet, Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. })), "{quiet:?}");
+    set_drop_percent(100);
+    let start_time = Instant::now();
+    while start_time.elapsed() < Duration::from_secs(3) {
+        let result = camera.next_image(Duration::from_millis(100));
+        assert!(matches!(result, Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. })), "{result:?}");
     }
-    drop_all(0);
-    let (image, _) = back_after(&mut camera, Instant::now());
+    set_drop_percent(0);
+    let (image, _) = time_to_recover(&mut camera, Instant::now());
     println!("silent for 3 s: begun anew {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
     assert_eq!(camera.counts().n_reconnections, 1);
     assert!((70..=100).contains(&image.n_skipped), "{} images lost in 3 s at 25 Hz", image.n_skipped);
     // Silent for good: opened again and again, and given up all the same.
-    drop_all(100);
-    let began = Instant::now();
+    set_drop_percent(100);
+    let start_time = Instant::now();
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(began.elapsed() < 3 * wait),
+            Ok(_) | Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => assert!(start_time.elapsed() < 3 * wait),
             Err(error) => break error.to_string(),
         }
     };
-    drop_all(0);
+    set_drop_percent(0);
     println!("silent for good: {error}");
     assert!(error.contains("not there again after") && error.contains("it sent no whole image for"), "{error}");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn damaged_images_and_broken_streams_are_counted_and_mended() {
+fn damaged_images_and_broken_streams_are_counted_and_recovered() {
     let rate_hz = 25.0;
     let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect("vivid opens");
-    let mut seen = Seen::during(&mut camera, 0.3);
+    let mut captured = CapturedImages::capture(&mut camera, 0.3);
     for _ in 0..3 {
         v4l2::set_control(&node(WEBCAM), DAMAGE, 1).expect("vivid injects faults");
-        seen.images.extend(Seen::during(&mut camera, 0.3).images);
+        captured.images.extend(CapturedImages::capture(&mut camera, 0.3).images);
     }
-    let (_, lost) = seen.report("three damaged images", rate_hz);
+    let (_, n_lost) = captured.report("three damaged images", rate_hz);
     assert_eq!(camera.counts().n_damaged, 3);
-    assert!(lost >= 3, "{lost}: a busy machine may lose more");
+    assert!(n_lost >= 3, "{n_lost}: a busy machine may lose more");
     assert_eq!(camera.counts().n_reconnections, 0, "a damaged image is no reason to begin anew");
 
     v4l2::set_control(&node(WEBCAM), BREAK_STREAM, 1).expect("vivid injects faults");
-    let (_, took) = back_after(&mut camera, Instant::now());
-    println!("a stream that broke down: images again after {took:.0?}");
-    assert!(took < Duration::from_secs(1) && camera.counts().n_reconnections == 1);
+    let (_, elapsed) = time_to_recover(&mut camera, Instant::now());
+    println!("a stream that broke down: images again after {elapsed:.0?}");
+    assert!(elapsed < Duration::from_secs(1) && camera.counts().n_reconnections == 1);
     drop(camera);
 
     v4l2::set_control(&node(WEBCAM), REFUSE_STREAM, 1).expect("vivid injects faults");
-    let refused = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect_err("vivid refuses").to_string();
-    println!("{refused}");
-    assert!(refused.contains("\"front\": it refuses to begin its stream"), "{refused}");
+    let open_error = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect_err("vivid refuses").to_string();
+    println!("{open_error}");
+    assert!(open_error.contains("\"front\": it refuses to begin its stream"), "{open_error}");
 }
 
 #[test]
@@ -300,14 +305,14 @@ fn all_formats_show_the_same_picture() {
     let bars = |rgb: &[u8]| -> Vec<u8> {
         (0..8).flat_map(|bar| rgb[(330 * 640 + bar * 80 + 40) * 3..][..3].to_vec()).collect()
     };
-    let wanted = bars(&rgb);
-    assert_eq!(wanted.chunks_exact(3).collect::<BTreeSet<_>>().len(), 8, "{wanted:?}");
+    let expected = bars(&rgb);
+    assert_eq!(expected.chunks_exact(3).collect::<BTreeSet<_>>().len(), 8, "{expected:?}");
     for format in [Bgr, Yuyv, Uyvy, Nv12] {
         let got = bars(&picture(format));
-        let most = wanted.iter().zip(&got).map(|(a, b)| a.abs_diff(*b)).max();
-        println!("{}: off by {most:?} of 255 at most", format.name());
+        let max_difference = expected.iter().zip(&got).map(|(a, b)| a.abs_diff(*b)).max();
+        println!("{}: off by {max_difference:?} of 255 at most", format.name());
         // Rounding to counts of a limited range, there and back.
-        assert!(most <= Some(3), "{}: {wanted:?}, got {got:?}", format.name());
+        assert!(max_difference <= Some(3), "{}: {expected:?}, got {got:?}", format.name());
     }
     let gray = bars(&picture(Grey));
     let is_gray = gray.chunks_exact(3).all(|pixel| pixel[0] == pixel[1] && pixel[1] == pixel[2]);
@@ -318,9 +323,9 @@ fn all_formats_show_the_same_picture() {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn the_newest_image_is_delivered_where_that_is_asked_for() {
+fn newest_image_is_delivered_if_configured() {
     let rate_hz = 25.0;
-    let of = |delivery| {
+    let deliver = |delivery| {
         let mut camera =
             V4l2Camera::open(Config { delivery, ..config(WEBCAM, [640, 360], rate_hz) }).expect("vivid opens");
         let mut images = Vec::new();
@@ -328,54 +333,58 @@ fn the_newest_image_is_delivered_where_that_is_asked_for() {
             std::thread::sleep(Duration::from_millis(200));
             images.push(camera.next_image(Duration::from_secs(2)).expect("vivid streams"));
         }
-        let behind = (drivers::clock::now().0 - images.last().expect("eight").stamp.0) as f64 * 1e-9;
-        (Seen { images, elapsed: Duration::default() }.report(&format!("{delivery:?}, every 200 ms"), rate_hz), behind)
+        let age_secs = (drivers::clock::now().0 - images.last().expect("eight").stamp.0) as f64 * 1e-9;
+        (
+            CapturedImages { images, elapsed: Duration::default() }
+                .report(&format!("{delivery:?}, every 200 ms"), rate_hz),
+            age_secs,
+        )
     };
-    let ((_, n_lost), behind_secs) = of(Delivery::Newest);
+    let ((_, n_lost), age_secs_of) = deliver(Delivery::Newest);
     assert!(n_lost >= 20, "{n_lost} lost of five images each 200 ms");
-    assert!(behind_secs < 0.15, "the newest image is {behind_secs} s old");
-    let (_, behind_secs) = of(Delivery::Every);
-    assert!(behind_secs > 0.2, "the oldest waiting image is only {behind_secs} s old");
+    assert!(age_secs_of < 0.15, "the newest image is {age_secs_of} s old");
+    let (_, age_secs_of) = deliver(Delivery::Every);
+    assert!(age_secs_of > 0.2, "the oldest waiting image is only {age_secs_of} s old");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn what_comes_before_anybody_asks_is_not_lost() {
+fn images_before_first_read_are_not_counted_as_lost() {
     let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
     // Other devices of a rig take their time to open; the eight images that fit wait meanwhile, the others go.
     std::thread::sleep(Duration::from_secs(1));
-    let asked = drivers::clock::now();
-    let seen = Seen::during(&mut camera, 0.5);
-    assert_eq!(seen.images[0].n_skipped, 0);
-    assert!(seen.images[0].stamp > asked, "an image from before");
+    let asked_at = drivers::clock::now();
+    let captured = CapturedImages::capture(&mut camera, 0.5);
+    assert_eq!(captured.images[0].n_skipped, 0);
+    assert!(captured.images[0].stamp > asked_at, "an image from before");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn what_cannot_be_is_refused_with_what_can() {
-    let refused = |config| V4l2Camera::open(config).expect_err("vivid cannot do that").to_string();
-    let size = refused(config(WEBCAM, [800, 600], 25.0));
+fn unsupported_modes_report_supported_ones() {
+    let open_error = |config| V4l2Camera::open(config).expect_err("vivid cannot do that").to_string();
+    let size = open_error(config(WEBCAM, [800, 600], 25.0));
     println!("{size}");
     assert!(size.contains("color 800x600 at 25 Hz") && size.contains("640x360 up to 40 Hz"), "{size}");
-    let fast = refused(config(WEBCAM, [1920, 1080], 60.0));
+    let fast = open_error(config(WEBCAM, [1920, 1080], 60.0));
     assert!(fast.contains("1920x1080 at 60 Hz"), "{fast}");
-    let jpeg = refused(Config { format: Some(V4l2Format::Mjpeg), ..config(WEBCAM, [640, 360], 25.0) });
+    let jpeg = open_error(Config { format: Some(V4l2Format::Mjpeg), ..config(WEBCAM, [640, 360], 25.0) });
     assert!(jpeg.contains("mjpeg 640x360"), "{jpeg}");
     let balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
-    let balance = refused(Config { settings: balance, ..config(WEBCAM, [640, 360], 25.0) });
+    let balance = open_error(Config { settings: balance, ..config(WEBCAM, [640, 360], 25.0) });
     assert!(balance.contains("no control for v4l2.white_balance_kelvin"), "{balance}");
     let gain =
-        refused(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
+        open_error(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
     assert!(gain.contains("v4l2.gain is 300, it takes 0 to 255"), "{gain}");
     let _streams = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
-    let busy = refused(config(WEBCAM, [640, 360], 25.0));
+    let busy = open_error(config(WEBCAM, [640, 360], 25.0));
     println!("{busy}");
     assert!(busy.contains("another program uses it"), "{busy}");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn the_program_lists_and_records_the_camera() {
+fn program_lists_and_records_camera() {
     let fieldrig = |args: &[&str]| {
         let output = Command::new("/bin/fieldrig").args(args).current_dir("/tmp").output().expect("it starts");
         let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
@@ -391,11 +400,11 @@ fn the_program_lists_and_records_the_camera() {
     let (code, text) =
         fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
     assert!(code == Some(0) || code == Some(3), "recorded, with loss at most: {code:?}");
-    let done = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
-    let done: serde_json::Value = serde_json::from_str(done).expect("JSON");
-    let number = |key: &str| done[key].as_u64().expect("a number");
-    let (images, lost) = (number("images"), number("images_lost_by_devices"));
-    assert!((98..=103).contains(&(images + lost)), "{images} and {lost} lost in 4 s at 25 Hz");
+    let summary = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
+    let summary: serde_json::Value = serde_json::from_str(summary).expect("JSON");
+    let number = |key: &str| summary[key].as_u64().expect("a number");
+    let (images, n_lost) = (number("images"), number("images_dropped_by_devices"));
+    assert!((98..=103).contains(&(images + n_lost)), "{images} and {n_lost} lost in 4 s at 25 Hz");
     let node = node(WEBCAM);
     assert_eq!((v4l2::control(&node, GAIN).ok(), v4l2::control(&node, BRIGHTNESS).ok()), (Some(77), Some(99)));
     let mut recording = drivers::recording::Recording::open(Path::new("/tmp/vivid.mcap")).expect("a recording");

@@ -4,7 +4,7 @@
 #![cfg(target_os = "linux")]
 
 use drivers::Arm;
-use drivers::franka::played::{Joints, Limits, Owner, PlayedRobot, RobotConfig};
+use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::{Chain, Transform};
@@ -17,16 +17,16 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// Set to `demand`, a machine that cannot run these tests fails them; `.ci/run` does.
-const DEMAND: &str = "FIELDRIG_HIL";
+const REQUIRE_HIL_VARIABLE: &str = "FIELDRIG_HIL";
 /// For whatever is slow on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 const URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 const PINS: &str = include_str!("sources.sha256");
 /// These tests want the machine for themselves.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 #[test]
-fn libfranka_moves_the_played_robot_and_recovers_from_a_reflex() {
+fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
@@ -40,35 +40,38 @@ fn libfranka_moves_the_played_robot_and_recovers_from_a_reflex() {
         flange_from_ee: Transform::identity(),
         limits: Limits::fr3(),
     };
-    let played = PlayedRobot::start(config, obedient(REST_RAD)).unwrap();
+    let emulated = EmulatedRobot::start(config, ideal_joints(REST_RAD)).unwrap();
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/hil/libfranka_client.py");
     let output = Command::new(python).arg(script).arg(ip.to_string()).output().unwrap();
-    let [told, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
-    assert!(output.status.success(), "{told}{errors}");
-    report(&format!("libfranka against the played robot: {told}"));
-    let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-    let number = |key: &str| told[key].as_f64().unwrap();
+    let [reported, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    assert!(output.status.success(), "{reported}{errors}");
+    report(&format!("libfranka against the played robot: {reported}"));
+    let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
+    let number = |key: &str| reported[key].as_f64().unwrap();
     // States that came together are one cycle of the client.
-    assert!(number("cycles") > 0.9 * 2000.0 && number("answered") > 0.99, "{told}");
-    for (ix, by) in told["moved_rad"].as_array().unwrap().iter().enumerate() {
+    assert!(number("cycles") > 0.9 * 2000.0 && number("answered") > 0.99, "{reported}");
+    for (ix, by) in reported["moved_rad"].as_array().unwrap().iter().enumerate() {
         let expected = if ix == 3 { 0.2 } else { 0.0 };
-        assert!((by.as_f64().unwrap() - expected).abs() < 1e-6, "{told}");
+        assert!((by.as_f64().unwrap() - expected).abs() < 1e-6, "{reported}");
     }
-    let stopped = told["stopped"].as_str().unwrap();
-    assert!(stopped.contains("reflex") && stopped.contains("discontinuity"), "{told}");
-    assert!(told["reflex"] == true && told["recovered"] == true && number("cycles_again") > 0.9 * 2000.0, "{told}");
-    drop(played);
+    let stopped = reported["stopped"].as_str().unwrap();
+    assert!(stopped.contains("reflex") && stopped.contains("discontinuity"), "{reported}");
+    assert!(
+        reported["reflex"] == true && reported["recovered"] == true && number("cycles_again") > 0.9 * 2000.0,
+        "{reported}"
+    );
+    drop(emulated);
 }
 
 #[test]
-fn ten_thousand_states_come_from_somebody_elses_controller() {
+fn ten_thousand_states_are_received_from_franka_sim() {
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
-    let server = SomebodyElses::start(&python);
+    let server = FrankaSim::start(&python);
     let mut arm = server.open(FrankaArm::open);
     let mut last = None;
     for _ in 0..10_000 {
-        let state = arm.read(PATIENCE).unwrap();
+        let state = arm.read(TEST_TIMEOUT).unwrap();
         assert!(last.is_none_or(|last| state.stamp > last));
         assert_eq!((state.position.len(), state.velocity.len(), state.effort.len()), (N_JOINTS, N_JOINTS, N_JOINTS));
         last = Some(state.stamp);
@@ -77,15 +80,15 @@ fn ten_thousand_states_come_from_somebody_elses_controller() {
     report(&format!("our driver against franka-sim: {statistics}\n"));
     assert!(statistics.success_frac() > 0.99, "{statistics}");
     // While it is ours nobody else gets in; and the true flange is 107 mm further.
-    let refused = FrankaArm::open(&server.config()).unwrap_err().to_string();
-    assert!(refused.contains("one client") && refused.contains("udp"), "{refused}");
+    let second_client_error = FrankaArm::open(&server.config()).unwrap_err().to_string();
+    assert!(second_client_error.contains("one client") && second_client_error.contains("udp"), "{second_client_error}");
 }
 
 #[test]
-fn ten_thousand_cycles_of_motion_are_taken_by_either_controller() {
+fn ten_thousand_motion_cycles_with_both_controllers() {
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
-    let server = SomebodyElses::start(&python);
+    let server = FrankaSim::start(&python);
     follow_for_ten_thousand_cycles("franka-sim", || {
         server.open(|config| MovableFrankaArm::open(config, &motion(), &ContactConfig::default()))
     });
@@ -97,9 +100,10 @@ fn ten_thousand_cycles_of_motion_are_taken_by_either_controller() {
         flange_from_ee: Transform::identity(),
         limits: Limits::fr3(),
     };
-    let played = PlayedRobot::start(config, obedient([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();
+    let emulated = EmulatedRobot::start(config, ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();
     let chain = chain("panda_link8");
-    let config = ArmConfig { address: played.address().to_string(), joint_names: chain.joint_names().to_vec(), chain };
+    let config =
+        ArmConfig { address: emulated.address().to_string(), joint_names: chain.joint_names().to_vec(), chain };
     follow_for_ten_thousand_cycles("the played robot", || {
         MovableFrankaArm::open(&config, &motion(), &ContactConfig::default()).unwrap()
     });
@@ -119,18 +123,18 @@ fn motion() -> MotionConfig {
 ///
 /// A machine that is busy with other things gets a second chance, and a third; a reflex for limits that were not kept gets none.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
-    const MAX_TRIED: usize = 3;
+    const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
     const NEAR_RAD: f64 = 5e-3; // franka-sim's joints have mass.
-    for tried in 1..=MAX_TRIED {
+    for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
-        let rest = arm.read(PATIENCE).expect("it tells its joints").position;
-        let mut ways = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
+        let rest = arm.read(TEST_TIMEOUT).expect("it tells its joints").position;
+        let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
-            let by_rad = BY_RAD * ways.next().expect("there is always another");
+            let by_rad = BY_RAD * directions.next().expect("there is always another");
             let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
             assert_eq!(arm.command(&target).expect("a target in its range"), target);
-            let until = Instant::now() + PATIENCE;
+            let until = Instant::now() + TEST_TIMEOUT;
             while arm.motion() == Motion::Moving {
                 assert!(Instant::now() < until, "it never comes to rest: {}", arm.motion_statistics());
                 std::thread::sleep(Duration::from_millis(5));
@@ -140,24 +144,28 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
                 arm.recover().expect("it recovers");
                 continue;
             }
-            let position = newest(&mut arm);
-            let off = position.iter().zip(&target.position).map(|(is, wanted)| (is - wanted).abs()).fold(0.0, f64::max);
+            let position = settled_position(&mut arm);
+            let off = position
+                .iter()
+                .zip(&target.position)
+                .map(|(is, requirements)| (is - requirements).abs())
+                .fold(0.0, f64::max);
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
         report(&format!("our driver moves {name}: {statistics}\n"));
-        let [told, _] = statistics.robots_success_frac().expect("it has moved");
-        if statistics.success_frac() > 0.99 && told > 0.99 && statistics.n_motions > 0 {
+        let [reported, _] = statistics.robot_success_frac().expect("it has moved");
+        if statistics.success_frac() > 0.99 && reported > 0.99 && statistics.n_motions > 0 {
             return;
         }
-        assert!(tried < MAX_TRIED, "{name}: {statistics}");
+        assert!(attempt < MAX_ATTEMPTS, "{name}: {statistics}");
     }
 }
 
 /// Where the joints are after they came to rest: states from before may wait.
-fn newest(arm: &mut MovableFrankaArm) -> Vec<f64> {
+fn settled_position(arm: &mut MovableFrankaArm) -> Vec<f64> {
     std::thread::sleep(Duration::from_millis(100));
-    let mut position = arm.read(PATIENCE).expect("it tells its joints").position;
+    let mut position = arm.read(TEST_TIMEOUT).expect("it tells its joints").position;
     while let Ok(state) = arm.read(Duration::ZERO) {
         position = state.position;
     }
@@ -165,24 +173,24 @@ fn newest(arm: &mut MovableFrankaArm) -> Vec<f64> {
 }
 
 /// `franka-sim`, which enforces what a robot does.
-struct SomebodyElses {
+struct FrankaSim {
     address: String,
-    _process: Killed,
+    _process: KillOnDrop,
 }
 
-impl SomebodyElses {
+impl FrankaSim {
     fn start(python: &Path) -> Self {
         let port =
             TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port").local_addr().expect("a free port").port();
         let log = fs::File::create(folder().join("franka-sim.log")).expect("room on the disk");
         // Its own model has to be fetched; ours is of primitives.
         let (root, model) = (Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), folder().join("panda.xml"));
-        let made = Command::new(python)
+        let model_output = Command::new(python)
             .arg(root.join("tests/hil/franka_sim_model.py"))
             .args([&root.join("rigs/robots/panda.urdf"), &model])
             .output()
             .expect("Python starts");
-        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+        assert!(model_output.status.success(), "{}", String::from_utf8_lossy(&model_output.stderr));
         let child = Command::new(python)
             .args(["-m", "franka_sim.run_server", "--no-gripper"])
             .args(["--enforce-comm-constraints", "--enforce-motion-limits", "--port", &port.to_string()])
@@ -192,7 +200,7 @@ impl SomebodyElses {
             .stderr(log)
             .spawn()
             .expect("Python starts");
-        Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: Killed(child) }
+        Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: KillOnDrop(child) }
     }
 
     /// It tells the pose of its seventh link as that of the flange.
@@ -203,7 +211,7 @@ impl SomebodyElses {
 
     /// Once it is there.
     fn open<T>(&self, open: impl Fn(&ArmConfig) -> Result<T, drivers::Error>) -> T {
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + TEST_TIMEOUT;
         loop {
             match open(&self.config()) {
                 Ok(arm) => return arm,
@@ -215,11 +223,11 @@ impl SomebodyElses {
 }
 
 /// Joints that rest there, and then are where they are wanted.
-fn obedient(rest_rad: [f64; N_JOINTS]) -> Owner {
+fn ideal_joints(rest_rad: [f64; N_JOINTS]) -> JointSimulator {
     let mut is_first = true;
-    Box::new(move |_, wanted| {
-        let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { wanted.position_rad };
-        Joints { position_rad, velocity_rad_s: wanted.velocity_rad_s, ..Joints::default() }
+    Box::new(move |_, requirements| {
+        let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { requirements.position_rad };
+        Joints { position_rad, velocity_rad_s: requirements.velocity_rad_s, ..Joints::default() }
     })
 }
 
@@ -228,9 +236,9 @@ fn chain(tip: &str) -> Chain {
 }
 
 /// A child that does not outlive the test.
-struct Killed(Child);
+struct KillOnDrop(Child);
 
-impl Drop for Killed {
+impl Drop for KillOnDrop {
     fn drop(&mut self) {
         // It may have ended by itself.
         let _ = self.0.kill();
@@ -245,9 +253,12 @@ fn report(text: &str) {
 
 /// The Python of the virtual environment; `None`, told in a line, where it cannot be made.
 fn environment() -> Option<PathBuf> {
-    if let Err(why) = make_environment() {
-        assert!(!std::env::var(DEMAND).is_ok_and(|value| value == "demand"), "{DEMAND}=demand, but {why}");
-        report(&format!("skipped: {why}\n"));
+    if let Err(reason) = make_environment() {
+        assert!(
+            !std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand"),
+            "{REQUIRE_HIL_VARIABLE}=demand, but {reason}"
+        );
+        report(&format!("skipped: {reason}\n"));
         return None;
     }
     Some(folder().join("bin/python"))
@@ -255,8 +266,8 @@ fn environment() -> Option<PathBuf> {
 
 /// Makes the virtual environment where it is not complete.
 fn make_environment() -> Result<(), String> {
-    let (folder, mark) = (folder(), folder().join("complete"));
-    if mark.exists() {
+    let (folder, complete_marker) = (folder(), folder().join("complete"));
+    if complete_marker.exists() {
         return Ok(());
     }
     if !cfg!(target_arch = "x86_64") {
@@ -269,19 +280,29 @@ fn make_environment() -> Result<(), String> {
         let last = errors.lines().last().unwrap_or_default().to_owned();
         if output.status.success() { Ok(()) } else { Err(last) }
     };
-    let is_right = "import sys; sys.exit(sys.version_info[:2] != (3, 11))";
-    run(Path::new("python3"), &["-c", is_right])
+    let is_python_3_11 = "import sys; sys.exit(sys.version_info[:2] != (3, 11))";
+    run(Path::new("python3"), &["-c", is_python_3_11])
         .map_err(|_| "the peers of Franka arms are wheels for Python 3.11 (Debian 12)".to_owned())?;
     // What an interrupted run left.
     let _ = fs::remove_dir_all(&folder);
-    let [at, wanted] = [&folder, &folder.join("wanted.txt")].map(|path| path.display().to_string());
+    let [at, requirements] = [&folder, &folder.join("wanted.txt")].map(|path| path.display().to_string());
     run(Path::new("python3"), &["-m", "venv", &at]).map_err(|error| format!("no virtual environment: {error}"))?;
-    let wanted_text: String = pins().map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n")).collect();
-    fs::write(&wanted, wanted_text).map_err(|error| error.to_string())?;
-    let pip =
-        ["-m", "pip", "install", "--quiet", "--only-binary=:all:", "--no-deps", "--require-hashes", "-r", &wanted];
+    let requirements_text: String =
+        pins().map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n")).collect();
+    fs::write(&requirements, requirements_text).map_err(|error| error.to_string())?;
+    let pip = [
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--only-binary=:all:",
+        "--no-deps",
+        "--require-hashes",
+        "-r",
+        &requirements,
+    ];
     run(&folder.join("bin/python"), &pip).map_err(|error| format!("PyPI gives no peers of Franka arms: {error}"))?;
-    fs::write(mark, "").map_err(|error| error.to_string())
+    fs::write(complete_marker, "").map_err(|error| error.to_string())
 }
 
 /// Named by what is in it, beside the other virtual hardware in the target folder.

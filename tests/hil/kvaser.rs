@@ -4,7 +4,7 @@
 use super::can::{Bench, damiao};
 use super::can_motion::{Motors, movable, wait_until_stopped};
 use super::qemu;
-use drivers::can::{ArmConfig, Arrived, Bus, BusConfig, CanArm, Link, MovableCanArm, State, WireErrors, played};
+use drivers::can::{ArmConfig, Bus, BusConfig, BusEvent, CanArm, Link, MovableCanArm, State, WireErrors, emulated};
 use drivers::motion::{JointTarget, Motion, MovableArm, OnLoss};
 use drivers::wire::can::{Frame, Id};
 use drivers::{Arm, Error, clock};
@@ -17,12 +17,12 @@ use std::time::Duration;
 
 // Of the chip's registers (SJA1000, data sheet of 2000, section 6.4): status and interrupts for errors.
 const HAS_ERRORS: u8 = 0x40;
-const IS_OFF_THE_BUS: u8 = 0x80;
+const IS_BUS_OFF: u8 = 0x80;
 const STATUS_CHANGED: u8 = 0x04;
 const PASSIVE_CHANGED: u8 = 0x20;
 
 /// What mends a card in all these tests.
-fn mends(interface: &str) -> String {
+fn fix_command(interface: &str) -> String {
     format!(
         "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate 1000000 restart-ms 100"
     )
@@ -31,9 +31,9 @@ fn mends(interface: &str) -> String {
 /// Types a line; what it told.
 fn sh(line: &str) -> String {
     let output = Command::new("/bin/sh").args(["-c", line]).output().expect("there is a shell");
-    let told = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
-    assert!(output.status.success(), "{line}: {told}");
-    told
+    let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+    assert!(output.status.success(), "{line}: {printed}");
+    printed
 }
 
 /// A card that its driver has found a moment ago.
@@ -61,7 +61,7 @@ impl Card {
     /// Set up as the rig file has it.
     fn up(interface: &'static str) -> Self {
         let card = Self::new(interface);
-        sh(&mends(interface));
+        sh(&fix_command(interface));
         card
     }
 
@@ -96,38 +96,38 @@ impl Card {
     }
 
     /// Whether interrupts of its chip reach the computer.
-    fn let_interrupts(&self, through: bool) {
+    fn set_interrupts_enabled(&self, enabled: bool) {
         const CONTROL: u64 = 0x38;
         let ports = fs::OpenOptions::new().write(true).open(self.device.join("resource0")).expect("we are root");
-        let control: u32 = if through { 0x2000 } else { 0 };
+        let control: u32 = if enabled { 0x2000 } else { 0 };
         ports.write_all_at(&control.to_le_bytes(), CONTROL).expect("a register");
     }
 
     /// Has its chip bent; the driver is told with the chip's next interrupt.
-    fn bend(&self, status: u8, interrupts: u8) {
-        println!("\n{}{} {status:02x} {interrupts:02x}", qemu::BEND, self.interface);
+    fn inject(&self, status: u8, interrupts: u8) {
+        println!("\n{}{} {status:02x} {interrupts:02x}", qemu::INJECT, self.interface);
         let mut answer = String::new();
         std::io::stdin().read_line(&mut answer).expect("the console can be read");
-        assert_eq!(answer.trim(), qemu::BENT);
+        assert_eq!(answer.trim(), qemu::INJECTED);
     }
 
     /// Has its chip bent, and interrupts.
-    fn suffer(&self, status: u8, interrupts: u8) {
-        self.bend(status, interrupts);
+    fn raise_error(&self, status: u8, interrupts: u8) {
+        self.inject(status, interrupts);
         // The order to clear an overrun, of which there is none; with it the chip looks at its interrupts anew.
         self.write(1, 0x08);
     }
 
-    fn suffers_warning(&self) {
-        self.suffer(HAS_ERRORS, STATUS_CHANGED);
+    fn enter_error_warning(&self) {
+        self.raise_error(HAS_ERRORS, STATUS_CHANGED);
     }
 
-    fn suffers_passive(&self) {
-        self.suffer(HAS_ERRORS, PASSIVE_CHANGED);
+    fn enter_error_passive(&self) {
+        self.raise_error(HAS_ERRORS, PASSIVE_CHANGED);
     }
 
-    fn goes_off_the_bus(&self) {
-        self.suffer(HAS_ERRORS | IS_OFF_THE_BUS, STATUS_CHANGED);
+    fn enter_bus_off(&self) {
+        self.raise_error(HAS_ERRORS | IS_BUS_OFF, STATUS_CHANGED);
     }
 }
 
@@ -138,13 +138,13 @@ fn doctor() -> String {
 }
 
 /// What error frames tell until they tell enough.
-fn errors_until(bus: &Bus, is_enough: impl Fn(&WireErrors) -> bool) -> WireErrors {
+fn errors_until(bus: &Bus, condition: impl Fn(&WireErrors) -> bool) -> WireErrors {
     let mut errors = WireErrors::default();
     let until = clock::now() + Duration::from_secs(10);
-    while !is_enough(&errors) {
+    while !condition(&errors) {
         assert!(clock::now() < until, "{errors:?}");
-        if let Some((_, Arrived::Errors(more))) = bus.receive(Duration::from_millis(100)).expect("it is up") {
-            errors.add(&more);
+        if let Some((_, BusEvent::Errors(new_errors))) = bus.receive(Duration::from_millis(100)).expect("it is up") {
+            errors.add(&new_errors);
         }
     }
     errors
@@ -152,8 +152,8 @@ fn errors_until(bus: &Bus, is_enough: impl Fn(&WireErrors) -> bool) -> WireError
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn a_card_that_is_set_up_wrongly_is_told_with_the_line_that_mends_it() {
-    let wrong = [
+fn misconfigured_card_reports_fix_command() {
+    let wrong_setups = [
         ("", "no bit rate is set, 1000000 is wanted"),
         (
             "sudo ip link set can0 up type can bitrate 500000 restart-ms 100",
@@ -165,27 +165,33 @@ fn a_card_that_is_set_up_wrongly_is_told_with_the_line_that_mends_it() {
         ),
         ("sudo ip link set can0 type can bitrate 1000000 restart-ms 100", "it is down"),
     ];
-    for (set_up, what) in wrong {
+    for (set_up, what) in wrong_setups {
         let card = Card::new("can0");
         if !set_up.is_empty() {
             sh(set_up);
         }
-        let complaints = card.link().complaints(&card.config());
-        let found = complaints.iter().find(|complaint| complaint.what.contains(what));
-        assert!(found.is_some_and(|complaint| complaint.command == mends("can0")), "{set_up}: {complaints:?}");
-        let refused = Bus::open(&card.config()).expect_err("it is not set up").to_string();
-        assert!(refused.contains(&mends("can0")), "{refused}");
-        let told = doctor();
-        assert!(told.contains(&format!("can0: {what}")) && told.contains(&mends("can0")), "{set_up}: {told}");
-
-        sh(&complaints[0].command);
-        assert_eq!(card.link().complaints(&card.config()), [], "{set_up}");
-        let told = doctor();
+        let problems = card.link().problems(&card.config());
+        let problem_found = problems.iter().find(|complaint| complaint.what.contains(what));
         assert!(
-            told.contains("can0: up, 1000000 bit/s, state active") && !told.contains("sudo ip link set can0"),
-            "{told}"
+            problem_found.is_some_and(|complaint| complaint.command == fix_command("can0")),
+            "{set_up}: {problems:?}"
         );
-        println!("kvaser: {what}: mended by {}", complaints[0].command);
+        let open_error = Bus::open(&card.config()).expect_err("it is not set up").to_string();
+        assert!(open_error.contains(&fix_command("can0")), "{open_error}");
+        let printed = doctor();
+        assert!(
+            printed.contains(&format!("can0: {what}")) && printed.contains(&fix_command("can0")),
+            "{set_up}: {printed}"
+        );
+
+        sh(&problems[0].command);
+        assert_eq!(card.link().problems(&card.config()), [], "{set_up}");
+        let printed = doctor();
+        assert!(
+            printed.contains("can0: up, 1000000 bit/s, state active") && !printed.contains("sudo ip link set can0"),
+            "{printed}"
+        );
+        println!("kvaser: {what}: mended by {}", problems[0].command);
     }
 }
 
@@ -201,14 +207,14 @@ fn frames_pass_between_cards_both_ways() {
             let sent = Frame::classic(id.expect("in range"), &bytes[..ix as usize % 9]).expect("up to eight bytes");
             assert!(sender.send(&sent).expect("it is up"));
             let arrived = receiver.receive(Duration::from_secs(5)).expect("it is up");
-            assert!(matches!(arrived, Some((_, Arrived::Frame(frame))) if frame == sent), "{arrived:?}, not {sent:?}");
+            assert!(matches!(arrived, Some((_, BusEvent::Frame(frame))) if frame == sent), "{arrived:?}, not {sent:?}");
         }
     }
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn an_arm_on_a_card_is_read_and_goes_on_when_the_bus_is_lost_for_a_moment() {
+fn arm_reading_survives_bus_off() {
     let cards = [Card::up("can0"), Card::up("can1")];
     let motors = vec![damiao(1), damiao(2)];
     let _bench = Bench::new(cards[1].config(), motors.clone(), vec![]);
@@ -223,29 +229,32 @@ fn an_arm_on_a_card_is_read_and_goes_on_when_the_bus_is_lost_for_a_moment() {
     }
     let monitor = cards[0].bus();
     for _ in 0..3 {
-        cards[0].goes_off_the_bus();
+        cards[0].enter_bus_off();
         let errors = errors_until(&monitor, |errors| errors.n_restarts > 0);
         assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
-        let back = clock::now();
+        let recovered_at = clock::now();
         let state = loop {
             let state = arm.read(Duration::from_secs(1)).expect("it goes on");
-            if state.stamp > back {
+            if state.stamp > recovered_at {
                 break state;
             }
         };
-        println!("kvaser: joints are read {:.0} ms after the bus is back", state.stamp.nanos_since(back) as f64 / 1e6);
+        println!(
+            "kvaser: joints are read {:.0} ms after the bus is back",
+            state.stamp.nanos_since(recovered_at) as f64 / 1e6
+        );
     }
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn an_arm_whose_bus_does_not_come_back_ends_with_the_cause() {
+fn persistent_bus_off_is_reported_as_cause() {
     let cards = [Card::up_with_restart("can0", 60_000), Card::up("can1")];
     let _bench = Bench::new(cards[1].config(), vec![damiao(1)], vec![]);
     let config = ArmConfig { buses: vec![cards[0].config()], motors: vec![damiao(1)], rate_hz: 100.0 };
     let mut arm = CanArm::open(&config).expect("it answers");
     arm.read(Duration::from_secs(5)).expect("it reports");
-    cards[0].goes_off_the_bus();
+    cards[0].enter_bus_off();
     let until = clock::now() + Duration::from_secs(10);
     let error = loop {
         match arm.read(Duration::from_millis(100)) {
@@ -259,7 +268,7 @@ fn an_arm_whose_bus_does_not_come_back_ends_with_the_cause() {
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn an_arm_that_is_moved_when_its_bus_is_lost_is_switched_on_again_only_on_request() {
+fn bus_off_stops_moving_arm_until_recovery() {
     let cards = [Card::up("can0"), Card::up("can1")];
     let configs = [damiao(1), damiao(2)];
     let motors = Motors::new(cards[1].config(), configs.to_vec(), false);
@@ -268,108 +277,112 @@ fn an_arm_that_is_moved_when_its_bus_is_lost_is_switched_on_again_only_on_reques
     config.motion.timeout = Duration::from_secs(2);
     let mut arm = MovableCanArm::open(&config).expect("they are switched on");
     let monitor = cards[0].bus();
-    for side in [1.0, -1.0] {
-        arm.command(&JointTarget { position: vec![side; 2] }).expect("it is switched on");
-        cards[0].goes_off_the_bus();
+    for direction_of_motion in [1.0, -1.0] {
+        arm.command(&JointTarget { position: vec![direction_of_motion; 2] }).expect("it is switched on");
+        cards[0].enter_bus_off();
         let reason = wait_until_stopped(&arm);
         assert!(reason.contains("can0 went off the bus"), "{reason}");
         let errors = errors_until(&monitor, |errors| errors.n_restarts > 0);
         assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
-        motors.wait_until("none obeys", |seen| seen.iter().all(|seen| seen.state == played::State::Free));
+        motors.wait_until("none obeys", |observed| {
+            observed.iter().all(|observed| observed.state == emulated::State::Free)
+        });
         std::thread::sleep(Duration::from_millis(500));
-        assert_eq!(motors.states(), [played::State::Free; 2], "the bus is back");
-        let refused = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("it was not recovered");
-        assert!(refused.to_string().contains("not recovered"), "{refused}");
+        assert_eq!(motors.states(), [emulated::State::Free; 2], "the bus is back");
+        let open_error = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("it was not recovered");
+        assert!(open_error.to_string().contains("not recovered"), "{open_error}");
         arm.recover().expect("the motors answer again");
         assert!(!matches!(arm.motion(), Motion::Stopped { .. }), "{:?}", arm.motion());
-        motors.wait_until("all obey", |seen| seen.iter().all(|seen| seen.state == played::State::Obeys));
+        motors.wait_until("all obey", |observed| {
+            observed.iter().all(|observed| observed.state == emulated::State::Enabled)
+        });
         println!("kvaser: {reason}; back, motors free; switched on again on request");
     }
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn states_of_a_controller_are_told_as_they_change() {
+fn controller_state_changes_are_reported() {
     let card = Card::up_with_restart("can0", 3000);
     let bus = card.bus();
     assert_eq!(card.link().state, Some(State::Active));
     assert_eq!(card.link().n_errors, Some([0, 0]));
-    card.suffers_warning();
+    card.enter_error_warning();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_warnings: 1, ..WireErrors::default() });
     assert_eq!(card.link().state, Some(State::Warning));
-    card.suffers_passive();
+    card.enter_error_passive();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_passive: 1, ..WireErrors::default() });
     assert_eq!(card.link().state, Some(State::Passive));
-    assert_eq!(card.link().complaints(&card.config()), [], "it still takes part");
-    card.goes_off_the_bus();
+    assert_eq!(card.link().problems(&card.config()), [], "it still takes part");
+    card.enter_bus_off();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_bus_off: 1, ..WireErrors::default() });
     let link = card.link();
     assert_eq!(link.state, Some(State::BusOff), "{link}");
-    let complaints = link.complaints(&card.config());
-    assert!(complaints.iter().any(|complaint| complaint.what.starts_with("it is off the bus")), "{complaints:?}");
+    let problems = link.problems(&card.config());
+    assert!(problems.iter().any(|complaint| complaint.what.starts_with("it is off the bus")), "{problems:?}");
     // Once the kernel has noticed that nothing goes out, which may take it a second, it takes frames and drops them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
     std::thread::sleep(Duration::from_millis(1200));
-    let n_taken = (0..50).filter(|_| bus.send(&frame).expect("it is up")).count();
-    assert_eq!(n_taken, 50);
-    let began = clock::now();
+    let n_accepted = (0..50).filter(|_| bus.send(&frame).expect("it is up")).count();
+    assert_eq!(n_accepted, 50);
+    let start_time = clock::now();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_restarts: 1, ..WireErrors::default() });
     assert_eq!(card.link().state, Some(State::Active));
-    println!("kvaser: warning, passive, off the bus, back after {:?}", clock::now().duration_since(began));
+    println!("kvaser: warning, passive, off the bus, back after {:?}", clock::now().duration_since(start_time));
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn a_bus_that_stays_lost_is_told_by_doctor_and_mended_by_its_line() {
+fn doctor_reports_bus_off_with_working_fix() {
     let card = Card::up_with_restart("can0", 0);
-    card.goes_off_the_bus();
+    card.enter_bus_off();
     let until = clock::now() + Duration::from_secs(5);
     while card.link().state != Some(State::BusOff) {
         assert!(clock::now() < until, "{}", card.link());
     }
-    let told = doctor();
-    assert!(told.contains("can0: it is off the bus") && told.contains(&mends("can0")), "{told}");
+    let printed = doctor();
+    assert!(printed.contains("can0: it is off the bus") && printed.contains(&fix_command("can0")), "{printed}");
     // What takes the chip's place on the bus again takes back what was bent.
-    card.bend(0, 0);
-    sh(&mends("can0"));
-    assert_eq!(card.link().complaints(&card.config()), []);
+    card.inject(0, 0);
+    sh(&fix_command("can0"));
+    assert_eq!(card.link().problems(&card.config()), []);
     assert_eq!(card.link().state, Some(State::Active));
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn motors_that_do_not_answer_while_the_controller_gets_errors_are_told_apart_from_silent_ones() {
+fn unacknowledged_frames_are_distinguished_from_silence() {
     let card = Card::up("can0");
     let config = ArmConfig { buses: vec![card.config()], motors: vec![damiao(1)], rate_hz: 100.0 };
-    let told = CanArm::open(&config).expect_err("nobody is there").to_string();
-    assert!(told.contains("no answer to 4 questions"), "{told}");
+    let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
+    assert!(printed.contains("no answer to 4 questions"), "{printed}");
     // The chip tells it with the first question; that driver has no word for frames that nobody acknowledges.
-    card.bend(HAS_ERRORS, PASSIVE_CHANGED);
-    let told = CanArm::open(&config).expect_err("nobody is there").to_string();
-    assert!(told.contains("nobody acknowledges frames"), "{told}");
+    card.inject(HAS_ERRORS, PASSIVE_CHANGED);
+    let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
+    assert!(printed.contains("nobody acknowledges frames"), "{printed}");
 }
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn frames_that_a_card_had_no_room_for_are_counted() {
+fn receive_overflows_are_counted() {
     let cards = [Card::up("can0"), Card::up("can1")];
     let [receiver, sender] = [cards[0].bus(), cards[1].bus()];
-    cards[0].let_interrupts(false);
+    cards[0].set_interrupts_enabled(false);
     for ix in 0..10_u8 {
         let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[ix; 8]).expect("eight bytes");
         assert!(sender.send(&frame).expect("it is up"));
     }
     let stamp = clock::now();
-    cards[0].let_interrupts(true);
+    cards[0].set_interrupts_enabled(true);
     let (mut n_frames, mut errors) = (0, WireErrors::default());
     while let Some((_, arrived)) = receiver.receive(Duration::from_millis(300)).expect("it is up") {
         match arrived {
-            Arrived::Frame(_) => n_frames += 1,
-            Arrived::Errors(more) => errors.add(&more),
+            BusEvent::Frame(_) => n_frames += 1,
+            BusEvent::Errors(new_errors) => errors.add(&new_errors),
         }
     }
     println!(
@@ -383,25 +396,25 @@ fn frames_that_a_card_had_no_room_for_are_counted() {
 
 #[test]
 #[ignore = "needs the machine with CAN cards"]
-fn the_load_of_the_bus_is_that_of_the_frames_sent() {
+fn bus_load_matches_frames_sent() {
     const N_FRAMES: u32 = 5000;
     const PERIOD: Duration = Duration::from_millis(2);
     let cards = [Card::up("can0"), Card::up("can1")];
     let [sender, receiver] = [cards[0].bus(), cards[1].bus()];
-    let hearing = std::thread::spawn(move || {
+    let receiving = std::thread::spawn(move || {
         let mut n = 0;
         while n < N_FRAMES {
             match receiver.receive(Duration::from_secs(5)).expect("it is up") {
-                Some((_, Arrived::Frame(_))) => n += 1,
+                Some((_, BusEvent::Frame(_))) => n += 1,
                 other => panic!("{n} frames came, then {other:?}"),
             }
         }
         receiver.busy()
     });
-    let began = clock::now();
+    let start_time = clock::now();
     let mut n_bits = 0;
     for ix in 0..N_FRAMES {
-        let due: Stamp = began + PERIOD * ix;
+        let due: Stamp = start_time + PERIOD * ix;
         std::thread::sleep(due.duration_since(clock::now()));
         let n_bytes = ix % 9;
         let (id, n_other_bits) = match ix % 2 {
@@ -412,12 +425,12 @@ fn the_load_of_the_bus_is_that_of_the_frames_sent() {
         let frame = Frame::classic(id.expect("in range"), &[0x55; 8][..n_bytes as usize]).expect("up to eight bytes");
         assert!(sender.send(&frame).expect("it is up"));
     }
-    let took = clock::now().secs_since(began);
-    let busy = [sender.busy(), hearing.join().expect("all frames come")];
+    let elapsed_secs = clock::now().secs_since(start_time);
+    let busy = [sender.busy(), receiving.join().expect("all frames come")];
     let expected_secs = f64::from(n_bits) / 1e6;
-    let load = |busy_secs: f64| 100.0 * busy_secs / took;
+    let load = |busy_secs: f64| 100.0 * busy_secs / elapsed_secs;
     println!(
-        "kvaser: {N_FRAMES} frames in {took:.1} s: {:.3} % and {:.3} % of the bus as the driver counts, {:.3} % by their bits",
+        "kvaser: {N_FRAMES} frames in {elapsed_secs:.1} s: {:.3} % and {:.3} % of the bus as the driver counts, {:.3} % by their bits",
         load(busy[0].as_secs_f64()),
         load(busy[1].as_secs_f64()),
         load(expected_secs)
@@ -426,8 +439,8 @@ fn the_load_of_the_bus_is_that_of_the_frames_sent() {
         // Each frame is counted in whole nanoseconds.
         assert!((busy.as_secs_f64() - expected_secs).abs() < 1e-9 * f64::from(N_FRAMES), "{busy:?}");
     }
-    for (card, way) in cards.iter().zip(["tx", "rx"]) {
-        let counted = fs::read_to_string(format!("/sys/class/net/{}/statistics/{way}_packets", card.interface));
-        assert_eq!(counted.expect("the kernel counts").trim(), N_FRAMES.to_string());
+    for (card, direction) in cards.iter().zip(["tx", "rx"]) {
+        let packets = fs::read_to_string(format!("/sys/class/net/{}/statistics/{direction}_packets", card.interface));
+        assert_eq!(packets.expect("the kernel counts").trim(), N_FRAMES.to_string());
     }
 }

@@ -54,39 +54,39 @@ const MAX_RUN: Duration = Duration::from_secs(420);
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 /// Set to `demand`, a machine that cannot run these tests fails them; `.ci/run` does.
-const DEMAND: &str = "FIELDRIG_HIL";
+const REQUIRE_HIL_VARIABLE: &str = "FIELDRIG_HIL";
 
 #[test]
-fn cameras_and_buses_in_a_kernel_of_their_own() {
+fn cameras_and_buses_in_virtual_kernel() {
     run_inside(&[], || {
         let folder = cache_folder();
         let kernel = build_kernel("um", &folder);
         let root = folder.join("root");
-        lay_out(&root, INIT, &[]);
+        install_root(&root, INIT, &[]);
         #[cfg(all(feature = "realsense", feature = "sim"))]
-        wire::lay_out(&root);
+        wire::install_root(&root);
         boot(&kernel, &root, &folder)
     });
 }
 
 #[test]
-fn can_cards_in_a_machine_of_their_own() {
+fn can_cards_in_virtual_machine() {
     run_inside(&[qemu::PROGRAM, qemu::IP], || {
         let folder = cache_folder();
         let kernel = build_kernel("x86", &folder);
         let root = folder.join("root-qemu");
-        qemu::lay_out(&root);
+        qemu::install_root(&root);
         qemu::boot(&kernel, &root)
     });
 }
 
-/// Runs tests in a machine whose console `boot` returns, unless something is missing here; `more` is what only this machine needs.
-fn run_inside(more: &[&str], boot: impl FnOnce() -> String) {
-    let is_demanded = std::env::var(DEMAND).is_ok_and(|value| value == "demand");
-    if let Some(why) = missing(more) {
-        assert!(!is_demanded, "{DEMAND}=demand, but {why}");
+/// Runs tests in a machine whose console `boot` returns, unless something is missing here; `extra_files` is what only this machine needs.
+fn run_inside(extra_files: &[&str], boot: impl FnOnce() -> String) {
+    let is_required = std::env::var(REQUIRE_HIL_VARIABLE).is_ok_and(|value| value == "demand");
+    if let Some(reason) = missing_requirement(extra_files) {
+        assert!(!is_required, "{REQUIRE_HIL_VARIABLE}=demand, but {reason}");
         // Bypasses the test harness, which hides the output of passing tests.
-        let _ = writeln!(std::io::stderr(), "skipped: {why}");
+        let _ = writeln!(std::io::stderr(), "skipped: {reason}");
         return;
     }
     // A test that failed while it had the lock leaves nothing behind that another one could trip over.
@@ -98,14 +98,14 @@ fn run_inside(more: &[&str], boot: impl FnOnce() -> String) {
 }
 
 /// Why the tests cannot run here.
-fn missing(more: &[&str]) -> Option<String> {
+fn missing_requirement(extra_files: &[&str]) -> Option<String> {
     let release = fs::read_to_string("/etc/os-release").unwrap_or_default();
     let is_bookworm = release.lines().any(|line| line == "VERSION_CODENAME=bookworm");
     if !is_bookworm || !cfg!(target_arch = "x86_64") {
         return Some("the virtual kernels are built of Debian 12's source, on x86-64 only".into());
     }
     // All files that only packages of the group `hil` provide: with only some of them, the kernel's build would fail.
-    let needed = [
+    let required = [
         "/usr/src/linux-source-6.1.tar.xz",
         "/usr/bin/busybox",
         "/usr/bin/make",
@@ -116,9 +116,9 @@ fn missing(more: &[&str]) -> Option<String> {
         "/usr/include/libelf.h",
         "/usr/include/openssl/opensslv.h",
     ];
-    for needed in needed.iter().chain(more) {
-        if !Path::new(needed).exists() {
-            return Some(format!("{needed} is missing: scripts/install-packages.sh hil"));
+    for required in required.iter().chain(extra_files) {
+        if !Path::new(required).exists() {
+            return Some(format!("{required} is missing: scripts/install-packages.sh hil"));
         }
     }
     None
@@ -141,7 +141,7 @@ fn build_kernel(kind: &str, folder: &Path) -> PathBuf {
 }
 
 /// A root folder: busybox, this program, `fieldrig`, more programs with their names, and the libraries that all these need.
-fn lay_out(root: &Path, init_script: &str, more: &[(PathBuf, &str)]) {
+fn install_root(root: &Path, init_script: &str, extra_files: &[(PathBuf, &str)]) {
     let _ = fs::remove_dir_all(root); // Not there the first time.
     for folder in ["bin", "dev", "lib", "proc", "rigs", "sys", "tmp"] {
         fs::create_dir_all(root.join(folder)).expect("room on the disk");
@@ -153,7 +153,7 @@ fn lay_out(root: &Path, init_script: &str, more: &[(PathBuf, &str)]) {
         (PathBuf::from(env!("CARGO_BIN_EXE_fieldrig")), "fieldrig"),
     ];
     let mut libraries = BTreeSet::new();
-    for (program, name) in programs.iter().chain(more) {
+    for (program, name) in programs.iter().chain(extra_files) {
         fs::copy(program, root.join("bin").join(name)).expect("room on the disk");
         libraries.extend(libraries_of(program));
     }
@@ -162,9 +162,9 @@ fn lay_out(root: &Path, init_script: &str, more: &[(PathBuf, &str)]) {
         fs::copy(&library, root.join("lib").join(name)).expect("ldd found it");
         // The dynamic linker is looked for where the programs say, the rest by LD_LIBRARY_PATH.
         if name.to_string_lossy().starts_with("ld-") {
-            let place = root.join(library.strip_prefix("/").expect("ldd prints whole paths"));
-            fs::create_dir_all(place.parent().expect("inside the root")).expect("room on the disk");
-            fs::copy(&library, place).expect("ldd found it");
+            let path_in_root = root.join(library.strip_prefix("/").expect("ldd prints whole paths"));
+            fs::create_dir_all(path_in_root.parent().expect("inside the root")).expect("room on the disk");
+            fs::copy(&library, path_in_root).expect("ldd found it");
         }
     }
     for file in ["vivid.toml", "vivid-can.toml", "kvaser.toml", "two.urdf"] {
@@ -200,15 +200,15 @@ fn boot(kernel: &Path, root: &Path, folder: &Path) -> String {
     run(&mut command, |_, _| {})
 }
 
-/// Runs a machine to its end, or ends it when that takes too long; returns what came on the console. `hears` is given each line of it.
-fn run(command: &mut Command, mut hears: impl FnMut(&mut Child, &str)) -> String {
+/// Runs a machine to its end, or ends it when that takes too long; returns what came on the console. `on_line` is given each line of it.
+fn run(command: &mut Command, mut on_line: impl FnMut(&mut Child, &str)) -> String {
     let mut child =
         command.stdout(Stdio::piped()).stderr(Stdio::inherit()).process_group(0).spawn().expect("it is a program");
     let group = format!("-{}", child.id());
     let mut lines = BufReader::new(child.stdout.take().expect("piped"));
-    let (done, is_done) = std::sync::mpsc::sync_channel::<()>(0);
+    let (done, done_receiver) = std::sync::mpsc::sync_channel::<()>(0);
     let guard = std::thread::spawn(move || {
-        if is_done.recv_timeout(MAX_RUN) == Err(RecvTimeoutError::Timeout) {
+        if done_receiver.recv_timeout(MAX_RUN) == Err(RecvTimeoutError::Timeout) {
             // The machine's processes are one group: none of them is left.
             let _ = Command::new("sh").args(["-c", &format!("kill -KILL {group}")]).status();
         }
@@ -217,7 +217,7 @@ fn run(command: &mut Command, mut hears: impl FnMut(&mut Child, &str)) -> String
     let mut line = Vec::new();
     while lines.read_until(b'\n', &mut line).is_ok_and(|n| n > 0) {
         let text = String::from_utf8_lossy(&line).replace('\r', "");
-        hears(&mut child, &text);
+        on_line(&mut child, &text);
         console += &text;
         line.clear();
     }

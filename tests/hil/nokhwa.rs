@@ -1,6 +1,6 @@
 //! Inside the virtual kernel: cameras by way of nokhwa, against vivid.
 
-use crate::cameras::{self, DROP_PERCENT, WEBCAM, drive, node};
+use crate::cameras::{self, DROP_PERCENT, WEBCAM, node, write_driver_action};
 use drivers::nokhwa::{Config, NokhwaCamera};
 use drivers::v4l2::{self, Delivery, V4l2Camera, V4l2Format};
 use drivers::{Camera, Error, Image, PixelFormat};
@@ -30,19 +30,19 @@ fn config() -> Config {
 
 /// Leaves the camera in a format that nokhwa knows: it opens none whose present one it does not, as after the tests of V4L2.
 fn open(config: Config) -> NokhwaCamera {
-    let known = v4l2::Config { format: Some(V4l2Format::Yuyv), ..cameras::config(WEBCAM, [640, 360], RATE_HZ) };
-    drop(V4l2Camera::open(known).expect("vivid opens"));
+    let known_format = v4l2::Config { format: Some(V4l2Format::Yuyv), ..cameras::config(WEBCAM, [640, 360], RATE_HZ) };
+    drop(V4l2Camera::open(known_format).expect("vivid opens"));
     NokhwaCamera::open(config).expect("vivid opens")
 }
 
 /// The next image after a fault, and how long it took.
-fn back_after(camera: &mut NokhwaCamera) -> (Image, Duration) {
-    let began = Instant::now();
+fn time_to_recover(camera: &mut NokhwaCamera) -> (Image, Duration) {
+    let start_time = Instant::now();
     loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(image) => return (image, began.elapsed()),
+            Ok(image) => return (image, start_time.elapsed()),
             Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
-                assert!(began.elapsed() < Duration::from_secs(10), "no image any more")
+                assert!(start_time.elapsed() < Duration::from_secs(10), "no image any more")
             }
             Err(other) => panic!("{other}"),
         }
@@ -50,12 +50,12 @@ fn back_after(camera: &mut NokhwaCamera) -> (Image, Duration) {
 }
 
 /// Until the camera says that it is looked for.
-fn lost_after(camera: &mut NokhwaCamera) -> Duration {
-    let began = Instant::now();
+fn time_to_disconnect(camera: &mut NokhwaCamera) -> Duration {
+    let start_time = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
-        assert!(began.elapsed() < Duration::from_secs(10), "the driver does not notice");
+        assert!(start_time.elapsed() < Duration::from_secs(10), "the driver does not notice");
     }
-    began.elapsed()
+    start_time.elapsed()
 }
 
 #[test]
@@ -66,46 +66,46 @@ fn nokhwa_streams_ten_seconds() {
         let first = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
         assert_eq!(first.decode_rgb().expect("raw pixels").len(), 640 * 360 * 3);
         assert!(matches!(first.format, PixelFormat::Yuv { .. }));
-        let began = Instant::now();
+        let start_time = Instant::now();
         let mut last = first.stamp;
-        while began.elapsed() < Duration::from_secs(if format.is_none() { 10 } else { 2 }) {
+        while start_time.elapsed() < Duration::from_secs(if format.is_none() { 10 } else { 2 }) {
             let image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
             assert!(image.stamp > last, "stamps go back");
             last = image.stamp;
         }
         let by_time = last.secs_since(first.stamp) * RATE_HZ;
         let counts = camera.counts();
-        println!("nokhwa, {:?}: {counts:?} in {:.2?}, {by_time:.1} by time", first.format, began.elapsed());
-        assert_eq!((counts.n_reconnections, counts.n_left_behind), (0, 0));
-        let counted = (counts.n_images - 1 + counts.n_skipped) as f64;
-        assert!((counted - by_time).abs() < 3.0, "{counted} images and gaps, {by_time} by time");
+        println!("nokhwa, {:?}: {counts:?} in {:.2?}, {by_time:.1} by time", first.format, start_time.elapsed());
+        assert_eq!((counts.n_reconnections, counts.n_abandoned), (0, 0));
+        let n_counted = (counts.n_images - 1 + counts.n_skipped) as f64;
+        assert!((n_counted - by_time).abs() < 3.0, "{n_counted} images and gaps, {by_time} by time");
     }
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn a_call_to_nokhwa_that_hangs_is_left_behind() {
+fn hanging_nokhwa_call_is_abandoned() {
     let mut camera = open(config());
     camera.next_image(Duration::from_secs(2)).expect("vivid streams");
     // Vivid sends nothing any more: nokhwa waits for ever.
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 100).expect("vivid injects faults");
-    let noticed = lost_after(&mut camera);
-    println!("nokhwa: a call that hangs was left behind after {noticed:.2?}");
-    assert!(noticed < Duration::from_secs(2), "{noticed:?}");
-    assert_eq!(camera.counts().n_left_behind, 1);
-    drive("unbind");
-    let pulled = Instant::now();
-    while pulled.elapsed() < Duration::from_secs(1) {
+    let detected_after = time_to_disconnect(&mut camera);
+    println!("nokhwa: a call that hangs was left behind after {detected_after:.2?}");
+    assert!(detected_after < Duration::from_secs(2), "{detected_after:?}");
+    assert_eq!(camera.counts().n_abandoned, 1);
+    write_driver_action("unbind");
+    let unplugged_at = Instant::now();
+    while unplugged_at.elapsed() < Duration::from_secs(1) {
         assert!(matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })));
     }
-    drive("bind");
-    let (image, took) = back_after(&mut camera);
+    write_driver_action("bind");
+    let (image, elapsed) = time_to_recover(&mut camera);
     println!(
-        "nokhwa: plugged in again, images after {took:.2?}; about {} were lost; {:?}",
+        "nokhwa: plugged in again, images after {elapsed:.2?}; about {} were lost; {:?}",
         image.n_skipped,
         camera.counts()
     );
-    assert!(took < Duration::from_secs(2), "{took:?}");
+    assert!(elapsed < Duration::from_secs(2), "{elapsed:?}");
     assert_eq!(camera.counts().n_reconnections, 1);
     for _ in 0..25 {
         camera.next_image(Duration::from_secs(2)).expect("it streams on");
@@ -114,34 +114,37 @@ fn a_call_to_nokhwa_that_hangs_is_left_behind() {
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn a_camera_of_nokhwa_survives_a_pulled_cable() {
+fn nokhwa_camera_survives_unplugging() {
     let mut camera = open(config());
     camera.next_image(Duration::from_secs(2)).expect("vivid streams");
-    drive("unbind");
-    let noticed = lost_after(&mut camera);
-    std::thread::sleep(Duration::from_secs(1).saturating_sub(noticed));
-    drive("bind");
-    let (image, took) = back_after(&mut camera);
+    write_driver_action("unbind");
+    let detected_after = time_to_disconnect(&mut camera);
+    std::thread::sleep(Duration::from_secs(1).saturating_sub(detected_after));
+    write_driver_action("bind");
+    let (image, elapsed) = time_to_recover(&mut camera);
     println!(
-        "nokhwa: pulled, noticed after {noticed:.2?}, images again after {took:.2?}, about {} lost",
+        "nokhwa: pulled, noticed after {detected_after:.2?}, images again after {elapsed:.2?}, about {} lost",
         image.n_skipped
     );
-    assert!(noticed < Duration::from_secs(2) && took < Duration::from_secs(2), "{noticed:?}, {took:?}");
+    assert!(
+        detected_after < Duration::from_secs(2) && elapsed < Duration::from_secs(2),
+        "{detected_after:?}, {elapsed:?}"
+    );
     assert!((20..=60).contains(&image.n_skipped), "{} images for a second without a camera", image.n_skipped);
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
-fn what_nokhwa_cannot_do_is_told() {
-    let refused = |config| NokhwaCamera::open(config).expect_err("not to be had").to_string();
-    let absent = refused(Config { device: "no such camera".into(), ..config() });
+fn unsupported_nokhwa_settings_are_errors() {
+    let open_error = |config| NokhwaCamera::open(config).expect_err("not to be had").to_string();
+    let absent = open_error(Config { device: "no such camera".into(), ..config() });
     println!("{absent}");
     assert!(absent.contains("\"no such camera\"") && absent.contains("vivid-000"), "{absent}");
     let mut large = config();
     large.intrinsics.size_px = [800, 600];
-    let large = refused(large);
+    let large = open_error(large);
     println!("{large}");
     assert!(large.contains("800x600 at 25 Hz cannot be had"), "{large}");
-    assert!(refused(Config { rate_hz: 29.97, ..config() }).contains("whole numbers"));
-    assert!(refused(Config { format: Some(V4l2Format::Grey), ..config() }).contains("grey"));
+    assert!(open_error(Config { rate_hz: 29.97, ..config() }).contains("whole numbers"));
+    assert!(open_error(Config { format: Some(V4l2Format::Grey), ..config() }).contains("grey"));
 }

@@ -33,16 +33,16 @@ $bb poweroff -f
 const SUDO: &str = "#!/bin/busybox sh\nexec /bin/\"$@\"\n";
 
 /// How a test inside asks for a chip to be bent: interface, bits of its status and its interrupts, both hexadecimal.
-pub(crate) const BEND: &str = "hil: bend ";
+pub(crate) const INJECT: &str = "hil: bend ";
 /// What it is answered, a line.
-pub(crate) const BENT: &str = "bent";
+pub(crate) const INJECTED: &str = "bent";
 /// A chip takes all frames while these are the last half of its acceptance registers; the first half is then free to name it.
 pub(crate) const ACCEPT_ALL: [u8; 4] = [0xFF; 4];
 /// Bits of the chip's status that say that it has errors and that it is off the bus.
 const STATUS_ERRORS: u8 = 0xC0;
 
-pub(crate) fn lay_out(root: &Path) {
-    super::lay_out(root, INIT, &[(PathBuf::from(IP), "ip")]);
+pub(crate) fn install_root(root: &Path) {
+    super::install_root(root, INIT, &[(PathBuf::from(IP), "ip")]);
     write_script(&root.join("bin/sudo"), SUDO);
 }
 
@@ -65,10 +65,10 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
         )
         .stdin(Stdio::piped());
     run(&mut command, |machine, line| {
-        if let Some((_, asked)) = line.split_once(BEND) {
-            let answer = match bend(machine.id(), asked.trim()) {
-                Ok(()) => BENT.to_owned(),
-                Err(why) => format!("not bent: {why}"),
+        if let Some((_, request)) = line.split_once(INJECT) {
+            let answer = match inject_fault(machine.id(), request.trim()) {
+                Ok(()) => INJECTED.to_owned(),
+                Err(error) => format!("not bent: {error}"),
             };
             // Where the machine has ended by now, its console tells.
             let _ = writeln!(machine.stdin.as_mut().expect("piped"), "{answer}");
@@ -80,9 +80,9 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
 ///
 /// The chip is found by its acceptance registers: the test inside has written the interface's name there. In QEMU these follow on
 /// mode, status, interrupts, enabled interrupts, messages waiting, their place, and clock divider, a byte each.
-fn bend(machine: u32, asked: &str) -> std::io::Result<()> {
-    let words: Vec<&str> = asked.split(' ').collect();
-    let &[interface, status, interrupts] = words.as_slice() else { panic!("three words, not {asked}") };
+fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
+    let words: Vec<&str> = request.split(' ').collect();
+    let &[interface, status, interrupts] = words.as_slice() else { panic!("three words, not {request}") };
     let [status, interrupts] = [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
     let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
     let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has one");

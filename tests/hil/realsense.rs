@@ -2,7 +2,7 @@
 //! and our alignment of depth beside the library's.
 
 use drivers::align::DepthAlignment;
-use drivers::realsense::played::{BagWriter, PlayedCamera, PlayedDepth};
+use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::realsense::{Config, Filter, Pace, RealsenseCamera, Settings, Stream};
 use drivers::{Camera, Devices, Error, Image, Live, PixelFormat, Sample, Source};
 use kinematics::{Intrinsics, Lens, Stamp, Transform};
@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// For whatever is slow on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 const RATE_HZ: u16 = 30;
 /// Whole microseconds, as the camera counts; some hours of them are more than 32 bits.
 const BEGIN_NANOS: i64 = 11_000_000_123_000;
@@ -27,9 +27,9 @@ const DEPTH_LATER_NANOS: i64 = 4_567_000;
 const N_IMAGES: i64 = 12;
 
 /// A D435i: depth from two infrared cameras, colour beside them.
-fn d435i(color_px: [u32; 2], lens: Lens) -> PlayedCamera {
+fn d435i(color_px: [u32; 2], lens: Lens) -> EmulatedCamera {
     let focal_px = f64::from(color_px[1]) * 1.2625;
-    PlayedCamera {
+    EmulatedCamera {
         name: "Intel RealSense D435I".into(),
         serial: "817612070000".into(),
         rate_hz: RATE_HZ,
@@ -41,7 +41,7 @@ fn d435i(color_px: [u32; 2], lens: Lens) -> PlayedCamera {
             rectified: false,
         },
         format: PixelFormat::Rgb8,
-        depth: Some(PlayedDepth {
+        depth: Some(EmulatedDepth {
             intrinsics: Intrinsics {
                 size_px: [640, 480],
                 focal_px: [385.375, 385.375],
@@ -53,12 +53,12 @@ fn d435i(color_px: [u32; 2], lens: Lens) -> PlayedCamera {
                 Translation3::new(0.014_8, 0.000_2, 0.000_3),
                 UnitQuaternion::from_euler_angles(0.003, -0.006, 0.002),
             ),
-            metres_per_count: 0.001,
+            meters_per_count: 0.001,
         }),
     }
 }
 
-fn depth_of(camera: &PlayedCamera) -> &PlayedDepth {
+fn depth_of(camera: &EmulatedCamera) -> &EmulatedDepth {
     camera.depth.as_ref().expect("it has depth")
 }
 
@@ -66,18 +66,18 @@ fn depth_of(camera: &PlayedCamera) -> &PlayedDepth {
 fn scene_m(ray: &Vector3<f64>) -> f64 {
     // normal * point = offset
     let planes = [(Vector3::new(0.25, 0.05, 1.0), 1.6), (Vector3::new(0.0, 1.0, 0.1), 0.7)];
-    let meets = |(normal, offset): &(Vector3<f64>, f64)| {
+    let distance_along_ray = |(normal, offset): &(Vector3<f64>, f64)| {
         let along = normal.dot(ray);
         if along > 0.0 { offset / along } else { f64::INFINITY }
     };
-    let behind = planes.iter().map(meets).fold(f64::INFINITY, f64::min);
-    let front = meets(&(Vector3::new(-0.3, 0.2, 1.0), 0.65));
+    let background = planes.iter().map(distance_along_ray).fold(f64::INFINITY, f64::min);
+    let front = distance_along_ray(&(Vector3::new(-0.3, 0.2, 1.0), 0.65));
     let hit = ray * front;
-    if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 { front.min(behind) } else { behind }
+    if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 { front.min(background) } else { background }
 }
 
 /// What the camera counts of the scene, with some holes.
-fn counts_of(depth: &PlayedDepth) -> Vec<u16> {
+fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
     let [width, height] = depth.intrinsics.size_px;
     let pixels = (0..height).flat_map(|row| (0..width).map(move |column| [column, row]));
     let count = |[column, row]: [u32; 2]| {
@@ -90,13 +90,13 @@ fn counts_of(depth: &PlayedDepth) -> Vec<u16> {
             clippy::cast_sign_loss,
             reason = "a few metres are below 65535 counts"
         )]
-        let count = (scene_m(&ray) / depth.metres_per_count).round() as u16;
+        let count = (scene_m(&ray) / depth.meters_per_count).round() as u16;
         count
     };
     pixels.map(count).collect()
 }
 
-fn image(camera: &PlayedCamera, number: i64) -> Image {
+fn image(camera: &EmulatedCamera, number: i64) -> Image {
     let [width, height] = camera.intrinsics.size_px;
     let bytes = (0..width * height * 3).map(|ix| (i64::from(ix) * 31 + number * 7).to_le_bytes()[0]);
     Image {
@@ -110,7 +110,7 @@ fn image(camera: &PlayedCamera, number: i64) -> Image {
     }
 }
 
-fn depth_image(camera: &PlayedCamera, number: i64) -> Image {
+fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
     let depth = depth_of(camera);
     // Each image has its own reading in the corner.
     let mut counts = counts_of(depth);
@@ -118,7 +118,7 @@ fn depth_image(camera: &PlayedCamera, number: i64) -> Image {
     Image {
         stamp: Stamp(BEGIN_NANOS + number * PERIOD_NANOS + DEPTH_LATER_NANOS),
         size_px: depth.intrinsics.size_px,
-        format: PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count },
+        format: PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count },
         data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
         exposure_secs: Some(0.007_123),
         ..image(camera, number)
@@ -126,7 +126,7 @@ fn depth_image(camera: &PlayedCamera, number: i64) -> Image {
 }
 
 /// A file of so many images.
-fn record(path: &Path, camera: &PlayedCamera, n_images: i64) {
+fn record(path: &Path, camera: &EmulatedCamera, n_images: i64) {
     let mut writer = BagWriter::create(path, camera).expect("a file to write");
     for number in 0..n_images {
         writer.write(&image(camera, number)).expect("room on the disk");
@@ -135,7 +135,7 @@ fn record(path: &Path, camera: &PlayedCamera, n_images: i64) {
     writer.finish().expect("room on the disk");
 }
 
-fn config(path: PathBuf, camera: &PlayedCamera, pace: Pace) -> Config {
+fn config(path: PathBuf, camera: &EmulatedCamera, pace: Pace) -> Config {
     Config {
         name: "wrist".into(),
         serial: String::new(),
@@ -157,7 +157,7 @@ fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
     let mut camera = RealsenseCamera::open(config).unwrap_or_else(|error| panic!("{error}"));
     let mut images = Vec::new();
     loop {
-        match camera.next_image(PATIENCE) {
+        match camera.next_image(TEST_TIMEOUT) {
             Ok(image) => images.push(image),
             Err(Error::NotDue { .. }) => {}
             Err(Error::Ended { .. }) => return (camera, images),
@@ -167,29 +167,32 @@ fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
 }
 
 /// Single precision on the way.
-fn assert_same_lens(got: &Intrinsics, wanted: &Intrinsics) {
+fn assert_same_lens(got: &Intrinsics, expected: &Intrinsics) {
     const REL: f64 = 1e-7;
-    let close = |got: f64, wanted: f64| (got - wanted).abs() <= REL * wanted.abs().max(1.0);
-    assert_eq!(got.size_px, wanted.size_px);
+    let close = |got: f64, expected: f64| (got - expected).abs() <= REL * expected.abs().max(1.0);
+    assert_eq!(got.size_px, expected.size_px);
     for axis in 0..2 {
-        assert!(close(got.focal_px[axis], wanted.focal_px[axis]), "{got:?}, not {wanted:?}");
-        assert!(close(got.principal_px[axis], wanted.principal_px[axis]), "{got:?}, not {wanted:?}");
+        assert!(close(got.focal_px[axis], expected.focal_px[axis]), "{got:?}, not {expected:?}");
+        assert!(close(got.principal_px[axis], expected.principal_px[axis]), "{got:?}, not {expected:?}");
     }
-    match (got.lens, wanted.lens) {
-        (Lens::BrownConrady(got), Lens::BrownConrady(wanted)) => {
-            assert!(got.iter().zip(wanted).all(|(got, wanted)| close(*got, wanted)), "{got:?}, not {wanted:?}");
+    match (got.lens, expected.lens) {
+        (Lens::BrownConrady(got), Lens::BrownConrady(expected)) => {
+            assert!(got.iter().zip(expected).all(|(got, expected)| close(*got, expected)), "{got:?}, not {expected:?}");
         }
-        (got, wanted) => assert_eq!(got, wanted),
+        (got, expected) => assert_eq!(got, expected),
     }
 }
 
 #[test]
-fn a_played_camera_comes_through_the_driver_as_it_was() {
+fn emulated_camera_round_trips_through_driver() {
     let folder = tempfile::tempdir().unwrap();
     let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
-    let l515 = PlayedCamera {
+    let l515 = EmulatedCamera {
         name: "Intel RealSense L515".into(),
-        depth: Some(PlayedDepth { metres_per_count: 0.000_25, ..depth_of(&d435i([640, 480], Lens::Pinhole)).clone() }),
+        depth: Some(EmulatedDepth {
+            meters_per_count: 0.000_25,
+            ..depth_of(&d435i([640, 480], Lens::Pinhole)).clone()
+        }),
         ..d435i([1280, 720], Lens::BrownConrady([0.155, -0.456, -0.0007, 0.0003, 0.41]))
     };
     for (camera, n_images) in [(d435i([640, 480], d455), N_IMAGES), (l515, 4)] {
@@ -198,15 +201,15 @@ fn a_played_camera_comes_through_the_driver_as_it_was() {
         let (driver, images) = play(config(path, &camera, Pace::Fast));
         // What the camera knows about itself.
         let (calibration, depth) = (driver.calibration(), depth_of(&camera));
-        let told = calibration.depth.as_ref().unwrap();
+        let reported_depth = calibration.depth.as_ref().unwrap();
         assert_same_lens(&calibration.intrinsics, &camera.intrinsics);
-        assert_same_lens(&told.intrinsics, &depth.intrinsics);
-        let off = told.camera_from_depth.inverse() * depth.camera_from_depth;
-        assert!(off.translation.vector.norm() < 1e-8 && off.rotation.angle() < 1e-6, "{off}");
-        assert_eq!(told.metres_per_count, depth.metres_per_count);
+        assert_same_lens(&reported_depth.intrinsics, &depth.intrinsics);
+        let error = reported_depth.camera_from_depth.inverse() * depth.camera_from_depth;
+        assert!(error.translation.vector.norm() < 1e-8 && error.rotation.angle() < 1e-6, "{error}");
+        assert_eq!(reported_depth.meters_per_count, depth.meters_per_count);
         // Every image once, in its own bytes, with its own stamp.
         let (depths, colors): (Vec<_>, Vec<_>) = images.into_iter().partition(Image::is_depth);
-        for (got, wanted) in [(&colors, image as fn(_, _) -> _), (&depths, depth_image)] {
+        for (got, expected) in [(&colors, image as fn(_, _) -> _), (&depths, depth_image)] {
             assert_eq!(
                 got.len(),
                 usize::try_from(n_images).unwrap(),
@@ -214,37 +217,37 @@ fn a_played_camera_comes_through_the_driver_as_it_was() {
                 got.first().map(|i| i.stamp)
             );
             for (got, number) in got.iter().zip(0..) {
-                let wanted: Image = wanted(&camera, number);
-                assert_eq!((got.stamp, got.size_px, got.format), (wanted.stamp, wanted.size_px, wanted.format));
-                assert!(got.data == wanted.data, "image {number} has other bytes");
-                let (got_secs, wanted_secs) = (got.exposure_secs.unwrap(), wanted.exposure_secs.unwrap());
+                let expected: Image = expected(&camera, number);
+                assert_eq!((got.stamp, got.size_px, got.format), (expected.stamp, expected.size_px, expected.format));
+                assert!(got.data == expected.data, "image {number} has other bytes");
+                let (got_secs, wanted_secs) = (got.exposure_secs.unwrap(), expected.exposure_secs.unwrap());
                 assert!((got_secs - wanted_secs).abs() < 1e-9, "{got_secs}, not {wanted_secs}");
                 assert_eq!(got.n_skipped, 0);
             }
         }
         // Metres: as exact as a count.
-        let metres = depths[0].decode_depth_m().unwrap();
-        for (ix, metres) in metres.iter().enumerate().filter(|(ix, metres)| *ix > 1 && **metres > 0.0) {
+        let meters = depths[0].decode_depth_m().unwrap();
+        for (ix, meters) in meters.iter().enumerate().filter(|(ix, meters)| *ix > 1 && **meters > 0.0) {
             let (column, row) = (ix % 640, ix / 640);
             let ray = depth.intrinsics.unproject([column as f64 + 0.5, row as f64 + 0.5]).unwrap();
-            let off_m = (f64::from(*metres) - scene_m(&ray)).abs();
-            assert!(off_m <= depth.metres_per_count * 0.501, "column {column} row {row}: {off_m} m");
+            let error_m = (f64::from(*meters) - scene_m(&ray)).abs();
+            assert!(error_m <= depth.meters_per_count * 0.501, "column {column} row {row}: {error_m} m");
         }
-        assert!(metres.iter().filter(|metres| **metres > 0.0).count() > 300_000);
+        assert!(meters.iter().filter(|meters| **meters > 0.0).count() > 300_000);
         assert_eq!(driver.counts().n_images, 2 * u64::try_from(n_images).unwrap());
     }
 }
 
 #[test]
-fn a_file_plays_in_real_time_and_a_slow_caller_of_a_fast_one_loses_nothing() {
+fn file_plays_in_real_time_and_fast_file_loses_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
     record(&path, &camera, N_IMAGES);
-    let began = Instant::now();
+    let start_time = Instant::now();
     let (_, images) = play(config(path.clone(), &camera, Pace::RealTime));
-    let lasts = Duration::from_nanos(((N_IMAGES - 1) * PERIOD_NANOS + DEPTH_LATER_NANOS).unsigned_abs());
-    assert!(began.elapsed() >= lasts, "{:?}", began.elapsed());
+    let duration = Duration::from_nanos(((N_IMAGES - 1) * PERIOD_NANOS + DEPTH_LATER_NANOS).unsigned_abs());
+    assert!(start_time.elapsed() >= duration, "{:?}", start_time.elapsed());
     let first = images[0].stamp.0;
     let since: Vec<i64> = images.iter().filter(|image| !image.is_depth()).map(|image| image.stamp.0 - first).collect();
     assert_eq!(since, (0..N_IMAGES).map(|number| number * PERIOD_NANOS).collect::<Vec<_>>());
@@ -261,93 +264,93 @@ fn a_file_plays_in_real_time_and_a_slow_caller_of_a_fast_one_loses_nothing() {
 }
 
 #[test]
-fn a_file_by_the_clock_begins_when_its_stamps_say_so() {
+fn file_on_the_clock_starts_at_its_stamps() {
     const LATER_SECS: f64 = 6.0; // Longer than a device may be silent.
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
-    let begins = drivers::clock::now().plus_secs(LATER_SECS);
+    let starts_at = drivers::clock::now().plus_secs(LATER_SECS);
     let mut writer = BagWriter::create(&path, &camera).unwrap();
     for number in 0..3 {
         writer.write(&image(&camera, number)).unwrap();
     }
     writer.finish().unwrap();
     // Only color was written.
-    let by_clock = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
-    let open = RealsenseCamera::open(Config { clock_offset_nanos: begins.0 - BEGIN_NANOS, ..by_clock }).unwrap();
+    let clock_config = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
+    let open = RealsenseCamera::open(Config { clock_offset_nanos: starts_at.0 - BEGIN_NANOS, ..clock_config }).unwrap();
     let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
     for number in 0..3 {
         let sample = live.next_sample().unwrap().unwrap();
-        assert_eq!(sample.stamp(), Stamp(begins.0 + number * PERIOD_NANOS));
+        assert_eq!(sample.stamp(), Stamp(starts_at.0 + number * PERIOD_NANOS));
         assert!(drivers::clock::now() >= sample.stamp(), "it came before its time");
     }
     assert_eq!(live.next_sample().unwrap(), None);
 }
 
 #[test]
-fn a_file_that_is_opened_late_begins_where_its_clock_is_and_has_lost_nothing() {
+fn file_opened_late_starts_at_current_time_without_loss() {
     let folder = tempfile::tempdir().unwrap();
     let (path, camera) = (folder.path().join("camera.bag"), d435i([640, 480], Lens::Pinhole));
     let n_before = 30;
     let mut writer = BagWriter::create(&path, &camera).unwrap();
     (0..3 * n_before).for_each(|number| writer.write(&image(&camera, number)).unwrap());
     writer.finish().unwrap();
-    let begins = drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
-    let by_clock = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
-    let open = RealsenseCamera::open(Config { clock_offset_nanos: begins.0 - BEGIN_NANOS, ..by_clock }).unwrap();
+    let starts_at = drivers::clock::now() - Duration::from_nanos((n_before * PERIOD_NANOS).unsigned_abs());
+    let clock_config = Config { depth_size_px: None, ..config(path, &camera, Pace::Clock) };
+    let open = RealsenseCamera::open(Config { clock_offset_nanos: starts_at.0 - BEGIN_NANOS, ..clock_config }).unwrap();
     let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
     let mut images = Vec::new();
     while let Some(Sample::Image(image)) = live.next_sample().unwrap() {
         images.push(image);
     }
-    let first = (images[0].stamp.0 - begins.0) / PERIOD_NANOS;
+    let first = (images[0].stamp.0 - starts_at.0) / PERIOD_NANOS;
     assert!((n_before..2 * n_before).contains(&first), "{first}");
     for (ix, image) in (first..).zip(&images) {
-        assert_eq!((image.stamp.0, image.n_skipped), (begins.0 + ix * PERIOD_NANOS, 0));
+        assert_eq!((image.stamp.0, image.n_skipped), (starts_at.0 + ix * PERIOD_NANOS, 0));
     }
     assert_eq!(first + i64::try_from(images.len()).unwrap(), 3 * n_before);
 }
 
 #[test]
-fn a_file_that_nobody_reads_to_its_end_is_let_go() {
+fn file_not_read_to_its_end_is_closed() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, camera) = (folder.path().join("long.bag"), d435i([640, 480], Lens::Pinhole));
     // More than all queues together hold.
     record(&path, &camera, 10 * N_IMAGES);
     let mut open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("a file");
-    open.next_image(PATIENCE).expect("its first image");
+    open.next_image(TEST_TIMEOUT).expect("its first image");
     std::thread::sleep(Duration::from_millis(500));
-    let began = Instant::now();
+    let start_time = Instant::now();
     drop(open);
-    assert!(began.elapsed() < PATIENCE, "{:?}", began.elapsed());
+    assert!(start_time.elapsed() < TEST_TIMEOUT, "{:?}", start_time.elapsed());
 }
 
 #[test]
-fn what_a_file_does_not_hold_is_told_and_filters_fill_holes() {
+fn missing_streams_are_errors_and_filters_fill_holes() {
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
     record(&path, &camera, 2);
-    let refused = |config: Config| RealsenseCamera::open(config).unwrap_err().to_string();
-    let plain = config(path.clone(), &camera, Pace::Fast);
-    let message = refused(Config { size_px: [848, 480], ..plain.clone() });
+    let open_error = |config: Config| RealsenseCamera::open(config).unwrap_err().to_string();
+    let plain_config = config(path.clone(), &camera, Pace::Fast);
+    let message = open_error(Config { size_px: [848, 480], ..plain_config.clone() });
     assert!(message.contains("color 848x480") && message.contains("rgb 640x480 at 30 Hz"), "{message}");
-    let message = refused(Config { stream: Stream::Infrared, ..plain.clone() });
+    let message = open_error(Config { stream: Stream::Infrared, ..plain_config.clone() });
     assert!(message.contains("no infrared"), "{message}");
-    let message = refused(Config { file: Some(folder.path().join("absent.bag")), ..plain.clone() });
+    let message = open_error(Config { file: Some(folder.path().join("absent.bag")), ..plain_config.clone() });
     assert!(message.contains("absent.bag") && message.contains("No such file"), "{message}");
-    let cut = folder.path().join("cut.bag");
-    std::fs::write(&cut, &std::fs::read(&path).unwrap()[..5000]).unwrap();
-    let message = refused(Config { file: Some(cut), ..plain.clone() });
+    let truncated = folder.path().join("cut.bag");
+    std::fs::write(&truncated, &std::fs::read(&path).unwrap()[..5000]).unwrap();
+    let message = open_error(Config { file: Some(truncated), ..plain_config.clone() });
     assert!(message.contains("cut.bag"), "{message}");
     let n_holes = |images: &[Image]| {
         let depth = images.iter().find(|image| image.is_depth()).unwrap();
         depth.data.as_chunks::<2>().0.iter().filter(|count| **count == [0; 2]).count()
     };
-    let (_, images) = play(plain.clone());
+    let (_, images) = play(plain_config.clone());
     assert!(n_holes(&images) > 1000);
     let filters = vec![Filter::Spatial, Filter::Temporal, Filter::HoleFilling];
-    let (_, filtered) = play(Config { filters, ..plain });
+    let (_, filtered) = play(Config { filters, ..plain_config });
     assert_eq!(filtered.len(), images.len());
     assert!(n_holes(&filtered) * 10 < n_holes(&images), "{} holes left", n_holes(&filtered));
     let stamps = |images: &[Image]| images.iter().map(|image| image.stamp).collect::<Vec<_>>();
@@ -365,14 +368,14 @@ fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<u16>, Durat
     let mut align = Align::new(Rs2StreamKind::Color, 1).expect("a block");
     let mut aligned = Vec::new();
     while aligned.len() < n_images {
-        let frames = pipeline.wait(Some(PATIENCE)).expect("images come");
+        let frames = pipeline.wait(Some(TEST_TIMEOUT)).expect("images come");
         if frames.count() < 2 {
             continue;
         }
-        let began = Instant::now();
+        let start_time = Instant::now();
         align.queue(frames).expect("depth and color");
-        let frames = align.wait(PATIENCE).expect("it aligns");
-        let took = began.elapsed();
+        let frames = align.wait(TEST_TIMEOUT).expect("it aligns");
+        let elapsed = start_time.elapsed();
         for depth in frames.frames_of_type::<DepthFrame>() {
             let count = |pixel: PixelKind<'_>| match pixel {
                 PixelKind::Z16 { depth } => *depth,
@@ -381,7 +384,7 @@ fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<u16>, Durat
             aligned.push((
                 i64::try_from(depth.frame_number()).expect("few images") - 1,
                 depth.iter().map(count).collect(),
-                took,
+                elapsed,
             ));
         }
     }
@@ -400,12 +403,12 @@ fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
 /// The library's fast path rounds the corners of a depth pixel after it has added half a pixel, as if to cut: everything lies half a
 /// pixel too far right and down (`src/proc/sse/sse-align.cpp`; its plain path does not). A colour camera whose centre lies half a
 /// pixel further sees the same from us.
-fn as_the_library_rounds(color: &Intrinsics) -> Intrinsics {
-    Intrinsics { principal_px: color.principal_px.map(|centre| centre + 0.5), ..color.clone() }
+fn with_library_rounding(color: &Intrinsics) -> Intrinsics {
+    Intrinsics { principal_px: color.principal_px.map(|center| center + 0.5), ..color.clone() }
 }
 
 #[test]
-fn our_alignment_is_the_librarys_but_for_its_half_pixel() {
+fn alignment_matches_library_except_half_pixel() {
     // Both work in single precision, which puts a corner on the other side of a pixel's edge now and then.
     const EQUAL_FRAC: f64 = 0.999;
     let folder = tempfile::tempdir().unwrap();
@@ -417,48 +420,53 @@ fn our_alignment_is_the_librarys_but_for_its_half_pixel() {
         let align = |color: &Intrinsics, image: &Image| {
             counts(&DepthAlignment::new(&depth.intrinsics, color, &depth.camera_from_depth).align(image).unwrap())
         };
-        for (number, theirs, _) in aligned_by_library(&path, 3) {
+        for (number, library, _) in aligned_by_library(&path, 3) {
             let image = depth_image(&camera, number);
-            let same = equal_frac(&align(&as_the_library_rounds(&camera.intrinsics), &image), &theirs);
-            let as_it_is = equal_frac(&align(&camera.intrinsics, &image), &theirs);
-            eprintln!("{color_px:?}: equal {same:.5}; without their half pixel {as_it_is:.5}");
-            assert!(same >= EQUAL_FRAC && as_it_is < same, "{color_px:?}: {same}, {as_it_is}");
-            assert!(theirs.iter().filter(|count| **count > 0).count() > theirs.len() / 2, "the scene is not seen");
+            let equal_with_rounding = equal_frac(&align(&with_library_rounding(&camera.intrinsics), &image), &library);
+            let equal_without_rounding = equal_frac(&align(&camera.intrinsics, &image), &library);
+            eprintln!(
+                "{color_px:?}: equal {equal_with_rounding:.5}; without their half pixel {equal_without_rounding:.5}"
+            );
+            assert!(
+                equal_with_rounding >= EQUAL_FRAC && equal_without_rounding < equal_with_rounding,
+                "{color_px:?}: {equal_with_rounding}, {equal_without_rounding}"
+            );
+            assert!(library.iter().filter(|count| **count > 0).count() > library.len() / 2, "the scene is not seen");
         }
     }
 }
 
 #[test]
 #[ignore = "a measurement: prints milliseconds; run it in release on one core (taskset -c 0)"]
-fn alignment_takes_a_fraction_of_the_librarys_time() {
+fn alignment_is_faster_than_library() {
     let folder = tempfile::tempdir().unwrap();
     for color_px in [[640, 480], [1280, 720]] {
         let camera = d435i(color_px, Lens::Pinhole);
         let path = folder.path().join("camera.bag");
         record(&path, &camera, N_IMAGES);
-        let mut theirs: Vec<_> = aligned_by_library(&path, 60).into_iter().map(|(.., took)| took).collect();
+        let mut library: Vec<_> = aligned_by_library(&path, 60).into_iter().map(|(.., elapsed)| elapsed).collect();
         let image = depth_image(&camera, 0);
         let align = DepthAlignment::new(
             &depth_of(&camera).intrinsics,
             &camera.intrinsics,
             &depth_of(&camera).camera_from_depth,
         );
-        let mut ours: Vec<_> = (0..60)
+        let mut own: Vec<_> = (0..60)
             .map(|_| {
-                let began = Instant::now();
+                let start_time = Instant::now();
                 std::hint::black_box(align.align(std::hint::black_box(&image)).unwrap());
-                began.elapsed()
+                start_time.elapsed()
             })
             .collect();
-        theirs.sort();
-        ours.sort();
-        let ratio = |at: usize| theirs[at].as_secs_f64() / ours[at].as_secs_f64();
+        library.sort();
+        own.sort();
+        let ratio = |at: usize| library[at].as_secs_f64() / own[at].as_secs_f64();
         eprintln!(
             "depth 640x480 to {color_px:?}: ours {:.2?} at best, {:.2?} in the median; the library {:.2?}, {:.2?}; {:.1} and {:.1} times",
-            ours[0],
-            ours[30],
-            theirs[0],
-            theirs[30],
+            own[0],
+            own[30],
+            library[0],
+            library[30],
             ratio(0),
             ratio(30)
         );

@@ -13,7 +13,7 @@ pub(crate) const SCRIPT: &str = "rigs/mobile-arm.mcap";
 pub(crate) const SECONDS: &str = "6";
 
 /// Simulates the rig of the scene into a root folder.
-pub(crate) fn lay_out(root: &Path) {
+pub(crate) fn install_root(root: &Path) {
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/wire/mobile-arm.toml");
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
     command.arg("record").arg(rig).args(["--sim", "--lockstep", "--seconds", SECONDS, "--out"]).arg(root.join(SCRIPT));
@@ -23,7 +23,7 @@ pub(crate) fn lay_out(root: &Path) {
 
 #[test]
 #[ignore = "needs the virtual kernel"]
-fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
+fn mobile_arm_is_read_and_moved_through_drivers() {
     let script = Path::new("/").join(SCRIPT);
     let mut playing = Command::new("/bin/fieldrig")
         .args(["sim", "mobile-arm", "--from"])
@@ -37,15 +37,15 @@ fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
     let mut stdout = BufReader::new(playing.stdout.take().expect("piped"));
     stdout.read_line(&mut line).expect("it prints a line");
     assert!(line.contains("\"event\":\"ready\"") && line.contains("7 motors on vcan0"), "{line}");
-    let fieldrig = |words: &[&str]| {
-        let output = Command::new("/bin/fieldrig").args(words).output().expect("it is laid out");
-        let told = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
-        println!("fieldrig {}: {told}", words.join(" "));
-        (output.status.code(), told)
+    let fieldrig = |arguments: &[&str]| {
+        let output = Command::new("/bin/fieldrig").args(arguments).output().expect("it is laid out");
+        let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
+        println!("fieldrig {}: {printed}", arguments.join(" "));
+        (output.status.code(), printed)
     };
-    let (code, told) = fieldrig(&["record", "/tmp/mobile/rig.toml", "--out", "/tmp/mobile.mcap", "--json"]);
+    let (code, printed) = fieldrig(&["record", "/tmp/mobile/rig.toml", "--out", "/tmp/mobile.mcap", "--json"]);
     // A busy machine loses images, which are counted.
-    assert!(matches!(code, Some(0 | 3)), "{told}");
+    assert!(matches!(code, Some(0 | 3)), "{printed}");
     let difference = compare::difference(&script, Path::new("/tmp/mobile.mcap"));
     println!("wire: {difference:?}");
     assert!(difference.n_images >= 20, "{difference:?}");
@@ -53,10 +53,11 @@ fn the_mobile_arm_comes_through_its_drivers_and_is_moved() {
     assert!(difference.joints_rad[0] < 2e-3, "{difference:?}");
     assert!(difference.base_m < 1e-6, "{difference:?}");
 
-    let words = ["move", "/tmp/mobile/rig.toml", "--by", "panda_joint1=0.1", "--enable-motion", "--leave", "--json"];
-    let (code, told) = fieldrig(&words);
-    assert_eq!(code, Some(0), "{told}");
-    assert!(compare::error_of_move(&told) < 0.01, "{told}");
+    let arguments =
+        ["move", "/tmp/mobile/rig.toml", "--by", "panda_joint1=0.1", "--enable-motion", "--exit-on-arrival", "--json"];
+    let (code, printed) = fieldrig(&arguments);
+    assert_eq!(code, Some(0), "{printed}");
+    assert!(compare::error_of_move(&printed) < 0.01, "{printed}");
     let _ = playing.kill(); // It plays until it is stopped.
     let _ = playing.wait();
 }

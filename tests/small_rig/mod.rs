@@ -5,7 +5,7 @@
 use std::path::Path;
 
 /// Factor by which its images are smaller than in the shipped rig file, along each side.
-const SMALLER: i64 = 4;
+const SCALE_DIVISOR: i64 = 4;
 
 /// Pace of the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,8 +36,8 @@ pub(crate) fn write_with(folder: &Path, change: impl FnOnce(&mut toml::Table)) {
         let holder = if table.is_empty() { &mut *wrist } else { wrist[table].as_table_mut().expect("a table") };
         for number in holder[key].as_array_mut().expect("two numbers") {
             *number = match &*number {
-                toml::Value::Integer(whole) => toml::Value::Integer(whole / SMALLER),
-                other => toml::Value::Float(other.as_float().expect("a number") / SMALLER as f64),
+                toml::Value::Integer(whole) => toml::Value::Integer(whole / SCALE_DIVISOR),
+                other => toml::Value::Float(other.as_float().expect("a number") / SCALE_DIVISOR as f64),
             };
         }
     }

@@ -26,8 +26,8 @@ pub(crate) fn write(folder: &Path, has_depth: bool, up_m: f64) {
         let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, up_m], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
         let mut frame = json!({ "file_path": photo, "transform_matrix": rows });
         if has_depth {
-            let metre = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
-            metre.save(folder.join(&depth)).expect("room on the disk");
+            let depth_image = ImageBuffer::<Luma<u16>, _>::from_pixel(w, h, Luma([1000]));
+            depth_image.save(folder.join(&depth)).expect("room on the disk");
             frame["depth_file_path"] = depth.into();
         }
         frames.push(frame);

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 /// What a recording holds.
-pub(super) struct Heard {
+pub(super) struct RecordedSamples {
     /// Color and depth, in their order.
     pub(super) images: Vec<Image>,
     pub(super) joints: JointHistory,
@@ -24,20 +24,20 @@ pub(super) struct Difference {
     pub(super) base_m: f64,
 }
 
-pub(super) fn heard(path: &Path) -> Heard {
+pub(super) fn read_samples(path: &Path) -> RecordedSamples {
     let mut recording = Recording::open(path).expect("a recording");
     let gap = Duration::from_millis(100);
     let (joints, poses) = (JointHistory::new(gap, usize::MAX), PoseHistory::new(gap, usize::MAX));
-    let mut heard = Heard { images: Vec::new(), joints, poses };
+    let mut read_samples = RecordedSamples { images: Vec::new(), joints, poses };
     while let Some(sample) = recording.next_sample().expect("it is whole") {
         match sample {
-            Sample::Image(image) => heard.images.push(image),
-            Sample::Joints(state) => heard.joints.push(state).expect("in order"),
-            Sample::Base(pose) => heard.poses.push(pose.stamp, pose.world_from_base).expect("in order"),
+            Sample::Image(image) => read_samples.images.push(image),
+            Sample::Joints(state) => read_samples.joints.push(state).expect("in order"),
+            Sample::Base(pose) => read_samples.poses.push(pose.stamp, pose.world_from_base).expect("in order"),
             _ => {}
         }
     }
-    heard
+    read_samples
 }
 
 /// What is added to the stamps of the script when it is played, as the rig file says that was written for it.
@@ -51,27 +51,37 @@ pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
 /// Compares at every color image that came through; each must be one of those played, to the pixel.
 pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
-    let (script, wire) = (heard(script), heard(wire));
+    let (script, wire) = (read_samples(script), read_samples(wire));
     let mut joints_rad = Vec::new();
     let mut base_m: f64 = 0.0;
     let n_images = wire.images.len();
     for image in &wire.images {
-        let scripted = Stamp(image.stamp.0 - offset_nanos);
+        let simulated_stamp = Stamp(image.stamp.0 - offset_nanos);
         // Cameras count microseconds.
-        let is_it =
-            |played: &&Image| played.is_depth() == image.is_depth() && played.stamp.0.abs_diff(scripted.0) < 1000;
-        let played = script.images.iter().find(is_it).unwrap_or_else(|| panic!("no image was played at {scripted:?}"));
+        let is_match = |emulated: &&Image| {
+            emulated.is_depth() == image.is_depth() && emulated.stamp.0.abs_diff(simulated_stamp.0) < 1000
+        };
+        let emulated =
+            script.images.iter().find(is_match).unwrap_or_else(|| panic!("no image was played at {simulated_stamp:?}"));
         if image.is_depth() {
-            assert_eq!(image.data, played.data, "depth at {scripted:?}");
+            assert_eq!(image.data, emulated.data, "depth at {simulated_stamp:?}");
         } else {
-            assert_eq!(image.decode_rgb().expect("RGB"), played.decode_rgb().expect("RGB"), "image at {scripted:?}");
+            assert_eq!(
+                image.decode_rgb().expect("RGB"),
+                emulated.decode_rgb().expect("RGB"),
+                "image at {simulated_stamp:?}"
+            );
         }
-        if let (Ok(told), Ok(played)) = (wire.joints.at(image.stamp), script.joints.at(scripted)) {
-            let offs = told.position.iter().zip(&played.position).map(|(told, played)| (told - played).abs());
-            joints_rad.push(offs.fold(0.0, f64::max));
+        if let (Ok(received), Ok(emulated)) = (wire.joints.at(image.stamp), script.joints.at(simulated_stamp)) {
+            let differences = received
+                .position
+                .iter()
+                .zip(&emulated.position)
+                .map(|(received, emulated)| (received - emulated).abs());
+            joints_rad.push(differences.fold(0.0, f64::max));
         }
-        if let (Ok(told), Ok(played)) = (wire.poses.at(image.stamp), script.poses.at(scripted)) {
-            base_m = base_m.max((told.translation.vector - played.translation.vector).norm());
+        if let (Ok(received), Ok(emulated)) = (wire.poses.at(image.stamp), script.poses.at(simulated_stamp)) {
+            base_m = base_m.max((received.translation.vector - emulated.translation.vector).norm());
         }
     }
     assert!(!joints_rad.is_empty(), "no image has joints around it");
@@ -80,8 +90,8 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
 }
 
 /// How far from its target `fieldrig move --json` says that the arm arrived, rad or m.
-pub(super) fn error_of_move(told: &str) -> f64 {
-    let done = told.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
+pub(super) fn error_of_move(received: &str) -> f64 {
+    let done = received.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
     let (_, rest) = done.split_once("\"error\":").expect("the key");
     rest.split([',', '}']).next().and_then(|error| error.parse().ok()).expect("a number")
 }

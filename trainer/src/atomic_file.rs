@@ -40,7 +40,7 @@ mod tests {
     use std::io::Write;
 
     #[test]
-    fn a_failed_write_keeps_the_previous_file_and_nothing_else() {
+    fn failed_write_keeps_only_the_previous_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scene.ply");
         write(&path, |file| file.write_all(b"first")).unwrap();

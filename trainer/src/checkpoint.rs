@@ -2,7 +2,7 @@
 //!
 //! `docs/reference/files.md` describes the layout.
 
-use crate::{Error, whole_file};
+use crate::{Error, atomic_file};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -12,10 +12,10 @@ use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
 /// Of the layout and of what the states of all methods mean.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 /// Magic, version, and the length of the description.
-const FRONT_BYTES: usize = 16;
-const SUM_BYTES: usize = 32;
+const PREAMBLE_BYTES: usize = 16;
+const CHECKSUM_BYTES: usize = 32;
 
 /// Everything that a model in training needs to go on.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,7 +51,7 @@ pub struct PendingCheckpoint(Box<dyn FnOnce() -> Result<Checkpoint, Error> + Sen
 /// What stands between the front and the arrays, as JSON.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Description {
+struct Header {
     method: String,
     seconds: f64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -61,11 +61,11 @@ struct Description {
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     is_finished: bool,
     state: serde_json::Value,
-    arrays: Vec<Length>,
+    arrays: Vec<ArrayHeader>,
 }
 
 #[derive(Serialize, Deserialize)]
-struct Length {
+struct ArrayHeader {
     name: String,
     bytes: u64,
 }
@@ -105,7 +105,7 @@ impl Checkpoint {
     /// Writes the file beside its place, waits until the disk has it, and moves it there: whatever happens, either the
     /// previous file or this one is under the name, whole.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
-        whole_file::write(path, |file| self.write_to(file))
+        atomic_file::write(path, |file| self.write_to(file))
     }
 
     /// Reads a whole file and checks every byte of it.
@@ -129,8 +129,8 @@ impl Checkpoint {
 
     fn write_to(&self, file: &mut impl Write) -> std::io::Result<()> {
         let lengths =
-            self.arrays.iter().map(|array| Length { name: array.name.clone(), bytes: array.bytes.len() as u64 });
-        let description = serde_json::to_vec(&Description {
+            self.arrays.iter().map(|array| ArrayHeader { name: array.name.clone(), bytes: array.bytes.len() as u64 });
+        let header = serde_json::to_vec(&Header {
             method: self.method.clone(),
             seconds: self.seconds,
             depth_from: self.depth_from.clone(),
@@ -139,52 +139,52 @@ impl Checkpoint {
             state: self.state.clone(),
             arrays: lengths.collect(),
         })?;
-        let n_bytes = u32::try_from(description.len()).map_err(std::io::Error::other)?;
-        let front = [&MAGIC[..], &VERSION.to_le_bytes(), &n_bytes.to_le_bytes()].concat();
-        let mut sum = Sha256::new();
-        let pieces = [&front, &description].into_iter().chain(self.arrays.iter().map(|array| &array.bytes));
-        for piece in pieces {
-            sum.update(piece);
-            file.write_all(piece)?;
+        let n_bytes = u32::try_from(header.len()).map_err(std::io::Error::other)?;
+        let preamble = [&MAGIC[..], &VERSION.to_le_bytes(), &n_bytes.to_le_bytes()].concat();
+        let mut checksum = Sha256::new();
+        let chunks = [&preamble, &header].into_iter().chain(self.arrays.iter().map(|array| &array.bytes));
+        for chunk in chunks {
+            checksum.update(chunk);
+            file.write_all(chunk)?;
         }
-        file.write_all(&sum.finalize())
+        file.write_all(&checksum.finalize())
     }
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
-        let front = bytes.get(..FRONT_BYTES).ok_or("cut off")?;
-        if front[..8] != MAGIC {
+        let preamble = bytes.get(..PREAMBLE_BYTES).ok_or("cut off")?;
+        if preamble[..8] != MAGIC {
             return Err("it does not begin as a checkpoint".to_owned());
         }
-        let word = |at: usize| u32::from_le_bytes([front[at], front[at + 1], front[at + 2], front[at + 3]]);
+        let word = |at: usize| u32::from_le_bytes([preamble[at], preamble[at + 1], preamble[at + 2], preamble[at + 3]]);
         if word(8) != VERSION {
             return Err(format!("version {} of the format, this program reads {VERSION}", word(8)));
         }
-        let whole = bytes.len().checked_sub(SUM_BYTES).filter(|n| *n >= FRONT_BYTES).ok_or("cut off")?;
-        let (body, sum) = bytes.split_at(whole);
-        let sum_is_right = Sha256::digest(body)[..] == *sum;
-        let rest = &body[FRONT_BYTES..];
-        let description = rest.get(..word(12) as usize).ok_or("cut off")?;
-        let mut rest = &rest[description.len()..];
-        let description: Description = match serde_json::from_slice(description) {
-            Ok(description) => description,
-            Err(error) if sum_is_right => return Err(format!("its description is not understood: {error}")),
+        let whole = bytes.len().checked_sub(CHECKSUM_BYTES).filter(|n| *n >= PREAMBLE_BYTES).ok_or("cut off")?;
+        let (body, checksum) = bytes.split_at(whole);
+        let checksum_matches = Sha256::digest(body)[..] == *checksum;
+        let rest = &body[PREAMBLE_BYTES..];
+        let header = rest.get(..word(12) as usize).ok_or("cut off")?;
+        let mut rest = &rest[header.len()..];
+        let header: Header = match serde_json::from_slice(header) {
+            Ok(header) => header,
+            Err(error) if checksum_matches => return Err(format!("its description is not understood: {error}")),
             Err(_) => return Err("damaged: its checksum does not match".to_owned()),
         };
-        let expected = description.arrays.iter().try_fold(0_u64, |sum, array| sum.checked_add(array.bytes));
+        let expected = header.arrays.iter().try_fold(0_u64, |total, array| total.checked_add(array.bytes));
         match expected.unwrap_or(u64::MAX) {
             expected if expected > rest.len() as u64 => return Err("cut off".to_owned()),
             expected if expected < rest.len() as u64 => return Err("bytes follow its end".to_owned()),
-            _ if !sum_is_right => return Err("damaged: its checksum does not match".to_owned()),
+            _ if !checksum_matches => return Err("damaged: its checksum does not match".to_owned()),
             _ => {}
         }
         let mut arrays = Vec::new();
-        for Length { name, bytes } in description.arrays {
+        for ArrayHeader { name, bytes } in header.arrays {
             let n_bytes = usize::try_from(bytes).expect("not longer than the file, which is in memory");
             let (array, after) = rest.split_at(n_bytes);
             arrays.push(Array { name, bytes: array.to_vec() });
             rest = after;
         }
-        let Description { method, seconds, depth_from, flags, is_finished, state, .. } = description;
+        let Header { method, seconds, depth_from, flags, is_finished, state, .. } = header;
         Ok(Self { method, seconds, depth_from, flags, is_finished, state, arrays })
     }
 }
@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_gives_back_what_was_written_and_replaces_the_one_before() {
+    fn written_file_round_trips_and_replaces_the_previous() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("training.ckpt");
         std::fs::write(folder.path().join("training.ckpt.part"), b"of a run that was killed").unwrap();
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn the_layout_is_the_documented_one() {
+    fn layout_matches_the_documentation() {
         let empty = Checkpoint::new("m", 7.into(), Vec::new());
         let bytes = bytes_of(&empty);
         let json = r#"{"method":"m","seconds":0.0,"state":7,"arrays":[]}"#;
@@ -237,38 +237,38 @@ mod tests {
     }
 
     #[test]
-    fn broken_files_are_refused_with_the_reason() {
+    fn broken_files_are_rejected_with_the_reason() {
         let whole = bytes_of(&checkpoint());
-        let complaint = |bytes: &[u8]| Checkpoint::from_bytes(bytes).unwrap_err();
+        let error_of = |bytes: &[u8]| Checkpoint::from_bytes(bytes).unwrap_err();
         for length in 0..whole.len() {
-            assert_eq!(complaint(&whole[..length]), "cut off", "{length} of {} bytes", whole.len());
+            assert_eq!(error_of(&whole[..length]), "cut off", "{length} of {} bytes", whole.len());
         }
-        assert_eq!(complaint(b"ply\nformat binary"), "it does not begin as a checkpoint");
-        assert_eq!(complaint(&[&whole[..], &[0; 5]].concat()), "bytes follow its end");
-        let changed = |at: usize, to: u8| {
+        assert_eq!(error_of(b"ply\nformat binary"), "it does not begin as a checkpoint");
+        assert_eq!(error_of(&[&whole[..], &[0; 5]].concat()), "bytes follow its end");
+        let error_with_byte = |at: usize, to: u8| {
             let mut bytes = whole.clone();
             bytes[at] = to;
-            complaint(&bytes)
+            error_of(&bytes)
         };
-        assert_eq!(changed(8, 1), "version 1 of the format, this program reads 2");
-        assert_eq!(changed(15, 255), "cut off");
+        assert_eq!(error_with_byte(8, 1), "version 1 of the format, this program reads 2");
+        assert_eq!(error_with_byte(15, 255), "cut off");
         for at in [20, whole.len() - 40, whole.len() - 1] {
-            assert_eq!(changed(at, 0xff), "damaged: its checksum does not match", "byte {at}");
+            assert_eq!(error_with_byte(at, 0xff), "damaged: its checksum does not match", "byte {at}");
         }
         let mut other = whole[..16].to_vec();
         other[12..16].copy_from_slice(&2_u32.to_le_bytes());
         other.extend(b"{}");
-        let sum = Sha256::digest(&other);
-        other.extend(sum);
-        assert!(complaint(&other).contains("missing field"));
+        let checksum = Sha256::digest(&other);
+        other.extend(checksum);
+        assert!(error_of(&other).contains("missing field"));
     }
 
     #[test]
-    fn arrays_have_the_lengths_that_are_asked_for() {
+    fn array_checks_the_requested_length() {
         let checkpoint = checkpoint();
         assert_eq!(checkpoint.array("means", 3).unwrap(), [1, 2, 3]);
-        let complaint = |name, n| checkpoint.array(name, n).unwrap_err().to_string();
-        assert!(complaint("means", 4).contains("\"means\" has 3 bytes, expected 4"));
-        assert!(complaint("rotations", 4).contains("\"rotations\" is missing"));
+        let error_of = |name, n| checkpoint.array(name, n).unwrap_err().to_string();
+        assert!(error_of("means", 4).contains("\"means\" has 3 bytes, expected 4"));
+        assert!(error_of("rotations", 4).contains("\"rotations\" is missing"));
     }
 }

@@ -34,7 +34,7 @@ pub enum Error {
     /// The GPU has no memory left for a buffer, or for commands or a transfer; these have no name and no size.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
-        of_buffer(label, *bytes)
+        buffer_suffix(label, *bytes)
     )]
     OutOfMemory {
         /// Name of the buffer.
@@ -68,14 +68,14 @@ pub enum Error {
         limit_bytes: u32,
     },
     /// Less memory than the smallest model of the method takes.
-    #[error("max_bytes = {max_bytes}: the smallest {model} takes {least_bytes} bytes")]
+    #[error("max_bytes = {max_bytes}: the smallest {model} takes {min_bytes} bytes")]
     BudgetTooSmall {
         /// The method's model, in words.
         model: &'static str,
         /// Bytes allowed.
         max_bytes: u64,
         /// Bytes needed.
-        least_bytes: u64,
+        min_bytes: u64,
     },
     /// A kernel imports what is not there.
     #[error("kernel {kernel}: unknown import {import:?}")]
@@ -108,12 +108,12 @@ pub enum Error {
         expected: usize,
     },
     /// A metric needs larger pictures.
-    #[error("{metric} needs pictures of at least {least_px}x{least_px} pixels, got {width}x{height}")]
+    #[error("{metric} needs pictures of at least {min_px}x{min_px} pixels, got {width}x{height}")]
     PictureTooSmall {
         /// The metric.
         metric: &'static str,
         /// Shortest side it takes, pixels.
-        least_px: u32,
+        min_px: u32,
         /// Width, pixels.
         width: u32,
         /// Height, pixels.
@@ -121,10 +121,10 @@ pub enum Error {
     },
     /// Every pixel, or every window, is masked.
     #[error("nothing to compare: the mask leaves no pixel")]
-    NothingSeen,
+    AllPixelsMasked,
     /// Two depth images differ in size.
     #[error("rendered depth has {rendered} pixels, true depth {truth}")]
-    DepthSize {
+    DepthSizeMismatch {
         /// Pixels of the rendered one.
         rendered: usize,
         /// Pixels of the true one.
@@ -189,16 +189,16 @@ pub enum Error {
 
 impl Error {
     /// Whether the GPU caused the error: on another device the same work may succeed.
-    pub fn is_of_gpu(&self) -> bool {
+    pub fn is_gpu_error(&self) -> bool {
         matches!(self, Self::DeviceLost | Self::OutOfMemory { .. } | Self::Rejected(_))
     }
 
     /// Whether there is no memory for a buffer of the requested size.
-    pub(crate) fn is_of_memory(&self) -> bool {
+    pub(crate) fn is_out_of_memory(&self) -> bool {
         matches!(self, Self::OutOfMemory { .. } | Self::BufferTooLarge { .. })
     }
 }
 
-fn of_buffer(label: &str, bytes: u64) -> String {
+fn buffer_suffix(label: &str, bytes: u64) -> String {
     if bytes == 0 { String::new() } else { format!(": buffer {label} needs {bytes} bytes") }
 }

@@ -1,9 +1,9 @@
 //! What a part of a model brings on images held back, and whether that is more than chance.
 
 /// Less is not worth having, dB.
-pub(crate) const LEAST_GAIN_DB: f64 = 0.05;
+pub(crate) const MIN_GAIN_DB: f64 = 0.05;
 /// Standard errors that a gain must exceed.
-const SURE: f64 = 2.0;
+const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// The gain on the same images with something and without.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +23,7 @@ impl Gain {
     }
 
     /// Whether it is at least this large, and not by chance.
-    pub(crate) fn pays(&self, least_db: f64) -> bool {
-        self.mean_db > f64::max(least_db, SURE * self.standard_error_db)
+    pub(crate) fn is_significant(&self, min_db: f64) -> bool {
+        self.mean_db > f64::max(min_db, MIN_STANDARD_ERRORS * self.standard_error_db)
     }
 }

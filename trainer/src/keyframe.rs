@@ -11,7 +11,7 @@ pub enum Split {
     /// Trained on.
     Train,
     /// Decides what the model needs; trained on once that is settled.
-    Selection,
+    Validation,
     /// Only reported, decides nothing.
     Test,
 }
@@ -21,7 +21,7 @@ impl Split {
     pub fn of(ix: usize) -> Self {
         match ix % 8 {
             0 => Self::Test,
-            4 => Self::Selection,
+            4 => Self::Validation,
             _ => Self::Train,
         }
     }
@@ -53,7 +53,7 @@ pub struct Keyframe {
     /// How the camera moves, in its own axes, when one of the joints that carry it moves by a radian or metre; empty where unknown.
     pub joint_twists: Arc<[Twist]>,
     /// Where the base was that carries the camera; `None` where no base moves it.
-    pub base: Option<BasePlace>,
+    pub base: Option<BaseState>,
     /// What it may be used for.
     pub split: Split,
     /// What a simulator knows.
@@ -62,7 +62,7 @@ pub struct Keyframe {
 
 impl Keyframe {
     /// Whether depth tells nothing about most of the image: it has none, or that of a scanner, which sees a band.
-    pub fn is_bare(&self) -> bool {
+    pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
             2 * n_known < depth.depth_m.len()
@@ -86,52 +86,49 @@ impl Keyframe {
         let Some(depth) = &self.depth else { return Ok(()) };
         let expected = depth.size_px[0] as usize * depth.size_px[1] as usize;
         if depth.depth_m.len() != expected {
-            return Err(Error::DepthSize { rendered: depth.depth_m.len(), truth: expected });
+            return Err(Error::DepthSizeMismatch { rendered: depth.depth_m.len(), truth: expected });
         }
         Ok(())
     }
 
     /// The keyframe as the base carries it when that stands elsewhere: all poses are multiplied from the left.
-    pub fn carried(&self, world_from_told: &Transform) -> Self {
+    pub fn with_base_correction(&self, map_from_odom: &Transform) -> Self {
         Self {
-            world_from_camera: world_from_told * self.world_from_camera,
+            world_from_camera: map_from_odom * self.world_from_camera,
             depth: self
                 .depth
                 .clone()
-                .map(|depth| DepthMap { world_from_camera: world_from_told * depth.world_from_camera, ..depth }),
-            base: self
-                .base
-                .clone()
-                .map(|base| BasePlace { world_from_told: world_from_told * base.world_from_told, ..base }),
+                .map(|depth| DepthMap { world_from_camera: map_from_odom * depth.world_from_camera, ..depth }),
+            base: self.base.clone().map(|base| BaseState { map_from_odom: map_from_odom * base.map_from_odom, ..base }),
             ..self.clone()
         }
     }
 
     /// Whether all numbers about the camera are finite; readings of depth may be what they like.
     pub fn is_finite(&self) -> bool {
-        let lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
+        let is_valid_lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
             focal_px.iter().all(|focal| focal.is_finite() && *focal > 0.0) && principal_px.iter().all(|x| x.is_finite())
         };
         let twists = self.twist.iter().chain(self.joint_twists.iter());
         transform::is_finite(&self.world_from_camera)
-            && lens(self.focal_px, self.principal_px)
+            && is_valid_lens(self.focal_px, self.principal_px)
             && self.readout_secs.is_finite()
             && twists.flat_map(|twist| twist.linear_m_s.iter().chain(twist.angular_rad_s.iter())).all(|x| x.is_finite())
             && self.depth.as_ref().is_none_or(|depth| {
-                transform::is_finite(&depth.world_from_camera) && lens(depth.focal_px, depth.principal_px)
+                transform::is_finite(&depth.world_from_camera) && is_valid_lens(depth.focal_px, depth.principal_px)
             })
     }
 }
 
 /// Where a base that walks was when it carried a camera.
 #[derive(Clone, Debug, PartialEq)]
-pub struct BasePlace {
+pub struct BaseState {
     /// Which of the places where the base stood, counted from 0; `None` while it walks.
-    pub stand: Option<usize>,
+    pub station: Option<usize>,
     /// Pose of the base at the keyframe's stamp, as its source told it.
     pub world_from_base: Transform,
     /// What the poses of the keyframe have been multiplied by from the left since: what its source got wrong.
-    pub world_from_told: Transform,
+    pub map_from_odom: Transform,
     /// The true pose of the base, from a simulator.
     pub truth: Option<Transform>,
 }
@@ -161,11 +158,11 @@ impl DepthMap {
     /// The middle pixels of squares of `stride` by `stride`, an odd number, as an image of their own: the same readings along the same
     /// rays. What is left over at the far edges is left out.
     #[must_use]
-    pub fn every(&self, stride: u32) -> Self {
+    pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
         let at = |x: u32, y: u32| ((y * stride + stride / 2) * self.size_px[0] + x * stride + stride / 2) as usize;
         let depth_m = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(|(x, y)| self.depth_m[at(x, y)]);
-        let scaled = |along: [f64; 2]| along.map(|px| px / f64::from(stride));
+        let scaled = |value_px: [f64; 2]| value_px.map(|px| px / f64::from(stride));
         Self {
             size_px: [width, height],
             focal_px: scaled(self.focal_px),
@@ -192,24 +189,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_third_reading_lies_where_it_lay() {
+    fn subsampled_depth_keeps_its_points() {
         let size_px = [8, 7];
         let depth_m: Vec<f32> = (0..56).map(|ix| 1.0 + ix as f32).collect();
-        let whole = DepthMap {
+        let full = DepthMap {
             size_px,
             focal_px: [5.0, 6.0],
             principal_px: [3.7, 3.1],
             depth_m: depth_m.into(),
             world_from_camera: Transform::identity(),
         };
-        let thin = whole.every(3);
-        assert_eq!((thin.size_px, thin.depth_m.len()), ([2, 2], 4));
+        let subsampled = full.subsampled(3);
+        assert_eq!((subsampled.size_px, subsampled.depth_m.len()), ([2, 2], 4));
         for (x, y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-            let z_m = thin.depth_m[(y * 2 + x) as usize];
-            assert_eq!(z_m, whole.depth_m[((3 * y + 1) * 8 + 3 * x + 1) as usize], "{x} {y}");
-            let apart = thin.point(x, y, z_m.into()) - whole.point(3 * x + 1, 3 * y + 1, z_m.into());
-            assert!(apart.norm() < 1e-12, "{x} {y}: {apart}");
+            let z_m = subsampled.depth_m[(y * 2 + x) as usize];
+            assert_eq!(z_m, full.depth_m[((3 * y + 1) * 8 + 3 * x + 1) as usize], "{x} {y}");
+            let difference = subsampled.point(x, y, z_m.into()) - full.point(3 * x + 1, 3 * y + 1, z_m.into());
+            assert!(difference.norm() < 1e-12, "{x} {y}: {difference}");
         }
-        assert_eq!(whole.every(1).depth_m, whole.depth_m);
+        assert_eq!(full.subsampled(1).depth_m, full.depth_m);
     }
 }

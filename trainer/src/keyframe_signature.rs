@@ -8,7 +8,7 @@ use std::sync::Arc;
 /// What tells one keyframe from another without its pixels.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Seen {
+pub(crate) struct KeyframeSignature {
     camera: String,
     stamp_nanos: i64,
     size_px: [u32; 2],
@@ -19,10 +19,10 @@ pub(crate) struct Seen {
     world_from_camera: [f64; 7],
 }
 
-impl Seen {
+impl KeyframeSignature {
     pub(crate) fn of(keyframe: &Keyframe) -> Self {
         let pose = &keyframe.world_from_camera;
-        let (place, turn) = (pose.translation.vector, pose.rotation.coords);
+        let (translation, rotation) = (pose.translation.vector, pose.rotation.coords);
         Self {
             camera: keyframe.camera.to_string(),
             stamp_nanos: keyframe.stamp.0,
@@ -30,7 +30,15 @@ impl Seen {
             depth_size_px: keyframe.depth.as_ref().map(|depth| depth.size_px),
             focal_px: keyframe.focal_px,
             principal_px: keyframe.principal_px,
-            world_from_camera: [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w],
+            world_from_camera: [
+                translation.x,
+                translation.y,
+                translation.z,
+                rotation.x,
+                rotation.y,
+                rotation.z,
+                rotation.w,
+            ],
         }
     }
 
@@ -38,7 +46,7 @@ impl Seen {
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
         let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
-        let what = if self.size_px != other.size_px {
+        let problem = if self.size_px != other.size_px {
             format!("has {other_width}x{other_height} pixels, had {width}x{height}")
         } else if self.depth_size_px != other.depth_size_px {
             "has another depth image".to_owned()
@@ -49,39 +57,41 @@ impl Seen {
         } else {
             return None;
         };
-        Some(format!("image {} of camera {:?} {what}", self.stamp_nanos, self.camera))
+        Some(format!("image {} of camera {:?} {problem}", self.stamp_nanos, self.camera))
     }
 }
 
 /// Keyframes of a list, in its order, and the others.
-pub(crate) type Matched = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
+pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
 /// Finds what was seen among keyframes, each as `corrected` gives it back; it must be as it was then.
-pub(crate) fn matched(
-    seen: &[Seen],
+pub(crate) fn match_keyframes(
+    expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
     corrected: impl Fn(&Arc<Keyframe>) -> Arc<Keyframe>,
-) -> Result<Matched, Error> {
+) -> Result<MatchedAndOthers, Error> {
     let by_name: HashMap<_, _> = keyframes
         .iter()
         .filter(|keyframe| keyframe.split != Split::Test)
         .map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe))
         .collect();
     let mut found = Vec::new();
-    let mut as_given: Vec<&Arc<Keyframe>> = Vec::new();
-    for seen in seen {
-        let (camera, stamp) = (seen.camera.as_str(), seen.stamp_nanos);
+    let mut matched_keyframes: Vec<&Arc<Keyframe>> = Vec::new();
+    for expected in expected {
+        let (camera, stamp) = (expected.camera.as_str(), expected.stamp_nanos);
         let keyframe = by_name.get(&(camera, stamp)).ok_or_else(|| {
             Error::CheckpointData(format!("image {stamp} of camera {camera:?} is not there to be learned from"))
         })?;
         let corrected = corrected(keyframe);
-        if let Some(difference) = seen.difference(&corrected) {
+        if let Some(difference) = expected.difference(&corrected) {
             return Err(Error::CheckpointData(difference));
         }
-        as_given.push(*keyframe);
+        matched_keyframes.push(*keyframe);
         found.push(corrected);
     }
-    let was_seen = |keyframe: &Arc<Keyframe>| as_given.iter().any(|given| Arc::ptr_eq(given, keyframe));
-    let rest = keyframes.iter().filter(|keyframe| !was_seen(keyframe)).cloned().collect();
-    Ok((found, rest))
+    let is_matched = |keyframe: &Arc<Keyframe>| {
+        matched_keyframes.iter().any(|matched_keyframe| Arc::ptr_eq(matched_keyframe, keyframe))
+    };
+    let others = keyframes.iter().filter(|keyframe| !is_matched(keyframe)).cloned().collect();
+    Ok((found, others))
 }

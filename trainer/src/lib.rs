@@ -8,6 +8,7 @@ pub mod eval;
 mod gain;
 pub mod gpu;
 pub mod keyframe;
+mod keyframe_signature;
 pub mod loss;
 pub mod method;
 #[cfg(test)]
@@ -17,7 +18,6 @@ pub mod optim;
 pub mod ply;
 mod range_points;
 pub mod request;
-mod seen;
 pub mod sort;
 pub mod splat;
 pub mod spz;
@@ -27,12 +27,12 @@ mod test_data;
 #[cfg(test)]
 mod test_scenes;
 
+pub mod atomic_file;
 pub mod tsdf;
-pub mod whole_file;
 
-pub use aligned::{Aligned, Renewable, WithRest};
+pub use aligned::{Aligned, Restartable, ResumedModel};
 pub use error::Error;
-pub use keyframe::{BasePlace, DepthMap, Keyframe, Split, Truth};
-pub use method::{Method, Part, Progress};
+pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
+pub use method::{Method, Progress, TrialReport};
 pub use range_points::RangePoints;
 pub use request::{Aabb, Picture, Projection, RenderRequest, Shutter};

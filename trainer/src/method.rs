@@ -3,7 +3,7 @@
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
-use crate::splat::PosedLens;
+use crate::splat::CalibratedCamera;
 use crate::{Error, Keyframe, Picture, RenderRequest};
 use kinematics::Stamp;
 use std::path::Path;
@@ -24,11 +24,11 @@ pub struct Progress {
 
 /// What a part of the model was found to be worth, on images held back for it.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct Part {
+pub struct TrialReport {
     /// What it is, in words.
     pub part: String,
     /// Mean PSNR with it less that without it, dB.
-    pub bought_db: f64,
+    pub gain_db: f64,
     /// Standard error of the mean, dB.
     pub standard_error_db: f64,
     /// Images it was measured on.
@@ -67,7 +67,7 @@ pub trait Method {
     fn primitive(&self) -> &'static str;
     /// Waits for what is queued, and says how many updates were made in all, those included that a trial took back: unlike
     /// [`Progress::step`] it never goes back.
-    fn n_taken(&mut self) -> Result<u64, Error>;
+    fn n_total_steps(&mut self) -> Result<u64, Error>;
     /// Makes of the keyframes so far what can be drawn without learning, as [`Method::render`] does.
     fn seed(&mut self) -> Result<(), Error>;
     /// Waits until everything that learning needs is compiled; [`Method::step`] would wait for it otherwise.
@@ -88,7 +88,7 @@ pub trait Method {
         1
     }
     /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
-    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error>;
+    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;
     /// Takes one step with a timestamp around every pass; empty where the adapter has none.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
     /// What alignment of the keyframes found, once that is settled; none where it was not asked for or could not be done.
@@ -96,7 +96,7 @@ pub trait Method {
     /// Where training stands.
     fn progress(&self) -> Progress;
     /// What the parts of the model that were tried bought, in the order of the trials.
-    fn report(&self) -> Vec<Part>;
+    fn report(&self) -> Vec<TrialReport>;
     /// Writes the model into a folder.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
     /// Takes all that training needs to go on from here; what is learned afterwards does not change it.

@@ -6,38 +6,38 @@ use std::fmt::Display;
 #[derive(Debug, Default)]
 pub(crate) struct Mismatches {
     n_checked: usize,
-    wrong: Vec<String>,
+    mismatches: Vec<String>,
     /// Largest difference as a multiple of its tolerance.
-    worst: f64,
+    max_ratio: f64,
 }
 
 impl Mismatches {
     /// Notes the pair unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN never passes.
     pub(crate) fn check(&mut self, name: impl Display, got: f64, expected: f64, abs: f64, rel: f64) {
-        let share = (got - expected).abs() / (abs + rel * got.abs().max(expected.abs()));
+        let ratio = (got - expected).abs() / (abs + rel * got.abs().max(expected.abs()));
         self.n_checked += 1;
-        self.worst = self.worst.max(share);
-        let passes = share <= 1.0; // False for NaN.
+        self.max_ratio = self.max_ratio.max(ratio);
+        let passes = ratio <= 1.0; // False for NaN.
         if !passes {
-            self.wrong.push(format!("{name}: got {got:.9e}, expected {expected:.9e} ({share:.1} x tolerance)"));
+            self.mismatches.push(format!("{name}: got {got:.9e}, expected {expected:.9e} ({ratio:.1} x tolerance)"));
         }
     }
 
     /// How many numbers were off.
-    pub(crate) fn n_wrong(&self) -> usize {
-        self.wrong.len()
+    pub(crate) fn n_mismatches(&self) -> usize {
+        self.mismatches.len()
     }
 
     /// Panics with every mismatch, or where nothing was compared at all.
     #[track_caller]
     pub(crate) fn assert_none(&self) {
         assert!(self.n_checked > 0, "nothing was compared");
-        let Self { n_checked, wrong, worst } = self;
+        let Self { n_checked, mismatches, max_ratio } = self;
         assert!(
-            wrong.is_empty(),
-            "{} of {n_checked} are off, worst {worst:.1} x tolerance:\n{}",
-            wrong.len(),
-            wrong.join("\n")
+            mismatches.is_empty(),
+            "{} of {n_checked} are off, worst {max_ratio:.1} x tolerance:\n{}",
+            mismatches.len(),
+            mismatches.join("\n")
         );
     }
 }
@@ -47,29 +47,29 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wrong_numbers_are_counted_and_named() {
-        let mut wrong = Mismatches::default();
-        wrong.check("right", 1.0, 1.0 + 1e-9, 1e-8, 0.0);
-        wrong.check("wrong", 1.0, 1.001, 1e-8, 1e-6);
-        wrong.check("negated", 1e-3, -1e-3, 1e-8, 1e-6);
-        wrong.check("missing", 0.0, 1e-3, 1e-8, 1e-6);
-        wrong.check("not a number", f64::NAN, 1.0, 1.0, 1.0);
-        wrong.check("endless", f64::INFINITY, 1.0, 1.0, 0.0);
-        assert_eq!(wrong.n_wrong(), 5);
-        assert!(wrong.wrong[0].starts_with("wrong: got"), "{}", wrong.wrong[0]);
+    fn mismatches_are_counted_and_named() {
+        let mut mismatches = Mismatches::default();
+        mismatches.check("right", 1.0, 1.0 + 1e-9, 1e-8, 0.0);
+        mismatches.check("wrong", 1.0, 1.001, 1e-8, 1e-6);
+        mismatches.check("negated", 1e-3, -1e-3, 1e-8, 1e-6);
+        mismatches.check("missing", 0.0, 1e-3, 1e-8, 1e-6);
+        mismatches.check("not a number", f64::NAN, 1.0, 1.0, 1.0);
+        mismatches.check("endless", f64::INFINITY, 1.0, 1.0, 0.0);
+        assert_eq!(mismatches.n_mismatches(), 5);
+        assert!(mismatches.mismatches[0].starts_with("wrong: got"), "{}", mismatches.mismatches[0]);
     }
 
     #[test]
     #[should_panic(expected = "1 of 1 are off")]
-    fn a_wrong_number_fails_the_test() {
-        let mut wrong = Mismatches::default();
-        wrong.check("x", 2.0, 1.0, 1e-9, 1e-9);
-        wrong.assert_none();
+    fn mismatch_panics() {
+        let mut mismatches = Mismatches::default();
+        mismatches.check("x", 2.0, 1.0, 1e-9, 1e-9);
+        mismatches.assert_none();
     }
 
     #[test]
     #[should_panic(expected = "nothing was compared")]
-    fn comparing_nothing_fails_the_test() {
+    fn empty_comparison_panics() {
         Mismatches::default().assert_none();
     }
 }

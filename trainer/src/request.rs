@@ -59,7 +59,7 @@ pub struct RenderRequest {
     pub background_srgb: [f32; 3],
     /// In the light and with the exposure that this camera had at this time, where the model knows them; `None`: in those of the
     /// mean image.
-    pub light_of: Option<(Arc<str>, Stamp)>,
+    pub appearance_of: Option<(Arc<str>, Stamp)>,
     /// Whether depth is requested. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
     pub depth: bool,
 }
@@ -88,7 +88,7 @@ impl Picture {
     }
 
     /// The picture made from the data read back from [`Self::buffers`].
-    pub(crate) fn of_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
+    pub(crate) fn from_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
         let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
         Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }
     }

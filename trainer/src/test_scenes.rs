@@ -14,7 +14,7 @@ pub(crate) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
 
 /// A thing with a surface.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Shape {
+pub(crate) enum TestShape {
     Sphere {
         center_m: Point3<f64>,
         radius_m: f64,
@@ -26,17 +26,17 @@ pub(crate) enum Shape {
     },
 }
 
-impl Shape {
+impl TestShape {
     /// Depth along z of the first surface on the ray, in a frame moved to `camera`.
-    fn depth_m(&self, origin: &Point3<f64>, along: &Vector3<f64>) -> Option<f64> {
+    fn depth_m(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<f64> {
         let depth_m = match self {
             Self::Sphere { center_m, radius_m } => {
                 let from = origin - center_m;
-                let (a, b) = (along.norm_squared(), along.dot(&from));
+                let (a, b) = (direction.norm_squared(), direction.dot(&from));
                 let root = b * b - a * (from.norm_squared() - radius_m * radius_m);
                 (root >= 0.0).then(|| (-b - root.sqrt()) / a)?
             }
-            Self::Plane { normal, offset_m } => (offset_m - normal.dot(&origin.coords)) / normal.dot(along),
+            Self::Plane { normal, offset_m } => (offset_m - normal.dot(&origin.coords)) / normal.dot(direction),
         };
         (depth_m > 0.0).then_some(depth_m)
     }
@@ -56,21 +56,21 @@ pub(crate) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
 }
 
 /// A camera at `eye` that looks at `target`, z up.
-pub(crate) fn looking(eye: Point3<f64>, target: Point3<f64>) -> Transform {
+pub(crate) fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
     let up = if (target - eye).xy().norm() < 1e-9 { Vector3::y() } else { Vector3::z() };
     Transform::face_towards(&eye, &target, &up) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
 /// What a camera sees of the shapes: exact depth and color.
-pub(crate) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+pub(crate) fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
     // The color camera sits 4 cm beside the depth camera and has another size.
     let color_pose = world_from_camera * Transform::translation(0.04, 0.0, 0.0);
-    let depth_m: Vec<f32> = seen(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
+    let depth_m: Vec<f32> = cast_pixels(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
         .map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth)))
         .collect();
     let color_size = [120, 100];
     let (color_focal, color_principal) = ([110.0, 110.0], [60.0, 50.0]);
-    let rgba: Vec<u8> = seen(shapes, &color_pose, color_size, color_focal, color_principal)
+    let rgba: Vec<u8> = cast_pixels(shapes, &color_pose, color_size, color_focal, color_principal)
         .flat_map(|hit| {
             let [red, green, blue] = hit.map_or([0; 3], |(_, point)| bytes(color_srgb(&point)));
             [red, green, blue, 255]
@@ -101,10 +101,10 @@ pub(crate) fn keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) 
 }
 
 /// The same in the size of a depth camera's images.
-pub(crate) fn large_keyframe(ix: i64, shapes: &[Shape], world_from_camera: Transform) -> Keyframe {
+pub(crate) fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
     let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
     let mut keyframe = keyframe(ix, shapes, world_from_camera);
-    let hits: Vec<_> = seen(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
+    let hits: Vec<_> = cast_pixels(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
     let colors = hits.iter().flat_map(|hit| {
         let [red, green, blue] = hit.map_or([0; 3], |(_, point)| bytes(color_srgb(&point)));
         [red, green, blue, 255]
@@ -123,8 +123,8 @@ fn bytes(color: [f64; 3]) -> [u8; 3] {
 }
 
 /// Depth and place of what each pixel sees.
-fn seen(
-    shapes: &[Shape],
+fn cast_pixels(
+    shapes: &[TestShape],
     world_from_camera: &Transform,
     [width, height]: [u32; 2],
     focal: [f64; 2],
@@ -132,43 +132,43 @@ fn seen(
 ) -> impl Iterator<Item = Option<(f64, Point3<f64>)>> {
     let origin: Point3<f64> = world_from_camera.translation.vector.into();
     let pixels = (0..height).flat_map(move |y| (0..width).map(move |x| [f64::from(x) + 0.5, f64::from(y) + 0.5]));
-    pixels.map(move |place| {
-        let in_camera = Vector3::new((place[0] - principal[0]) / focal[0], (place[1] - principal[1]) / focal[1], 1.0);
-        let along = world_from_camera.rotation * in_camera;
-        let first = shapes.iter().filter_map(|shape| shape.depth_m(&origin, &along)).min_by(f64::total_cmp)?;
-        Some((first, origin + along * first))
+    pixels.map(move |pixel| {
+        let in_camera = Vector3::new((pixel[0] - principal[0]) / focal[0], (pixel[1] - principal[1]) / focal[1], 1.0);
+        let direction = world_from_camera.rotation * in_camera;
+        let depth = shapes.iter().filter_map(|shape| shape.depth_m(&origin, &direction)).min_by(f64::total_cmp)?;
+        Some((depth, origin + direction * depth))
     })
 }
 
 /// A ball of 30 cm whose middle is `at`.
-pub(crate) fn ball(at: Point3<f64>) -> Shape {
-    Shape::Sphere { center_m: at, radius_m: 0.3 }
+pub(crate) fn ball(at: Point3<f64>) -> TestShape {
+    TestShape::Sphere { center_m: at, radius_m: 0.3 }
 }
 
 /// The floor under it.
-pub(crate) fn floor() -> Shape {
-    Shape::Plane { normal: Vector3::z(), offset_m: -0.3 }
+pub(crate) fn floor() -> TestShape {
+    TestShape::Plane { normal: Vector3::z(), offset_m: -0.3 }
 }
 
 /// Views of a point from all around, `n` of them, evenly over the sphere (Vogel 1979).
-pub(crate) fn all_around(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub(crate) fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
             let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
-            let (turn, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
-            let eye = target + 1.0 * Vector3::new(radius * turn.cos(), radius * turn.sin(), height);
-            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, looking(eye, target)))
+            let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
+            let eye = target + 1.0 * Vector3::new(radius * angle.cos(), radius * angle.sin(), height);
+            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, look_at(eye, target)))
         })
         .collect()
 }
 
 /// Views from a part of a ring above the floor.
-pub(crate) fn ring(shapes: &[Shape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub(crate) fn ring(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
-            let turn = 0.35 * ix as f64;
-            let eye = target + Vector3::new(1.1 * turn.cos(), 1.1 * turn.sin(), 0.5);
-            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, looking(eye, target)))
+            let angle = 0.35 * ix as f64;
+            let eye = target + Vector3::new(1.1 * angle.cos(), 1.1 * angle.sin(), 0.5);
+            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, look_at(eye, target)))
         })
         .collect()
 }
@@ -187,7 +187,7 @@ pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
         far_m: 100.0,
         crop: None,
         background_srgb: [0.0, 0.5, 1.0],
-        light_of: None,
+        appearance_of: None,
         depth: true,
     }
 }

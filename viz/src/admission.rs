@@ -17,7 +17,7 @@ const MAX_CONNECTIONS: usize = 256;
 /// WebSocket clients at a time.
 const MAX_CLIENTS: usize = 32;
 /// Connections use at most this fraction of the files that the process may open.
-const DESCRIPTOR_SHARE: usize = 4;
+const DESCRIPTORS_PER_CONNECTION: usize = 4;
 /// A connection whose peer takes no byte for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 /// An HTTP connection without a new request for this long is closed.
@@ -41,7 +41,7 @@ pub(crate) struct Limits {
 impl Limits {
     /// The limits for a process that may open this many files.
     pub(crate) fn of_descriptors(n_descriptors: usize) -> Self {
-        let connections = (n_descriptors / DESCRIPTOR_SHARE).clamp(8, MAX_CONNECTIONS);
+        let connections = (n_descriptors / DESCRIPTORS_PER_CONNECTION).clamp(8, MAX_CONNECTIONS);
         Self { connections, clients: MAX_CLIENTS.min(connections / 2) }
     }
 
@@ -79,11 +79,11 @@ struct Registry {
 #[derive(Debug)]
 pub(crate) struct Connection {
     number: u64,
-    state: Mutex<State>,
+    state: Mutex<ConnectionState>,
 }
 
 #[derive(Debug)]
-struct State {
+struct ConnectionState {
     /// Reads and writes fail from now on.
     is_closed: bool,
     reader: Option<Waker>,
@@ -99,9 +99,9 @@ struct State {
 
 #[derive(Debug)]
 struct Client {
-    seated: Instant,
+    admitted: Instant,
     /// When it sent its last message. Pongs do not count, because libraries send them on their own.
-    spoke: Option<Instant>,
+    last_message: Option<Instant>,
     /// When the ping was sent that it has not answered yet.
     pinged: Option<Instant>,
     /// Whether it has ever answered a ping, which shows that it reads.
@@ -141,25 +141,26 @@ impl Admission {
     }
 
     /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client.
-    pub(crate) fn seat(&self, connection: &Connection) -> bool {
+    pub(crate) fn admit_client(&self, connection: &Connection) -> bool {
         // Held until the client is registered, so that two clients never count the same free place.
         let registry = self.registry();
         let now = Instant::now();
-        let seated = registry.connections.values().filter(|other| other.has_seat());
-        let (mut n_seated, mut worst): (usize, Option<(Dispensability, &Arc<Connection>)>) = (0, None);
-        for other in seated {
-            n_seated += 1;
+        let admitted = registry.connections.values().filter(|other| other.is_admitted());
+        let (mut n_admitted, mut most_dispensable): (usize, Option<(Dispensability, &Arc<Connection>)>) = (0, None);
+        for other in admitted {
+            n_admitted += 1;
             if let Some(dispensability) = other.dispensability(now)
-                && worst.is_none_or(|(most, _)| dispensability > most)
+                && most_dispensable.is_none_or(|(worst_so_far, _)| dispensability > worst_so_far)
             {
-                worst = Some((dispensability, other));
+                most_dispensable = Some((dispensability, other));
             }
         }
-        if n_seated >= self.limits.clients {
-            let Some((_, other)) = worst else { return false };
+        if n_admitted >= self.limits.clients {
+            let Some((_, other)) = most_dispensable else { return false };
             other.close("a new client replaces it");
         }
-        connection.state().client = Some(Client { seated: now, spoke: None, pinged: None, has_answered: false });
+        connection.state().client =
+            Some(Client { admitted: now, last_message: None, pinged: None, has_answered: false });
         true
     }
 
@@ -167,7 +168,7 @@ impl Admission {
     pub(crate) fn sweep(&self) {
         let now = Instant::now();
         for connection in self.registry().connections.values() {
-            if let Some(reason) = connection.overdue(now) {
+            if let Some(reason) = connection.timeout_reason(now) {
                 connection.close(reason);
             }
         }
@@ -187,7 +188,7 @@ impl Admission {
 
 impl Connection {
     fn new(number: u64) -> Self {
-        let state = State {
+        let state = ConnectionState {
             is_closed: false,
             reader: None,
             writer: None,
@@ -205,14 +206,14 @@ impl Connection {
     }
 
     /// The client has sent a message.
-    pub(crate) fn spoke(&self) {
+    pub(crate) fn last_message(&self) {
         if let Some(client) = &mut self.state().client {
-            client.spoke = Some(Instant::now());
+            client.last_message = Some(Instant::now());
         }
     }
 
     /// Whether a ping is due: at most one is unanswered at a time.
-    pub(crate) fn take_ping(&self) -> bool {
+    pub(crate) fn start_ping(&self) -> bool {
         match &mut self.state().client {
             Some(client) if client.pinged.is_none() => {
                 client.pinged = Some(Instant::now());
@@ -223,14 +224,14 @@ impl Connection {
     }
 
     /// The client has answered a ping, so it reads.
-    pub(crate) fn answered_ping(&self) {
+    pub(crate) fn record_pong(&self) {
         if let Some(client) = &mut self.state().client {
             client.pinged = None;
             client.has_answered = true;
         }
     }
 
-    fn has_seat(&self) -> bool {
+    fn is_admitted(&self) -> bool {
         let state = self.state();
         state.client.is_some() && !state.is_closed
     }
@@ -243,25 +244,25 @@ impl Connection {
         if let Some(stuck_for) = stuck_for.filter(|time| *time >= UNRESPONSIVE_AFTER) {
             return Some((2, stuck_for));
         }
-        match client.spoke.filter(|_| client.has_answered) {
-            None => Some((1, now - client.seated)),
-            Some(spoke) if now - spoke >= IDLE_CLIENT_AFTER => Some((0, now - spoke)),
+        match client.last_message.filter(|_| client.has_answered) {
+            None => Some((1, now - client.admitted)),
+            Some(last_message) if now - last_message >= IDLE_CLIENT_AFTER => Some((0, now - last_message)),
             Some(_) => None,
         }
     }
 
     /// The reason to close the connection now, if there is one.
-    fn overdue(&self, now: Instant) -> Option<&'static str> {
+    fn timeout_reason(&self, now: Instant) -> Option<&'static str> {
         let state = self.state();
-        let is_over = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
-        if is_over(state.blocked_since, WRITE_TIMEOUT) {
+        let is_timed_out = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
+        if is_timed_out(state.blocked_since, WRITE_TIMEOUT) {
             return Some("its peer does not read");
         }
         match &state.client {
-            Some(client) => is_over(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings"),
+            Some(client) => is_timed_out(client.pinged, PONG_TIMEOUT).then_some("it does not answer pings"),
             None => {
                 let idle_since = Some(state.requested.unwrap_or(state.opened));
-                is_over(idle_since, IDLE_TIMEOUT).then_some("it has been idle for too long")
+                is_timed_out(idle_since, IDLE_TIMEOUT).then_some("it has been idle for too long")
             }
         }
     }
@@ -280,7 +281,7 @@ impl Connection {
     }
 
     /// See [`Admission::registry`].
-    fn state(&self) -> MutexGuard<'_, State> {
+    fn state(&self) -> MutexGuard<'_, ConnectionState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -418,10 +419,10 @@ mod tests {
     }
 
     /// Does what a page does as soon as it is connected.
-    fn use_client(stream: &GuardedStream) {
-        stream.connection().spoke();
-        assert!(stream.connection().take_ping());
-        stream.connection().answered_ping();
+    fn act_like_page(stream: &GuardedStream) {
+        stream.connection().last_message();
+        assert!(stream.connection().start_ping());
+        stream.connection().record_pong();
     }
 
     fn is_closed(stream: &GuardedStream) -> bool {
@@ -437,7 +438,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_half_open_request_gives_way() {
+    fn oldest_half_open_request_is_evicted() {
         run(async {
             let port = Port::open();
             let (served, _a) = port.connect();
@@ -454,34 +455,36 @@ mod tests {
     }
 
     #[test]
-    fn seats_are_counted_and_given_back() {
+    fn client_slots_are_counted_and_released() {
         run(async {
             let port = Port::open();
             let (a, _a) = port.connect();
             let (b, _b) = port.connect();
             let (c, _c) = port.connect();
             for stream in [&a, &b] {
-                assert!(port.admission.seat(stream.connection()));
-                use_client(stream);
+                assert!(port.admission.admit_client(stream.connection()));
+                act_like_page(stream);
             }
-            assert!(!port.admission.seat(c.connection()), "both clients are in use");
+            assert!(!port.admission.admit_client(c.connection()), "both clients are in use");
             drop(a);
-            assert!(port.admission.seat(c.connection()));
+            assert!(port.admission.admit_client(c.connection()));
             assert!(!is_closed(&b));
         });
     }
 
     #[test]
-    fn the_most_dispensable_client_loses_its_seat() {
+    fn most_dispensable_client_is_evicted() {
         run(async {
             let port = Port::open();
             let (speaking, _a) = port.connect();
             let (other, _b) = port.connect();
             let (newcomer, _c) = port.connect();
-            assert!(port.admission.seat(speaking.connection()) && port.admission.seat(other.connection()));
-            use_client(&speaking);
-            other.connection().spoke(); // It does not read.
-            assert!(port.admission.seat(newcomer.connection()), "the other client never answered a ping");
+            assert!(
+                port.admission.admit_client(speaking.connection()) && port.admission.admit_client(other.connection())
+            );
+            act_like_page(&speaking);
+            other.connection().last_message(); // It does not read.
+            assert!(port.admission.admit_client(newcomer.connection()), "the other client never answered a ping");
             assert!(is_closed(&other) && !is_closed(&speaking));
 
             let now = Instant::now();
@@ -489,31 +492,31 @@ mod tests {
             assert_eq!(connection.dispensability(now), None);
             let idle = connection.dispensability(now + IDLE_CLIENT_AFTER).expect("idle");
             let silent = newcomer.connection().dispensability(now).expect("silent");
-            assert!(connection.take_ping() && !connection.take_ping(), "one ping at a time");
+            assert!(connection.start_ping() && !connection.start_ping(), "one ping at a time");
             let unresponsive = connection.dispensability(Instant::now() + UNRESPONSIVE_AFTER).expect("unresponsive");
             assert!(idle < silent && silent < unresponsive);
-            connection.answered_ping();
+            connection.record_pong();
             assert_eq!(connection.dispensability(now), None);
         });
     }
 
     #[test]
-    fn peers_that_do_not_read_or_answer_are_overdue() {
+    fn unresponsive_peers_time_out() {
         run(async {
             let port = Port::open();
             let (mut stuck, _a) = port.connect();
             let filling = async { while stuck.write_all(&[0; 65536]).await.is_ok() {} };
             assert!(tokio::time::timeout(Duration::from_millis(500), filling).await.is_err(), "the peer never reads");
             let soon = Instant::now() + Duration::from_millis(100);
-            assert_eq!(stuck.connection().overdue(soon), None);
-            assert!(stuck.connection().overdue(soon + WRITE_TIMEOUT).is_some());
+            assert_eq!(stuck.connection().timeout_reason(soon), None);
+            assert!(stuck.connection().timeout_reason(soon + WRITE_TIMEOUT).is_some());
 
             let (client, _b) = port.connect();
-            assert!(port.admission.seat(client.connection()) && client.connection().take_ping());
-            assert_eq!(client.connection().overdue(soon), None);
-            assert!(client.connection().overdue(soon + PONG_TIMEOUT).is_some());
-            client.connection().answered_ping();
-            assert_eq!(client.connection().overdue(soon + 2 * PONG_TIMEOUT), None, "a quiet client may stay");
+            assert!(port.admission.admit_client(client.connection()) && client.connection().start_ping());
+            assert_eq!(client.connection().timeout_reason(soon), None);
+            assert!(client.connection().timeout_reason(soon + PONG_TIMEOUT).is_some());
+            client.connection().record_pong();
+            assert_eq!(client.connection().timeout_reason(soon + 2 * PONG_TIMEOUT), None, "a quiet client may stay");
         });
     }
 }

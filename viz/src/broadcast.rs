@@ -2,9 +2,9 @@
 
 use crate::Hub;
 use crate::clock::ServerClock;
-use crate::news::LiveImage;
 use crate::picture::pack_live_image;
 use crate::protocol::{KeyframeMessage, ServerMessage};
+use crate::updates::LiveImage;
 use axum::extract::ws::Message;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,13 +15,13 @@ use tokio::task::JoinSet;
 /// How often the hub is checked for new data.
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
 /// A status is sent at most this often, and so is the image of each camera.
-const NEWS_PERIOD: Duration = Duration::from_millis(190);
+const UPDATE_PERIOD: Duration = Duration::from_millis(190);
 /// The list of keyframes is sent at most this often, because it is long and always sent in full.
 const KEYFRAMES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The latest encoded message of each kind.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Bulletin {
+pub(crate) struct LatestMessages {
     scene: Option<Item>,
     status: Option<Item>,
     keyframes: Option<Item>,
@@ -44,7 +44,7 @@ pub(crate) struct Received {
     live_images: BTreeMap<Arc<str>, u64>,
 }
 
-impl Bulletin {
+impl LatestMessages {
     /// The next message that a client has not received: short messages first, and live images and keyframes only if `long`.
     pub(crate) fn next(&self, received: &mut Received, long: bool) -> Option<Message> {
         let newer = |item: &Option<Item>, number: &mut u64| {
@@ -79,29 +79,29 @@ enum Encoded {
 }
 
 /// The image of a camera that is being encoded or was encoded last.
-struct Begun {
+struct ImageEncoding {
     image: Arc<LiveImage>,
     at: Instant,
     is_running: bool,
 }
 
 /// Encodes new data while there are clients; runs until the server stops.
-pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sender<Bulletin>) {
+pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: watch::Sender<LatestMessages>) {
     let (mut scene, mut status, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.keyframes(), hub.live_images());
     // A client may connect before the first check, and it has not seen what was set earlier.
     scene.mark_changed();
     status.mark_changed();
     keyframes.mark_changed();
-    let mut status_sent = Throttle::new(NEWS_PERIOD);
+    let mut status_sent = Throttle::new(UPDATE_PERIOD);
     let mut keyframes_sent = Throttle::new(KEYFRAMES_PERIOD);
-    let mut begun: BTreeMap<Arc<str>, Begun> = BTreeMap::new();
+    let mut image_encodings: BTreeMap<Arc<str>, ImageEncoding> = BTreeMap::new();
     let mut encodings: JoinSet<Encoded> = JoinSet::new();
     let mut is_encoding_keyframes = false;
     let mut n_items = 0;
-    let mut publish = |change: &dyn Fn(&mut Bulletin, u64)| {
+    let mut publish_item = |change: &dyn Fn(&mut LatestMessages, u64)| {
         n_items += 1;
-        bulletin.send_modify(|bulletin| change(bulletin, n_items));
+        latest_messages.send_modify(|latest_messages| change(latest_messages, n_items));
     };
     let mut check = tokio::time::interval(CHECK_PERIOD);
     check.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -111,51 +111,55 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sen
             Some(encoded) = encodings.join_next() => match encoded {
                 Ok(Encoded::Keyframes(message)) => {
                     is_encoding_keyframes = false;
-                    publish(&|bulletin, number| bulletin.keyframes = Some(Item { number, message: message.clone() }));
+                    publish_item(&|latest_messages, number| latest_messages.keyframes = Some(Item { number, message: message.clone() }));
                 }
                 Ok(Encoded::LiveImage(camera, message)) => {
-                    if let Some(begun) = begun.get_mut(&camera) {
-                        begun.is_running = false;
+                    if let Some(image_encodings) = image_encodings.get_mut(&camera) {
+                        image_encodings.is_running = false;
                     }
-                    publish(&|bulletin, number| {
-                        bulletin.live_images.insert(Arc::clone(&camera), Item { number, message: message.clone() });
+                    publish_item(&|latest_messages, number| {
+                        latest_messages.live_images.insert(Arc::clone(&camera), Item { number, message: message.clone() });
                     });
                 }
                 Err(error) => {
                     log::error!("cannot encode a message for clients: {error}");
                     // Which one is unknown: everything may be encoded again when it changes.
                     is_encoding_keyframes = false;
-                    begun.values_mut().for_each(|begun| begun.is_running = false);
+                    image_encodings.values_mut().for_each(|image_encodings| image_encodings.is_running = false);
                 }
             },
         }
         if hub.n_clients() == 0 {
-            if !bulletin.borrow().is_empty() {
-                bulletin.send_replace(Bulletin::default());
+            if !latest_messages.borrow().is_empty() {
+                latest_messages.send_replace(LatestMessages::default());
             }
             // The next client receives everything.
             scene.mark_changed();
             status.mark_changed();
             keyframes.mark_changed();
-            begun.retain(|_, begun| begun.is_running);
+            image_encodings.retain(|_, image_encodings| image_encodings.is_running);
             status_sent.reset();
             keyframes_sent.reset();
             continue;
         }
-        if let Some(hint) = fresh(&mut scene).flatten() {
+        if let Some(hint) = take_if_changed(&mut scene).flatten() {
             let message = text(&ServerMessage::from(&*hint));
-            publish(&|bulletin, number| bulletin.scene = Some(Item { number, message: message.clone() }));
+            publish_item(&|latest_messages, number| {
+                latest_messages.scene = Some(Item { number, message: message.clone() })
+            });
         }
         if status_sent.is_due()
-            && let Some(latest) = fresh(&mut status).flatten()
+            && let Some(latest) = take_if_changed(&mut status).flatten()
         {
             status_sent.begin();
             let message = text(&ServerMessage::Status(&latest));
-            publish(&|bulletin, number| bulletin.status = Some(Item { number, message: message.clone() }));
+            publish_item(&|latest_messages, number| {
+                latest_messages.status = Some(Item { number, message: message.clone() })
+            });
         }
         if keyframes_sent.is_due()
             && !is_encoding_keyframes
-            && let Some(list) = fresh(&mut keyframes)
+            && let Some(list) = take_if_changed(&mut keyframes)
         {
             keyframes_sent.begin();
             is_encoding_keyframes = true;
@@ -165,13 +169,15 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, bulletin: watch::Sen
             });
         }
         for (camera, image) in &*live_images.borrow() {
-            let is_new = begun.get(camera).is_none_or(|begun| {
-                !begun.is_running && begun.at.elapsed() >= NEWS_PERIOD && !Arc::ptr_eq(&begun.image, image)
+            let is_new = image_encodings.get(camera).is_none_or(|image_encodings| {
+                !image_encodings.is_running
+                    && image_encodings.at.elapsed() >= UPDATE_PERIOD
+                    && !Arc::ptr_eq(&image_encodings.image, image)
             });
             if is_new {
                 let (camera, image) = (Arc::clone(camera), Arc::clone(image));
-                let entry = Begun { image: Arc::clone(&image), at: Instant::now(), is_running: true };
-                begun.insert(Arc::clone(&camera), entry);
+                let entry = ImageEncoding { image: Arc::clone(&image), at: Instant::now(), is_running: true };
+                image_encodings.insert(Arc::clone(&camera), entry);
                 encodings.spawn_blocking(move || {
                     let message = live_message(&image, clock);
                     Encoded::LiveImage(camera, message)
@@ -196,7 +202,7 @@ fn text(message: &ServerMessage<'_>) -> Message {
 }
 
 /// The value, if it changed since the last call. An error would mean that the hub is gone, but the hub outlives the server.
-fn fresh<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
+fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
     receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
 }
 
@@ -226,31 +232,32 @@ impl Throttle {
 
 #[cfg(test)]
 mod tests {
-    use super::{Bulletin, Item, Received};
+    use super::{Item, LatestMessages, Received};
     use axum::extract::ws::Message;
 
     fn item(number: u64) -> Item {
         Item { number, message: Message::text(number.to_string()) }
     }
 
-    fn next(bulletin: &Bulletin, received: &mut Received, long: bool) -> Option<String> {
-        bulletin.next(received, long).map(|message| message.into_text().expect("text").to_string())
+    fn next(latest_messages: &LatestMessages, received: &mut Received, long: bool) -> Option<String> {
+        latest_messages.next(received, long).map(|message| message.into_text().expect("text").to_string())
     }
 
     #[test]
-    fn short_messages_go_first_and_cameras_in_turn() {
-        let mut bulletin = Bulletin { scene: Some(item(1)), status: Some(item(4)), ..Bulletin::default() };
-        bulletin.keyframes = Some(item(2));
-        bulletin.live_images = [("left".into(), item(3)), ("right".into(), item(5))].into();
+    fn short_messages_first_then_cameras_round_robin() {
+        let mut latest_messages =
+            LatestMessages { scene: Some(item(1)), status: Some(item(4)), ..LatestMessages::default() };
+        latest_messages.keyframes = Some(item(2));
+        latest_messages.live_images = [("left".into(), item(3)), ("right".into(), item(5))].into();
         let mut received = Received::default();
-        assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("1"));
-        assert_eq!(next(&bulletin, &mut received, false).as_deref(), Some("4"));
-        assert_eq!(next(&bulletin, &mut received, false), None, "only long messages are left");
-        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("3"));
-        bulletin.live_images.insert("left".into(), item(6));
-        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("5"), "the other camera's turn");
-        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("6"));
-        assert_eq!(next(&bulletin, &mut received, true).as_deref(), Some("2"));
-        assert_eq!(next(&bulletin, &mut received, true), None);
+        assert_eq!(next(&latest_messages, &mut received, false).as_deref(), Some("1"));
+        assert_eq!(next(&latest_messages, &mut received, false).as_deref(), Some("4"));
+        assert_eq!(next(&latest_messages, &mut received, false), None, "only long messages are left");
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("3"));
+        latest_messages.live_images.insert("left".into(), item(6));
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera's turn");
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("6"));
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("2"));
+        assert_eq!(next(&latest_messages, &mut received, true), None);
     }
 }

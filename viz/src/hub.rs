@@ -1,10 +1,10 @@
 //! The meeting place of the training thread and the server; no call of the training thread waits for a client.
 
-use crate::news::{Ended, KeyframePose, LiveImage, SceneHint, Status};
 use crate::pose::row_major;
 use crate::protocol::{PictureHeader, ProjectionMessage};
-use crate::queue::{Outgoing, Queue, Ticket};
-use crate::render_order::RenderOrder;
+use crate::queue::{Outgoing, Queue, RenderJob};
+use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
+use crate::view_request::ViewRequest;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -47,7 +47,7 @@ impl Hub {
     }
 
     /// Reports the result of the run. Clients keep showing it after the server has stopped.
-    pub fn set_ended(&self, ended: Ended) {
+    pub fn set_run_result(&self, ended: RunResult) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);
             status.ended = Some(ended);
@@ -88,13 +88,13 @@ impl Hub {
     ///
     /// One call gives one stage of one client; clients are served in turn.
     pub fn next_request(&self) -> Option<PendingRender> {
-        let ticket = self.queue().take()?;
+        let job = self.queue().take()?;
         Some(PendingRender {
-            request: ticket.order.stage_request(ticket.stage),
-            begun: Instant::now(),
+            request: job.view_request.stage_request(job.stage),
+            started: Instant::now(),
             hub: self.clone(),
-            ticket,
-            is_settled: false,
+            job,
+            is_released: false,
         })
     }
 
@@ -114,8 +114,8 @@ impl Hub {
         self.queue().leave(client);
     }
 
-    pub(crate) fn order(&self, client: u64, order: RenderOrder) {
-        self.queue().order(client, order);
+    pub(crate) fn view_request(&self, client: u64, view_request: ViewRequest) {
+        self.queue().view_request(client, view_request);
         self.shared.work_arrived.notify_all();
     }
 
@@ -123,8 +123,8 @@ impl Hub {
         self.queue().collect(client)
     }
 
-    pub(crate) fn settle(&self, client: u64) {
-        self.queue().settle(client);
+    pub(crate) fn release(&self, client: u64) {
+        self.queue().release(client);
         self.shared.work_arrived.notify_all();
     }
 
@@ -155,52 +155,52 @@ impl Hub {
 pub struct PendingRender {
     /// What to draw, at the size of this stage.
     pub request: RenderRequest,
-    begun: Instant,
+    started: Instant,
     hub: Hub,
-    ticket: Ticket,
-    is_settled: bool,
+    job: RenderJob,
+    is_released: bool,
 }
 
 impl PendingRender {
     /// Which of several models to draw; the first if `None`. It is the client's word: there may be no such model.
     pub fn method(&self) -> Option<&str> {
-        self.ticket.order.method.as_deref()
+        self.job.view_request.method.as_deref()
     }
 
     /// Sends the drawn picture to the client; encoding happens on the server's side.
     pub fn deliver(mut self, picture: Picture) {
         let header = self.header(&picture);
         if header.last {
-            self.hub.queue().drawn(&self.ticket, header.render_millis);
+            self.hub.queue().record_render_time(&self.job, header.render_millis);
         }
-        self.answer(Outgoing::Picture(Box::new((self.ticket.clone(), header, picture))));
+        self.enqueue_answer(Outgoing::Picture(Box::new((self.job.clone(), header, picture))));
     }
 
     /// Tells the client in one sentence why this picture could not be drawn.
     pub fn fail(mut self, reason: &str) {
-        self.answer(Outgoing::Failed { id: self.ticket.order.id, reason: reason.to_owned() });
+        self.enqueue_answer(Outgoing::Failed { id: self.job.view_request.id, reason: reason.to_owned() });
     }
 
-    fn answer(&mut self, outgoing: Outgoing) {
-        self.is_settled = true; // The session settles it once it is sent.
-        self.hub.queue().put(self.ticket.client, outgoing);
+    fn enqueue_answer(&mut self, outgoing: Outgoing) {
+        self.is_released = true; // The session settles it once it is sent.
+        self.hub.queue().push_outgoing(self.job.client, outgoing);
     }
 
     fn header(&self, picture: &Picture) -> PictureHeader {
-        let order = &self.ticket.order;
+        let view_request = &self.job.view_request;
         PictureHeader {
-            id: order.id,
-            stage: self.ticket.stage,
-            n_stages: order.stages.len(),
-            scale: order.stages[self.ticket.stage],
-            last: self.ticket.stage + 1 == order.stages.len(),
+            id: view_request.id,
+            stage: self.job.stage,
+            n_stages: view_request.stages.len(),
+            scale: view_request.stages[self.job.stage],
+            last: self.job.stage + 1 == view_request.stages.len(),
             size_px: picture.size_px,
-            full_size_px: order.request.size_px,
-            world_from_camera: row_major(&order.request.world_from_camera),
-            projection: projection_message(&order.request.projection),
-            near_m: order.request.near_m,
-            far_m: order.request.far_m,
-            render_millis: self.begun.elapsed().as_secs_f64() * 1e3,
+            full_size_px: view_request.request.size_px,
+            world_from_camera: row_major(&view_request.request.world_from_camera),
+            projection: projection_message(&view_request.request.projection),
+            near_m: view_request.request.near_m,
+            far_m: view_request.request.far_m,
+            render_millis: self.started.elapsed().as_secs_f64() * 1e3,
             color: None,
             depth: None,
         }
@@ -209,8 +209,8 @@ impl PendingRender {
 
 impl Drop for PendingRender {
     fn drop(&mut self) {
-        if !self.is_settled {
-            self.hub.settle(self.ticket.client);
+        if !self.is_released {
+            self.hub.release(self.job.client);
         }
     }
 }

@@ -39,7 +39,7 @@ pub(crate) struct Pixels<'a> {
 
 /// Why an image cannot be encoded.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Unencodable {
+pub(crate) enum JpegError {
     #[error("a {width} x {height} image needs {needed} values but has {got}")]
     Length { width: u32, height: u32, needed: usize, got: usize },
     #[error("a {width} x {height} image cannot be encoded as JPEG, which allows 1 to 65535 pixels each way")]
@@ -60,11 +60,11 @@ impl Layout {
 
 impl Pixels<'_> {
     /// Checks that the number of bytes matches the size.
-    pub(crate) fn check(&self) -> Result<(), Unencodable> {
+    pub(crate) fn check(&self) -> Result<(), JpegError> {
         let [width, height] = self.size_px;
         let needed = width as usize * height as usize * self.layout.n_channels();
         let got = self.bytes.len();
-        if got == needed { Ok(()) } else { Err(Unencodable::Length { width, height, needed, got }) }
+        if got == needed { Ok(()) } else { Err(JpegError::Length { width, height, needed, got }) }
     }
 }
 
@@ -74,7 +74,7 @@ pub(crate) fn n_threads() -> usize {
 }
 
 /// Encodes a baseline JPEG file.
-pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result<Vec<u8>, Unencodable> {
+pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result<Vec<u8>, JpegError> {
     let n_px = pixels.size_px[0] as usize * pixels.size_px[1] as usize;
     encode_in_strips(pixels, quality, chroma, n_threads().min(n_px / MIN_STRIP_PX))
 }
@@ -84,14 +84,14 @@ pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result
 /// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte and predicts nothing
 /// from the strip before, exactly as at a restart marker. Joined by these markers, the scans therefore form the scan of
 /// the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
-fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, Unencodable> {
+fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, JpegError> {
     pixels.check()?;
     let [width, height] = pixels.size_px;
     let (Ok(width_px), Ok(height_px)) = (u16::try_from(width), u16::try_from(height)) else {
-        return Err(Unencodable::Size { width, height });
+        return Err(JpegError::Size { width, height });
     };
     if width_px == 0 || height_px == 0 {
-        return Err(Unencodable::Size { width, height });
+        return Err(JpegError::Size { width, height });
     }
     let block_px: u16 = if chroma == Chroma::Full { 8 } else { 16 };
     let blocks_per_row = width_px.div_ceil(block_px);
@@ -127,7 +127,7 @@ fn encode_strip(
     [width, height]: [u16; 2],
     quality: u8,
     chroma: Chroma,
-) -> Result<Vec<u8>, Unencodable> {
+) -> Result<Vec<u8>, JpegError> {
     let mut file = Vec::with_capacity(1024 + bytes.len() / 12);
     let mut encoder = Encoder::new(&mut file, quality);
     encoder.set_sampling_factor(match chroma {
@@ -196,7 +196,7 @@ fn parts_of(file: &[u8]) -> Parts {
 }
 
 /// Averages squares of `factor` x `factor` pixels; columns and rows that do not fill a square are left out.
-pub(crate) fn shrink(pixels: &Pixels<'_>, factor: u32) -> Result<([u32; 2], Vec<u8>), Unencodable> {
+pub(crate) fn shrink(pixels: &Pixels<'_>, factor: u32) -> Result<([u32; 2], Vec<u8>), JpegError> {
     pixels.check()?;
     let n_channels = pixels.layout.n_channels();
     let size_px = pixels.size_px.map(|n| n / factor);
@@ -245,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn strips_decode_to_the_same_pixels_as_one_piece() {
+    fn strips_decode_like_one_image() {
         for (width, height) in [(160, 128), (161, 129), (1, 1), (7, 50), (16, 17), (333, 255), (15, 1000), (64, 8)] {
             for layout in [Layout::Rgb, Layout::Rgba] {
                 let bytes = scene(width, height, layout);
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_length_or_size_is_an_error_not_a_panic() {
+    fn wrong_length_or_size_is_an_error() {
         let encode = |size_px, bytes: &[u8]| {
             encode_in_strips(&Pixels { size_px, layout: Layout::Rgba, bytes }, 90, Chroma::Full, 2)
         };

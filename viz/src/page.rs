@@ -78,8 +78,8 @@ fn has_version(request: &HeaderMap, etag: &str) -> bool {
 fn accepts_gzip(request: &HeaderMap) -> bool {
     items(request, header::ACCEPT_ENCODING).any(|item| {
         let (coding, weight) = item.split_once(';').unwrap_or((item, ""));
-        let is_refused = weight.trim().strip_prefix("q=").and_then(|q| q.parse::<f64>().ok()) == Some(0.0);
-        coding.trim().eq_ignore_ascii_case("gzip") && !is_refused
+        let is_excluded = weight.trim().strip_prefix("q=").and_then(|q| q.parse::<f64>().ok()) == Some(0.0);
+        coding.trim().eq_ignore_ascii_case("gzip") && !is_excluded
     })
 }
 

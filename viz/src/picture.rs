@@ -1,16 +1,16 @@
 //! Packs pictures and live images into binary messages.
 
 use crate::clock::ServerClock;
-use crate::jpeg::{Chroma, Layout, Pixels, Unencodable, encode, n_threads, shrink};
-use crate::news::{LiveImage, LivePixels};
+use crate::jpeg::{Chroma, JpegError, Layout, Pixels, encode, n_threads, shrink};
 use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeader, PictureHeader, frame};
-use crate::render_order::RenderOrder;
+use crate::updates::{LiveImage, LivePixels};
+use crate::view_request::ViewRequest;
 use trainer::Picture;
 
 /// JPEG quality of the last stage: no visible blocks on textures.
 const QUALITY_LAST: u8 = 92;
 /// JPEG quality of everything that is replaced soon.
-const QUALITY_BRIEF: u8 = 80;
+const QUALITY_INTERMEDIATE: u8 = 80;
 /// Smaller pictures keep full color resolution: halving it saves little, and they are shown enlarged.
 const MIN_HALVED_PX: usize = 256 * 256;
 /// Maximum width of live images as sent; the page shows them smaller still.
@@ -20,40 +20,40 @@ const MIN_DEPTH_PX: usize = 128 * 1024;
 
 /// Why a picture cannot be sent.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Unsendable {
+pub(crate) enum PackError {
     #[error("a {width} x {height} depth map needs {needed} values but has {got}")]
     DepthLength { width: u32, height: u32, needed: usize, got: usize },
     #[error(transparent)]
-    Encode(#[from] Unencodable),
+    Encode(#[from] JpegError),
     #[error("the JPEG file cannot be decoded: {0}")]
     Decode(#[from] image::ImageError),
     #[error("the JPEG file has {got:?} pixels, expected {expected:?}")]
-    Announced { got: [u32; 2], expected: [u32; 2] },
+    SizeMismatch { got: [u32; 2], expected: [u32; 2] },
 }
 
 /// The binary message of one drawn stage.
 pub(crate) fn pack_picture(
-    order: &RenderOrder,
+    view_request: &ViewRequest,
     mut header: PictureHeader,
     picture: &Picture,
-) -> Result<Vec<u8>, Unsendable> {
+) -> Result<Vec<u8>, PackError> {
     let (color, depth) = std::thread::scope(|scope| {
         // Color and depth in parallel: color takes most of the time and keeps this thread.
-        let depth = order.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
-        let color = order.color.then(|| pack_color(picture, header.last));
+        let depth = view_request.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
+        let color = view_request.color.then(|| pack_color(picture, header.last));
         (color, depth.map(|task| task.join().expect("packing depth does not panic")))
     });
     let color = color.transpose()?.unwrap_or_default();
-    if order.color {
+    if view_request.color {
         header.color = Some(ColorPart { format: "jpeg", offset: 0, bytes: color.len() });
     }
     let mut depth_bytes = Vec::new();
-    if let (Some(packed), Some(format)) = (depth.transpose()?, order.depth) {
+    if let (Some(packed), Some(format)) = (depth.transpose()?, view_request.depth) {
         depth_bytes = packed.bytes;
         header.depth = Some(DepthPart {
             format,
             size_px: packed.size_px,
-            metres_per_count: packed.metres_per_count,
+            meters_per_count: packed.meters_per_count,
             offset: color.len(),
             bytes: depth_bytes.len(),
         });
@@ -61,15 +61,15 @@ pub(crate) fn pack_picture(
     Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth_bytes]))
 }
 
-fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, Unencodable> {
+fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
     let pixels = Pixels { size_px: picture.size_px, layout: Layout::Rgba, bytes: &picture.rgba_srgb };
     let is_small = picture.rgba_srgb.len() < 4 * MIN_HALVED_PX;
-    let quality = if is_last { QUALITY_LAST } else { QUALITY_BRIEF };
+    let quality = if is_last { QUALITY_LAST } else { QUALITY_INTERMEDIATE };
     encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
 }
 
 /// The binary message of a live image, shrunk to the size that the page shows.
-pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, Unsendable> {
+pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, PackError> {
     // A very flat image keeps one row.
     let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).min(image.size_px[1]).max(1);
     let decoded;
@@ -79,7 +79,7 @@ pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<V
             decoded = image::load_from_memory_with_format(file, image::ImageFormat::Jpeg)?.into_rgb8();
             let got = [decoded.width(), decoded.height()];
             if got != image.size_px {
-                return Err(Unsendable::Announced { got, expected: image.size_px });
+                return Err(PackError::SizeMismatch { got, expected: image.size_px });
             }
             Pixels { size_px: got, layout: Layout::Rgb, bytes: decoded.as_raw() }
         }
@@ -87,11 +87,11 @@ pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<V
         LivePixels::Rgba(bytes) => Pixels { size_px: image.size_px, layout: Layout::Rgba, bytes },
     };
     if factor == 1 {
-        let jpeg = encode(&pixels, QUALITY_BRIEF, Chroma::Halved)?;
+        let jpeg = encode(&pixels, QUALITY_INTERMEDIATE, Chroma::Halved)?;
         return Ok(live_message(image, image.size_px, 1, &jpeg, clock));
     }
     let (size_px, rgb) = shrink(&pixels, factor)?;
-    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_BRIEF, Chroma::Halved)?;
+    let jpeg = encode(&Pixels { size_px, layout: Layout::Rgb, bytes: &rgb }, QUALITY_INTERMEDIATE, Chroma::Halved)?;
     Ok(live_message(image, size_px, factor, &jpeg, clock))
 }
 
@@ -102,16 +102,16 @@ fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], 
 /// Depth as it goes on the wire.
 struct PackedDepth {
     size_px: [u32; 2],
-    metres_per_count: f64,
+    meters_per_count: f64,
     bytes: Vec<u8>,
 }
 
-fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, Unsendable> {
+fn pack_depth(format: DepthFormat, picture: &Picture) -> Result<PackedDepth, PackError> {
     let [width, height] = picture.size_px;
     let needed = width as usize * height as usize;
     let got = picture.depth_m.len();
     if got != needed {
-        return Err(Unsendable::DepthLength { width, height, needed, got });
+        return Err(PackError::DepthLength { width, height, needed, got });
     }
     Ok(match format {
         DepthFormat::F32 => f32_depth(picture),
@@ -124,7 +124,7 @@ fn f32_depth(picture: &Picture) -> PackedDepth {
     for (packed, depth) in bytes.chunks_exact_mut(4).zip(&picture.depth_m) {
         packed.copy_from_slice(&depth.to_le_bytes());
     }
-    PackedDepth { size_px: picture.size_px, metres_per_count: 1.0, bytes }
+    PackedDepth { size_px: picture.size_px, meters_per_count: 1.0, bytes }
 }
 
 /// Halves the size, keeping the nearest of each 2x2 pixels so that thin things in front stay; 0 is nothing.
@@ -137,10 +137,10 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     let pairs_per_thread = (size_px[1] as usize).div_ceil(n_threads.max(1)).max(1);
     let (bands, mut bytes) = (picture.depth_m.chunks((2 * width * pairs_per_thread).max(1)), Vec::new());
     let furthest_m = std::thread::scope(|scope| {
-        let tasks: Vec<_> = bands.clone().map(|band| scope.spawn(move || furthest(band))).collect();
+        let tasks: Vec<_> = bands.clone().map(|band| scope.spawn(move || max_depth(band))).collect();
         tasks.into_iter().map(|task| task.join().expect("a maximum does not panic")).fold(0.0, f32::max)
     });
-    let metres_per_count = if furthest_m > 0.0 { f64::from(furthest_m) / f64::from(u16::MAX) } else { 1.0 };
+    let meters_per_count = if furthest_m > 0.0 { f64::from(furthest_m) / f64::from(u16::MAX) } else { 1.0 };
     bytes.resize(2 * out_width * size_px[1] as usize, 0);
     std::thread::scope(|scope| {
         for (band, packed) in bands.zip(bytes.chunks_mut((2 * out_width * pairs_per_thread).max(1))) {
@@ -150,37 +150,37 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
                     let (upper, lower) = rows.split_at(width);
                     // The last row of an odd height has no row below it.
                     nearest_of_squares(upper, if lower.is_empty() { upper } else { lower }, &mut nearest_m);
-                    write_counts(&nearest_m, 1.0 / metres_per_count, packed);
+                    write_counts(&nearest_m, 1.0 / meters_per_count, packed);
                 }
             });
         }
     });
-    PackedDepth { size_px, metres_per_count, bytes }
+    PackedDepth { size_px, meters_per_count, bytes }
 }
 
 /// Depth of a pixel, or infinity if nothing was seen there.
-fn seen_or_infinity(depth_m: f32) -> f32 {
+fn depth_or_infinity(depth_m: f32) -> f32 {
     // False for a NaN.
     if depth_m > 0.0 { depth_m } else { f32::INFINITY }
 }
 
-fn furthest(depth_m: &[f32]) -> f32 {
-    depth_m.iter().fold(0.0, |furthest, &depth| if depth.is_finite() { furthest.max(depth) } else { furthest })
+fn max_depth(depth_m: &[f32]) -> f32 {
+    depth_m.iter().fold(0.0, |max_depth, &depth| if depth.is_finite() { max_depth.max(depth) } else { max_depth })
 }
 
 fn nearest_of_squares(upper: &[f32], lower: &[f32], nearest_m: &mut [f32]) {
     let squares = upper.chunks(2).zip(lower.chunks(2));
     for (nearest, (upper, lower)) in nearest_m.iter_mut().zip(squares) {
         let (right_above, right_below) = (upper[upper.len() - 1], lower[lower.len() - 1]);
-        let left = seen_or_infinity(upper[0]).min(seen_or_infinity(lower[0]));
-        *nearest = left.min(seen_or_infinity(right_above)).min(seen_or_infinity(right_below));
+        let left = depth_or_infinity(upper[0]).min(depth_or_infinity(lower[0]));
+        *nearest = left.min(depth_or_infinity(right_above)).min(depth_or_infinity(right_below));
     }
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "counts lie between 0 and 65535")]
-fn write_counts(depth_m: &[f32], counts_per_metre: f64, packed: &mut [u8]) {
+fn write_counts(depth_m: &[f32], counts_per_meter: f64, packed: &mut [u8]) {
     for (packed, depth) in packed.chunks_exact_mut(2).zip(depth_m) {
-        let count = (f64::from(*depth) * counts_per_metre + 0.5) as u16;
+        let count = (f64::from(*depth) * counts_per_meter + 0.5) as u16;
         let count = if depth.is_finite() { count.max(1) } else { 0 };
         packed.copy_from_slice(&count.to_le_bytes());
     }
@@ -190,13 +190,13 @@ fn write_counts(depth_m: &[f32], counts_per_metre: f64, packed: &mut [u8]) {
 mod tests {
     use super::{PackedDepth, half_depth, pack_live_image};
     use crate::clock::ServerClock;
-    use crate::news::{LiveImage, LivePixels};
+    use crate::updates::{LiveImage, LivePixels};
     use kinematics::Stamp;
     use std::time::Instant;
     use trainer::Picture;
 
     #[test]
-    fn half_depth_keeps_the_nearest_and_marks_holes() {
+    fn half_depth_keeps_nearest_and_holes() {
         let depth_m = vec![
             1.0,
             2.0,
@@ -223,20 +223,20 @@ mod tests {
     fn check_halved(packed: &PackedDepth) {
         assert_eq!(packed.size_px, [3, 2]);
         let counts = packed.bytes.chunks_exact(2).map(|count| u16::from_le_bytes([count[0], count[1]]));
-        let metres: Vec<f64> = counts.map(|count| f64::from(count) * packed.metres_per_count).collect();
-        for (got, expected) in metres.iter().zip([0.5, 0.0, 4.0, 2.5, 8.0, 10.0]) {
-            assert!((got - expected).abs() <= 0.5 * packed.metres_per_count + 1e-9, "{metres:?}");
+        let meters: Vec<f64> = counts.map(|count| f64::from(count) * packed.meters_per_count).collect();
+        for (got, expected) in meters.iter().zip([0.5, 0.0, 4.0, 2.5, 8.0, 10.0]) {
+            assert!((got - expected).abs() <= 0.5 * packed.meters_per_count + 1e-9, "{meters:?}");
         }
     }
 
     #[test]
-    fn a_picture_without_anything_has_zero_depth() {
+    fn empty_picture_has_zero_depth() {
         let packed = half_depth(&Picture { size_px: [2, 2], rgba_srgb: vec![0; 16], depth_m: vec![0.0; 4] }, 1);
         assert_eq!(packed.bytes, [0, 0]);
     }
 
     #[test]
-    fn large_live_images_are_shrunk_and_their_lens_with_them() {
+    fn large_live_images_are_shrunk_with_intrinsics() {
         let size_px = [1280, 720];
         let rgb: Vec<u8> = (0..size_px[0] * size_px[1]).flat_map(|_| [200, 100, 50]).collect();
         let jpeg = {
@@ -275,7 +275,7 @@ mod tests {
     #[test]
     #[ignore = "measures"]
     #[expect(clippy::print_stdout, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a measurement")]
-    fn packing_takes() {
+    fn measure_packing() {
         for size_px in [[1024, 1024], [1280, 720]] {
             let n_px = size_px[0] * size_px[1];
             let wave = |ix: u32, period: f64| (127.0 + 100.0 * (f64::from(ix) / period).sin()) as u8;

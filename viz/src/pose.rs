@@ -35,7 +35,7 @@ mod tests {
     use nalgebra::{Isometry3, Vector3};
 
     #[test]
-    fn a_pose_comes_back_as_it_went() {
+    fn poses_round_trip() {
         let pose = Isometry3::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));
         let back = from_row_major(&row_major(&pose)).expect("rigid");
         assert!((back.to_homogeneous() - pose.to_homogeneous()).amax() < 1e-12);
@@ -43,7 +43,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_rigid_is_refused() {
+    fn non_rigid_matrices_are_rejected() {
         let good = row_major(&Isometry3::identity());
         for (ix, wrong) in [(0, 2.0), (0, -1.0), (5, f64::NAN), (3, f64::INFINITY), (1, 0.1), (12, 0.5), (15, 2.0)] {
             let mut rows = good;

@@ -1,12 +1,12 @@
 //! The messages of `docs/reference/protocol.md` as they are written on the wire.
 
 use crate::clock::ServerClock;
-use crate::news::{KeyframePose, LiveImage, SceneHint, Status};
 use crate::pose::row_major;
+use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::{Deserialize, Serialize};
 
 /// Version of the messages; a client that says another one is sent away.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;
 
 /// Longest text message a client may send, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
@@ -232,7 +232,7 @@ pub(crate) struct ColorPart {
 pub(crate) struct DepthPart {
     pub(crate) format: DepthFormat,
     pub(crate) size_px: [u32; 2],
-    pub(crate) metres_per_count: f64,
+    pub(crate) meters_per_count: f64,
     pub(crate) offset: usize,
     pub(crate) bytes: usize,
 }
@@ -253,7 +253,7 @@ pub(crate) struct LiveHeader<'a> {
 impl<'a> LiveHeader<'a> {
     /// The header of an image that is sent at `size_px` after its sides were divided by `factor`.
     pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], factor: u32, clock: ServerClock) -> Self {
-        let shrunk = |value: f64| value / f64::from(factor);
+        let scaled_down = |value: f64| value / f64::from(factor);
         Self {
             camera: &image.camera,
             stamp_nanos: image.stamp.0,
@@ -261,8 +261,8 @@ impl<'a> LiveHeader<'a> {
             size_px,
             format: "jpeg",
             world_from_camera: image.world_from_camera.as_ref().map(row_major),
-            focal_px: image.focal_px.map(shrunk),
-            principal_px: image.principal_px.map(shrunk),
+            focal_px: image.focal_px.map(scaled_down),
+            principal_px: image.principal_px.map(scaled_down),
         }
     }
 }

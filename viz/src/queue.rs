@@ -1,7 +1,7 @@
 //! Who waits for which picture: the newest order of each client, stage by stage, clients in turn.
 
 use crate::protocol::PictureHeader;
-use crate::render_order::RenderOrder;
+use crate::view_request::ViewRequest;
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use tokio::sync::Notify;
@@ -16,15 +16,15 @@ const FAST_MILLIS: f64 = 20.0;
 /// All connected clients and what they wait for.
 #[derive(Debug, Default)]
 pub(crate) struct Queue {
-    clients: BTreeMap<u64, Waiting>,
+    clients: BTreeMap<u64, ClientQueue>,
     n_joined: u64,
     last_served: u64,
 }
 
 /// What one client waits for.
 #[derive(Debug, Default)]
-struct Waiting {
-    order: Option<Arc<RenderOrder>>,
+struct ClientQueue {
+    view_request: Option<Arc<ViewRequest>>,
     next_stage: usize,
     n_unsent: usize,
     outbox: VecDeque<Outgoing>,
@@ -42,11 +42,11 @@ struct FullPicture {
 
 /// One stage that the training side shall draw.
 #[derive(Clone, Debug)]
-pub(crate) struct Ticket {
+pub(crate) struct RenderJob {
     /// Who asked.
     pub(crate) client: u64,
     /// What was asked.
-    pub(crate) order: Arc<RenderOrder>,
+    pub(crate) view_request: Arc<ViewRequest>,
     /// Which of the order's stages.
     pub(crate) stage: usize,
 }
@@ -55,7 +55,7 @@ pub(crate) struct Ticket {
 #[derive(Debug)]
 pub(crate) enum Outgoing {
     /// A drawn stage, not yet encoded; the header still lacks the payload's parts.
-    Picture(Box<(Ticket, PictureHeader, Picture)>),
+    Picture(Box<(RenderJob, PictureHeader, Picture)>),
     /// A stage that could not be drawn.
     Failed { id: u64, reason: String },
 }
@@ -64,7 +64,7 @@ impl Queue {
     /// Adds a client; the returned handle is notified when something lies in its outbox.
     pub(crate) fn join(&mut self) -> (u64, Arc<Notify>) {
         self.n_joined += 1;
-        let waiting = Waiting::default();
+        let waiting = ClientQueue::default();
         let wake = Arc::clone(&waiting.wake);
         self.clients.insert(self.n_joined, waiting);
         (self.n_joined, wake)
@@ -83,23 +83,23 @@ impl Queue {
     /// Takes an order in; the stages of the client's older order that nobody has begun are given up.
     ///
     /// Only the last stage is kept if it is expected to be fast.
-    pub(crate) fn order(&mut self, client: u64, mut order: RenderOrder) {
+    pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) {
         if let Some(waiting) = self.clients.get_mut(&client) {
-            if waiting.last_full.as_ref().is_some_and(|last| last.expected_millis(&order) < FAST_MILLIS) {
-                order.stages.drain(..order.stages.len() - 1);
+            if waiting.last_full.as_ref().is_some_and(|last| last.expected_millis(&view_request) < FAST_MILLIS) {
+                view_request.stages.drain(..view_request.stages.len() - 1);
             }
-            waiting.order = Some(Arc::new(order));
+            waiting.view_request = Some(Arc::new(view_request));
             waiting.next_stage = 0;
         }
     }
 
     /// Whether [`take`](Self::take) would give something.
     pub(crate) fn has_work(&self) -> bool {
-        self.clients.values().any(Waiting::is_ready)
+        self.clients.values().any(ClientQueue::is_ready)
     }
 
     /// The next stage to draw: clients in turn, each client's stages in order.
-    pub(crate) fn take(&mut self) -> Option<Ticket> {
+    pub(crate) fn take(&mut self) -> Option<RenderJob> {
         let after = self.clients.range(self.last_served + 1..).find(|(_, waiting)| waiting.is_ready());
         let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
         self.last_served = client;
@@ -107,15 +107,15 @@ impl Queue {
     }
 
     /// Records how long the last stage of an order took to draw.
-    pub(crate) fn drawn(&mut self, ticket: &Ticket, millis: f64) {
-        if let Some(waiting) = self.clients.get_mut(&ticket.client) {
-            let (method, n_px) = (ticket.order.method.clone(), n_px_of_last_stage(&ticket.order));
+    pub(crate) fn record_render_time(&mut self, job: &RenderJob, millis: f64) {
+        if let Some(waiting) = self.clients.get_mut(&job.client) {
+            let (method, n_px) = (job.view_request.method.clone(), n_px_of_last_stage(&job.view_request));
             waiting.last_full = Some(FullPicture { method, n_px, millis });
         }
     }
 
     /// Puts a result into a client's outbox and wakes it.
-    pub(crate) fn put(&mut self, client: u64, outgoing: Outgoing) {
+    pub(crate) fn push_outgoing(&mut self, client: u64, outgoing: Outgoing) {
         if let Some(waiting) = self.clients.get_mut(&client) {
             waiting.outbox.push_back(outgoing);
             waiting.wake.notify_one();
@@ -128,42 +128,42 @@ impl Queue {
     }
 
     /// One stage of a client is sent, or will never be drawn.
-    pub(crate) fn settle(&mut self, client: u64) {
+    pub(crate) fn release(&mut self, client: u64) {
         if let Some(waiting) = self.clients.get_mut(&client) {
             waiting.n_unsent = waiting.n_unsent.saturating_sub(1);
         }
     }
 }
 
-impl Waiting {
+impl ClientQueue {
     fn is_ready(&self) -> bool {
-        self.order.is_some() && self.n_unsent < MAX_UNSENT
+        self.view_request.is_some() && self.n_unsent < MAX_UNSENT
     }
 
-    fn take(&mut self, client: u64) -> Option<Ticket> {
-        let order = self.order.clone()?;
+    fn take(&mut self, client: u64) -> Option<RenderJob> {
+        let view_request = self.view_request.clone()?;
         let stage = self.next_stage;
         self.next_stage += 1;
         self.n_unsent += 1;
-        if self.next_stage == order.stages.len() {
-            self.order = None;
+        if self.next_stage == view_request.stages.len() {
+            self.view_request = None;
         }
-        Some(Ticket { client, order, stage })
+        Some(RenderJob { client, view_request, stage })
     }
 }
 
 impl FullPicture {
     /// Expected time of the last stage of an order: that of the last picture, scaled up if the order has more pixels.
-    fn expected_millis(&self, order: &RenderOrder) -> f64 {
-        if self.method != order.method {
+    fn expected_millis(&self, view_request: &ViewRequest) -> f64 {
+        if self.method != view_request.method {
             return f64::INFINITY;
         }
-        self.millis * (n_px_of_last_stage(order) / self.n_px).max(1.0)
+        self.millis * (n_px_of_last_stage(view_request) / self.n_px).max(1.0)
     }
 }
 
-fn n_px_of_last_stage(order: &RenderOrder) -> f64 {
-    let size_px = order.stage_request(order.stages.len() - 1).size_px;
+fn n_px_of_last_stage(view_request: &ViewRequest) -> f64 {
+    let size_px = view_request.stage_request(view_request.stages.len() - 1).size_px;
     f64::from(size_px[0]) * f64::from(size_px[1])
 }
 
@@ -171,105 +171,112 @@ fn n_px_of_last_stage(order: &RenderOrder) -> f64 {
 mod tests {
     use super::Queue;
     use crate::protocol::RenderMessage;
-    use crate::render_order::RenderOrder;
+    use crate::view_request::ViewRequest;
 
-    fn order(id: u64) -> RenderOrder {
+    fn view_request(id: u64) -> ViewRequest {
         let message: RenderMessage = serde_json::from_value(serde_json::json!({
             "id": id, "size_px": [100, 100], "projection": {"kind": "equirectangular"},
             "world_from_camera": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
         }))
         .expect("valid");
-        RenderOrder::check(&message).expect("valid")
+        ViewRequest::check(&message).expect("valid")
     }
 
     /// Takes and settles at once, as with a fast client.
     fn drain(queue: &mut Queue) -> Vec<(u64, u64, usize)> {
         std::iter::from_fn(|| {
-            let ticket = queue.take()?;
-            queue.settle(ticket.client);
-            Some((ticket.client, ticket.order.id, ticket.stage))
+            let job = queue.take()?;
+            queue.release(job.client);
+            Some((job.client, job.view_request.id, job.stage))
         })
         .collect()
     }
 
     #[test]
-    fn clients_are_served_in_turn() {
+    fn clients_are_served_round_robin() {
         let mut queue = Queue::default();
         let (a, _) = queue.join();
         let (b, _) = queue.join();
-        queue.order(a, order(10));
-        queue.order(b, order(20));
+        queue.view_request(a, view_request(10));
+        queue.view_request(b, view_request(20));
         let served = drain(&mut queue);
         assert_eq!(served, [(a, 10, 0), (b, 20, 0), (a, 10, 1), (b, 20, 1), (a, 10, 2), (b, 20, 2)]);
     }
 
     #[test]
-    fn a_newer_order_replaces_the_waiting_stages() {
+    fn newer_request_replaces_waiting_stages() {
         let mut queue = Queue::default();
         let (a, _) = queue.join();
-        queue.order(a, order(1));
+        queue.view_request(a, view_request(1));
         let first = queue.take().expect("an order waits");
-        assert_eq!((first.order.id, first.stage), (1, 0));
-        queue.order(a, order(2));
-        queue.settle(a);
+        assert_eq!((first.view_request.id, first.stage), (1, 0));
+        queue.view_request(a, view_request(2));
+        queue.release(a);
         assert_eq!(drain(&mut queue), [(a, 2, 0), (a, 2, 1), (a, 2, 2)]);
     }
 
     #[test]
-    fn a_slow_client_holds_up_only_itself() {
+    fn slow_client_delays_only_itself() {
         let mut queue = Queue::default();
         let (slow, _) = queue.join();
         let (fast, _) = queue.join();
-        queue.order(slow, order(1));
-        queue.order(fast, order(2));
+        queue.view_request(slow, view_request(1));
+        queue.view_request(fast, view_request(2));
         let mut served = Vec::new();
-        while let Some(ticket) = queue.take() {
-            if ticket.client == fast {
-                queue.settle(fast);
+        while let Some(job) = queue.take() {
+            if job.client == fast {
+                queue.release(fast);
             }
-            served.push(ticket.client);
+            served.push(job.client);
         }
         assert_eq!(served, [slow, fast, slow, fast, fast]);
-        queue.settle(slow);
+        queue.release(slow);
         assert!(queue.has_work());
     }
 
     #[test]
-    fn after_a_fast_full_picture_only_the_last_stage_is_drawn() {
+    fn fast_full_picture_skips_coarse_stages() {
         let mut queue = Queue::default();
         let (a, _) = queue.join();
-        let draw = |queue: &mut Queue, id: u64, millis: f64, change: fn(&mut RenderOrder)| {
-            let mut asked = order(id);
-            change(&mut asked);
-            queue.order(a, asked);
+        let draw = |queue: &mut Queue, id: u64, millis: f64, change: fn(&mut ViewRequest)| {
+            let mut requested = view_request(id);
+            change(&mut requested);
+            queue.view_request(a, requested);
             let mut scales = Vec::new();
-            while let Some(ticket) = queue.take() {
-                scales.push(ticket.order.stages[ticket.stage]);
-                if ticket.stage + 1 == ticket.order.stages.len() {
-                    queue.drawn(&ticket, millis);
+            while let Some(job) = queue.take() {
+                scales.push(job.view_request.stages[job.stage]);
+                if job.stage + 1 == job.view_request.stages.len() {
+                    queue.record_render_time(&job, millis);
                 }
-                queue.settle(a);
+                queue.release(a);
             }
             scales
         };
         assert_eq!(draw(&mut queue, 1, 19.0, |_| ()), [0.1, 0.5, 1.0], "there is no earlier picture");
         assert_eq!(draw(&mut queue, 2, 21.0, |_| ()), [1.0], "the last one was fast");
         assert_eq!(draw(&mut queue, 3, 3.0, |_| ()), [0.1, 0.5, 1.0], "the last one was slow");
-        assert_eq!(draw(&mut queue, 4, 3.0, |order| order.stages = vec![0.5]), [0.5]);
+        assert_eq!(draw(&mut queue, 4, 3.0, |view_request| view_request.stages = vec![0.5]), [0.5]);
         assert_eq!(draw(&mut queue, 5, 6.0, |_| ()), [1.0], "four times the pixels in 12 ms");
-        assert_eq!(draw(&mut queue, 6, 6.0, |order| order.request.size_px = [200, 200]), [0.1, 0.5, 1.0], "24 ms");
-        assert_eq!(draw(&mut queue, 7, 1.0, |order| order.method = Some("nerf".to_owned())), [0.1, 0.5, 1.0]);
-        assert_eq!(draw(&mut queue, 8, 1.0, |order| order.method = Some("nerf".to_owned())), [1.0]);
+        assert_eq!(
+            draw(&mut queue, 6, 6.0, |view_request| view_request.request.size_px = [200, 200]),
+            [0.1, 0.5, 1.0],
+            "24 ms"
+        );
+        assert_eq!(
+            draw(&mut queue, 7, 1.0, |view_request| view_request.method = Some("nerf".to_owned())),
+            [0.1, 0.5, 1.0]
+        );
+        assert_eq!(draw(&mut queue, 8, 1.0, |view_request| view_request.method = Some("nerf".to_owned())), [1.0]);
     }
 
     #[test]
-    fn nothing_is_kept_of_a_client_that_left() {
+    fn disconnected_client_is_forgotten() {
         let mut queue = Queue::default();
         let (a, _) = queue.join();
-        queue.order(a, order(1));
+        queue.view_request(a, view_request(1));
         queue.leave(a);
         assert!(queue.take().is_none() && !queue.has_work() && queue.n_clients() == 0);
-        queue.order(a, order(2));
+        queue.view_request(a, view_request(2));
         assert!(queue.take().is_none());
     }
 }

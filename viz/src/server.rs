@@ -5,7 +5,7 @@ use crate::broadcast::broadcast;
 use crate::clock::ServerClock;
 use crate::page::FILES;
 use crate::protocol::MAX_MESSAGE_BYTES;
-use crate::session::{self, Site};
+use crate::session::{self, ServerContext};
 use crate::{Error, Hub, Status};
 use axum::extract::{Extension, Request, State, WebSocketUpgrade};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
@@ -68,11 +68,11 @@ pub struct Server {
 impl Server {
     /// Listens, and serves what lies in the hub until dropped.
     pub fn start(config: ServerConfig, hub: Hub) -> Result<Self, Error> {
-        let asked = config.listen;
-        if !asked.ip().is_loopback() {
-            return Err(Error::NotLoopback { address: asked });
+        let listen_address = config.listen;
+        if !listen_address.ip().is_loopback() {
+            return Err(Error::NotLoopback { address: listen_address });
         }
-        let (listener, address) = listen(asked)?;
+        let (listener, address) = listen(listen_address)?;
         let (stop, stopped) = watch::channel(false);
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -112,38 +112,38 @@ impl Drop for Server {
 }
 
 fn listen(address: SocketAddr) -> Result<(TcpListener, SocketAddr), Error> {
-    let refused = |source: std::io::Error| match source.kind() {
+    let listen_error = |source: std::io::Error| match source.kind() {
         std::io::ErrorKind::AddrInUse => Error::AddressInUse { address },
         _ => Error::Listen { address, source },
     };
-    let listener = TcpListener::bind(address).map_err(refused)?;
-    listener.set_nonblocking(true).map_err(refused)?;
-    let bound = listener.local_addr().map_err(refused)?;
+    let listener = TcpListener::bind(address).map_err(listen_error)?;
+    listener.set_nonblocking(true).map_err(listen_error)?;
+    let bound = listener.local_addr().map_err(listen_error)?;
     Ok((listener, bound))
 }
 
 async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<bool>) -> std::io::Result<()> {
     #[cfg(unix)]
-    tune(&listener);
+    set_socket_options(&listener);
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let clock = ServerClock::start();
-    let (bulletin_sender, bulletin) = watch::channel(crate::broadcast::Bulletin::default());
-    tokio::spawn(broadcast(hub.clone(), clock, bulletin_sender));
+    let (latest_messages_sender, latest_messages) = watch::channel(crate::broadcast::LatestMessages::default());
+    tokio::spawn(broadcast(hub.clone(), clock, latest_messages_sender));
     let admission = Admission::new(Limits::of_process());
-    let site = Site { hub: hub.clone(), clock, bulletin, stopped: stopped.clone() };
-    let app = TowerToHyperService::new(router(Visited { site, admission: Arc::clone(&admission) }));
+    let server_context = ServerContext { hub: hub.clone(), clock, latest_messages, stopped: stopped.clone() };
+    let app = TowerToHyperService::new(router(AppState { server_context, admission: Arc::clone(&admission) }));
     tokio::select! {
         () = accept(&listener, &admission, &app) => {}
         () = sweep(&admission) => {}
         _ = stopped.changed() => {}
     }
     drop(listener);
-    let all_left = async {
+    let all_disconnected = async {
         while hub.n_clients() > 0 {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    if tokio::time::timeout(GOODBYE_TIMEOUT, all_left).await.is_err() {
+    if tokio::time::timeout(GOODBYE_TIMEOUT, all_disconnected).await.is_err() {
         log::debug!("{} clients did not take leave in time", hub.n_clients());
     }
     Ok(())
@@ -151,7 +151,7 @@ async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<boo
 
 /// Sets options that accepted sockets inherit; if that fails, only latency suffers.
 #[cfg(unix)]
-fn tune(listener: &TcpListener) {
+fn set_socket_options(listener: &TcpListener) {
     let tuned = rustix::net::sockopt::set_socket_send_buffer_size(listener, SEND_BUFFER_BYTES)
         .and_then(|()| rustix::net::listen(listener, BACKLOG));
     if let Err(error) = tuned {
@@ -222,21 +222,21 @@ async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router
 
 /// What the handlers share.
 #[derive(Clone)]
-struct Visited {
-    site: Site,
+struct AppState {
+    server_context: ServerContext,
     admission: Arc<Admission>,
 }
 
-fn router(visited: Visited) -> Router {
+fn router(app_state: AppState) -> Router {
     let mut router = Router::new().route("/status", get(status)).route("/ws", get(connect));
     for file in FILES {
         router = router.route(file.path, get(move |headers: HeaderMap| async move { file.response(&headers) }));
     }
-    router.layer(from_fn(refuse_strangers)).layer(from_fn(secure)).with_state(visited)
+    router.layer(from_fn(reject_foreign_origins)).layer(from_fn(add_security_headers)).with_state(app_state)
 }
 
-async fn status(State(visited): State<Visited>) -> Response {
-    let latest = visited.site.hub.status().borrow().clone();
+async fn status(State(app_state): State<AppState>) -> Response {
+    let latest = app_state.server_context.hub.status().borrow().clone();
     let json = match latest {
         Some(status) => serde_json::to_string(&*status),
         None => serde_json::to_string(&Status::default()),
@@ -253,18 +253,18 @@ async fn status(State(visited): State<Visited>) -> Response {
 async fn connect(
     upgrade: WebSocketUpgrade,
     Extension(connection): Extension<Arc<Connection>>,
-    State(visited): State<Visited>,
+    State(app_state): State<AppState>,
 ) -> Response {
-    if !visited.admission.seat(&connection) {
+    if !app_state.admission.admit_client(&connection) {
         return (StatusCode::SERVICE_UNAVAILABLE, "too many clients are connected, try again later").into_response();
     }
     upgrade
         .max_message_size(MAX_MESSAGE_BYTES)
-        .on_upgrade(move |socket| session::serve(socket, connection, visited.site))
+        .on_upgrade(move |socket| session::serve(socket, connection, app_state.server_context))
 }
 
 /// Adds headers that keep other web sites from embedding or reading the responses.
-async fn secure(request: Request, next: Next) -> Response {
+async fn add_security_headers(request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let headers = response.headers_mut();
     let policies: [(HeaderName, &'static str); 4] = [
@@ -278,34 +278,34 @@ async fn secure(request: Request, next: Next) -> Response {
 }
 
 /// Only pages of this server may use it: other web sites open in the same browser reach loopback too.
-async fn refuse_strangers(request: Request, next: Next) -> Response {
-    if is_ours(request.headers()) {
+async fn reject_foreign_origins(request: Request, next: Next) -> Response {
+    if is_same_origin(request.headers()) {
         next.run(request).await
     } else {
         (StatusCode::FORBIDDEN, "only pages of this server, opened under localhost, may use it").into_response()
     }
 }
 
-fn is_ours(headers: &HeaderMap) -> bool {
+fn is_same_origin(headers: &HeaderMap) -> bool {
     let text = |name| headers.get(name).and_then(|value| value.to_str().ok());
     let Some(host) = text(header::HOST) else { return false };
     let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
     let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
     let is_local = name.eq_ignore_ascii_case("localhost") || address.is_ok_and(|address| address.is_loopback());
-    let has_our_origin = match headers.get(header::ORIGIN) {
+    let has_same_origin = match headers.get(header::ORIGIN) {
         None => true, // Not a browser.
         Some(_) => text(header::ORIGIN).and_then(|origin| origin.strip_prefix("http://")) == Some(host),
     };
-    is_local && has_our_origin
+    is_local && has_same_origin
 }
 
 #[cfg(test)]
 mod tests {
-    use super::is_ours;
+    use super::is_same_origin;
     use axum::http::{HeaderMap, HeaderValue, header};
 
     #[test]
-    fn other_sites_and_renamed_hosts_are_strangers() {
+    fn foreign_origins_and_hosts_are_rejected() {
         let cases = [
             ("127.0.0.1:7007", None, true),
             ("localhost:8080", Some("http://localhost:8080"), true),
@@ -323,8 +323,8 @@ mod tests {
             if let Some(origin) = origin {
                 headers.insert(header::ORIGIN, HeaderValue::from_static(origin));
             }
-            assert_eq!(is_ours(&headers), expected, "{host} {origin:?}");
+            assert_eq!(is_same_origin(&headers), expected, "{host} {origin:?}");
         }
-        assert!(!is_ours(&HeaderMap::new()));
+        assert!(!is_same_origin(&HeaderMap::new()));
     }
 }

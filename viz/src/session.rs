@@ -2,12 +2,12 @@
 
 use crate::Hub;
 use crate::admission::Connection;
-use crate::broadcast::{Bulletin, Received};
+use crate::broadcast::{LatestMessages, Received};
 use crate::clock::ServerClock;
-use crate::picture::{Unsendable, pack_picture};
+use crate::picture::{PackError, pack_picture};
 use crate::protocol::{ClientMessage, PROTOCOL_VERSION, ServerMessage};
 use crate::queue::Outgoing;
-use crate::render_order::{DEFAULT_STAGES, MAX_SIZE_PX, Malformed, RenderOrder};
+use crate::view_request::{DEFAULT_STAGES, InvalidRequest, MAX_SIZE_PX, ViewRequest};
 use axum::extract::ws::{Message, WebSocket};
 use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
@@ -26,45 +26,45 @@ const PING_PERIOD: Duration = Duration::from_secs(1);
 /// Maximum number of answers that wait for a client to read; a client that requests more is disconnected.
 const MAX_REPLIES: usize = 64;
 /// Pictures are sent before live images and keyframe lists, but delay them by at most this long.
-const MAX_NEWS_DELAY: Duration = Duration::from_millis(500);
+const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
 
 /// Shared by all sessions.
 #[derive(Clone)]
-pub(crate) struct Site {
+pub(crate) struct ServerContext {
     /// Takes requests and returns pictures.
     pub(crate) hub: Hub,
     /// The server's clock.
     pub(crate) clock: ServerClock,
     /// The latest encoded messages.
-    pub(crate) bulletin: watch::Receiver<Bulletin>,
+    pub(crate) latest_messages: watch::Receiver<LatestMessages>,
     /// Becomes true when the server stops.
     pub(crate) stopped: watch::Receiver<bool>,
 }
 
 /// Talks with one client until either side leaves.
-pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, site: Site) {
-    let (client, wake) = site.hub.join();
-    let membership = Membership { hub: &site.hub, client };
+pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server_context: ServerContext) {
+    let (client, wake) = server_context.hub.join();
+    let client_guard = ClientGuard { hub: &server_context.hub, client };
     log::info!("client {client} connected");
     let (sink, stream) = socket.split();
     let (replies, waiting_replies) = mpsc::channel(MAX_REPLIES);
-    let reader = Reader { stream, hub: &site.hub, client, connection: &connection, replies };
-    let writer = Writer { sink, site: &site, client, connection: &connection };
+    let reader = Reader { stream, hub: &server_context.hub, client, connection: &connection, replies };
+    let writer = Writer { sink, server_context: &server_context, client, connection: &connection };
     tokio::select! {
         () = reader.run() => {}
         _ = writer.run(&wake, waiting_replies) => {}
     }
-    drop(membership);
+    drop(client_guard);
     log::info!("client {client} left");
 }
 
 /// Takes a client out of the hub however its session ends.
-struct Membership<'a> {
+struct ClientGuard<'a> {
     hub: &'a Hub,
     client: u64,
 }
 
-impl Drop for Membership<'_> {
+impl Drop for ClientGuard<'_> {
     fn drop(&mut self) {
         self.hub.leave(self.client);
     }
@@ -91,7 +91,7 @@ impl Reader<'_> {
         while let Some(Ok(message)) = self.stream.next().await {
             let reply = match message {
                 Message::Pong(_) => {
-                    self.connection.answered_ping();
+                    self.connection.record_pong();
                     continue;
                 }
                 Message::Ping(_) => continue,
@@ -102,7 +102,7 @@ impl Reader<'_> {
                     message: "binary messages are not supported, send JSON as text".to_owned(),
                 }),
             };
-            self.connection.spoke();
+            self.connection.last_message();
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
             if self.replies.try_send(reply).is_err() {
@@ -117,87 +117,87 @@ impl Reader<'_> {
     }
 
     fn answer(&self, text: &str) -> Option<Reply> {
-        match understand(text) {
-            Ok(Understood::Order(order)) => {
-                self.hub.order(self.client, *order);
+        match parse_message(text) {
+            Ok(ParsedMessage::Order(view_request)) => {
+                self.hub.view_request(self.client, *view_request);
                 None
             }
-            Ok(Understood::SameVersion) => None,
-            Ok(Understood::OtherVersion(theirs)) => Some(Reply::Goodbye {
-                reason: format!("the client speaks protocol {theirs}, this server {PROTOCOL_VERSION}"),
+            Ok(ParsedMessage::SameVersion) => None,
+            Ok(ParsedMessage::OtherVersion(client_version)) => Some(Reply::Goodbye {
+                reason: format!("the client speaks protocol {client_version}, this server {PROTOCOL_VERSION}"),
             }),
-            Ok(Understood::Ping { t }) => Some(Reply::Pong { t }),
-            Ok(Understood::Goodbye) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
+            Ok(ParsedMessage::Ping { t }) => Some(Reply::Pong { t }),
+            Ok(ParsedMessage::Goodbye) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
             Err(error) => Some(Reply::Error { id: id_of(text), message: error.to_string() }),
         }
     }
 }
 
 /// Whether the session goes on.
-type Going = ControlFlow<()>;
+type SessionFlow = ControlFlow<()>;
 
 struct Writer<'a> {
     sink: SplitSink<WebSocket, Message>,
-    site: &'a Site,
+    server_context: &'a ServerContext,
     client: u64,
     connection: &'a Connection,
 }
 
 /// A picture that is being encoded.
-struct Packing {
+struct EncodingTask {
     id: u64,
-    task: JoinHandle<Result<Vec<u8>, Unsendable>>,
+    task: JoinHandle<Result<Vec<u8>, PackError>>,
 }
 
 impl Writer<'_> {
     /// Sends until the connection fails or a goodbye is sent; pictures go before other messages.
-    async fn run(mut self, wake: &tokio::sync::Notify, mut replies: mpsc::Receiver<Reply>) -> Going {
-        let mut stopped = self.site.stopped.clone();
-        let mut bulletin = self.site.bulletin.clone();
+    async fn run(mut self, wake: &tokio::sync::Notify, mut replies: mpsc::Receiver<Reply>) -> SessionFlow {
+        let mut stopped = self.server_context.stopped.clone();
+        let mut latest_messages = self.server_context.latest_messages.clone();
         let mut received = Received::default();
-        let mut long_news_sent = Instant::now();
-        let mut packing: Option<Packing> = None;
+        let mut long_update_sent = Instant::now();
+        let mut encoding: Option<EncodingTask> = None;
         let mut heartbeat = tokio::time::interval(HEARTBEAT_PERIOD);
         let mut ping = tokio::time::interval(PING_PERIOD);
         heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
         ping.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        self.greet().await?;
+        self.send_hello().await?;
         loop {
-            if packing.is_none()
-                && let Some(outgoing) = self.site.hub.collect(self.client)
+            if encoding.is_none()
+                && let Some(outgoing) = self.server_context.hub.collect(self.client)
             {
                 match outgoing {
-                    Outgoing::Picture(drawn) => packing = Some(pack(drawn)),
+                    Outgoing::Picture(rendered) => encoding = Some(pack(rendered)),
                     Outgoing::Failed { id, reason } => {
-                        let sent = self.complain(Some(id), &reason).await;
-                        self.site.hub.settle(self.client);
+                        let sent = self.send_error(Some(id), &reason).await;
+                        self.server_context.hub.release(self.client);
                         sent?;
                         continue;
                     }
                 }
             }
-            let lets_long_news = packing.is_none() || long_news_sent.elapsed() > MAX_NEWS_DELAY;
+            let allows_long_updates = encoding.is_none() || long_update_sent.elapsed() > MAX_UPDATE_DELAY;
             tokio::select! {
                 biased;
-                _ = stopped.changed() => return self.part_when_stopped().await,
+                _ = stopped.changed() => return self.send_goodbye_when_stopped().await,
                 Some(reply) = replies.recv() => self.reply(reply).await?,
-                packed = finished(&mut packing) => {
-                    let id = packing.take().map(|packing| packing.id);
+                packed = finished(&mut encoding) => {
+                    let id = encoding.take().map(|encoding| encoding.id);
                     let sent = self.send_picture(id, packed).await;
-                    self.site.hub.settle(self.client);
+                    self.server_context.hub.release(self.client);
                     sent?;
                 }
-                () = wake.notified(), if packing.is_none() => {}
+                () = wake.notified(), if encoding.is_none() => {}
                 _ = heartbeat.tick() => {
-                    let clock_millis = self.site.clock.now_millis();
-                    self.say(&ServerMessage::Heartbeat { clock_millis }).await?;
+                    let clock_millis = self.server_context.clock.now_millis();
+                    self.send_message(&ServerMessage::Heartbeat { clock_millis }).await?;
                 }
-                _ = ping.tick() => if self.connection.take_ping() {
+                _ = ping.tick() => if self.connection.start_ping() {
                     self.send(Message::Ping(Default::default())).await?;
                 },
-                message = next_news(&mut bulletin, &mut received, lets_long_news) => {
-                    if lets_long_news {
-                        long_news_sent = Instant::now();
+                message = next_update(&mut latest_messages, &mut received, allows_long_updates) => {
+                    if allows_long_updates {
+                        long_update_sent = Instant::now();
                     }
                     self.send(message).await?;
                 }
@@ -205,61 +205,61 @@ impl Writer<'_> {
         }
     }
 
-    async fn greet(&mut self) -> Going {
+    async fn send_hello(&mut self) -> SessionFlow {
         let hello = ServerMessage::Hello {
             protocol: PROTOCOL_VERSION,
             server: concat!("fieldrig ", env!("CARGO_PKG_VERSION")),
             client: self.client,
             max_size_px: [MAX_SIZE_PX; 2],
             default_stages: &DEFAULT_STAGES,
-            clock_millis: self.site.clock.now_millis(),
+            clock_millis: self.server_context.clock.now_millis(),
         };
-        self.say(&hello).await
+        self.send_message(&hello).await
     }
 
-    async fn reply(&mut self, reply: Reply) -> Going {
+    async fn reply(&mut self, reply: Reply) -> SessionFlow {
         match reply {
-            Reply::Error { id, message } => self.complain(id, &message).await,
+            Reply::Error { id, message } => self.send_error(id, &message).await,
             Reply::Pong { t } => {
-                let clock_millis = self.site.clock.now_millis();
-                self.say(&ServerMessage::Pong { t, clock_millis }).await
+                let clock_millis = self.server_context.clock.now_millis();
+                self.send_message(&ServerMessage::Pong { t, clock_millis }).await
             }
-            Reply::Goodbye { reason } => self.part(&reason).await,
+            Reply::Goodbye { reason } => self.send_goodbye(&reason).await,
         }
     }
 
-    async fn send_picture(&mut self, id: Option<u64>, packed: Packed) -> Going {
+    async fn send_picture(&mut self, id: Option<u64>, packed: EncodingResult) -> SessionFlow {
         match packed {
             Ok(Ok(bytes)) => self.send(Message::binary(bytes)).await,
-            Ok(Err(error)) => self.complain(id, &error.to_string()).await,
-            Err(error) => self.complain(id, &error.to_string()).await,
+            Ok(Err(error)) => self.send_error(id, &error.to_string()).await,
+            Err(error) => self.send_error(id, &error.to_string()).await,
         }
     }
 
     /// Sends the last status, which holds the result of the run, then a goodbye.
-    async fn part_when_stopped(&mut self) -> Going {
-        let latest = self.site.hub.status().borrow().clone();
+    async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
+        let latest = self.server_context.hub.status().borrow().clone();
         if let Some(status) = latest {
-            self.say(&ServerMessage::Status(&status)).await?;
+            self.send_message(&ServerMessage::Status(&status)).await?;
         }
-        self.part("the server has stopped").await
+        self.send_goodbye("the server has stopped").await
     }
 
-    async fn complain(&mut self, id: Option<u64>, message: &str) -> Going {
-        self.say(&ServerMessage::Error { id, message }).await
+    async fn send_error(&mut self, id: Option<u64>, message: &str) -> SessionFlow {
+        self.send_message(&ServerMessage::Error { id, message }).await
     }
 
-    async fn part(&mut self, reason: &str) -> Going {
-        self.say(&ServerMessage::Goodbye { reason }).await?;
+    async fn send_goodbye(&mut self, reason: &str) -> SessionFlow {
+        self.send_message(&ServerMessage::Goodbye { reason }).await?;
         self.send(Message::Close(None)).await?;
         ControlFlow::Break(())
     }
 
-    async fn say(&mut self, message: &ServerMessage<'_>) -> Going {
+    async fn send_message(&mut self, message: &ServerMessage<'_>) -> SessionFlow {
         self.send(Message::text(message.to_json())).await
     }
 
-    async fn send(&mut self, message: Message) -> Going {
+    async fn send(&mut self, message: Message) -> SessionFlow {
         match self.sink.send(message).await {
             Ok(()) => ControlFlow::Continue(()),
             Err(error) => {
@@ -271,32 +271,36 @@ impl Writer<'_> {
 }
 
 /// An encoded picture, or the reason why there is none.
-type Packed = Result<Result<Vec<u8>, Unsendable>, JoinError>;
+type EncodingResult = Result<Result<Vec<u8>, PackError>, JoinError>;
 
-fn pack(drawn: Box<(crate::queue::Ticket, crate::protocol::PictureHeader, trainer::Picture)>) -> Packing {
-    let id = drawn.0.order.id;
+fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, trainer::Picture)>) -> EncodingTask {
+    let id = rendered.0.view_request.id;
     let task = tokio::task::spawn_blocking(move || {
-        let (ticket, header, picture) = *drawn;
-        pack_picture(&ticket.order, header, &picture)
+        let (job, header, picture) = *rendered;
+        pack_picture(&job.view_request, header, &picture)
     });
-    Packing { id, task }
+    EncodingTask { id, task }
 }
 
 /// Waits for the picture that is being encoded; forever if there is none.
-async fn finished(packing: &mut Option<Packing>) -> Packed {
-    match packing {
-        Some(packing) => (&mut packing.task).await,
+async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
+    match encoding {
+        Some(encoding) => (&mut encoding.task).await,
         None => std::future::pending().await,
     }
 }
 
 /// Waits for a message that the client has not received yet.
-async fn next_news(bulletin: &mut watch::Receiver<Bulletin>, received: &mut Received, long: bool) -> Message {
+async fn next_update(
+    latest_messages: &mut watch::Receiver<LatestMessages>,
+    received: &mut Received,
+    long: bool,
+) -> Message {
     loop {
-        if let Some(message) = bulletin.borrow_and_update().next(received, long) {
+        if let Some(message) = latest_messages.borrow_and_update().next(received, long) {
             return message;
         }
-        if bulletin.changed().await.is_err() {
+        if latest_messages.changed().await.is_err() {
             // The server is about to stop.
             std::future::pending::<()>().await;
         }
@@ -304,21 +308,21 @@ async fn next_news(bulletin: &mut watch::Receiver<Bulletin>, received: &mut Rece
 }
 
 /// What a client's text means.
-enum Understood {
+enum ParsedMessage {
     SameVersion,
     OtherVersion(u32),
-    Order(Box<RenderOrder>),
+    Order(Box<ViewRequest>),
     Ping { t: f64 },
     Goodbye,
 }
 
-fn understand(text: &str) -> Result<Understood, Malformed> {
+fn parse_message(text: &str) -> Result<ParsedMessage, InvalidRequest> {
     Ok(match serde_json::from_str(text)? {
-        ClientMessage::Hello(hello) if hello.protocol == PROTOCOL_VERSION => Understood::SameVersion,
-        ClientMessage::Hello(hello) => Understood::OtherVersion(hello.protocol),
-        ClientMessage::Render(message) => Understood::Order(Box::new(RenderOrder::check(&message)?)),
-        ClientMessage::Ping(ping) => Understood::Ping { t: ping.t },
-        ClientMessage::Goodbye(_) => Understood::Goodbye,
+        ClientMessage::Hello(hello) if hello.protocol == PROTOCOL_VERSION => ParsedMessage::SameVersion,
+        ClientMessage::Hello(hello) => ParsedMessage::OtherVersion(hello.protocol),
+        ClientMessage::Render(message) => ParsedMessage::Order(Box::new(ViewRequest::check(&message)?)),
+        ClientMessage::Ping(ping) => ParsedMessage::Ping { t: ping.t },
+        ClientMessage::Goodbye(_) => ParsedMessage::Goodbye,
     })
 }
 

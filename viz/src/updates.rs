@@ -28,12 +28,12 @@ pub struct Status {
     /// Sentences that an operator should read, such as a lost camera.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
-    pub ended: Option<Ended>,
+    pub ended: Option<RunResult>,
 }
 
 /// Result of a run that has ended.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Ended {
+pub struct RunResult {
     /// Folder of the saved model; `None` if nothing was saved.
     pub folder: Option<String>,
     /// Final scores in one line, such as `PSNR 26.76 dB`; empty if there are none.
@@ -141,7 +141,7 @@ mod tests {
     use super::{MAX_HISTORY, ModelStatus, Status};
 
     #[test]
-    fn long_curves_are_thinned_and_keep_their_ends() {
+    fn long_curves_are_thinned_keeping_ends() {
         let with = |psnr_history: Vec<(f64, f64)>| ModelStatus { psnr_history, ..ModelStatus::default() };
         let long = with((0..5000).map(|ix| (f64::from(ix), f64::from(ix) * 0.5)).collect());
         let short = with(vec![(1.0, 2.0)]);

@@ -18,7 +18,7 @@ const DEFAULT_FAR_M: f64 = 100.0;
 
 /// What is wrong with a message; shown to the client.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Malformed {
+pub(crate) enum InvalidRequest {
     #[error("the message is not understood: {0}")]
     Json(#[from] serde_json::Error),
     #[error("{field} is not a rigid motion: 16 numbers row major, orthonormal rotation, last row 0 0 0 1")]
@@ -43,7 +43,7 @@ pub(crate) enum Malformed {
 
 /// A checked render message.
 #[derive(Clone, Debug)]
-pub(crate) struct RenderOrder {
+pub(crate) struct ViewRequest {
     /// The client's own number.
     pub(crate) id: u64,
     /// Which of several models; the first if `None`.
@@ -58,12 +58,12 @@ pub(crate) struct RenderOrder {
     pub(crate) depth: Option<DepthFormat>,
 }
 
-impl RenderOrder {
+impl ViewRequest {
     /// Checks what a client sent.
-    pub(crate) fn check(message: &RenderMessage) -> Result<Self, Malformed> {
+    pub(crate) fn check(message: &RenderMessage) -> Result<Self, InvalidRequest> {
         let outputs = message.outputs.as_deref().unwrap_or(&[Output::Color]);
         if outputs.is_empty() {
-            return Err(Malformed::NoOutput);
+            return Err(InvalidRequest::NoOutput);
         }
         let size_px = checked_size(message.size_px)?;
         let (near_m, far_m) =
@@ -80,7 +80,7 @@ impl RenderOrder {
                 far_m,
                 crop: message.crop.as_ref().map(checked_crop).transpose()?,
                 background_srgb: checked_background(message.background_srgb.unwrap_or([0.0; 3]))?,
-                light_of: None,
+                appearance_of: None,
                 depth: outputs.contains(&Output::Depth),
             },
             stages: checked_stages(message.stages.as_deref().unwrap_or(&DEFAULT_STAGES))?,
@@ -111,26 +111,26 @@ fn scaled(n: u32, scale: f64) -> u32 {
     (f64::from(n) * scale).round().max(1.0) as u32
 }
 
-fn rigid(rows: &[f64; 16], field: &'static str) -> Result<Transform, Malformed> {
-    from_row_major(rows).ok_or(Malformed::NotRigid { field })
+fn rigid(rows: &[f64; 16], field: &'static str) -> Result<Transform, InvalidRequest> {
+    from_row_major(rows).ok_or(InvalidRequest::NotRigid { field })
 }
 
-fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], Malformed> {
+fn checked_size(size_px: [u32; 2]) -> Result<[u32; 2], InvalidRequest> {
     let fits = size_px.iter().all(|n| (1..=MAX_SIZE_PX).contains(n));
-    if fits { Ok(size_px) } else { Err(Malformed::Size { got: size_px }) }
+    if fits { Ok(size_px) } else { Err(InvalidRequest::Size { got: size_px }) }
 }
 
-fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), Malformed> {
+fn checked_range(near_m: f64, far_m: f64) -> Result<(f64, f64), InvalidRequest> {
     let fits = near_m > 0.0 && near_m < far_m && far_m.is_finite();
-    if fits { Ok((near_m, far_m)) } else { Err(Malformed::NearFar { near_m, far_m }) }
+    if fits { Ok((near_m, far_m)) } else { Err(InvalidRequest::NearFar { near_m, far_m }) }
 }
 
-fn checked_stages(stages: &[f64]) -> Result<Vec<f64>, Malformed> {
+fn checked_stages(stages: &[f64]) -> Result<Vec<f64>, InvalidRequest> {
     let fits = (1..=MAX_STAGES).contains(&stages.len()) && stages.iter().all(|scale| *scale > 0.0 && *scale <= 1.0);
-    if fits { Ok(stages.to_vec()) } else { Err(Malformed::Stages) }
+    if fits { Ok(stages.to_vec()) } else { Err(InvalidRequest::Stages) }
 }
 
-fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<Projection, Malformed> {
+fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<Projection, InvalidRequest> {
     let ProjectionMessage::Pinhole { focal_px, principal_px, vertical_fov_rad } = *message else {
         return Ok(Projection::Equirectangular);
     };
@@ -138,73 +138,77 @@ fn checked_projection(message: &ProjectionMessage, size_px: [u32; 2]) -> Result<
     let focal_px = match (focal_px, vertical_fov_rad) {
         (Some(focal_px), None) => focal_px,
         (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => [0.5 * height / (0.5 * angle).tan(); 2],
-        _ => return Err(Malformed::Pinhole),
+        _ => return Err(InvalidRequest::Pinhole),
     };
     let principal_px = principal_px.unwrap_or([0.5 * width, 0.5 * height]);
     let fits = focal_px.iter().all(|f| *f > 0.0 && f.is_finite()) && principal_px.iter().all(|c| c.is_finite());
-    if fits { Ok(Projection::Pinhole { focal_px, principal_px }) } else { Err(Malformed::Pinhole) }
+    if fits { Ok(Projection::Pinhole { focal_px, principal_px }) } else { Err(InvalidRequest::Pinhole) }
 }
 
-fn checked_crop(message: &CropMessage) -> Result<Aabb, Malformed> {
+fn checked_crop(message: &CropMessage) -> Result<Aabb, InvalidRequest> {
     let world_from_box = match &message.world_from_box {
         Some(rows) => rigid(rows, "world_from_box")?,
         None => Transform::identity(),
     };
     let fits = message.min_m.iter().zip(&message.max_m).all(|(min, max)| min < max && (max - min).is_finite());
-    if fits { Ok(Aabb { world_from_box, min_m: message.min_m, max_m: message.max_m }) } else { Err(Malformed::Crop) }
+    if fits {
+        Ok(Aabb { world_from_box, min_m: message.min_m, max_m: message.max_m })
+    } else {
+        Err(InvalidRequest::Crop)
+    }
 }
 
-fn checked_background(color: [f32; 3]) -> Result<[f32; 3], Malformed> {
+fn checked_background(color: [f32; 3]) -> Result<[f32; 3], InvalidRequest> {
     let fits = color.iter().all(|c| (0.0..=1.0).contains(c));
-    if fits { Ok(color) } else { Err(Malformed::Background) }
+    if fits { Ok(color) } else { Err(InvalidRequest::Background) }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::{Malformed, RenderOrder};
+    use super::{InvalidRequest, ViewRequest};
     use crate::protocol::RenderMessage;
     use serde_json::{Value, json};
     use trainer::Projection;
 
-    fn message(change: impl FnOnce(&mut Value)) -> Result<RenderOrder, Malformed> {
+    fn message(change: impl FnOnce(&mut Value)) -> Result<ViewRequest, InvalidRequest> {
         let mut value = json!({
             "id": 7, "size_px": [1280, 720],
             "world_from_camera": [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1],
             "projection": {"kind": "pinhole", "focal_px": [900.0, 910.0], "principal_px": [630.0, 365.0]},
         });
         change(&mut value);
-        RenderOrder::check(&serde_json::from_value::<RenderMessage>(value)?)
+        ViewRequest::check(&serde_json::from_value::<RenderMessage>(value)?)
     }
 
     #[test]
     fn stages_keep_the_field_of_view() {
-        let order = message(|_| ()).expect("valid");
-        assert_eq!(order.stages, [0.1, 0.5, 1.0]);
-        let sizes: Vec<_> = (0..3).map(|stage| order.stage_request(stage).size_px).collect();
+        let view_request = message(|_| ()).expect("valid");
+        assert_eq!(view_request.stages, [0.1, 0.5, 1.0]);
+        let sizes: Vec<_> = (0..3).map(|stage| view_request.stage_request(stage).size_px).collect();
         assert_eq!(sizes, [[128, 72], [640, 360], [1280, 720]]);
-        let Projection::Pinhole { focal_px, principal_px } = order.stage_request(0).projection else {
+        let Projection::Pinhole { focal_px, principal_px } = view_request.stage_request(0).projection else {
             panic!("a pinhole stays one");
         };
         for (got, expected) in focal_px.iter().chain(&principal_px).zip([90.0, 91.0, 63.0, 36.5]) {
             assert!((got - expected).abs() < 1e-9, "{got} instead of {expected}");
         }
-        assert!(order.color && order.depth.is_none());
+        assert!(view_request.color && view_request.depth.is_none());
     }
 
     #[test]
     fn the_smallest_stage_has_at_least_one_pixel() {
-        let order = message(|value| {
+        let view_request = message(|value| {
             value["size_px"] = json!([3, 1]);
             value["stages"] = json!([0.01]);
         });
-        assert_eq!(order.expect("valid").stage_request(0).size_px, [1, 1]);
+        assert_eq!(view_request.expect("valid").stage_request(0).size_px, [1, 1]);
     }
 
     #[test]
     fn a_field_of_view_becomes_a_focal_length() {
         let right_angle = json!({"kind": "pinhole", "vertical_fov_rad": std::f64::consts::FRAC_PI_2});
-        let order = message(|value| value["projection"] = right_angle).expect("valid");
-        let Projection::Pinhole { focal_px, principal_px } = order.request.projection else {
+        let view_request = message(|value| value["projection"] = right_angle).expect("valid");
+        let Projection::Pinhole { focal_px, principal_px } = view_request.request.projection else {
             panic!("a pinhole stays one");
         };
         assert!((focal_px[0] - 360.0).abs() < 1e-9 && (focal_px[1] - 360.0).abs() < 1e-9);
@@ -212,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn every_wrong_field_is_named() {
+    fn errors_name_the_invalid_field() {
         let cases: [(&str, Value, &str); 12] = [
             ("world_from_camera", json!([2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "world_from_camera"),
             ("world_from_camera", json!([1, 2, 3]), "length"),

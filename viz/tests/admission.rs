@@ -12,12 +12,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 use trainer::Picture;
-use viz::{Ended, Hub, LiveImage, LivePixels, ModelStatus, Server, ServerConfig, Status};
+use viz::{Hub, LiveImage, LivePixels, ModelStatus, RunResult, Server, ServerConfig, Status};
 
 /// Far more than loopback needs; a test that waits this long has failed.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 /// A new viewer gets the page and is connected within this time, whatever else is connected.
-const VIEWER_PATIENCE: Duration = Duration::from_secs(1);
+const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
 /// A half-open request is closed after 3 s; on two busy cores it may take longer.
 const HALF_OPEN_SECS: std::ops::Range<f64> = 2.0..8.0;
 /// A client that never reads is disconnected after 8 s, at the next check.
@@ -31,7 +31,7 @@ fn start() -> (Hub, Server) {
 
 fn connect(address: SocketAddr) -> TcpStream {
     let stream = TcpStream::connect(address).expect("the server listens");
-    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
     stream
 }
 
@@ -58,32 +58,32 @@ fn upgrade_only(address: SocketAddr) -> TcpStream {
 }
 
 fn wait_until(is_done: impl Fn() -> bool) -> f64 {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !is_done() {
-        assert!(begun.elapsed() < PATIENCE, "waited in vain");
+        assert!(started.elapsed() < TIMEOUT, "waited in vain");
         std::thread::sleep(Duration::from_millis(5));
     }
-    begun.elapsed().as_secs_f64()
+    started.elapsed().as_secs_f64()
 }
 
 /// Time until the other side closes.
 fn secs_until_closed(stream: &mut TcpStream) -> f64 {
-    let begun = Instant::now();
+    let started = Instant::now();
     let mut rest = Vec::new();
     // A reset also ends the connection.
     let _ = stream.read_to_end(&mut rest);
-    begun.elapsed().as_secs_f64()
+    started.elapsed().as_secs_f64()
 }
 
 /// Raises the limit on open files: both ends of all connections are in this process.
 #[cfg(unix)]
-fn raise_descriptor_limit(wanted: u64) {
+fn raise_descriptor_limit(n_descriptors: u64) {
     use rustix::process::{Resource, getrlimit, setrlimit};
     let mut limit = getrlimit(Resource::Nofile);
     let allowed = limit.maximum.unwrap_or(u64::MAX);
-    assert!(allowed >= wanted, "this test needs {wanted} file descriptors, the hard limit is {allowed}");
-    if limit.current.is_some_and(|current| current < wanted) {
-        limit.current = Some(wanted);
+    assert!(allowed >= n_descriptors, "this test needs {n_descriptors} file descriptors, the hard limit is {allowed}");
+    if limit.current.is_some_and(|current| current < n_descriptors) {
+        limit.current = Some(n_descriptors);
         setrlimit(Resource::Nofile, limit).expect("below the hard limit");
     }
 }
@@ -101,7 +101,7 @@ impl Viewer {
         let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
-                client.say(&json!({"type": "ping", "t": 2.0}));
+                client.send_json(&json!({"type": "ping", "t": 2.0}));
                 if client.text_of("pong")["t"] != json!(2.0) {
                     return false;
                 }
@@ -125,15 +125,15 @@ impl Viewer {
 fn open_viewer(address: SocketAddr) -> Client {
     let mut took = Duration::MAX;
     for _ in 0..4 {
-        let begun = Instant::now();
+        let started = Instant::now();
         let (head, _) = get(address, "/", "");
         assert!(head.starts_with("http/1.1 200"), "{head}");
         let mut viewer = Client::connect(address);
-        viewer.say(&json!({"type": "ping", "t": 1.0}));
+        viewer.send_json(&json!({"type": "ping", "t": 1.0}));
         assert_eq!(viewer.text()["type"], json!("hello"));
         viewer.text_of("pong");
-        took = took.min(begun.elapsed());
-        if took < VIEWER_PATIENCE {
+        took = took.min(started.elapsed());
+        if took < VIEWER_TIMEOUT {
             return viewer;
         }
     }
@@ -142,7 +142,7 @@ fn open_viewer(address: SocketAddr) -> Client {
 
 #[cfg(unix)]
 #[test]
-fn a_viewer_connects_while_idle_sockets_pile_up() {
+fn viewer_connects_despite_idle_sockets() {
     raise_descriptor_limit(4096);
     let (hub, server) = start();
     let address = server.address();
@@ -161,8 +161,8 @@ fn a_viewer_connects_while_idle_sockets_pile_up() {
     assert!(viewer.stop(), "a viewer in use stays connected while 500 others connect");
     let mut message = render_message(1, [64, 48]);
     message["stages"] = json!([1.0]);
-    other.say(&message);
-    assert!(hub.wait_for_request(PATIENCE));
+    other.send_json(&message);
+    assert!(hub.wait_for_request(TIMEOUT));
     let pending = hub.next_request().expect("a request waits");
     let picture = Picture { size_px: [64, 48], rgba_srgb: vec![9; 64 * 48 * 4], depth_m: vec![0.0; 64 * 48] };
     pending.deliver(picture);
@@ -171,7 +171,7 @@ fn a_viewer_connects_while_idle_sockets_pile_up() {
 }
 
 #[test]
-fn seats_are_released_however_a_session_ends() {
+fn client_slots_are_released_after_any_session_end() {
     let (hub, server) = start();
     for _ in 0..3 {
         let clients: Vec<_> = (0..32).map(|_| Client::connect(server.address())).collect();
@@ -202,19 +202,19 @@ fn half_open_and_idle_connections_are_closed() {
 }
 
 #[test]
-fn a_client_that_never_reads_is_disconnected_and_a_quiet_one_stays() {
+fn never_reading_client_is_disconnected_quiet_one_stays() {
     let (hub, server) = start();
     let never_reading = upgrade_only(server.address());
     let mut quiet = Client::connect(server.address());
     wait_until(|| hub.n_clients() == 2);
-    let begun = Instant::now();
+    let started = Instant::now();
     while hub.n_clients() == 2 {
-        assert!(begun.elapsed() < PATIENCE, "both clients stay");
+        assert!(started.elapsed() < TIMEOUT, "both clients stay");
         assert_ne!(quiet.receive(), Received::End, "a client that reads keeps its connection");
     }
-    let secs = begun.elapsed().as_secs_f64();
+    let secs = started.elapsed().as_secs_f64();
     assert!(NEVER_READING_SECS.contains(&secs), "it was disconnected after {secs} s");
-    quiet.say(&json!({"type": "ping", "t": 3.0}));
+    quiet.send_json(&json!({"type": "ping", "t": 3.0}));
     quiet.text_of("pong");
     drop(never_reading);
 }
@@ -228,33 +228,33 @@ fn requests_are_read_while_a_picture_waits_for_the_client() {
     message["stages"] = json!([1.0]);
     message["outputs"] = json!(["depth"]);
     message["depth_format"] = json!("f32");
-    client.say(&message);
-    assert!(hub.wait_for_request(PATIENCE));
+    client.send_json(&message);
+    assert!(hub.wait_for_request(TIMEOUT));
     let pending = hub.next_request().expect("a request waits");
     let n_px = (SIZE_PX[0] * SIZE_PX[1]) as usize;
     // Almost 16 MiB, more than the sockets hold.
     pending.deliver(Picture { size_px: SIZE_PX, rgba_srgb: vec![0; 4 * n_px], depth_m: vec![1.0; n_px] });
     std::thread::sleep(Duration::from_millis(500));
     message["id"] = json!(2);
-    client.say(&message);
-    let begun = Instant::now();
-    assert!(hub.wait_for_request(PATIENCE), "the request is not read while the picture waits");
-    assert!(begun.elapsed() < Duration::from_secs(2), "the request was read after {:?}", begun.elapsed());
+    client.send_json(&message);
+    let started = Instant::now();
+    assert!(hub.wait_for_request(TIMEOUT), "the request is not read while the picture waits");
+    assert!(started.elapsed() < Duration::from_secs(2), "the request was read after {:?}", started.elapsed());
     drop(hub.next_request());
     assert_eq!(client.binary_of("picture").0["id"], json!(1));
 }
 
 #[test]
-fn the_server_is_heard_at_least_every_half_second() {
+fn server_sends_heartbeats() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let hello_millis = client.text()["clock_millis"].as_f64().expect("a time");
     let mut last_millis = hello_millis;
-    let (begun, mut heard) = (Instant::now(), Instant::now());
-    while begun.elapsed() < Duration::from_secs(2) {
+    let (started, mut last_heartbeat) = (Instant::now(), Instant::now());
+    while started.elapsed() < Duration::from_secs(2) {
         let heartbeat = client.text_of("heartbeat");
-        assert!(heard.elapsed() < Duration::from_millis(500), "silence of {:?}", heard.elapsed());
-        heard = Instant::now();
+        assert!(last_heartbeat.elapsed() < Duration::from_millis(500), "silence of {:?}", last_heartbeat.elapsed());
+        last_heartbeat = Instant::now();
         let millis = heartbeat["clock_millis"].as_f64().expect("a time");
         assert!(millis >= last_millis, "the clock runs backward from {last_millis} to {millis}");
         last_millis = millis;
@@ -280,7 +280,7 @@ fn the_age_of_a_live_image_comes_from_its_capture() {
         principal_px: [4.0; 2],
     });
     let captured_millis = client.binary_of("live_image").0["captured_millis"].as_f64().expect("a time");
-    client.say(&json!({"type": "ping", "t": 41.5}));
+    client.send_json(&json!({"type": "ping", "t": 41.5}));
     let pong = client.text_of("pong");
     assert_eq!(pong["t"], json!(41.5));
     let age_millis = pong["clock_millis"].as_f64().expect("a time") - captured_millis;
@@ -288,7 +288,7 @@ fn the_age_of_a_live_image_comes_from_its_capture() {
 }
 
 #[test]
-fn the_result_of_a_run_reaches_clients_before_the_goodbye() {
+fn run_result_arrives_before_goodbye() {
     let (hub, server) = start();
     let model = ModelStatus { psnr: Some(26.5), ..ModelStatus::default() };
     hub.set_status(Status { state: "training".to_owned(), keyframes: 40, model, ..Status::default() });
@@ -298,7 +298,7 @@ fn the_result_of_a_run_reaches_clients_before_the_goodbye() {
     let saving = client.text_of("status");
     assert_eq!((&saving["state"], &saving["psnr"], &saving["keyframes"]), (&json!("saving"), &json!(26.5), &json!(40)));
     let folder = Some("runs/kitchen".to_owned());
-    hub.set_ended(Ended { folder, scores: "PSNR 26.50 dB".to_owned(), seconds: 98.0 });
+    hub.set_run_result(RunResult { folder, scores: "PSNR 26.50 dB".to_owned(), seconds: 98.0 });
     drop(server);
     let ended = client.text_of("status");
     assert_eq!((&ended["state"], &ended["psnr"]), (&json!("finished"), &json!(26.5)));
@@ -307,7 +307,7 @@ fn the_result_of_a_run_reaches_clients_before_the_goodbye() {
 }
 
 #[test]
-fn answers_cannot_be_embedded_by_other_sites() {
+fn responses_cannot_be_embedded_by_other_sites() {
     let (_hub, server) = start();
     for path in ["/", "/status", "/nothing"] {
         let (head, _) = get(server.address(), path, "");

@@ -17,20 +17,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use trainer::{Projection, RenderRequest};
-use viz::{Ended, Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, SceneHint, Server, ServerConfig, Status};
+use viz::{Hub, KeyframePose, LiveImage, LivePixels, ModelStatus, RunResult, SceneHint, Server, ServerConfig, Status};
 
 const WINDOW_PX: [u32; 2] = [1280, 760];
 /// Sizes of the screenshots in `CARGO_TARGET_TMPDIR`.
 const DESKTOP_PX: [u32; 2] = [1280, 800];
 const PHONE_PX: [u32; 2] = [390, 844];
 /// The page shows a lost connection within this time.
-const LOSS_SHOWN_WITHIN_MILLIS: f64 = 1000.0;
+const MAX_LOSS_DISPLAY_MILLIS: f64 = 1000.0;
 /// Added to the time of each picture: if pictures were faster than 20 ms, the server would leave out the coarse stages.
 const DRAWING: Duration = Duration::from_millis(25);
 /// How long the link is cut.
 const CUT: Duration = Duration::from_secs(25);
 /// Far more than two busy cores need to draw the page in software.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 /// Whether a pixel has a share of the page's `--accent`, the color of live cameras; nothing else here is blue-green.
 fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
@@ -40,17 +40,17 @@ fn is_accent([red, green, blue]: [u8; 3]) -> bool {
 type Asked = (RenderRequest, Option<String>);
 
 /// Draws requests on its own thread and keeps them, as a training thread would serve them.
-struct Painter {
-    asked: Arc<Mutex<Vec<Asked>>>,
+struct RenderThread {
+    requests_seen: Arc<Mutex<Vec<Asked>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
-impl Painter {
+impl RenderThread {
     fn start(hub: Hub) -> Self {
-        let asked: Arc<Mutex<Vec<Asked>>> = Arc::default();
+        let requests_seen: Arc<Mutex<Vec<Asked>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let (seen, stopped) = (Arc::clone(&asked), Arc::clone(&stop));
+        let (seen, stopped) = (Arc::clone(&requests_seen), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
                 hub.wait_for_request(Duration::from_millis(50));
@@ -63,19 +63,19 @@ impl Painter {
                 }
             }
         });
-        Self { asked, stop, thread: Some(thread) }
+        Self { requests_seen, stop, thread: Some(thread) }
     }
 
     fn requests(&self) -> Vec<RenderRequest> {
-        self.asked.lock().expect("no panic holds it").iter().map(|(request, _)| request.clone()).collect()
+        self.requests_seen.lock().expect("no panic holds it").iter().map(|(request, _)| request.clone()).collect()
     }
 
     fn methods(&self) -> Vec<Option<String>> {
-        self.asked.lock().expect("no panic holds it").iter().map(|(_, method)| method.clone()).collect()
+        self.requests_seen.lock().expect("no panic holds it").iter().map(|(_, method)| method.clone()).collect()
     }
 }
 
-impl Drop for Painter {
+impl Drop for RenderThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
@@ -85,7 +85,7 @@ impl Drop for Painter {
 }
 
 /// A camera that stands beside the scene, so that its frustum is seen from the first view.
-fn beside() -> KeyframePose {
+fn side_camera() -> KeyframePose {
     let eye = Point3::new(-0.8, -0.3, 0.6);
     let rotation = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
     KeyframePose {
@@ -99,7 +99,7 @@ fn beside() -> KeyframePose {
 
 /// An image of the camera beside the scene, captured now.
 fn live_image(rgba: Arc<[u8]>) -> LiveImage {
-    let camera = beside();
+    let camera = side_camera();
     LiveImage {
         camera: Arc::clone(&camera.camera),
         stamp: Stamp(1),
@@ -112,8 +112,8 @@ fn live_image(rgba: Arc<[u8]>) -> LiveImage {
     }
 }
 
-fn tell_news(hub: &Hub) {
-    let live = beside();
+fn publish_updates(hub: &Hub) {
+    let live = side_camera();
     let request = RenderRequest {
         world_from_camera: live.world_from_camera,
         size_px: live.size_px,
@@ -123,7 +123,7 @@ fn tell_news(hub: &Hub) {
         far_m: 50.0,
         crop: None,
         background_srgb: [0.1; 3],
-        light_of: None,
+        appearance_of: None,
         depth: true,
     };
     hub.set_live_image(live_image(draw(&request).rgba_srgb.into()));
@@ -157,16 +157,16 @@ fn tell_news(hub: &Hub) {
 }
 
 #[test]
-fn the_page_shows_the_scene_where_it_is() {
+fn page_renders_scene_and_overlays_correctly() {
     let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
     let Some(program) = chromium().filter(|_| bundle.is_file()) else {
         eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
         return;
     };
     let hub = Hub::new();
-    tell_news(&hub);
+    publish_updates(&hub);
     let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
-    let painter = Painter::start(hub.clone());
+    let render_thread = RenderThread::start(hub.clone());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-{}", std::process::id()));
     let mut browser = Browser::open(&program, &profile, &server.url(), WINDOW_PX);
@@ -176,7 +176,7 @@ fn the_page_shows_the_scene_where_it_is() {
     assert_eq!(browser.text("psnr"), "26.76");
     assert_eq!(browser.text("primitives"), "84,512");
     assert_eq!(browser.text("refused-total"), "843");
-    let at_rest = painter.requests();
+    let at_rest = render_thread.requests();
     let full = at_rest.last().expect("drawn").clone();
     let widths: Vec<_> = at_rest.iter().map(|request| request.size_px[0]).collect();
     let is_tenth = widths.iter().any(|width| (width * 10).abs_diff(full.size_px[0]) < 10);
@@ -185,30 +185,32 @@ fn the_page_shows_the_scene_where_it_is() {
     let first_view = Translation3::new(0.0, 0.0, 0.3) * looking_along_y();
     assert!((full.world_from_camera.inverse() * first_view).translation.vector.norm() < 1e-6, "starts at the hint");
 
-    check_switch(&mut browser, &painter);
+    check_switch(&mut browser, &render_thread);
     check_live_frustum(&mut browser, &full);
     check_picture(&mut browser, &full);
-    let turned = check_drag(&mut browser, &painter, &full);
+    let turned = check_drag(&mut browser, &render_thread, &full);
     check_picture(&mut browser, &turned);
     std::fs::write(scratch.join("page-dragged.png"), browser.screenshot()).expect("written");
     check_reconnect(&mut browser, server, &hub);
 
     drop(browser);
-    drop(painter);
+    drop(render_thread);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
 /// Another model's button asks for its pictures and shows its figures.
-fn check_switch(browser: &mut Browser, painter: &Painter) {
+fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     let press = |browser: &mut Browser, method: &str| {
         browser.evaluate(&format!("document.querySelector('#models button[data-method={method}]').click()"));
     };
-    assert!(painter.methods().iter().all(Option::is_none), "nobody chose");
+    assert!(render_thread.methods().iter().all(Option::is_none), "nobody chose");
     press(browser, "tsdf");
     wait_for(browser, "the other model's figures", |browser| browser.text("primitives-name") == "Voxel blocks");
-    wait_for(browser, "its picture", |_| painter.methods().last() == Some(&Some("tsdf".to_owned())));
+    wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
     press(browser, "splat");
-    wait_for(browser, "the first model's picture", |_| painter.methods().last() == Some(&Some("splat".to_owned())));
+    wait_for(browser, "the first model's picture", |_| {
+        render_thread.methods().last() == Some(&Some("splat".to_owned()))
+    });
     wait_for(browser, "a full picture of it", |browser| browser.text("picture-text").contains("100 %"));
     assert_eq!(browser.text("primitives-name"), "Splats");
 }
@@ -217,7 +219,7 @@ fn check_switch(browser: &mut Browser, painter: &Painter) {
 fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
     let shot = canvas_shot(browser);
-    let camera = beside();
+    let camera = side_camera();
     let depth = 1.6 * 0.12 * 0.8; // Of the drawn frustum: see web/src/overlays.ts.
     let corner = |u: f64, v: f64| {
         let at = |pixel: f64, focal: f64, principal: f64| (pixel - principal) / focal * depth;
@@ -252,8 +254,12 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
         for y in 80..i64::from(shot.height()) - 240 {
             for x in (4..i64::from(shot.width()) - 4).step_by(3) {
                 let ix = usize::try_from(y * i64::from(shot.width()) + x).expect("inside") * 4;
-                let wanted = &expected.rgba_srgb[ix..ix + 3];
-                sum += pixel(&shot, x + dx, y).iter().zip(wanted).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>();
+                let expected_pixel = &expected.rgba_srgb[ix..ix + 3];
+                sum += pixel(&shot, x + dx, y)
+                    .iter()
+                    .zip(expected_pixel)
+                    .map(|(a, b)| f64::from(a.abs_diff(*b)))
+                    .sum::<f64>();
                 n += 3.0;
             }
         }
@@ -266,8 +272,8 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
 }
 
 /// Dragging asks for small pictures, resting for full ones, and the camera turns about the center.
-fn check_drag(browser: &mut Browser, painter: &Painter, before: &RenderRequest) -> RenderRequest {
-    let n_before = painter.requests().len();
+fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &RenderRequest) -> RenderRequest {
+    let n_before = render_thread.requests().len();
     browser.mouse("mousePressed", [300, 300]);
     for ix in 0..12 {
         browser.mouse("mouseMoved", [300 + 12 * ix, 300 + 5 * ix]);
@@ -276,7 +282,7 @@ fn check_drag(browser: &mut Browser, painter: &Painter, before: &RenderRequest) 
     browser.mouse("mouseReleased", [432, 355]);
     wait_for(browser, "a small picture", |browser| !browser.text("picture-text").contains("100 %"));
     wait_for(browser, "a full picture after the drag", |browser| browser.text("picture-text").contains("100 %"));
-    let requests = painter.requests();
+    let requests = render_thread.requests();
     let first = &requests[n_before];
     assert!(first.size_px[0] * 2 <= before.size_px[0] + 1, "a moving view is drawn small: {:?}", first.size_px);
     let after = requests.last().expect("drawn");
@@ -302,16 +308,16 @@ fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
 
 /// Runs the page through a proxy that cuts the connection, as a wireless link would, up to the end of the run.
 #[test]
-fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
+fn page_shows_connection_loss_and_run_result() {
     let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
     let Some(program) = chromium().filter(|_| bundle.is_file()) else {
         eprintln!("page test skipped: it needs Chromium and the bundled page (make web)");
         return;
     };
     let hub = Hub::new();
-    tell_news(&hub);
+    publish_updates(&hub);
     let server = Server::start(ServerConfig { listen: ([127, 0, 0, 1], 0).into() }, hub.clone()).expect("a free port");
-    let painter = Painter::start(hub.clone());
+    let render_thread = RenderThread::start(hub.clone());
     let proxy = Proxy::start(server.address());
     let scratch = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
     let profile = scratch.join(format!("chromium-link-{}", std::process::id()));
@@ -321,7 +327,7 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
     browser.evaluate(RECORDER);
     assert_eq!(browser.text("banner"), "");
-    shoot(&mut browser, "connected");
+    save_screenshot(&mut browser, "connected");
 
     browser.evaluate("record.cutAt = performance.now()");
     proxy.cut();
@@ -329,24 +335,24 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     std::thread::sleep(Duration::from_millis(1500));
     assert!(browser.text("banner").starts_with("No data from the server for "), "{}", browser.text("banner"));
     wait_for(&mut browser, "attempts to reconnect", |browser| browser.text("banner").contains("reconnecting"));
-    shoot(&mut browser, "lost");
+    save_screenshot(&mut browser, "lost");
     std::thread::sleep(CUT.saturating_sub(cut_at.elapsed()));
     camera.stop();
     std::thread::sleep(Duration::from_millis(600)); // From here on, every image is too old to be live.
     browser.evaluate("record.isLive = false");
-    proxy.mend();
+    proxy.restore();
     wait_for(&mut browser, "the return", |browser| browser.text("connection").contains("connected"));
     std::thread::sleep(Duration::from_millis(1500));
     assert_eq!(browser.text("banner"), "");
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
-    assert!(shown_after < LOSS_SHOWN_WITHIN_MILLIS, "the lost connection was shown after {shown_after} ms");
+    assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
     assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was called live");
     assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
     camera.stop();
 
-    hub.set_ended(Ended {
+    hub.set_run_result(RunResult {
         folder: Some("runs/2026-03-01-kitchen".to_owned()),
         scores: "PSNR 26.76 dB".to_owned(),
         seconds: 98.4,
@@ -358,9 +364,9 @@ fn the_page_shows_a_lost_server_and_the_end_of_a_run() {
     let expected = "Finished after 98 s: model saved in runs/2026-03-01-kitchen, PSNR 26.76 dB";
     assert_eq!(browser.text("banner"), expected);
     assert_eq!(browser.text("psnr"), "26.76", "the scores stay");
-    shoot(&mut browser, "finished");
+    save_screenshot(&mut browser, "finished");
     drop(browser);
-    drop(painter);
+    drop(render_thread);
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
@@ -381,7 +387,7 @@ fn label(browser: &mut Browser) -> String {
 }
 
 /// Saves screenshots for both window sizes.
-fn shoot(browser: &mut Browser, name: &str) {
+fn save_screenshot(browser: &mut Browser, name: &str) {
     for (window, size_px) in [("phone", PHONE_PX), ("desktop", DESKTOP_PX)] {
         browser.resize(size_px);
         std::thread::sleep(Duration::from_millis(400));
@@ -417,9 +423,9 @@ impl Camera {
 }
 
 fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !is_there(browser) {
-        assert!(begun.elapsed() < PATIENCE, "waited in vain for {what}");
+        assert!(started.elapsed() < TIMEOUT, "waited in vain for {what}");
         std::thread::sleep(Duration::from_millis(50));
     }
 }

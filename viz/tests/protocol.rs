@@ -18,7 +18,7 @@ use viz::{
 };
 
 /// Far more than loopback needs; a test that waits this long has failed.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 
 fn start() -> (Hub, Server) {
     let hub = Hub::new();
@@ -35,7 +35,7 @@ fn render_message(id: u64) -> Value {
 }
 
 fn next(hub: &Hub) -> PendingRender {
-    assert!(hub.wait_for_request(PATIENCE), "no request came");
+    assert!(hub.wait_for_request(TIMEOUT), "no request came");
     hub.next_request().expect("a request waits")
 }
 
@@ -49,13 +49,17 @@ fn draw_all(hub: &Hub, n_stages: usize) {
 }
 
 #[test]
-fn a_client_is_greeted_with_the_version_and_told_the_news() {
+fn client_receives_hello_then_current_state() {
     let (hub, server) = start();
     hub.set_status(Status {
         state: "training".to_owned(),
         refused: [("blurred".to_owned(), 3)].into(),
-        model: ModelStatus { psnr: Some(24.5), psnr_history: vec![(1.0, 20.0), (2.0, 24.5)], ..learned("splat", 1200) },
-        others: vec![learned("tsdf", 30)],
+        model: ModelStatus {
+            psnr: Some(24.5),
+            psnr_history: vec![(1.0, 20.0), (2.0, 24.5)],
+            ..model_status("splat", 1200)
+        },
+        others: vec![model_status("tsdf", 30)],
         ..Status::default()
     });
     hub.set_scene_hint(SceneHint {
@@ -83,30 +87,30 @@ fn a_client_is_greeted_with_the_version_and_told_the_news() {
     assert_eq!((&status["others"][0]["method"], &status["others"][0]["step"]), (&json!("tsdf"), &json!(30)));
     let keyframes = client.text_of("keyframes");
     assert_eq!(keyframes["keyframes"][0]["focal_px"], json!([600.0, 601.0]));
-    hub.set_status(Status { model: learned("splat", 1300), ..Status::default() });
+    hub.set_status(Status { model: model_status("splat", 1300), ..Status::default() });
     let status = client.text_of("status");
     assert_eq!((&status["step"], &status["others"]), (&json!(1300), &json!([])));
 }
 
 /// A model that made so many steps.
-fn learned(method: &str, step: u64) -> ModelStatus {
+fn model_status(method: &str, step: u64) -> ModelStatus {
     ModelStatus { method: method.to_owned(), step, ..ModelStatus::default() }
 }
 
 #[test]
-fn a_client_says_which_of_several_models_it_wants_to_see() {
+fn client_selects_the_model() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let mut message = render_message(1);
     message["stages"] = json!([1.0]);
-    client.say(&message);
+    client.send_json(&message);
     let pending = next(&hub);
     assert_eq!(pending.method(), None, "the first");
     pending.fail("nothing was seen yet");
     assert_eq!(client.text_of("error")["id"], json!(1));
     message["id"] = json!(2);
     message["method"] = json!("tsdf");
-    client.say(&message);
+    client.send_json(&message);
     let pending = next(&hub);
     assert_eq!(pending.method(), Some("tsdf"));
     let picture = draw(&pending.request);
@@ -115,13 +119,13 @@ fn a_client_says_which_of_several_models_it_wants_to_see() {
 }
 
 #[test]
-fn stages_stream_as_they_are_drawn_and_show_the_scene() {
+fn stages_stream_and_show_the_scene() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let mut message = render_message(9);
     message["outputs"] = json!(["color", "depth"]);
     message["depth_format"] = json!("f32");
-    client.say(&message);
+    client.send_json(&message);
     let mut sizes = Vec::new();
     for stage in 0..3 {
         draw_all(&hub, 1); // The stage arrives before the next one is drawn.
@@ -141,12 +145,12 @@ fn stages_stream_as_they_are_drawn_and_show_the_scene() {
 }
 
 /// The server keeps a quaternion, so that a matrix comes back with a few roundings.
-fn check_same_pose(sent: &Value, came_back: &Value) {
+fn check_same_pose(sent: &Value, returned: &Value) {
     let numbers =
         |value: &Value| value.as_array().map(|rows| rows.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
-    let (sent, came_back) = (numbers(sent).expect("numbers"), numbers(came_back).expect("numbers"));
-    assert_eq!((sent.len(), came_back.len()), (16, 16));
-    assert!(sent.iter().zip(&came_back).all(|(a, b)| (a - b).abs() < 1e-12), "{sent:?} became {came_back:?}");
+    let (sent, returned) = (numbers(sent).expect("numbers"), numbers(returned).expect("numbers"));
+    assert_eq!((sent.len(), returned.len()), (16, 16));
+    assert!(sent.iter().zip(&returned).all(|(a, b)| (a - b).abs() < 1e-12), "{sent:?} became {returned:?}");
 }
 
 /// The request of a stage as its header tells it, through nothing but the wire.
@@ -170,7 +174,7 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
         far_m: header["far_m"].as_f64().expect("far"),
         crop: None,
         background_srgb: [0.0; 3],
-        light_of: None,
+        appearance_of: None,
         depth: true,
     }
 }
@@ -191,16 +195,16 @@ fn check_against_scene(request: &trainer::RenderRequest, picture: &image::RgbIma
 }
 
 #[test]
-fn a_newer_request_replaces_what_was_not_begun() {
+fn newer_request_replaces_unstarted_stages() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
-    client.say(&render_message(1));
-    let begun = next(&hub);
-    client.say(&render_message(2));
-    client.say(&render_message(3));
+    client.send_json(&render_message(1));
+    let started = next(&hub);
+    client.send_json(&render_message(2));
+    client.send_json(&render_message(3));
     client.settle(); // The server answers in order, so the requests have arrived.
-    let picture = draw(&begun.request);
-    begun.deliver(picture);
+    let picture = draw(&started.request);
+    started.deliver(picture);
     draw_all(&hub, 3);
     let drawn: Vec<_> = (0..4)
         .map(|_| client.binary_of("picture").0)
@@ -211,12 +215,12 @@ fn a_newer_request_replaces_what_was_not_begun() {
 }
 
 #[test]
-fn two_clients_are_served_in_turn_and_a_leaver_costs_nothing() {
+fn clients_alternate_and_disconnected_ones_are_skipped() {
     let (hub, server) = start();
     let mut first = Client::connect(server.address());
     let mut second = Client::connect(server.address());
-    first.say(&render_message(10));
-    second.say(&render_message(20));
+    first.send_json(&render_message(10));
+    second.send_json(&render_message(20));
     first.settle();
     second.settle();
     assert_eq!(hub.n_clients(), 2);
@@ -232,7 +236,7 @@ fn two_clients_are_served_in_turn_and_a_leaver_costs_nothing() {
 }
 
 #[test]
-fn a_malformed_message_gets_a_sentence_and_the_connection_stays() {
+fn malformed_message_gets_error_and_connection_stays() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
     let mut wrong_size = render_message(31);
@@ -249,24 +253,24 @@ fn a_malformed_message_gets_a_sentence_and_the_connection_stays() {
         (wrong_pose.to_string(), json!(32), "world_from_camera"),
     ];
     for (message, id, named) in cases {
-        client.say_raw(tungstenite::Message::text(message.clone()));
+        client.send_raw(tungstenite::Message::text(message.clone()));
         let error = client.text_of("error");
         assert_eq!(error["id"], id, "{message}");
         let sentence = error["message"].as_str().unwrap_or_default();
         assert!(sentence.contains(named) && !sentence.contains('\n'), "{message}: {sentence}");
     }
-    client.say_raw(tungstenite::Message::binary(vec![0, 1, 2]));
+    client.send_raw(tungstenite::Message::binary(vec![0, 1, 2]));
     assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("binary")));
-    client.say(&render_message(34));
+    client.send_json(&render_message(34));
     draw_all(&hub, 3);
     assert_eq!(client.binary_of("picture").0["id"], json!(34));
 }
 
 #[test]
-fn a_picture_that_cannot_be_drawn_is_an_error_message() {
+fn failed_render_sends_error_message() {
     let (hub, server) = start();
     let mut client = Client::connect(server.address());
-    client.say(&render_message(5));
+    client.send_json(&render_message(5));
     next(&hub).fail("the GPU is lost");
     let error = client.text_of("error");
     assert_eq!((&error["id"], &error["message"]), (&json!(5), &json!("the GPU is lost")));
@@ -276,7 +280,7 @@ fn a_picture_that_cannot_be_drawn_is_an_error_message() {
     pending.deliver(picture);
     assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("has 7")));
     drop(next(&hub)); // Given up silently: the client's later requests are served all the same.
-    client.say(&render_message(6));
+    client.send_json(&render_message(6));
     draw_all(&hub, 3);
     assert_eq!(client.binary_of("picture").0["id"], json!(6));
 }
@@ -313,7 +317,7 @@ fn live_images_reach_every_client_once_as_jpeg() {
 }
 
 #[test]
-fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
+fn every_wire_field_is_documented_and_typed() {
     let folder = std::path::PathBuf::from(env!("CARGO_MANIFEST_DIR"));
     let docs = std::fs::read_to_string(folder.join("../docs/reference/protocol.md")).expect("the docs");
     let page = std::fs::read_to_string(folder.join("web/src/protocol.ts")).expect("the page's messages");
@@ -332,12 +336,12 @@ fn every_field_on_the_wire_is_in_the_docs_and_known_to_the_page() {
 /// One message of each type that the server sends.
 fn one_of_each() -> Vec<Value> {
     let (hub, server) = start();
-    hub.set_status(Status { others: vec![learned("tsdf", 30)], ..Status::default() });
+    hub.set_status(Status { others: vec![model_status("tsdf", 30)], ..Status::default() });
     hub.set_scene_hint(SceneHint { center_m: [0.0; 3], radius_m: 1.0, world_from_camera: Transform::identity() });
     let mut client = Client::connect(server.address());
     let mut messages = vec![client.text()];
     messages.extend(["scene", "status", "keyframes", "heartbeat"].map(|kind| client.text_of(kind)));
-    client.say(&json!({"type": "ping", "t": 1.0}));
+    client.send_json(&json!({"type": "ping", "t": 1.0}));
     messages.push(client.text_of("pong"));
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
@@ -350,10 +354,10 @@ fn one_of_each() -> Vec<Value> {
         principal_px: [4.0; 2],
     });
     messages.push(client.binary_of("live_image").0);
-    client.say(&render_message(1));
+    client.send_json(&render_message(1));
     draw_all(&hub, 1);
     messages.push(client.binary_of("picture").0);
-    client.say_raw(tungstenite::Message::text("{"));
+    client.send_raw(tungstenite::Message::text("{"));
     messages.push(client.text_of("error"));
     drop(server);
     messages.push(client.text_of("goodbye"));
@@ -368,18 +372,18 @@ fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
 }
 
 #[test]
-fn another_version_is_sent_away_and_the_same_is_welcome() {
+fn other_protocol_versions_are_rejected() {
     let (_hub, server) = start();
     let mut client = Client::connect(server.address());
-    client.say(&json!({"type": "hello", "protocol": viz::PROTOCOL_VERSION}));
+    client.send_json(&json!({"type": "hello", "protocol": viz::PROTOCOL_VERSION}));
     client.settle();
-    client.say(&json!({"type": "hello", "protocol": 999}));
+    client.send_json(&json!({"type": "hello", "protocol": 999}));
     assert!(client.text_of("goodbye")["reason"].as_str().is_some_and(|reason| reason.contains("999")));
     assert_eq!(client.receive(), Received::End);
 }
 
 #[test]
-fn a_stopping_server_says_goodbye_and_frees_the_port() {
+fn stopping_server_sends_goodbye_and_frees_port() {
     let (hub, server) = start();
     let address = server.address();
     let mut client = Client::connect(address);
@@ -392,12 +396,12 @@ fn a_stopping_server_says_goodbye_and_frees_the_port() {
 }
 
 #[test]
-fn a_taken_port_and_a_public_address_are_refused_in_one_sentence() {
+fn used_port_and_public_address_are_rejected() {
     let holder = TcpListener::bind("127.0.0.1:0").expect("a free port exists");
-    let taken = holder.local_addr().expect("bound");
-    let error = Server::start(ServerConfig { listen: taken }, Hub::new()).expect_err("taken");
-    assert!(matches!(error, Error::AddressInUse { address } if address == taken));
-    assert!(error.to_string().contains(&taken.to_string()), "{error}");
+    let used_address = holder.local_addr().expect("bound");
+    let error = Server::start(ServerConfig { listen: used_address }, Hub::new()).expect_err("taken");
+    assert!(matches!(error, Error::AddressInUse { address } if address == used_address));
+    assert!(error.to_string().contains(&used_address.to_string()), "{error}");
     let public: SocketAddr = "0.0.0.0:0".parse().expect("an address");
     let error = Server::start(ServerConfig { listen: public }, Hub::new()).expect_err("public");
     assert!(matches!(error, Error::NotLoopback { .. }) && error.to_string().contains("TLS"), "{error}");
@@ -406,7 +410,7 @@ fn a_taken_port_and_a_public_address_are_refused_in_one_sentence() {
 #[test]
 fn the_page_and_the_status_are_served_over_http() {
     let (hub, server) = start();
-    hub.set_status(Status { model: learned("splat", 77), ..Status::default() });
+    hub.set_status(Status { model: model_status("splat", 77), ..Status::default() });
     let page = get(server.address(), "/", "localhost");
     assert!(page.starts_with("HTTP/1.1 200") && page.contains("fieldrig"), "{page}");
     let status = get(server.address(), "/status", "localhost");
@@ -418,7 +422,7 @@ fn the_page_and_the_status_are_served_over_http() {
 
 fn get(address: SocketAddr, path: &str, host: &str) -> String {
     let mut stream = TcpStream::connect(address).expect("the server listens");
-    stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+    stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
     write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").expect("sent");
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).expect("an answer");
@@ -426,15 +430,15 @@ fn get(address: SocketAddr, path: &str, host: &str) -> String {
 }
 
 fn wait_until(is_done: impl Fn() -> bool) {
-    let begun = Instant::now();
+    let started = Instant::now();
     while !is_done() {
-        assert!(begun.elapsed() < PATIENCE, "waited in vain");
+        assert!(started.elapsed() < TIMEOUT, "waited in vain");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
 
 #[test]
-fn the_analytic_scene_tells_left_from_right_and_up_from_down() {
+fn analytic_scene_is_asymmetric() {
     let request = request_of_stage(
         &json!({"size_px": [80, 60]}),
         &json!({"size_px": [80, 60], "full_size_px": [80, 60], "near_m": 0.01, "far_m": 100.0,

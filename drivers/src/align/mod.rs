@@ -9,7 +9,7 @@
 mod cover;
 
 use crate::{Error, Image, PixelFormat};
-use cover::{Canvas, Covered, MOST_COLUMNS};
+use cover::{MAX_COLUMNS, NearestDepth, PixelBounds};
 use kinematics::{Intrinsics, Lens, Transform};
 use std::sync::Arc;
 
@@ -32,7 +32,7 @@ struct ColorCamera {
     principal_px: [f32; 2],
     lens: ColorLens,
     /// Square of the radius on the plane `z` = 1 up to which the lens is in use; beyond it distortion polynomials may turn back.
-    reach2: f32,
+    max_radius_squared: f32,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -58,7 +58,7 @@ struct View {
     focal_px: [f32; 2],
     principal_px: [f32; 2],
     /// Position that stands for what the colour camera does not see.
-    unseen_px: f32,
+    hidden_px: f32,
 }
 
 /// Room for the work on one row of depth.
@@ -69,7 +69,7 @@ struct Row {
     numbers: Vec<f32>,
     /// Columns and rows in the colour image, pixels.
     positions_px: [Vec<f32>; 2],
-    covered: Covered,
+    bounds: PixelBounds,
 }
 
 /// What is done with vector instructions.
@@ -77,7 +77,7 @@ struct Task<'a> {
     alignment: &'a DepthAlignment,
     /// Two bytes each, the lower one first.
     counts: &'a [u8],
-    metres_per_count: f64,
+    meters_per_count: f64,
 }
 
 impl pulp::NullaryFnOnce for Task<'_> {
@@ -85,11 +85,11 @@ impl pulp::NullaryFnOnce for Task<'_> {
 
     #[inline(always)]
     fn call(self) -> Arc<[u8]> {
-        let aligned = self.alignment.align_counts(self.counts.as_chunks().0, self.metres_per_count);
+        let aligned = self.alignment.align_counts(self.counts.as_chunks().0, self.meters_per_count);
         let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
         let bytes = Arc::get_mut(&mut data).expect("nobody else has it yet");
-        for (bytes, less_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
-            let count = less_one.wrapping_add(1);
+        for (bytes, count_minus_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
+            let count = count_minus_one.wrapping_add(1);
             // The largest count says nothing either.
             *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
         }
@@ -121,7 +121,7 @@ impl DepthAlignment {
     ///
     /// Fails for images that hold no depth or have another size than the depth camera.
     pub fn align(&self, depth: &Image) -> Result<Image, Error> {
-        let PixelFormat::DepthU16 { metres_per_count } = depth.format else {
+        let PixelFormat::DepthU16 { meters_per_count } = depth.format else {
             return Err(depth.wrong_kind("depth"));
         };
         if depth.size_px != self.depth_px {
@@ -133,25 +133,25 @@ impl DepthAlignment {
             });
         }
         // The same code for every set of vector instructions; the widest that this computer has runs.
-        let task = Task { alignment: self, counts: depth.raw_bytes()?, metres_per_count };
+        let task = Task { alignment: self, counts: depth.raw_bytes()?, meters_per_count };
         let data = pulp::Arch::new().dispatch(task);
         Ok(Image { size_px: self.color.size_px, data, ..depth.clone() })
     }
 
     /// The nearest count less one of each colour pixel: so 0, which says nothing, is the largest number and never stays.
     #[inline(always)]
-    fn align_counts(&self, counts: &[[u8; 2]], metres_per_count: f64) -> Vec<u16> {
+    fn align_counts(&self, counts: &[[u8; 2]], meters_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
-        let mut canvas = Canvas::new(self.color.size_px.map(|side| side as usize), depth_width);
-        let cells = || [vec![0; depth_width], vec![0; depth_width]];
+        let mut nearest_depth = NearestDepth::new(self.color.size_px.map(|side| side as usize), depth_width);
+        let pixel_bounds = || [vec![0; depth_width], vec![0; depth_width]];
         let mut work = Row {
             counts: vec![0; depth_width],
             numbers: vec![0.0; depth_width],
             positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
-            covered: Covered { first: cells(), last: cells() },
+            bounds: PixelBounds { first: pixel_bounds(), last: pixel_bounds() },
         };
         // In units of one count, so that counts need no factor.
-        let depth_in_color = self.depth_in_color.map(|metres| narrow(metres / metres_per_count));
+        let depth_in_color = self.depth_in_color.map(|meters| narrow(meters / meters_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
             work.counts.iter_mut().zip(row).for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));
             work.numbers.iter_mut().zip(&work.counts).for_each(|(number, count)| *number = f32::from(*count));
@@ -159,9 +159,9 @@ impl DepthAlignment {
             self.project(&mut work, depth_in_color, first_corner, Corner::First);
             // The opposite corners lie one row and one column on.
             self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
-            canvas.put(&work.counts, &work.covered);
+            nearest_depth.put(&work.counts, &work.bounds);
         }
-        canvas.into_nearest()
+        nearest_depth.into_nearest()
     }
 
     /// Colour pixels, column and row, where the corners of a row are seen; `start` is the place of the first among all.
@@ -171,12 +171,12 @@ impl DepthAlignment {
             depth_in_color,
             focal_px: self.color.focal_px,
             principal_px: self.color.principal_px,
-            unseen_px: match corner {
+            hidden_px: match corner {
                 Corner::First => f32::MAX,
                 Corner::Last => -1.0,
             },
         };
-        let reach2 = self.color.reach2;
+        let max_radius_squared = self.color.max_radius_squared;
         let [columns, rows] = &mut work.positions_px;
         let counts = &work.numbers;
         let rays = [0, 1, 2].map(|axis| &self.corners[axis][start..]);
@@ -184,19 +184,21 @@ impl DepthAlignment {
             ColorLens::Pinhole => project_by(columns, rows, counts, rays, &view, |x, y| ([x, y], true)),
             ColorLens::BrownConrady(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
                 let r2 = x * x + y * y;
-                (brown_conrady(k, x, y, r2), r2 <= reach2)
+                (brown_conrady(k, x, y, r2), r2 <= max_radius_squared)
             }),
             ColorLens::KannalaBrandt(k) => project_by(columns, rows, counts, rays, &view, |x, y| {
                 let r2 = x * x + y * y;
-                (kannala_brandt(k, x, y, r2), r2 <= reach2)
+                (kannala_brandt(k, x, y, r2), r2 <= max_radius_squared)
             }),
         }
-        let cells = match corner {
-            Corner::First => &mut work.covered.first,
-            Corner::Last => &mut work.covered.last,
+        let pixel_bounds = match corner {
+            Corner::First => &mut work.bounds.first,
+            Corner::Last => &mut work.bounds.last,
         };
-        for ((cells, positions_px), side) in cells.iter_mut().zip(&work.positions_px).zip(self.color.size_px) {
-            number(cells, positions_px, side, corner);
+        for ((pixel_bounds, positions_px), side) in
+            pixel_bounds.iter_mut().zip(&work.positions_px).zip(self.color.size_px)
+        {
+            number(pixel_bounds, positions_px, side, corner);
         }
     }
 }
@@ -214,14 +216,14 @@ fn project_by(
 ) {
     let n = counts.len();
     let (xs, ys, zs, columns, rows) = (&xs[..n], &ys[..n], &zs[..n], &mut columns[..n], &mut rows[..n]);
-    let View { depth_in_color: [tx, ty, tz], focal_px: [fx, fy], principal_px: [cx, cy], unseen_px } = *view;
+    let View { depth_in_color: [tx, ty, tz], focal_px: [fx, fy], principal_px: [cx, cy], hidden_px } = *view;
     for ix in 0..n {
         let z = counts[ix] * zs[ix] + tz;
         let inverse = 1.0 / z;
         let (x, y) = ((counts[ix] * xs[ix] + tx) * inverse, (counts[ix] * ys[ix] + ty) * inverse);
-        let ([distorted_x, distorted_y], is_in_use) = distort(x, y);
+        let ([distorted_x, distorted_y], is_valid) = distort(x, y);
         // The column alone keeps a pixel away.
-        columns[ix] = if (z > 0.0) & is_in_use { distorted_x * fx + cx } else { unseen_px };
+        columns[ix] = if (z > 0.0) & is_valid { distorted_x * fx + cx } else { hidden_px };
         rows[ix] = distorted_y * fy + cy;
     }
 }
@@ -231,23 +233,23 @@ fn project_by(
 #[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
     // Larger images get no depth beyond.
-    let side = (side as usize).min(MOST_COLUMNS) as f32;
-    let (least, most) = match corner {
+    let side = (side as usize).min(MAX_COLUMNS) as f32;
+    let (min, max) = match corner {
         Corner::First => (1.0, side + 1.0),
         Corner::Last => (0.0, side),
     };
     // From here on floats have no fractions, and their low bits count.
-    const WHOLE: f32 = 8_388_608.0;
+    const INTEGER_FLOAT: f32 = 8_388_608.0;
     let n = positions_px.len();
     let (numbers, positions_px) = (&mut numbers[..n], &positions_px[..n]);
     for ix in 0..n {
         // Comparisons as vector instructions make them, which `max` and `min` are not for what is no number.
-        let from_one = positions_px[ix] + 1.0;
-        let from_one = if from_one > least { from_one } else { least };
-        let from_one = if from_one < most { from_one } else { most };
-        let nearest = (from_one + WHOLE) - WHOLE;
-        let below = nearest - if nearest > from_one { 1.0 } else { 0.0 };
-        numbers[ix] = (below + WHOLE).to_bits() as u16;
+        let one_based = positions_px[ix] + 1.0;
+        let one_based = if one_based > min { one_based } else { min };
+        let one_based = if one_based < max { one_based } else { max };
+        let nearest = (one_based + INTEGER_FLOAT) - INTEGER_FLOAT;
+        let below = nearest - if nearest > one_based { 1.0 } else { 0.0 };
+        numbers[ix] = (below + INTEGER_FLOAT).to_bits() as u16;
     }
 }
 
@@ -259,19 +261,19 @@ impl ColorCamera {
             Lens::BrownConrady(k) => ColorLens::BrownConrady(k.map(narrow)),
             Lens::KannalaBrandt(k) => ColorLens::KannalaBrandt(k.map(narrow)),
         };
-        let reach = if matches!(lens, ColorLens::Pinhole) { f64::INFINITY } else { reach(camera) };
+        let max_radius = if matches!(lens, ColorLens::Pinhole) { f64::INFINITY } else { max_radius(camera) };
         Self {
             size_px: camera.size_px,
             focal_px: camera.focal_px.map(narrow),
             principal_px: camera.principal_px.map(narrow),
             lens,
-            reach2: narrow(reach * reach),
+            max_radius_squared: narrow(max_radius * max_radius),
         }
     }
 }
 
 /// The largest radius on the plane `z` = 1 that the edge of an image shows, and a little more for corners just outside.
-fn reach(camera: &Intrinsics) -> f64 {
+fn max_radius(camera: &Intrinsics) -> f64 {
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
     let columns = (0..=width).flat_map(|column| [[column, 0], [column, height]]);
@@ -311,7 +313,7 @@ mod tests {
     use kinematics::Stamp;
     use nalgebra::{Translation3, UnitQuaternion};
 
-    const METRES_PER_COUNT: f64 = 1e-3;
+    const METERS_PER_COUNT: f64 = 1e-3;
 
     fn camera([width, height]: [u32; 2], focal_px: f64, lens: Lens) -> Intrinsics {
         Intrinsics {
@@ -328,7 +330,7 @@ mod tests {
             camera: "wrist".into(),
             stamp: Stamp(7),
             size_px,
-            format: PixelFormat::DepthU16 { metres_per_count: METRES_PER_COUNT },
+            format: PixelFormat::DepthU16 { meters_per_count: METERS_PER_COUNT },
             data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
             exposure_secs: None,
             n_skipped: 0,
@@ -357,15 +359,16 @@ mod tests {
         for (ix, &count) in counts.iter().enumerate().filter(|(_, count)| **count > 0 && **count < u16::MAX) {
             let column = (ix % depth.size_px[0] as usize) as f64;
             let row = (ix / depth.size_px[0] as usize) as f64;
-            let seen = |corner: [f64; 2]| {
-                let point = depth.unproject(corner)? * (f64::from(count) * METRES_PER_COUNT);
+            let visible = |corner: [f64; 2]| {
+                let point = depth.unproject(corner)? * (f64::from(count) * METERS_PER_COUNT);
                 let pixel =
                     color.project(&(color_from_depth.rotation * point + color_from_depth.translation.vector))?;
                 #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
                 let cell = |position: f64| position.floor() as i64;
                 Some(pixel.map(cell))
             };
-            let (Some([left, top]), Some([right, bottom])) = (seen([column, row]), seen([column + 1.0, row + 1.0]))
+            let (Some([left, top]), Some([right, bottom])) =
+                (visible([column, row]), visible([column + 1.0, row + 1.0]))
             else {
                 continue;
             };
@@ -380,7 +383,7 @@ mod tests {
     }
 
     /// As on a D435: the colour camera 15 mm beside the depth camera, and turned a little.
-    fn beside() -> Transform {
+    fn color_from_depth_like_d435() -> Transform {
         Transform::from_parts(
             Translation3::new(0.0148, 0.0002, 0.0003),
             UnitQuaternion::from_euler_angles(0.003, -0.006, 0.002),
@@ -393,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_are_those_of_the_twin() {
+    fn aligned_depth_matches_twin() {
         // f32 puts a corner on the other side of a pixel's edge once in some ten thousand.
         const EQUAL_FRAC: f64 = 0.999;
         let size_px = [320, 240];
@@ -405,44 +408,48 @@ mod tests {
             let cameras = [([320, 240], 300.0), ([640, 360], 455.0), ([1280, 720], 1000.0), ([160, 120], 140.0)];
             for (color_px, focal_px) in cameras {
                 let (depth, color) = (camera(size_px, 190.0, depth_lens), camera(color_px, focal_px, color_lens));
-                let alignment = DepthAlignment::new(&depth, &color, &beside());
+                let alignment = DepthAlignment::new(&depth, &color, &color_from_depth_like_d435());
                 let got = counts(&alignment.align(&image(size_px, &scene)).expect("depth"));
-                let wanted = twin(&depth, &color, &beside(), &scene);
-                let equal = equal_frac(&got, &wanted);
+                let expected = twin(&depth, &color, &color_from_depth_like_d435(), &scene);
+                let equal = equal_frac(&got, &expected);
                 assert!(equal >= EQUAL_FRAC, "{color_lens:?} {color_px:?}: {equal}");
-                assert!(wanted.iter().filter(|count| **count > 0).count() > wanted.len() / 2, "the scene is not seen");
+                assert!(
+                    expected.iter().filter(|count| **count > 0).count() > expected.len() / 2,
+                    "the scene is not seen"
+                );
                 // The comparison sees a camera one centimetre elsewhere.
-                let elsewhere = Transform::from_parts(Translation3::new(0.025, 0.0, 0.0), beside().rotation);
-                assert!(equal_frac(&got, &twin(&depth, &color, &elsewhere, &scene)) < EQUAL_FRAC);
+                let shifted =
+                    Transform::from_parts(Translation3::new(0.025, 0.0, 0.0), color_from_depth_like_d435().rotation);
+                assert!(equal_frac(&got, &twin(&depth, &color, &shifted, &scene)) < EQUAL_FRAC);
             }
         }
     }
 
     #[test]
-    fn images_too_wide_for_all_strips_are_those_of_the_twin() {
+    fn very_wide_images_match_twin() {
         for width in [20_000, 40_000] {
             let camera = |focal_px| camera([width, 5], focal_px, Lens::Pinhole);
             let (depth, color) = (camera(12_000.0), camera(20_000.0));
-            let moved = Transform::translation(0.0148, 0.0, 0.0);
+            let shifted = Transform::translation(0.0148, 0.0, 0.0);
             let scene = scene(depth.size_px);
-            let alignment = DepthAlignment::new(&depth, &color, &moved);
+            let alignment = DepthAlignment::new(&depth, &color, &shifted);
             let got = counts(&alignment.align(&image(depth.size_px, &scene)).expect("depth"));
-            let wanted = twin(&depth, &color, &moved, &scene);
+            let expected = twin(&depth, &color, &shifted, &scene);
             // So far from the middle f32 knows a corner to some thousandths of a pixel.
-            let equal = equal_frac(&got, &wanted);
+            let equal = equal_frac(&got, &expected);
             assert!(equal >= 0.99, "{width}: {equal}");
-            assert!(wanted.iter().filter(|count| **count > 0).count() > wanted.len() / 2, "the scene is not seen");
+            assert!(expected.iter().filter(|count| **count > 0).count() > expected.len() / 2, "the scene is not seen");
         }
     }
 
     #[test]
-    fn a_wall_moves_by_baseline_over_depth_and_a_box_hides_it() {
+    fn disparity_is_baseline_over_depth_with_occlusion() {
         // 400 px * 51.25 mm / 1 m is 20.5 px to the right; no corner lies on an edge of a pixel's column.
         let camera =
             Intrinsics { focal_px: [400.0; 2], principal_px: [32.0, 16.25], ..camera([64, 32], 1.0, Lens::Pinhole) };
         let color = Intrinsics { principal_px: [32.0, 16.75], ..camera.clone() };
-        let moved = Transform::translation(0.05125, 0.0, 0.0);
-        let alignment = DepthAlignment::new(&camera, &color, &moved);
+        let shifted = Transform::translation(0.05125, 0.0, 0.0);
+        let alignment = DepthAlignment::new(&camera, &color, &shifted);
         let wall = alignment.align(&image([64, 32], &[1000; 64 * 32])).expect("depth");
         for (ix, count) in counts(&wall).into_iter().enumerate() {
             assert_eq!(count, if ix % 64 < 20 { 0 } else { 1000 }, "column {} row {}", ix % 64, ix / 64);
@@ -458,23 +465,23 @@ mod tests {
     }
 
     #[test]
-    fn what_says_nothing_goes_nowhere_and_what_is_not_before_the_camera_is_not_seen() {
+    fn invalid_and_behind_camera_depth_is_dropped() {
         let camera = camera([64, 48], 60.0, Lens::BrownConrady([0.1, 0.0, 0.0, 0.0, 0.0]));
         // The colour camera stands 1 mm before the depth camera: a count of 1 lies in its centre.
         for z in [-0.001, -0.000_999_99, -1.0, f64::NAN] {
             let alignment = DepthAlignment::new(&camera, &camera, &Transform::translation(0.0, 0.0, z));
             for count in [0, 1, 2, u16::MAX] {
                 let aligned = alignment.align(&image([64, 48], &[count; 64 * 48])).expect("depth");
-                let seen = counts(&aligned);
-                assert!(seen.iter().all(|seen| *seen == 0 || *seen == count));
-                assert!(![0, u16::MAX].contains(&count) || seen.iter().all(|seen| *seen == 0));
+                let visible = counts(&aligned);
+                assert!(visible.iter().all(|visible| *visible == 0 || *visible == count));
+                assert!(![0, u16::MAX].contains(&count) || visible.iter().all(|visible| *visible == 0));
             }
         }
         let alignment = DepthAlignment::new(&camera, &camera, &Transform::identity());
         assert!(matches!(alignment.align(&image([64, 47], &[0; 64 * 47])), Err(Error::ImageSize { .. })));
         assert!(matches!(alignment.align(&image([64, 48], &[0; 64 * 47])), Err(Error::ImageLength { .. })));
         let color = Image { format: PixelFormat::Gray8, ..image([64, 48], &[0; 32 * 48]) };
-        assert!(matches!(alignment.align(&color), Err(Error::WrongKind { wanted: "depth", .. })));
+        assert!(matches!(alignment.align(&color), Err(Error::WrongKind { expected: "depth", .. })));
     }
 
     #[test]
@@ -486,7 +493,7 @@ mod tests {
             [(Lens::Pinhole, [640, 480], 610.0), (d455, [640, 480], 610.0), (d455, [1280, 720], 910.0)]
         {
             let (depth, color) = (camera(size_px, 385.0, Lens::Pinhole), camera(color_px, focal_px, lens));
-            let alignment = DepthAlignment::new(&depth, &color, &beside());
+            let alignment = DepthAlignment::new(&depth, &color, &color_from_depth_like_d435());
             let depth = image(size_px, &scene(size_px));
             let best = (0..50).map(|_| {
                 let began = std::time::Instant::now();

@@ -1,10 +1,10 @@
 //! An arm whose joints are motors on CAN buses: a thread a bus asks and listens, the caller gets states of all joints.
 
-use super::bus::{Arrived, Bus, WireErrors};
+use super::bus::{Bus, BusEvent, WireErrors};
+use super::bus_load::max_cycle_rate_hz;
 use super::config::{ArmConfig, BusConfig};
-use super::joints::{Joints, Told};
+use super::joints::{JointReading, Joints};
 use super::motor::Motor;
-use super::pace::affordable_hz;
 use crate::wire::can::{Frame, canopen};
 use crate::{Arm, Error, clock};
 use kinematics::{JointState, Stamp};
@@ -19,7 +19,7 @@ const POLL: Duration = Duration::from_millis(50);
 /// Readings that may wait for a slow caller: a second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
 /// A turn of a bus's thread that took longer was held up from outside.
-const MAX_TURN: Duration = Duration::from_millis(200);
+const MAX_LOOP_DELAY: Duration = Duration::from_millis(200);
 /// A motor that says nothing for so long while the others do is told.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
@@ -27,7 +27,7 @@ const MAX_SILENCE: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub struct CanArm {
     names: Vec<String>,
-    arriving: Receiver<Result<Told, Error>>,
+    readings: Receiver<Result<JointReading, Error>>,
     joints: Joints,
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
@@ -36,23 +36,23 @@ pub struct CanArm {
 impl CanArm {
     /// Checks how the buses are set up, finds all motors and starts to read; the first that does not answer is an error.
     pub fn open(config: &ArmConfig) -> Result<Self, Error> {
-        let (sender, arriving) = sync_channel(MAX_WAITING);
+        let (sender, readings) = sync_channel(MAX_WAITING);
         let stop = Arc::new(AtomicBool::new(false));
         let mut buses = Vec::new();
         for (bus_ix, bus) in config.buses.iter().enumerate() {
             let bus = Bus::open(bus)?;
-            let own = config.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
-            let motors = own.map(|(joint_ix, motor)| Ok((joint_ix, Motor::set_up(&bus, motor)?)));
+            let motors_of_bus = config.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
+            let motors = motors_of_bus.map(|(joint_ix, motor)| Ok((joint_ix, Motor::set_up(&bus, motor)?)));
             let motors = motors.collect::<Result<Vec<_>, Error>>()?;
             buses.push((bus, motors));
         }
         let names: Vec<String> = config.motors.iter().map(|motor| motor.joint.clone()).collect();
-        let mut arm = Self { joints: Joints::new(names.len()), names, arriving, stop, threads: Vec::new() };
+        let mut arm = Self { joints: Joints::new(names.len()), names, readings, stop, threads: Vec::new() };
         for (bus, motors) in buses {
             let cycle = Cycle::new(bus.config(), &motors, config.rate_hz);
             let device = format!("CAN {}", bus.config().interface);
-            let line = Line { bus, motors, cycle, sender: sender.clone(), stop: Arc::clone(&arm.stop) };
-            let thread = std::thread::Builder::new().name(device.clone()).spawn(move || line.run());
+            let reader = BusReader { bus, motors, cycle, sender: sender.clone(), stop: Arc::clone(&arm.stop) };
+            let thread = std::thread::Builder::new().name(device.clone()).spawn(move || reader.run());
             arm.threads.push(thread.map_err(|source| Error::Thread { device, source })?);
         }
         Ok(arm)
@@ -67,12 +67,12 @@ impl Arm for CanArm {
     /// A state of all joints is told as soon as each has told something new; it is stamped with the newest of these readings, and
     /// the others are carried on to there with their own velocity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
-        let until = Instant::now() + timeout;
+        let deadline = Instant::now() + timeout;
         loop {
-            let left = until.saturating_duration_since(Instant::now());
-            match self.arriving.recv_timeout(left) {
-                Ok(Ok(told)) => {
-                    if let Some(state) = self.joints.take(&told) {
+            let remaining = deadline.saturating_duration_since(Instant::now());
+            match self.readings.recv_timeout(remaining) {
+                Ok(Ok(reading_of_joint)) => {
+                    if let Some(state) = self.joints.take(&reading_of_joint) {
                         return Ok(state);
                     }
                 }
@@ -98,44 +98,44 @@ impl Drop for CanArm {
 /// What is sent again and again on a bus.
 #[derive(Debug)]
 struct Cycle {
-    questions: Vec<Frame>,
+    poll_frames: Vec<Frame>,
     period: Duration,
 }
 
 impl Cycle {
     /// Asks as often as wanted, or as often as keeps the bus's load in bounds.
     fn new(bus: &BusConfig, motors: &[(usize, Motor)], rate_hz: f64) -> Self {
-        let mut questions: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.question()).collect();
-        if motors.iter().any(|(_, motor)| motor.wants_sync()) {
-            questions.push(canopen::encode_sync());
+        let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.poll_frame()).collect();
+        if motors.iter().any(|(_, motor)| motor.needs_sync()) {
+            poll_frames.push(canopen::encode_sync());
         }
-        let mut of_a_cycle = questions.clone();
-        let mut unasked = Vec::new();
-        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.usual_answer()) {
+        let mut cycle_frames = poll_frames.clone();
+        let mut unsolicited = Vec::new();
+        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.typical_answer()) {
             match own_rate_hz {
-                Some(own_rate_hz) => unasked.push((answer, own_rate_hz)),
-                None => of_a_cycle.push(answer),
+                Some(own_rate_hz) => unsolicited.push((answer, own_rate_hz)),
+                None => cycle_frames.push(answer),
             }
         }
-        let asked_hz = match questions.is_empty() {
+        let poll_rate_hz = match poll_frames.is_empty() {
             // Nobody is asked; what comes, comes as often as the motors have it.
             true => rate_hz,
-            false => affordable_hz(bus, &of_a_cycle, &unasked, rate_hz),
+            false => max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz),
         };
-        Self { questions, period: Duration::from_secs_f64(1.0 / asked_hz) }
+        Self { poll_frames, period: Duration::from_secs_f64(1.0 / poll_rate_hz) }
     }
 }
 
 /// A bus with its motors, on its thread.
-struct Line {
+struct BusReader {
     bus: Bus,
     motors: Vec<(usize, Motor)>,
     cycle: Cycle,
-    sender: SyncSender<Result<Told, Error>>,
+    sender: SyncSender<Result<JointReading, Error>>,
     stop: Arc<AtomicBool>,
 }
 
-impl Line {
+impl BusReader {
     fn run(self) {
         if let Err(error) = self.read() {
             // Nobody may listen any more, or be so far behind that the arm is as good as silent.
@@ -144,36 +144,37 @@ impl Line {
     }
 
     fn read(&self) -> Result<(), Error> {
-        let began = clock::now();
-        let mut next_cycle = began;
+        let start = clock::now();
+        let mut next_cycle = start;
         let mut errors = WireErrors::default();
-        let mut heard: Vec<Stamp> = vec![began; self.motors.len()];
+        let mut last_heard: Vec<Stamp> = vec![start; self.motors.len()];
         let (mut n_dropped, mut n_unsent) = (0_u64, 0_u64);
-        let mut before = began;
+        let mut previous = start;
         while !self.stop.load(Ordering::Relaxed) {
             let now = clock::now();
-            let stood_still = now.duration_since(std::mem::replace(&mut before, now));
-            if stood_still > MAX_TURN {
+            let stall = now.duration_since(std::mem::replace(&mut previous, now));
+            if stall > MAX_LOOP_DELAY {
                 // While this computer did something else, nobody listened: no motor is silent for that.
-                heard.iter_mut().for_each(|heard| *heard = heard.plus_secs(stood_still.as_secs_f64()));
+                last_heard.iter_mut().for_each(|last_heard| *last_heard = last_heard.plus_secs(stall.as_secs_f64()));
             }
-            if !self.cycle.questions.is_empty() && now >= next_cycle {
-                for question in &self.cycle.questions {
-                    n_unsent += u64::from(!self.bus.send(question)?);
+            if !self.cycle.poll_frames.is_empty() && now >= next_cycle {
+                for poll_frame in &self.cycle.poll_frames {
+                    n_unsent += u64::from(!self.bus.send(poll_frame)?);
                 }
                 // Cycles that were missed are not made up for.
                 next_cycle = (next_cycle + self.cycle.period).max(now);
-                self.look_for_silence(&heard, now, &errors)?;
+                self.check_silence(&last_heard, now, &errors)?;
             }
-            let left = if self.cycle.questions.is_empty() { POLL } else { next_cycle.duration_since(now).min(POLL) };
-            match self.bus.receive(left)? {
-                Some((stamp, Arrived::Frame(frame))) => {
+            let remaining =
+                if self.cycle.poll_frames.is_empty() { POLL } else { next_cycle.duration_since(now).min(POLL) };
+            match self.bus.receive(remaining)? {
+                Some((stamp, BusEvent::Frame(frame))) => {
                     for (ix, (joint_ix, motor)) in self.motors.iter().enumerate() {
                         let Some(reading) = motor.read(&frame) else { continue };
                         // Not its stamp: whoever reads late does not make a motor silent.
-                        heard[ix] = now;
-                        let told = Told { joint_ix: *joint_ix, stamp, reading };
-                        match self.sender.try_send(Ok(told)) {
+                        last_heard[ix] = now;
+                        let reading_of_joint = JointReading { joint_ix: *joint_ix, stamp, reading };
+                        match self.sender.try_send(Ok(reading_of_joint)) {
                             Ok(()) => {}
                             Err(TrySendError::Full(_)) => n_dropped += 1,
                             Err(TrySendError::Disconnected(_)) => return Ok(()),
@@ -181,11 +182,11 @@ impl Line {
                         break;
                     }
                 }
-                Some((_, Arrived::Errors(more))) => self.tell_errors(&mut errors, &more),
-                None => self.look_for_silence(&heard, clock::now(), &errors)?,
+                Some((_, BusEvent::Errors(new_errors))) => self.log_errors(&mut errors, &new_errors),
+                None => self.check_silence(&last_heard, clock::now(), &errors)?,
             }
         }
-        let seconds = clock::now().secs_since(began);
+        let seconds = clock::now().secs_since(start);
         let interface = &self.bus.config().interface;
         let load = 100.0 * self.bus.busy().as_secs_f64() / seconds.max(1e-9);
         log::info!(
@@ -197,9 +198,10 @@ impl Line {
 
     /// The first motor that has said nothing for too long is an error: the joints' states stop with it. What was wrong on the wire is
     /// told with it, for a bus that is lost silences motors, too.
-    fn look_for_silence(&self, heard: &[Stamp], now: Stamp, errors: &WireErrors) -> Result<(), Error> {
-        let silent = |heard: &Stamp| now.duration_since(*heard) > MAX_SILENCE;
-        let Some(((_, motor), _)) = self.motors.iter().zip(heard).find(|(_, heard)| silent(heard)) else {
+    fn check_silence(&self, last_heard: &[Stamp], now: Stamp, errors: &WireErrors) -> Result<(), Error> {
+        let silent = |last_heard: &Stamp| now.duration_since(*last_heard) > MAX_SILENCE;
+        let Some(((_, motor), _)) = self.motors.iter().zip(last_heard).find(|(_, last_heard)| silent(last_heard))
+        else {
             return Ok(());
         };
         let mut reason = format!("it has said nothing for {MAX_SILENCE:?}");
@@ -211,11 +213,11 @@ impl Line {
     }
 
     /// Logs errors on the wire: every time that the bus was lost, and others each time that they have doubled.
-    fn tell_errors(&self, sum: &mut WireErrors, more: &WireErrors) {
-        let before = sum.n_frames.checked_ilog2();
-        sum.add(more);
-        if more.n_bus_off + more.n_restarts > 0 || sum.n_frames.checked_ilog2() != before {
-            log::warn!("{}: errors on the wire so far: {sum}", self.bus.config().interface);
+    fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
+        let previous = total.n_frames.checked_ilog2();
+        total.add(new_errors);
+        if new_errors.n_bus_off + new_errors.n_restarts > 0 || total.n_frames.checked_ilog2() != previous {
+            log::warn!("{}: errors on the wire so far: {total}", self.bus.config().interface);
         }
     }
 }
@@ -226,7 +228,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rate_keeps_the_load_of_a_classic_bus_under_seventy_percent() {
+    fn rate_keeps_classic_bus_load_under_70_percent() {
         let bus = BusConfig {
             interface: "can0".to_owned(),
             bitrate_hz: 1_000_000,

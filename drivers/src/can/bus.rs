@@ -23,7 +23,7 @@ const ENOBUFS: i32 = 105;
 
 /// What came.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Arrived {
+pub enum BusEvent {
     /// A frame of somebody else.
     Frame(Frame),
     /// The controller tells of errors on the wire.
@@ -66,14 +66,14 @@ impl WireErrors {
     }
 
     /// Adds what another one counted.
-    pub fn add(&mut self, more: &Self) {
-        self.n_frames += more.n_frames;
-        self.n_bus_off += more.n_bus_off;
-        self.n_restarts += more.n_restarts;
-        self.n_warnings += more.n_warnings;
-        self.n_passive += more.n_passive;
-        self.n_unacknowledged += more.n_unacknowledged;
-        self.n_overflows += more.n_overflows;
+    pub fn add(&mut self, other: &Self) {
+        self.n_frames += other.n_frames;
+        self.n_bus_off += other.n_bus_off;
+        self.n_restarts += other.n_restarts;
+        self.n_warnings += other.n_warnings;
+        self.n_passive += other.n_passive;
+        self.n_unacknowledged += other.n_unacknowledged;
+        self.n_overflows += other.n_overflows;
     }
 }
 
@@ -130,7 +130,7 @@ impl Bus {
 
     /// The same, with another bound: what is of this instant only must not wait.
     pub fn send_within(&self, frame: &Frame, bound: Duration) -> Result<bool, Error> {
-        let began = clock::now();
+        let start = clock::now();
         loop {
             match self.write(frame) {
                 Ok(()) => {
@@ -138,29 +138,29 @@ impl Bus {
                     return Ok(true);
                 }
                 Err(error) if error.raw_os_error() == Some(ENOBUFS) || error.should_retry() => {
-                    if clock::now().duration_since(began) >= bound {
+                    if clock::now().duration_since(start) >= bound {
                         return Ok(false);
                     }
                     std::thread::sleep(Duration::from_micros(200));
                 }
-                Err(source) => return Err(self.refused(source)),
+                Err(source) => return Err(self.bus_error(source)),
             }
         }
     }
 
     fn write(&self, frame: &Frame) -> io::Result<()> {
         let id = socket_id(frame.id());
-        let unfit = || io::Error::from(io::ErrorKind::InvalidInput);
+        let invalid = || io::Error::from(io::ErrorKind::InvalidInput);
         if frame.is_remote() {
-            let made = CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(unfit)?;
-            return self.socket.write_frame(&made);
+            let socket_frame = CanRemoteFrame::new_remote(id, frame.n_bytes()).ok_or_else(invalid)?;
+            return self.socket.write_frame(&socket_frame);
         }
         if frame.is_fd() {
-            let mut made = CanFdFrame::new(id, frame.data()).ok_or_else(unfit)?;
-            made.set_brs(frame.is_switched());
-            return self.socket.write_frame(&made);
+            let mut socket_frame = CanFdFrame::new(id, frame.data()).ok_or_else(invalid)?;
+            socket_frame.set_brs(frame.is_switched());
+            return self.socket.write_frame(&socket_frame);
         }
-        self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(unfit)?)
+        self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(invalid)?)
     }
 
     /// Waits until something came on any of them, or the time is over.
@@ -171,30 +171,30 @@ impl Bus {
     }
 
     /// Waits for what comes next; `None` where nothing came.
-    pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, Arrived)>, Error> {
+    pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error> {
         // A receive timeout of the socket counts in jiffies, up to 10 ms each; that of ppoll is fine.
         match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timespec(timeout))) {
             Ok(0) | Err(Errno::INTR) => return Ok(None),
             Ok(_) => {}
-            Err(error) => return Err(self.refused(error.into())),
+            Err(error) => return Err(self.bus_error(error.into())),
         }
         let (frame, at) = match self.socket.read_frame_with_timestamp() {
             Ok(read) => read,
             Err(error) if error.should_retry() => return Ok(None),
-            Err(source) => return Err(self.refused(source)),
+            Err(source) => return Err(self.bus_error(source)),
         };
         let now = clock::now();
         // The kernel's stamp is of the wall clock; how long ago it was is the same on ours.
         let stamp = at.elapsed().map_or(now, |age| now - age);
         let frame = match frame {
-            CanAnyFrame::Error(error) => return Ok(Some((stamp, Arrived::Errors(WireErrors::of(error))))),
-            CanAnyFrame::Normal(frame) => Frame::classic(own_id(&frame), frame.data()),
-            CanAnyFrame::Remote(frame) => Frame::remote(own_id(&frame), frame.dlc()),
-            CanAnyFrame::Fd(frame) => Frame::fd(own_id(&frame), frame.data(), frame.is_brs()),
+            CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(WireErrors::of(error))))),
+            CanAnyFrame::Normal(frame) => Frame::classic(id_of(&frame), frame.data()),
+            CanAnyFrame::Remote(frame) => Frame::remote(id_of(&frame), frame.dlc()),
+            CanAnyFrame::Fd(frame) => Frame::fd(id_of(&frame), frame.data(), frame.is_brs()),
         };
-        let frame = frame.map_err(|error| self.refused(io::Error::other(error.to_string())))?;
+        let frame = frame.map_err(|error| self.bus_error(io::Error::other(error.to_string())))?;
         self.count(&frame);
-        Ok(Some((stamp, Arrived::Frame(frame))))
+        Ok(Some((stamp, BusEvent::Frame(frame))))
     }
 
     fn count(&self, frame: &Frame) {
@@ -203,7 +203,7 @@ impl Bus {
         self.busy_nanos.fetch_add(nanos, Ordering::Relaxed);
     }
 
-    fn refused(&self, reason: io::Error) -> Error {
+    fn bus_error(&self, reason: io::Error) -> Error {
         Error::CanBus { interface: self.config.interface.clone(), reason }
     }
 }
@@ -222,7 +222,7 @@ fn socket_id(id: Id) -> SocketId {
     }
 }
 
-fn own_id(frame: &impl EmbeddedFrame) -> Id {
+fn id_of(frame: &impl EmbeddedFrame) -> Id {
     match frame.id() {
         SocketId::Standard(id) => Id::standard(id.as_raw().into()),
         SocketId::Extended(id) => Id::extended(id.as_raw()),

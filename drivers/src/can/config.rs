@@ -75,7 +75,7 @@ pub enum Family {
 
 impl Family {
     /// Whether it could not be told from another one on the same bus.
-    pub fn clashes(&self, other: &Self) -> bool {
+    pub fn conflicts_with(&self, other: &Self) -> bool {
         match (self, other) {
             // It would take the other one's answers for orders.
             (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => {

@@ -2,9 +2,9 @@
 
 use super::ROBSTRIDE_HOST;
 use super::config::{Family, MotorConfig};
-use super::motor::{MOST_RAD, Motor};
-use super::played::Played;
-use crate::hostile::take;
+use super::emulated::EmulatedMotor;
+use super::motor::{MAX_RAD, Motor};
+use crate::fuzz::take;
 use crate::wire::can::mit::{Command, Limits, Motion};
 use crate::wire::can::tmotor::Thermometer;
 use crate::wire::can::{Frame, Id, canopen, cia402, damiao, odrive, robstride, tmotor};
@@ -70,7 +70,7 @@ pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
     let encode = |frame: &Frame| {
         let n = frame.n_bytes();
         let code = if n <= 8 { n } else { 9 + FD_LENGTHS.iter().position(|len| *len == n).expect("an FD length") };
-        let flag = |is: bool, bit: u8| if is { bit } else { 0 };
+        let flag = |condition: bool, bit: u8| if condition { bit } else { 0 };
         let head = u8::try_from(code).expect("small")
             | flag(frame.id().is_extended(), 0x10)
             | flag(frame.is_remote(), 0x20)
@@ -85,20 +85,20 @@ pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
 /// whatever played motors send is read, and their shafts are somewhere.
 pub fn frames(bytes: &[u8]) {
     let configs = motors();
-    let heard: Vec<_> = configs.iter().map(|config| Motor::with_limits(config.clone(), LIMITS)).collect();
-    let mut played: Vec<_> = configs.iter().map(|config| Played::new(config.family, LIMITS)).collect();
-    let mut at = Stamp(0);
+    let listeners: Vec<_> = configs.iter().map(|config| Motor::with_limits(config.clone(), LIMITS)).collect();
+    let mut emulated: Vec<_> = configs.iter().map(|config| EmulatedMotor::new(config.family, LIMITS)).collect();
+    let mut now = Stamp(0);
     for frame in decode_frames(bytes) {
         codecs(&frame);
-        at += Duration::from_millis(1);
-        for (ix, played) in played.iter_mut().enumerate() {
-            check(&heard[ix], &frame);
-            let answers = played.take(&frame).unwrap_or_default();
-            for sent in answers.into_iter().chain(played.report(at).unwrap_or_default()) {
-                check(&heard[ix], &sent);
+        now += Duration::from_millis(1);
+        for (ix, emulated) in emulated.iter_mut().enumerate() {
+            check(&listeners[ix], &frame);
+            let answers = emulated.take(&frame).unwrap_or_default();
+            for sent in answers.into_iter().chain(emulated.report(now).unwrap_or_default()) {
+                check(&listeners[ix], &sent);
             }
-            let Motion { position_rad, velocity_rad_s, torque_nm } = played.motion();
-            assert!([position_rad, velocity_rad_s, torque_nm].iter().all(|number| number.is_finite()), "{played:?}");
+            let Motion { position_rad, velocity_rad_s, torque_nm } = emulated.motion();
+            assert!([position_rad, velocity_rad_s, torque_nm].iter().all(|number| number.is_finite()), "{emulated:?}");
         }
     }
 }
@@ -113,12 +113,12 @@ fn check(motor: &Motor, frame: &Frame) {
         Family::TMotor { model, .. } => model.limits(),
         Family::Odrive { .. } | Family::Cia402 { .. } => Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY),
     };
-    let most_rad = (limits.position_rad / config.gear_ratio + config.offset_rad.abs()).min(MOST_RAD);
-    let most_rad_s = (limits.velocity_rad_s / config.gear_ratio).min(MOST_RAD);
-    let most_nm = limits.torque_nm * config.gear_ratio;
-    assert!(reading.position_rad.abs() <= most_rad + 1e-9, "{frame:?}: {reading:?}");
-    assert!(reading.velocity_rad_s.abs() <= most_rad_s + 1e-9, "{frame:?}: {reading:?}");
-    assert!(reading.effort_nm.is_none_or(|nm| nm.abs() <= most_nm + 1e-9), "{frame:?}: {reading:?}");
+    let max_rad = (limits.position_rad / config.gear_ratio + config.offset_rad.abs()).min(MAX_RAD);
+    let max_rad_s = (limits.velocity_rad_s / config.gear_ratio).min(MAX_RAD);
+    let max_nm = limits.torque_nm * config.gear_ratio;
+    assert!(reading.position_rad.abs() <= max_rad + 1e-9, "{frame:?}: {reading:?}");
+    assert!(reading.velocity_rad_s.abs() <= max_rad_s + 1e-9, "{frame:?}: {reading:?}");
+    assert!(reading.effort_nm.is_none_or(|nm| nm.abs() <= max_nm + 1e-9), "{frame:?}: {reading:?}");
 }
 
 /// Every codec on one frame; what it reads is not looked at here.
@@ -130,7 +130,7 @@ fn codecs(frame: &Frame) {
     let _ = damiao::decode_register(frame);
     let _ = damiao::decode_feedback(frame, &LIMITS);
     let _ = robstride::decode_answer(frame, ROBSTRIDE_HOST, &LIMITS);
-    for thermometer in [Thermometer::Less40, Thermometer::Plain] {
+    for thermometer in [Thermometer::Offset40, Thermometer::Plain] {
         let _ = tmotor::decode_feedback(frame, &LIMITS, thermometer);
     }
     let _ = odrive::decode_answer(frame);
@@ -140,7 +140,7 @@ fn codecs(frame: &Frame) {
         assert_eq!(object.mapped(), number);
     }
     if let Ok(state) = cia402::State::from_statusword((number & 0xFFFF) as u16) {
-        let _ = state.order_to_enable(number >> 16 != 0).map(|order| state.after(order));
+        let _ = state.next_enabling_command(number >> 16 != 0).map(|state_command| state.after(state_command));
     }
     let reals: [f32; 5] = std::array::from_fn(|_| f32::from_le_bytes(take(&mut data)));
     let _ = damiao::limits_from_registers(reals[0], reals[1], reals[2]);
@@ -154,42 +154,42 @@ fn codecs(frame: &Frame) {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::can::emulated::State;
     use crate::can::motor::Reading;
-    use crate::can::played::State;
-    use crate::hostile::Random;
+    use crate::fuzz::Random;
 
     /// What is said on all buses while an arm is set up and read for some cycles.
-    pub(crate) fn talk() -> Vec<Frame> {
-        said_and_told().into_iter().flat_map(|(said, _)| said).collect()
+    pub(crate) fn example_traffic() -> Vec<Frame> {
+        record_traffic().into_iter().flat_map(|(sent_frames, _)| sent_frames).collect()
     }
 
     /// That, for each motor on its bus, and what it told of its joint.
-    fn said_and_told() -> Vec<(Vec<Frame>, Vec<Reading>)> {
-        motors().into_iter().map(|config| said_and_told_by(&config)).collect()
+    fn record_traffic() -> Vec<(Vec<Frame>, Vec<Reading>)> {
+        motors().into_iter().map(|config| record_traffic_of(&config)).collect()
     }
 
-    fn said_and_told_by(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
-        let mut played = Played::new(config.family, LIMITS);
-        let heard = Motor::with_limits(config.clone(), LIMITS);
-        let (mut said, mut told) = (set_up(config), Vec::new());
-        for frame in said.clone() {
-            said.extend(played.take(&frame).unwrap());
+    fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
+        let mut emulated = EmulatedMotor::new(config.family, LIMITS);
+        let listeners = Motor::with_limits(config.clone(), LIMITS);
+        let (mut sent_frames, mut expected_readings) = (set_up(config), Vec::new());
+        for frame in sent_frames.clone() {
+            sent_frames.extend(emulated.take(&frame).unwrap());
         }
         for cycle in 0..6_u16 {
-            played.set_motion(Motion { position_rad: 0.4 * f64::from(cycle), velocity_rad_s: 0.5, torque_nm: -0.25 });
-            let mut questions: Vec<Frame> = heard.question().into_iter().collect();
-            questions.extend(heard.wants_sync().then(canopen::encode_sync));
+            emulated.set_motion(Motion { position_rad: 0.4 * f64::from(cycle), velocity_rad_s: 0.5, torque_nm: -0.25 });
+            let mut poll_frames: Vec<Frame> = listeners.poll_frame().into_iter().collect();
+            poll_frames.extend(listeners.needs_sync().then(canopen::encode_sync));
             if let Family::TMotor { motor, .. } = config.family {
                 // Another master commands it; here we are that master.
-                questions.push(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap());
+                poll_frames.push(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap());
             }
-            let mut answers: Vec<Frame> = questions.iter().flat_map(|frame| played.take(frame).unwrap()).collect();
-            answers.extend(played.report(Stamp(0) + Duration::from_millis(20) * u32::from(cycle)).unwrap());
-            told.extend(answers.iter().filter_map(|frame| heard.read(frame)));
-            said.extend(questions);
-            said.extend(answers);
+            let mut answers: Vec<Frame> = poll_frames.iter().flat_map(|frame| emulated.take(frame).unwrap()).collect();
+            answers.extend(emulated.report(Stamp(0) + Duration::from_millis(20) * u32::from(cycle)).unwrap());
+            expected_readings.extend(answers.iter().filter_map(|frame| listeners.read(frame)));
+            sent_frames.extend(poll_frames);
+            sent_frames.extend(answers);
         }
-        (said, told)
+        (sent_frames, expected_readings)
     }
 
     /// What the driver says so that a motor reports.
@@ -205,13 +205,13 @@ pub(crate) mod tests {
                 vec![robstride::encode_request(ROBSTRIDE_HOST, motor, &report, &LIMITS).unwrap()]
             }
             Family::Cia402 { node, .. } => {
-                let (pdo, way) = (canopen::Pdo::First, canopen::Direction::Transmit);
+                let (pdo, direction) = (canopen::Pdo::First, canopen::Direction::Transmit);
                 let objects = [
-                    (pdo.mapping(way, 1), cia402::POSITION.mapped().into()),
-                    (pdo.mapping(way, 2), cia402::VELOCITY.mapped().into()),
-                    (pdo.mapping(way, 0), 2),
-                    (pdo.communication(way, 2), 1),
-                    (pdo.communication(way, 1), i64::from(pdo.id(way, node).value())),
+                    (pdo.mapping(direction, 1), cia402::POSITION.mapped().into()),
+                    (pdo.mapping(direction, 2), cia402::VELOCITY.mapped().into()),
+                    (pdo.mapping(direction, 0), 2),
+                    (pdo.communication(direction, 2), 1),
+                    (pdo.communication(direction, 1), i64::from(pdo.id(direction, node).value())),
                 ];
                 let objects = objects.map(|(object, value)| canopen::encode_write(node, object, value).unwrap());
                 objects.into_iter().chain([canopen::encode_nmt(canopen::Nmt::Start, Some(node))]).collect()
@@ -221,24 +221,24 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn frames_cut_doubled_or_out_of_order_move_no_joint() {
+    fn corrupted_frames_move_no_joint() {
         let mut random = Random(1);
-        for (config, (said, told)) in motors().into_iter().zip(said_and_told()) {
+        for (config, (sent_frames, expected_readings)) in motors().into_iter().zip(record_traffic()) {
             let motor = Motor::with_limits(config, LIMITS);
-            assert!(told.len() >= 5, "{motor:?} tells");
+            assert!(expected_readings.len() >= 5, "{motor:?} tells");
             let read = |frames: &[Frame]| {
                 let readings: Vec<Reading> = frames.iter().filter_map(|frame| motor.read(frame)).collect();
-                assert!(readings.iter().all(|reading| told.contains(reading)), "{motor:?}: {readings:?}");
+                assert!(readings.iter().all(|reading| expected_readings.contains(reading)), "{motor:?}: {readings:?}");
                 readings.len()
             };
-            let doubled: Vec<Frame> = said.iter().flat_map(|frame| [*frame; 2]).collect();
-            assert_eq!((read(&said), read(&doubled)), (told.len(), 2 * told.len()));
+            let doubled: Vec<Frame> = sent_frames.iter().flat_map(|frame| [*frame; 2]).collect();
+            assert_eq!((read(&sent_frames), read(&doubled)), (expected_readings.len(), 2 * expected_readings.len()));
             for _ in 0..20 {
-                let mut shuffled = said.clone();
+                let mut shuffled = sent_frames.clone();
                 random.shuffle(&mut shuffled);
-                assert_eq!(read(&shuffled), told.len());
+                assert_eq!(read(&shuffled), expected_readings.len());
             }
-            for frame in &said {
+            for frame in &sent_frames {
                 let bytes = [frame.data(), frame.data()].concat();
                 let cut = (0..frame.data().len()).map(|n| Frame::classic(frame.id(), &bytes[..n]).unwrap());
                 read(&cut.collect::<Vec<_>>());
@@ -251,13 +251,13 @@ pub(crate) mod tests {
 
     /// A command to go elsewhere, stiffly; none switches a motor on.
     fn command(config: &MotorConfig) -> Frame {
-        let elsewhere = Command { position_rad: 1.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, ..Command::default() };
+        let target = Command { position_rad: 1.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, ..Command::default() };
         match config.family {
-            Family::Damiao { motor, .. } => damiao::encode_command(motor, &elsewhere, &LIMITS),
+            Family::Damiao { motor, .. } => damiao::encode_command(motor, &target, &LIMITS),
             Family::Robstride { motor, model } => {
-                robstride::encode_request(ROBSTRIDE_HOST, motor, &robstride::Request::Move(elsewhere), &model.limits())
+                robstride::encode_request(ROBSTRIDE_HOST, motor, &robstride::Request::Move(target), &model.limits())
             }
-            Family::TMotor { motor, model } => tmotor::encode_command(motor, &elsewhere, &model.limits()),
+            Family::TMotor { motor, model } => tmotor::encode_command(motor, &target, &model.limits()),
             Family::Odrive { node } => {
                 let request = odrive::Request::SetPosition { position_rad: 1.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
                 odrive::encode_request(node, &request)
@@ -272,63 +272,63 @@ pub(crate) mod tests {
 
     /// Where a shaft is that began at 0, after frames a millisecond apart and a tenth of a second more.
     fn shaft_after(config: &MotorConfig, frames: &[Frame]) -> (f64, State) {
-        let mut played = Played::new(config.family, LIMITS);
+        let mut emulated = EmulatedMotor::new(config.family, LIMITS);
         for millis in 0..100 + frames.len() {
-            let at = Stamp(0) + Duration::from_millis(millis as u64);
-            played.report(at).unwrap();
+            let now = Stamp(0) + Duration::from_millis(millis as u64);
+            emulated.report(now).unwrap();
             if let Some(frame) = frames.get(millis) {
                 // What it cannot read it does not obey.
-                let _ = played.take(frame);
+                let _ = emulated.take(frame);
             }
         }
-        (played.motion().position_rad, played.state())
+        (emulated.motion().position_rad, emulated.state())
     }
 
     #[test]
-    fn no_motor_that_was_not_switched_on_moves_whatever_comes() {
+    fn disabled_motor_never_moves() {
         let mut random = Random(6);
         for config in motors() {
             let mut frames = set_up(&config);
             frames.extend([command(&config); 20]);
             for _ in 0..20 {
-                let mut spoilt = frames.clone();
-                random.shuffle(&mut spoilt);
-                for frame in spoilt.iter_mut().filter(|frame| !frame.is_fd() && frame.data().len() > 1).step_by(3) {
+                let mut corrupted = frames.clone();
+                random.shuffle(&mut corrupted);
+                for frame in corrupted.iter_mut().filter(|frame| !frame.is_fd() && frame.data().len() > 1).step_by(3) {
                     *frame = Frame::classic(frame.id(), &frame.data()[..frame.data().len() - 1]).unwrap();
                 }
                 assert_eq!(shaft_after(&config, &frames), (0.0, State::Free), "{config:?}");
-                assert_eq!(shaft_after(&config, &spoilt), (0.0, State::Free), "{config:?}");
+                assert_eq!(shaft_after(&config, &corrupted), (0.0, State::Free), "{config:?}");
             }
         }
         let damiao = &motors()[0];
-        let mit_mode = damiao::Access::Write(damiao::Register::ControlMode, damiao::Value::Whole(1));
+        let mit_mode = damiao::Access::Write(damiao::Register::ControlMode, damiao::Value::Integer(1));
         let mit_mode = damiao::RegisterMessage { motor: 1, access: mit_mode };
         let on = [
             damiao::encode_register(&mit_mode, None).unwrap(),
-            damiao::encode_order(1, damiao::Order::Enable).unwrap(),
+            damiao::encode_state_command(1, damiao::StateCommand::Enable).unwrap(),
             command(damiao),
         ];
         let (position_rad, state) = shaft_after(damiao, &on);
-        assert!(position_rad > 0.1 && state == State::Obeys, "once it is on it does: {position_rad} rad, {state:?}");
+        assert!(position_rad > 0.1 && state == State::Enabled, "once it is on it does: {position_rad} rad, {state:?}");
     }
 
     #[test]
-    fn a_motion_that_no_joint_makes_is_no_reading() {
+    fn implausible_motion_is_not_a_reading() {
         let config = motors().remove(3);
         let Family::Odrive { node } = config.family else { panic!("the fourth is an ODrive") };
         let motor = Motor::with_limits(config, LIMITS);
-        let told = |position_rad, velocity_rad_s| {
+        let expected_readings = |position_rad, velocity_rad_s| {
             motor.read(&odrive::encode_answer(node, &odrive::Answer::Motion { position_rad, velocity_rad_s }).unwrap())
         };
-        assert!(told(3.0, 1.0).is_some());
-        assert_eq!(told(1e30, 1.0), None);
-        assert_eq!(told(3.0, -1e30), None);
+        assert!(expected_readings(3.0, 1.0).is_some());
+        assert_eq!(expected_readings(1e30, 1.0), None);
+        assert_eq!(expected_readings(3.0, -1e30), None);
     }
 
     #[test]
-    fn frames_come_back_from_their_bytes() {
-        let said = talk();
-        assert_eq!(decode_frames(&encode_frames(&said)), said);
+    fn frames_round_trip_through_bytes() {
+        let sent_frames = example_traffic();
+        assert_eq!(decode_frames(&encode_frames(&sent_frames)), sent_frames);
         let id = Id::extended(0x1234).unwrap();
         let others =
             [Frame::remote(id, 5).unwrap(), Frame::fd(id, &[7; 48], true).unwrap(), Frame::fd(id, &[], false).unwrap()];

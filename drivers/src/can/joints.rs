@@ -5,7 +5,7 @@ use kinematics::{JointState, Stamp};
 
 /// What a motor told.
 #[derive(Debug)]
-pub(super) struct Told {
+pub(super) struct JointReading {
     pub(super) joint_ix: usize,
     pub(super) stamp: Stamp,
     pub(super) reading: Reading,
@@ -23,13 +23,13 @@ impl Joints {
     }
 
     /// Takes a reading; gives a state and begins anew once every joint has one.
-    pub(super) fn take(&mut self, told: &Told) -> Option<JointState> {
-        self.newest[told.joint_ix] = Some((told.stamp, told.reading));
+    pub(super) fn take(&mut self, joint_reading: &JointReading) -> Option<JointState> {
+        self.newest[joint_reading.joint_ix] = Some((joint_reading.stamp, joint_reading.reading));
         let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
         self.newest.fill(None);
         let stamp = all.iter().map(|(stamp, _)| *stamp).max()?;
-        let at = |(then, reading): &(Stamp, Reading)| {
-            reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*then)
+        let at = |(stamp_of_reading, reading): &(Stamp, Reading)| {
+            reading.position_rad + reading.velocity_rad_s * stamp.secs_since(*stamp_of_reading)
         };
         Some(JointState {
             stamp,
@@ -44,22 +44,22 @@ impl Joints {
 mod tests {
     use super::*;
 
-    fn told(joint_ix: usize, millis: i64, position_rad: f64) -> Told {
+    fn joint_reading(joint_ix: usize, millis: i64, position_rad: f64) -> JointReading {
         let reading = Reading { position_rad, velocity_rad_s: 2.0, effort_nm: Some(0.5) };
-        Told { joint_ix, stamp: Stamp(millis * 1_000_000), reading }
+        JointReading { joint_ix, stamp: Stamp(millis * 1_000_000), reading }
     }
 
     #[test]
-    fn a_state_waits_for_all_joints_and_carries_them_on_to_the_newest() {
+    fn state_waits_for_all_joints_and_extrapolates() {
         let mut joints = Joints::new(3);
-        assert_eq!(joints.take(&told(0, 1, 0.0)), None);
-        assert_eq!(joints.take(&told(2, 2, 0.2)), None);
-        assert_eq!(joints.take(&told(0, 3, 0.1)), None, "the newer one counts");
-        let state = joints.take(&told(1, 5, 0.3)).unwrap();
+        assert_eq!(joints.take(&joint_reading(0, 1, 0.0)), None);
+        assert_eq!(joints.take(&joint_reading(2, 2, 0.2)), None);
+        assert_eq!(joints.take(&joint_reading(0, 3, 0.1)), None, "the newer one counts");
+        let state = joints.take(&joint_reading(1, 5, 0.3)).unwrap();
         assert_eq!(state.stamp, Stamp(5_000_000));
         let expected = [0.1 + 2.0 * 0.002, 0.3, 0.2 + 2.0 * 0.003];
         assert!(state.position.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-12));
         assert_eq!((state.velocity, state.effort), (vec![2.0; 3], vec![0.5; 3]));
-        assert_eq!(joints.take(&told(1, 6, 0.3)), None, "it begins anew");
+        assert_eq!(joints.take(&joint_reading(1, 6, 0.3)), None, "it begins anew");
     }
 }

@@ -49,7 +49,7 @@ pub struct Link {
 
 /// What is wrong with an interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Complaint {
+pub struct LinkProblem {
     /// In words.
     pub what: String,
     /// What a person types to mend it.
@@ -61,8 +61,8 @@ impl Link {
     pub fn read(interface: &str) -> Result<Self, Error> {
         let details = CanInterface::open(interface).and_then(|open| open.details());
         details.map(|details| Self::of(interface, &details)).map_err(|error| {
-            let reason = match told(error) {
-                error if error.raw_os_error() == Some(ENODEV) => missing(interface),
+            let reason = match io_error(error) {
+                error if error.raw_os_error() == Some(ENODEV) => missing_interface(interface),
                 error => error,
             };
             Error::CanBus { interface: interface.to_owned(), reason }
@@ -97,48 +97,48 @@ impl Link {
         self.state.is_none()
     }
 
-    /// What must be mended before motors on it can be read as `wanted`; nothing where all is well.
-    pub fn complaints(&self, wanted: &BusConfig) -> Vec<Complaint> {
-        let command = set_up(&self.interface, self.is_virtual(), wanted);
-        let mut complaints = Vec::new();
-        let mut complain = |what: String| complaints.push(Complaint { what, command: command.clone() });
+    /// What must be mended before motors on it can be read as `config`; nothing where all is well.
+    pub fn problems(&self, config: &BusConfig) -> Vec<LinkProblem> {
+        let command = set_up_command(&self.interface, self.is_virtual(), config);
+        let mut problems = Vec::new();
+        let mut report = |what: String| problems.push(LinkProblem { what, command: command.clone() });
         if !self.is_up {
-            complain("it is down".to_owned());
+            report("it is down".to_owned());
         }
-        if wanted.data_bitrate_hz.is_some() && !self.is_fd {
-            complain("it does not take FD frames".to_owned());
+        if config.data_bitrate_hz.is_some() && !self.is_fd {
+            report("it does not take FD frames".to_owned());
         }
         if self.is_virtual() {
-            return complaints;
+            return problems;
         }
         match self.bitrate_hz {
-            Some(bitrate_hz) if bitrate_hz == wanted.bitrate_hz => {}
+            Some(bitrate_hz) if bitrate_hz == config.bitrate_hz => {}
             Some(bitrate_hz) => {
-                complain(format!("its bit rate is {bitrate_hz}, the rig file says {}", wanted.bitrate_hz));
+                report(format!("its bit rate is {bitrate_hz}, the rig file says {}", config.bitrate_hz));
             }
-            None => complain(format!("no bit rate is set, {} is wanted", wanted.bitrate_hz)),
+            None => report(format!("no bit rate is set, {} is wanted", config.bitrate_hz)),
         }
-        if let Some(data_bitrate_hz) = wanted.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
-            let is = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
-            complain(format!("its bit rate of FD data is {is}, the rig file says {data_bitrate_hz}"));
+        if let Some(data_bitrate_hz) = config.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
+            let reported = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
+            report(format!("its bit rate of FD data is {reported}, the rig file says {data_bitrate_hz}"));
         }
-        if self.restart_millis == Some(0) && !wanted.accept_no_restart {
-            complain(format!(
+        if self.restart_millis == Some(0) && !config.accept_no_restart {
+            report(format!(
                 "it does not come back by itself once it went off the bus (restart-ms 0; for an adapter that cannot, on a serial \
                  line for instance, arm.bus.{}.accept_no_restart = true)",
                 self.interface
             ));
         }
         if self.is_up && self.state >= Some(State::BusOff) {
-            complain("it is off the bus: look at wiring, termination and the bit rate of the others".to_owned());
+            report("it is off the bus: look at wiring, termination and the bit rate of the others".to_owned());
         }
-        complaints
+        problems
     }
 
     /// The first complaint as an error.
-    pub fn check(&self, wanted: &BusConfig) -> Result<(), Error> {
-        match self.complaints(wanted).into_iter().next() {
-            Some(Complaint { what, command }) => {
+    pub fn check(&self, config: &BusConfig) -> Result<(), Error> {
+        match self.problems(config).into_iter().next() {
+            Some(LinkProblem { what, command }) => {
                 Err(Error::CanLink { interface: self.interface.clone(), what, command })
             }
             None => Ok(()),
@@ -166,32 +166,32 @@ impl std::fmt::Display for Link {
 }
 
 /// The line that sets an interface up as wanted.
-fn set_up(interface: &str, is_virtual: bool, wanted: &BusConfig) -> String {
+fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> String {
     if is_virtual {
-        return match wanted.data_bitrate_hz {
+        return match config.data_bitrate_hz {
             // Its length of frames cannot be changed while it is up.
             Some(_) => format!("sudo ip link set {interface} down; sudo ip link set {interface} mtu 72 up"),
             None => format!("sudo ip link set {interface} up"),
         };
     }
-    let fd = wanted.data_bitrate_hz.map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
-    let restart = if wanted.accept_no_restart { String::new() } else { format!(" restart-ms {RESTART_MILLIS}") };
+    let fd = config.data_bitrate_hz.map_or_else(String::new, |rate| format!(" dbitrate {rate} fd on"));
+    let restart = if config.accept_no_restart { String::new() } else { format!(" restart-ms {RESTART_MILLIS}") };
     format!(
         "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate {}{fd}{restart}",
-        wanted.bitrate_hz
+        config.bitrate_hz
     )
 }
 
 /// The system's number for "no such device".
 const ENODEV: i32 = 19;
 
-fn missing(interface: &str) -> io::Error {
+fn missing_interface(interface: &str) -> io::Error {
     if interface.starts_with("vcan") {
-        let mend =
+        let create_command =
             format!("sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up");
         return io::Error::new(
             io::ErrorKind::NotFound,
-            format!("no such interface; a virtual one is made with: {mend}"),
+            format!("no such interface; a virtual one is made with: {create_command}"),
         );
     }
     let others = match interfaces(Path::new("/sys")).as_slice() {
@@ -202,7 +202,7 @@ fn missing(interface: &str) -> io::Error {
 }
 
 /// What the system said, with its number where there is one.
-fn told(error: socketcan::Error) -> io::Error {
+fn io_error(error: socketcan::Error) -> io::Error {
     match error {
         socketcan::Error::Io(error) => error,
         socketcan::Error::Nl(error) => {
@@ -216,11 +216,11 @@ fn told(error: socketcan::Error) -> io::Error {
 mod tests {
     use super::*;
 
-    fn wanted(data_bitrate_hz: Option<u32>) -> BusConfig {
+    fn config(data_bitrate_hz: Option<u32>) -> BusConfig {
         BusConfig { interface: "can0".to_owned(), bitrate_hz: 1_000_000, data_bitrate_hz, accept_no_restart: false }
     }
 
-    fn good() -> Link {
+    fn good_link() -> Link {
         Link {
             interface: "can0".to_owned(),
             is_up: true,
@@ -234,42 +234,42 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_the_command_that_mends_it() {
-        const MENDS: &str =
+    fn problems_come_with_the_command_that_fixes_them() {
+        const EXPECTED_COMMAND: &str =
             "sudo ip link set can0 down; sudo ip link set can0 up type can bitrate 1000000 restart-ms 100";
-        assert_eq!(good().complaints(&wanted(None)), []);
-        let bent: [(Link, &str); 5] = [
-            (Link { is_up: false, state: Some(State::Stopped), ..good() }, "it is down"),
-            (Link { bitrate_hz: Some(500_000), ..good() }, "its bit rate is 500000, the rig file says 1000000"),
-            (Link { bitrate_hz: None, ..good() }, "no bit rate is set"),
-            (Link { restart_millis: Some(0), ..good() }, "does not come back by itself"),
-            (Link { state: Some(State::BusOff), ..good() }, "off the bus"),
+        assert_eq!(good_link().problems(&config(None)), []);
+        let broken_links: [(Link, &str); 5] = [
+            (Link { is_up: false, state: Some(State::Stopped), ..good_link() }, "it is down"),
+            (Link { bitrate_hz: Some(500_000), ..good_link() }, "its bit rate is 500000, the rig file says 1000000"),
+            (Link { bitrate_hz: None, ..good_link() }, "no bit rate is set"),
+            (Link { restart_millis: Some(0), ..good_link() }, "does not come back by itself"),
+            (Link { state: Some(State::BusOff), ..good_link() }, "off the bus"),
         ];
-        for (link, what) in bent {
-            let complaints = link.complaints(&wanted(None));
-            assert_eq!(complaints.len(), 1, "{complaints:?}");
-            assert!(complaints[0].what.contains(what), "{complaints:?}");
-            assert_eq!(complaints[0].command, MENDS);
-            assert!(link.check(&wanted(None)).is_err_and(|error| error.to_string().contains(MENDS)));
+        for (link, what) in broken_links {
+            let problems = link.problems(&config(None));
+            assert_eq!(problems.len(), 1, "{problems:?}");
+            assert!(problems[0].what.contains(what), "{problems:?}");
+            assert_eq!(problems[0].command, EXPECTED_COMMAND);
+            assert!(link.check(&config(None)).is_err_and(|error| error.to_string().contains(EXPECTED_COMMAND)));
         }
     }
 
     #[test]
-    fn frames_with_flexible_data_rate_need_it_switched_on() {
-        let complaints = good().complaints(&wanted(Some(5_000_000)));
-        assert_eq!(complaints.len(), 2, "{complaints:?}");
-        assert!(complaints[0].command.ends_with("bitrate 1000000 dbitrate 5000000 fd on restart-ms 100"));
-        let link = Link { is_fd: true, data_bitrate_hz: Some(5_000_000), ..good() };
-        assert_eq!(link.complaints(&wanted(Some(5_000_000))), []);
+    fn can_fd_requires_fd_enabled() {
+        let problems = good_link().problems(&config(Some(5_000_000)));
+        assert_eq!(problems.len(), 2, "{problems:?}");
+        assert!(problems[0].command.ends_with("bitrate 1000000 dbitrate 5000000 fd on restart-ms 100"));
+        let link = Link { is_fd: true, data_bitrate_hz: Some(5_000_000), ..good_link() };
+        assert_eq!(link.problems(&config(Some(5_000_000))), []);
     }
 
     #[test]
-    fn virtual_interfaces_have_no_rate_and_need_only_be_up() {
-        let slcan = BusConfig { accept_no_restart: true, ..wanted(None) };
-        assert_eq!(Link { restart_millis: Some(0), ..good() }.complaints(&slcan), []);
-        let link = Link { bitrate_hz: None, restart_millis: None, state: None, n_errors: None, ..good() };
-        assert_eq!(link.complaints(&wanted(None)), []);
+    fn virtual_interfaces_only_need_to_be_up() {
+        let slcan = BusConfig { accept_no_restart: true, ..config(None) };
+        assert_eq!(Link { restart_millis: Some(0), ..good_link() }.problems(&slcan), []);
+        let link = Link { bitrate_hz: None, restart_millis: None, state: None, n_errors: None, ..good_link() };
+        assert_eq!(link.problems(&config(None)), []);
         let down = Link { is_up: false, ..link };
-        assert_eq!(down.complaints(&wanted(None))[0].command, "sudo ip link set can0 up");
+        assert_eq!(down.problems(&config(None))[0].command, "sudo ip link set can0 up");
     }
 }

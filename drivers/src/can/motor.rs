@@ -7,7 +7,7 @@
 use super::ROBSTRIDE_HOST;
 use super::bus::Bus;
 use super::config::{Family, MotorConfig};
-use super::talk::Talk;
+use super::query::MotorQuery;
 use crate::Error;
 use crate::wire::can::canopen::{self, Direction, Nmt, NodeState, Object, Pdo};
 use crate::wire::can::damiao::{self, Access, Register, RegisterMessage, Value};
@@ -32,7 +32,7 @@ const EVERY_SYNC: i64 = 1;
 /// Bit of a PDO's entry 1 that switches it off.
 const PDO_OFF: i64 = 1 << 31;
 /// No joint is further from its zero, or faster, rad or rad/s: such a reading is noise.
-pub(super) const MOST_RAD: f64 = 1e4;
+pub(super) const MAX_RAD: f64 = 1e4;
 
 /// What a joint does.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -52,40 +52,42 @@ pub(super) struct Motor {
 impl Motor {
     /// Asks the motor for what its counts cover, and has it report.
     pub(super) fn set_up(bus: &Bus, config: &MotorConfig) -> Result<Self, Error> {
-        let talk = Talk::new(bus, config);
+        let query = MotorQuery::new(bus, config);
         let mut motor = Self::with_limits(config.clone(), Limits::of(1.0, 1.0, 1.0));
         match config.family {
             Family::Damiao { motor: number, feedback } => {
-                let real = |register| match talk.register(number, feedback, register)? {
-                    Value::Real(real) => Ok(real),
-                    Value::Whole(_) => Err(talk.fault(format!("register {register:?} holds no real number"))),
+                let real = |register| match query.register(number, feedback, register)? {
+                    Value::Float(real) => Ok(real),
+                    Value::Integer(_) => Err(query.fault(format!("register {register:?} holds no real number"))),
                 };
                 let [p_max, v_max, t_max] =
                     [Register::PositionLimit, Register::VelocityLimit, Register::TorqueLimit].map(real);
-                motor.limits = talk.said(damiao::limits_from_registers(p_max?, v_max?, t_max?))?;
-                log::debug!("{}: counts cover {:?}", talk.name(), motor.limits);
+                motor.limits = query.map_error(damiao::limits_from_registers(p_max?, v_max?, t_max?))?;
+                log::debug!("{}: counts cover {:?}", query.name(), motor.limits);
             }
             Family::Robstride { motor: number, model } => {
                 motor.limits = model.limits();
-                let interval = Request::Write(Parameter::ReportInterval, robstride::Value::Whole(SHORTEST_REPORT));
+                let interval = Request::Write(Parameter::ReportInterval, robstride::Value::Integer(SHORTEST_REPORT));
                 for request in [interval, Request::ReportActively(true)] {
-                    talk.robstride(number, &request, &motor.limits)?;
+                    query.robstride(number, &request, &motor.limits)?;
                 }
-                motor
-                    .hear(&talk, "it does not report; is its number right, and its firmware one with active report?")?;
+                motor.wait_for_reading(
+                    &query,
+                    "it does not report; is its number right, and its firmware one with active report?",
+                )?;
             }
             Family::TMotor { model, .. } => {
                 motor.limits = model.limits();
-                motor.hear(
-                    &talk,
+                motor.wait_for_reading(
+                    &query,
                     "an AK motor in MIT mode speaks only when another master commands it, and none does",
                 )?;
             }
-            Family::Odrive { .. } => motor.hear(
-                &talk,
+            Family::Odrive { .. } => motor.wait_for_reading(
+                &query,
                 "it sends no encoder estimates; set axis0.config.can.encoder_msg_rate_ms = 10, and look at its node_id",
             )?,
-            Family::Cia402 { node, .. } => set_up_drive(&talk, node)?,
+            Family::Cia402 { node, .. } => set_up_drive(&query, node)?,
         }
         Ok(motor)
     }
@@ -111,7 +113,7 @@ impl Motor {
     }
 
     /// What is sent in each cycle so that it tells where it is; `None` where it tells unasked, or at a SYNC.
-    pub(super) fn question(&self) -> Option<Frame> {
+    pub(super) fn poll_frame(&self) -> Option<Frame> {
         match self.config.family {
             Family::Damiao { motor, .. } => {
                 damiao::encode_register(&RegisterMessage { motor, access: Access::Refresh }, None).ok()
@@ -120,12 +122,12 @@ impl Motor {
         }
     }
 
-    pub(super) fn wants_sync(&self) -> bool {
+    pub(super) fn needs_sync(&self) -> bool {
         matches!(self.config.family, Family::Cia402 { .. })
     }
 
     /// A frame like those that tell where it is, and how often it comes in a second where that is not ours to say.
-    pub(super) fn usual_answer(&self) -> (Frame, Option<f64>) {
+    pub(super) fn typical_answer(&self) -> (Frame, Option<f64>) {
         let (id, rate_hz) = match self.config.family {
             Family::Damiao { feedback, .. } => (Id::standard(feedback.into()), None),
             Family::Robstride { .. } => (Id::extended(0), Some(1.0 / ROBSTRIDE_REPORT_SECS)),
@@ -141,17 +143,24 @@ impl Motor {
     pub(super) fn read(&self, frame: &Frame) -> Option<Reading> {
         let (position, velocity, torque) = match self.config.family {
             Family::Damiao { motor, feedback } => {
-                let is_its = frame.id() == Id::standard(feedback.into()).ok()? && !is_register(frame, motor);
-                let told = is_its.then(|| damiao::decode_feedback(frame, &self.limits).ok()).flatten()?;
-                if u16::from(told.motor_low) != motor & 0xF {
+                let is_from_motor = frame.id() == Id::standard(feedback.into()).ok()? && !is_register(frame, motor);
+                let feedback_message =
+                    is_from_motor.then(|| damiao::decode_feedback(frame, &self.limits).ok()).flatten()?;
+                if u16::from(feedback_message.motor_low) != motor & 0xF {
                     return None;
                 }
-                (told.motion.position_rad, told.motion.velocity_rad_s, Some(told.motion.torque_nm))
+                (
+                    feedback_message.motion.position_rad,
+                    feedback_message.motion.velocity_rad_s,
+                    Some(feedback_message.motion.torque_nm),
+                )
             }
             Family::Robstride { motor, .. } => match robstride::decode_answer(frame, ROBSTRIDE_HOST, &self.limits) {
-                Ok(robstride::Answer::Feedback(told)) if told.motor == motor => {
-                    (told.motion.position_rad, told.motion.velocity_rad_s, Some(told.motion.torque_nm))
-                }
+                Ok(robstride::Answer::Feedback(feedback_message)) if feedback_message.motor == motor => (
+                    feedback_message.motion.position_rad,
+                    feedback_message.motion.velocity_rad_s,
+                    Some(feedback_message.motion.torque_nm),
+                ),
                 _ => return None,
             },
             Family::TMotor { motor, .. } => {
@@ -159,11 +168,15 @@ impl Motor {
                 if frame.id().value() == u32::from(motor) {
                     return None;
                 }
-                let told = tmotor::decode_feedback(frame, &self.limits, Thermometer::Less40).ok()?;
-                if told.motor != motor {
+                let feedback_message = tmotor::decode_feedback(frame, &self.limits, Thermometer::Offset40).ok()?;
+                if feedback_message.motor != motor {
                     return None;
                 }
-                (told.motion.position_rad, told.motion.velocity_rad_s, Some(told.motion.torque_nm))
+                (
+                    feedback_message.motion.position_rad,
+                    feedback_message.motion.velocity_rad_s,
+                    Some(feedback_message.motion.torque_nm),
+                )
             }
             Family::Odrive { node } => match odrive::decode_answer(frame) {
                 Ok((from, odrive::Answer::Motion { position_rad, velocity_rad_s })) if from == node => {
@@ -186,12 +199,12 @@ impl Motor {
             velocity_rad_s: velocity * per_turn,
             effort_nm: torque.map(|torque| torque / per_turn),
         };
-        (reading.position_rad.abs() <= MOST_RAD && reading.velocity_rad_s.abs() <= MOST_RAD).then_some(reading)
+        (reading.position_rad.abs() <= MAX_RAD && reading.velocity_rad_s.abs() <= MAX_RAD).then_some(reading)
     }
 
     /// Waits until the motor tells where it is.
-    fn hear(&self, talk: &Talk<'_>, silent: &str) -> Result<(), Error> {
-        talk.wait(MAX_REPORT, |frame| self.read(frame))?.map(drop).ok_or_else(|| talk.fault(silent))
+    fn wait_for_reading(&self, query: &MotorQuery<'_>, timeout_reason: &str) -> Result<(), Error> {
+        query.wait(MAX_REPORT, |frame| self.read(frame))?.map(drop).ok_or_else(|| query.fault(timeout_reason))
     }
 }
 
@@ -201,16 +214,17 @@ fn is_register(frame: &Frame, motor: u16) -> bool {
 }
 
 /// Has a drive send position and velocity at every SYNC, and starts it; it stays switched off.
-fn set_up_drive(talk: &Talk<'_>, node: canopen::Node) -> Result<(), Error> {
-    let mut entries = every_sync(Pdo::First, Direction::Transmit, node, &[cia402::POSITION, cia402::VELOCITY]);
+fn set_up_drive(query: &MotorQuery<'_>, node: canopen::Node) -> Result<(), Error> {
+    let mut entries =
+        map_pdo_at_every_sync(Pdo::First, Direction::Transmit, node, &[cia402::POSITION, cia402::VELOCITY]);
     entries.push((canopen::PRODUCER_HEARTBEAT, HEARTBEAT_MILLIS));
-    start_drive(talk, node, &entries)
+    start_drive(query, node, &entries)
 }
 
 /// The entries that lay objects into a PDO of a drive and have it sent, or taken, at every SYNC.
 ///
 /// Source: CiA 301, section 7.5.2.36: a PDO is switched off while its mapping is changed.
-pub(super) fn every_sync(
+pub(super) fn map_pdo_at_every_sync(
     pdo: Pdo,
     direction: Direction,
     node: canopen::Node,
@@ -227,15 +241,15 @@ pub(super) fn every_sync(
 }
 
 /// Sets entries while a drive's PDOs rest, and starts these.
-pub(super) fn start_drive(talk: &Talk<'_>, node: canopen::Node, entries: &[(Object, i64)]) -> Result<(), Error> {
-    talk.send(Ok(canopen::encode_nmt(Nmt::EnterPreOperational, Some(node))))?;
+pub(super) fn start_drive(query: &MotorQuery<'_>, node: canopen::Node, entries: &[(Object, i64)]) -> Result<(), Error> {
+    query.send(Ok(canopen::encode_nmt(Nmt::EnterPreOperational, Some(node))))?;
     for (object, value) in entries {
-        talk.set(node, *object, *value)?;
+        query.set(node, *object, *value)?;
     }
-    talk.send(Ok(canopen::encode_nmt(Nmt::Start, Some(node))))?;
-    let started = talk.wait(MAX_REPORT, |frame| match canopen::decode_heartbeat(frame) {
+    query.send(Ok(canopen::encode_nmt(Nmt::Start, Some(node))))?;
+    let started = query.wait(MAX_REPORT, |frame| match canopen::decode_heartbeat(frame) {
         Ok((from, NodeState::Operational)) => (from == node).then_some(()),
         _ => None,
     })?;
-    started.ok_or_else(|| talk.fault("the drive was started and does not say that it is operational"))
+    started.ok_or_else(|| query.fault("the drive was started and does not say that it is operational"))
 }

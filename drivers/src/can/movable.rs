@@ -4,10 +4,10 @@
 //! to be, which is also what keeps the motors' own watchdogs quiet.
 
 use super::arm::MAX_WAITING;
+use super::arm_loop::{ArmLoop, Request};
 use super::config::ArmConfig;
-use super::joints::{Joints, Told};
-use super::moving::{Moving, Request};
-use super::watchdog::Plan;
+use super::joints::{JointReading, Joints};
+use super::watchdog::WatchdogPlan;
 use crate::motion::{JointTarget, Motion, MotionConfig, MovableArm};
 use crate::wire::can::odrive::Endpoints;
 use crate::{Arm, Error};
@@ -41,18 +41,18 @@ pub struct MovableArmConfig {
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
-    arriving: Receiver<Result<Told, Error>>,
+    readings: Receiver<Result<JointReading, Error>>,
     joints: Joints,
     requests: SyncSender<Request>,
     motion: Arc<Mutex<Motion>>,
-    is_ending: Arc<AtomicBool>,
+    is_shutting_down: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl MovableCanArm {
     /// Checks what can be checked without the motors: limits, and whether each of them can do what is asked for.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
-        Plan::new(config).map(drop)
+        WatchdogPlan::new(config).map(drop)
     }
 
     /// Checks what the motors can do, sets their timeouts and reads them back, and switches them on, held where they are.
@@ -60,30 +60,31 @@ impl MovableCanArm {
     /// Where anything fails, all of them are left switched off.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
         let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
-        let (sender, arriving) = sync_channel(MAX_WAITING);
-        let (requests, requested) = sync_channel(1);
+        let (sender, readings) = sync_channel(MAX_WAITING);
+        let (requests, request_receiver) = sync_channel(1);
         let motion = Arc::new(Mutex::new(Motion::Stopped { reason: "it was not switched on yet".to_owned() }));
-        let is_ending = Arc::new(AtomicBool::new(false));
-        let moving = Moving::new(config, requested, sender, Arc::clone(&motion), Arc::clone(&is_ending))?;
+        let is_shutting_down = Arc::new(AtomicBool::new(false));
+        let arm_loop =
+            ArmLoop::new(config, request_receiver, sender, Arc::clone(&motion), Arc::clone(&is_shutting_down))?;
         let device = "moved CAN arm".to_owned();
-        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || moving.run());
+        let thread = std::thread::Builder::new().name(device.clone()).spawn(move || arm_loop.run());
         let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
         let joints = Joints::new(names.len());
-        let mut arm = Self { names, arriving, joints, requests, motion, is_ending, thread };
+        let mut arm = Self { names, readings, joints, requests, motion, is_shutting_down, thread };
         arm.recover()?;
         Ok(arm)
     }
 
     /// Has the arm's thread do something, and waits for what came of it.
-    fn ask<T>(
+    fn request_and_wait<T>(
         &self,
         request: impl FnOnce(SyncSender<Result<T, Error>>) -> Request,
-        within: Duration,
+        timeout: Duration,
     ) -> Result<T, Error> {
         let (sender, answer) = sync_channel(1);
-        let gone = || Error::Motion { reason: "its thread does not answer".to_owned() };
-        self.requests.try_send(request(sender)).map_err(|_| gone())?;
-        answer.recv_timeout(within).map_err(|_| gone())?
+        let no_answer = || Error::Motion { reason: "its thread does not answer".to_owned() };
+        self.requests.try_send(request(sender)).map_err(|_| no_answer())?;
+        answer.recv_timeout(timeout).map_err(|_| no_answer())?
     }
 }
 
@@ -95,11 +96,11 @@ impl Arm for MovableCanArm {
     /// As of [`CanArm`](super::CanArm). An arm that stopped goes on being read where its motors tell without being
     /// commanded and without a SYNC.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
-        let until = Instant::now() + timeout;
+        let deadline = Instant::now() + timeout;
         loop {
-            match self.arriving.recv_timeout(until.saturating_duration_since(Instant::now())) {
-                Ok(told) => {
-                    if let Some(state) = self.joints.take(&told?) {
+            match self.readings.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+                Ok(reading) => {
+                    if let Some(state) = self.joints.take(&reading?) {
                         return Ok(state);
                     }
                 }
@@ -113,7 +114,7 @@ impl Arm for MovableCanArm {
 
 impl MovableArm for MovableCanArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        self.ask(|answer| Request::HeadFor(target.clone(), answer), MAX_ANSWER)
+        self.request_and_wait(|answer| Request::SetTarget(target.clone(), answer), MAX_ANSWER)
     }
 
     fn motion(&self) -> Motion {
@@ -121,17 +122,17 @@ impl MovableArm for MovableCanArm {
     }
 
     fn stop(&mut self) -> Result<(), Error> {
-        self.ask(Request::Stop, MAX_ANSWER)
+        self.request_and_wait(Request::Stop, MAX_ANSWER)
     }
 
     fn recover(&mut self) -> Result<(), Error> {
-        self.ask(Request::Recover, MAX_RECOVERY)
+        self.request_and_wait(Request::Recover, MAX_RECOVERY)
     }
 }
 
 impl Drop for MovableCanArm {
     fn drop(&mut self) {
-        self.is_ending.store(true, Ordering::Relaxed);
+        self.is_shutting_down.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
             // A thread that panicked has said so.
             let _ = thread.join();

@@ -7,9 +7,9 @@
 use super::ROBSTRIDE_HOST;
 use super::bus::Bus;
 use super::config::{Family, MotorConfig};
-use super::motor::{Motor, Reading, every_sync, start_drive};
-use super::talk::Talk;
-use super::watchdog::{self, Plan};
+use super::motor::{Motor, Reading, map_pdo_at_every_sync, start_drive};
+use super::query::MotorQuery;
+use super::watchdog::{self, WatchdogPlan};
 use crate::motion::{MotionLimits, OnLoss};
 use crate::wire::can::canopen::{self, Direction, Pdo};
 use crate::wire::can::damiao::{self, Access, Register, RegisterMessage};
@@ -27,7 +27,7 @@ const ODRIVE_HEARTBEAT_HZ: f64 = 10.0;
 /// ... and so does a Robstride motor.
 const REPORT_HZ: f64 = 100.0;
 /// A motor that tells unasked where it is does so at least this often.
-const MAX_UNASKED: Duration = Duration::from_millis(50);
+const MAX_UNSOLICITED_INTERVAL: Duration = Duration::from_millis(50);
 /// What an SDO answer says where a drive has no such object.
 const NO_SUCH_OBJECT: u32 = 0x0602_0000;
 
@@ -37,41 +37,41 @@ pub(super) enum Health {
     /// Switched off.
     Off,
     /// It obeys commands.
-    Obeys,
+    Enabled,
     /// It stopped by itself.
     Fault(String),
 }
 
 /// Frames of both sides that keep a motor moving: those of each cycle, and others with how often they come in a second.
 pub(super) struct Traffic {
-    pub(super) of_a_cycle: Vec<Frame>,
-    pub(super) unasked: Vec<(Frame, f64)>,
+    pub(super) cycle_frames: Vec<Frame>,
+    pub(super) unsolicited: Vec<(Frame, f64)>,
 }
 
-/// A motor that may be moved, and is switched off until [`Mover::enable`] is sent.
+/// A motor that may be moved, and is switched off until [`MovableMotor::enable`] is sent.
 #[derive(Debug)]
-pub(super) struct Mover {
+pub(super) struct MovableMotor {
     motor: Motor,
     health: Option<Health>,
     /// State of a CiA 402 drive.
     drive: cia402::State,
 }
 
-impl Mover {
+impl MovableMotor {
     /// Finds a motor, switches it off, forgets its faults, sets its watchdog and its mode, and reads both back.
-    pub(super) fn make_ready(bus: &Bus, config: &MotorConfig, plan: &Plan) -> Result<Self, Error> {
+    pub(super) fn prepare(bus: &Bus, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Self, Error> {
         let motor = match config.family {
             // It answers commands only, and is asked with the order that switches it off.
             Family::TMotor { model, .. } => Motor::with_limits(config.clone(), model.limits()),
             _ => Motor::set_up(bus, config)?,
         };
-        let mover = Self { motor, health: None, drive: cia402::State::NotReadyToSwitchOn };
-        let talk = Talk::new(bus, config);
-        mover.check_gains(&talk)?;
-        mover.switch_off(&talk)?;
-        watchdog::set(&talk, &config.family, mover.motor.limits(), plan)?;
-        mover.set_mode(&talk, plan)?;
-        Ok(mover)
+        let movable_motor = Self { motor, health: None, drive: cia402::State::NotReadyToSwitchOn };
+        let query = MotorQuery::new(bus, config);
+        movable_motor.check_gains(&query)?;
+        movable_motor.switch_off(&query)?;
+        watchdog::set(&query, &config.family, movable_motor.motor.limits(), plan)?;
+        movable_motor.set_mode(&query, plan)?;
+        Ok(movable_motor)
     }
 
     pub(super) fn config(&self) -> &MotorConfig {
@@ -88,70 +88,75 @@ impl Mover {
     }
 
     /// Forgets what it told about itself.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn clear_health(&mut self) {
         self.health = None;
     }
 
     /// The joint's limits, and no further and faster than the motor's counts go.
     pub(super) fn limits(&self, joint: &MotionLimits) -> MotionLimits {
         let (config, per_turn) = (self.motor.config(), self.motor.per_turn());
-        let (most_rad, most_rad_s) = match config.family {
+        let (max_rad, max_rad_s) = match config.family {
             Family::Odrive { .. } => (f64::INFINITY, f64::INFINITY),
             Family::Cia402 { units, .. } => (units.rad_from_raw(i32::MAX), f64::INFINITY),
             _ => (self.motor.limits().position_rad, self.motor.limits().velocity_rad_s),
         };
-        let most = most_rad * per_turn.abs();
+        let max = max_rad * per_turn.abs();
         let [lower, upper] = joint.position;
         MotionLimits {
-            position: [lower.max(config.offset_rad - most), upper.min(config.offset_rad + most)],
-            velocity: joint.velocity.min(most_rad_s * per_turn.abs()),
+            position: [lower.max(config.offset_rad - max), upper.min(config.offset_rad + max)],
+            velocity: joint.velocity.min(max_rad_s * per_turn.abs()),
             ..*joint
         }
     }
 
-    /// How long it may be silent before it counts as lost, where `usual` is what others may.
-    pub(super) fn max_silence(&self, usual: Duration) -> Duration {
+    /// How long it may be silent before it counts as lost, where `default_limit` is what others may.
+    pub(super) fn max_silence(&self, default_limit: Duration) -> Duration {
         match self.motor.config().family {
-            Family::Odrive { .. } => usual.max(MAX_UNASKED),
-            _ => usual,
+            Family::Odrive { .. } => default_limit.max(MAX_UNSOLICITED_INTERVAL),
+            _ => default_limit,
         }
     }
 
     /// What goes over its bus while it moves.
     pub(super) fn traffic(family: &Family) -> Traffic {
-        let eight = |id: Id| Frame::classic(id, &[0; 8]).expect("eight bytes");
-        let (short, long) = (eight(Id::standard(0).expect("small")), eight(Id::extended(0).expect("small")));
-        let (of_a_cycle, unasked) = match family {
+        let frame_of_8_bytes = |id: Id| Frame::classic(id, &[0; 8]).expect("eight bytes");
+        let (short, long) =
+            (frame_of_8_bytes(Id::standard(0).expect("small")), frame_of_8_bytes(Id::extended(0).expect("small")));
+        let (cycle_frames, unsolicited) = match family {
             Family::Damiao { .. } | Family::TMotor { .. } => (vec![short; 2], vec![]),
             Family::Robstride { .. } => (vec![long; 2], vec![(long, REPORT_HZ)]),
             Family::Odrive { .. } => (vec![short], vec![(short, REPORT_HZ), (short, ODRIVE_HEARTBEAT_HZ)]),
             // Target, position and state.
             Family::Cia402 { .. } => (vec![short; 3], vec![]),
         };
-        Traffic { of_a_cycle, unasked }
+        Traffic { cycle_frames, unsolicited }
     }
 
     /// What is sent so that it tells where it is while it is off; `None` where it tells unasked, or at a SYNC.
-    pub(super) fn question(&self) -> Option<Frame> {
+    pub(super) fn poll_frame(&self) -> Option<Frame> {
         match self.motor.config().family {
-            Family::TMotor { motor, .. } => tmotor::encode_order(motor, tmotor::Order::Disable).ok(),
-            _ => self.motor.question(),
+            Family::TMotor { motor, .. } => tmotor::encode_state_command(motor, tmotor::StateCommand::Disable).ok(),
+            _ => self.motor.poll_frame(),
         }
     }
 
-    pub(super) fn wants_sync(&self) -> bool {
-        self.motor.wants_sync()
+    pub(super) fn needs_sync(&self) -> bool {
+        self.motor.needs_sync()
     }
 
     /// What switches it on; a CiA 402 drive is brought there by its commands.
     pub(super) fn enable(&self) -> Result<Vec<Frame>, CanError> {
         let limits = self.motor.limits();
         match self.motor.config().family {
-            Family::Damiao { motor, .. } => Ok(vec![damiao::encode_order(motor, damiao::Order::Enable)?]),
+            Family::Damiao { motor, .. } => {
+                Ok(vec![damiao::encode_state_command(motor, damiao::StateCommand::Enable)?])
+            }
             Family::Robstride { motor, .. } => {
                 Ok(vec![robstride::encode_request(ROBSTRIDE_HOST, motor, &Request::Enable, limits)?])
             }
-            Family::TMotor { motor, .. } => Ok(vec![tmotor::encode_order(motor, tmotor::Order::Enable)?]),
+            Family::TMotor { motor, .. } => {
+                Ok(vec![tmotor::encode_state_command(motor, tmotor::StateCommand::Enable)?])
+            }
             Family::Odrive { node } => {
                 let closed = odrive::Request::SetState(odrive::State::ClosedLoopControl);
                 // Its watchdog may have run out while it was off.
@@ -186,11 +191,11 @@ impl Mover {
             }
             Family::Cia402 { node, units } => {
                 // What brings it one state nearer to obeying, and keeps it there; a fault is not reset by this.
-                let order = match self.drive {
-                    cia402::State::OperationEnabled => cia402::Order::EnableOperation,
-                    state => state.order_to_enable(false).unwrap_or(cia402::Order::DisableVoltage),
+                let state_command = match self.drive {
+                    cia402::State::OperationEnabled => cia402::StateCommand::EnableOperation,
+                    state => state.next_enabling_command(false).unwrap_or(cia402::StateCommand::DisableVoltage),
                 };
-                let [low, high] = order.controlword().to_le_bytes();
+                let [low, high] = state_command.controlword().to_le_bytes();
                 let [a, b, c, d] = units.raw_from_rad("the target position", position_rad)?.to_le_bytes();
                 Frame::classic(Pdo::First.id(Direction::Receive, node), &[low, high, a, b, c, d])
             }
@@ -198,10 +203,12 @@ impl Mover {
     }
 
     /// What is said to it last, where it shall do by itself from now on what `on_loss` says; `position_rad` is where its joint was sent.
-    pub(super) fn leave(&self, on_loss: OnLoss, position_rad: f64) -> Result<Vec<Frame>, CanError> {
+    pub(super) fn shutdown(&self, on_loss: OnLoss, position_rad: f64) -> Result<Vec<Frame>, CanError> {
         match (on_loss, self.motor.config().family) {
             (OnLoss::Release, _) => self.release(),
-            (OnLoss::Hold, Family::Cia402 { node, .. }) => Ok(vec![order(node, cia402::Order::QuickStop)?]),
+            (OnLoss::Hold, Family::Cia402 { node, .. }) => {
+                Ok(vec![state_command(node, cia402::StateCommand::QuickStop)?])
+            }
             (OnLoss::Hold, _) => Ok(vec![self.command(position_rad, 0.0)?]),
             (OnLoss::Damp, _) => Ok(vec![self.command_with(position_rad, 0.0, 0.0)?]),
         }
@@ -210,38 +217,38 @@ impl Mover {
     /// What switches it off.
     fn release(&self) -> Result<Vec<Frame>, CanError> {
         let frame = match self.motor.config().family {
-            Family::Damiao { motor, .. } => damiao::encode_order(motor, damiao::Order::Disable),
+            Family::Damiao { motor, .. } => damiao::encode_state_command(motor, damiao::StateCommand::Disable),
             Family::Robstride { motor, .. } => {
                 let stop = Request::Stop { clear_fault: false };
                 robstride::encode_request(ROBSTRIDE_HOST, motor, &stop, self.motor.limits())
             }
-            Family::TMotor { motor, .. } => tmotor::encode_order(motor, tmotor::Order::Disable),
+            Family::TMotor { motor, .. } => tmotor::encode_state_command(motor, tmotor::StateCommand::Disable),
             Family::Odrive { node } => odrive::encode_request(node, &odrive::Request::SetState(odrive::State::Idle)),
-            Family::Cia402 { node, .. } => order(node, cia402::Order::DisableVoltage),
+            Family::Cia402 { node, .. } => state_command(node, cia402::StateCommand::DisableVoltage),
         };
         Ok(vec![frame?])
     }
 
     /// What its joint does, where a frame tells; how it is, is kept.
-    pub(super) fn hear(&mut self, frame: &Frame) -> Option<Reading> {
+    pub(super) fn process_frame(&mut self, frame: &Frame) -> Option<Reading> {
         let reading = self.motor.read(frame);
         let is_feedback = reading.is_some();
         let limits = *self.motor.limits();
         let family = self.motor.config().family;
         match family {
             Family::Damiao { .. } if is_feedback => {
-                let told = damiao::decode_feedback(frame, &limits).ok()?;
-                self.health = Some(match told.status {
+                let reported = damiao::decode_feedback(frame, &limits).ok()?;
+                self.health = Some(match reported.status {
                     damiao::Status::Disabled => Health::Off,
-                    damiao::Status::Enabled => Health::Obeys,
-                    damiao::Status::LostCommunication => Health::Fault(LOST.to_owned()),
+                    damiao::Status::Enabled => Health::Enabled,
+                    damiao::Status::LostCommunication => Health::Fault(COMMUNICATION_LOST.to_owned()),
                     status => Health::Fault(format!("it stopped: {status:?}")),
                 });
             }
             Family::Robstride { motor, .. } => match robstride::decode_answer(frame, ROBSTRIDE_HOST, &limits) {
-                Ok(robstride::Answer::Feedback(told)) if told.motor == motor => {
-                    self.health = Some(match (told.mode, told.faults) {
-                        (robstride::Mode::Run, Faults(0)) => Health::Obeys,
+                Ok(robstride::Answer::Feedback(reported)) if reported.motor == motor => {
+                    self.health = Some(match (reported.mode, reported.faults) {
+                        (robstride::Mode::Run, Faults(0)) => Health::Enabled,
                         (_, Faults(0)) => Health::Off,
                         (_, Faults(bits)) => Health::Fault(format!("it has the fault bits {bits:#08b}")),
                     });
@@ -252,10 +259,10 @@ impl Mover {
                 _ => {}
             },
             Family::TMotor { .. } if is_feedback => {
-                let told = tmotor::decode_feedback(frame, &limits, Thermometer::Less40).ok()?;
+                let reported = tmotor::decode_feedback(frame, &limits, Thermometer::Offset40).ok()?;
                 // It does not tell whether it obeys.
-                self.health = Some(match told.health.map(|health| health.fault) {
-                    None | Some(tmotor::Fault::None) => Health::Obeys,
+                self.health = Some(match reported.health.map(|health| health.fault) {
+                    None | Some(tmotor::Fault::None) => Health::Enabled,
                     Some(fault) => Health::Fault(format!("it stopped: {fault:?}")),
                 });
             }
@@ -264,9 +271,9 @@ impl Mover {
                     && from == node
                 {
                     self.health = Some(match (errors, state) {
-                        (0, odrive::State::ClosedLoopControl) => Health::Obeys,
+                        (0, odrive::State::ClosedLoopControl) => Health::Enabled,
                         (0, _) => Health::Off,
-                        (odrive::WATCHDOG_TIMER_EXPIRED, _) => Health::Fault(LOST.to_owned()),
+                        (odrive::WATCHDOG_TIMER_EXPIRED, _) => Health::Fault(COMMUNICATION_LOST.to_owned()),
                         (errors, _) => Health::Fault(format!("it has the errors {errors:#x}")),
                     });
                 }
@@ -275,7 +282,7 @@ impl Mover {
                 if let Some(state) = state_of(frame, node) {
                     self.drive = state;
                     self.health = Some(match state {
-                        cia402::State::OperationEnabled => Health::Obeys,
+                        cia402::State::OperationEnabled => Health::Enabled,
                         cia402::State::QuickStopActive => Health::Fault("it made a quick stop".to_owned()),
                         cia402::State::Fault | cia402::State::FaultReactionActive => {
                             Health::Fault("it has a fault".to_owned())
@@ -297,89 +304,95 @@ impl Mover {
     }
 
     /// What its counts do not hold would be cut off without a word.
-    fn check_gains(&self, talk: &Talk<'_>) -> Result<(), Error> {
+    fn check_gains(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let Some([kp, kd]) = self.gains() else { return Ok(()) };
-        let most = self.motor.limits();
-        match kp <= most.kp_nm_rad && kd <= most.kd_nm_s_rad {
+        let max = self.motor.limits();
+        match kp <= max.kp_nm_rad && kd <= max.kd_nm_s_rad {
             true => Ok(()),
-            false => Err(talk.fault(format!(
+            false => Err(query.fault(format!(
                 "its stiffness and damping are {kp} N m / rad and {kd} N m s / rad at the motor, whose counts hold up to {} and {}",
-                most.kp_nm_rad, most.kd_nm_s_rad
+                max.kp_nm_rad, max.kd_nm_s_rad
             ))),
         }
     }
 
     /// Switches it off and forgets what had stopped it, which is logged.
-    fn switch_off(&self, talk: &Talk<'_>) -> Result<(), Error> {
-        let stuck = |why: String| talk.fault(format!("it is to be switched off and does not say so: {why}"));
+    fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
+        let switch_off_error =
+            |why: String| query.fault(format!("it is to be switched off and does not say so: {why}"));
         match self.motor.config().family {
             Family::Damiao { motor, .. } => {
                 let mut status = damiao::Status::Enabled;
-                for order in [damiao::Order::Disable, damiao::Order::ClearError, damiao::Order::Disable] {
-                    status = talk.ask(&talk.said(damiao::encode_order(motor, order))?, |frame| {
-                        self.motor.read(frame)?;
-                        damiao::decode_feedback(frame, self.motor.limits()).ok().map(|told| told.status)
-                    })?;
+                for state_command in
+                    [damiao::StateCommand::Disable, damiao::StateCommand::ClearError, damiao::StateCommand::Disable]
+                {
+                    status = query.request_answer(
+                        &query.map_error(damiao::encode_state_command(motor, state_command))?,
+                        |frame| {
+                            self.motor.read(frame)?;
+                            damiao::decode_feedback(frame, self.motor.limits()).ok().map(|reported| reported.status)
+                        },
+                    )?;
                     if status == damiao::Status::Disabled {
                         return Ok(());
                     }
-                    log::warn!("{}: it tells {status:?}", talk.name());
+                    log::warn!("{}: it tells {status:?}", query.name());
                 }
-                Err(stuck(format!("{status:?}")))
+                Err(switch_off_error(format!("{status:?}")))
             }
             Family::Robstride { motor, .. } => {
                 let limits = self.motor.limits();
-                talk.robstride(motor, &Request::Stop { clear_fault: true }, limits)?;
+                query.robstride(motor, &Request::Stop { clear_fault: true }, limits)?;
                 let mut last = None;
                 let off =
-                    talk.wait(MAX_CHANGE, |frame| match robstride::decode_answer(frame, ROBSTRIDE_HOST, limits) {
-                        Ok(robstride::Answer::Feedback(told)) if told.motor == motor => {
-                            last = Some((told.mode, told.faults));
+                    query.wait(MAX_CHANGE, |frame| match robstride::decode_answer(frame, ROBSTRIDE_HOST, limits) {
+                        Ok(robstride::Answer::Feedback(reported)) if reported.motor == motor => {
+                            last = Some((reported.mode, reported.faults));
                             (last == Some((robstride::Mode::Reset, Faults(0)))).then_some(())
                         }
                         _ => None,
                     })?;
-                off.ok_or_else(|| stuck(format!("{last:?}")))
+                off.ok_or_else(|| switch_off_error(format!("{last:?}")))
             }
             Family::TMotor { motor, .. } => {
-                let disable = talk.said(tmotor::encode_order(motor, tmotor::Order::Disable))?;
-                talk.ask(&disable, |frame| self.motor.read(frame)).map(drop)
+                let disable = query.map_error(tmotor::encode_state_command(motor, tmotor::StateCommand::Disable))?;
+                query.request_answer(&disable, |frame| self.motor.read(frame)).map(drop)
             }
             Family::Odrive { node } => {
                 let idle = odrive::Request::SetState(odrive::State::Idle);
                 for request in [idle, odrive::Request::ClearErrors] {
-                    talk.send(odrive::encode_request(node, &request))?;
+                    query.send(odrive::encode_request(node, &request))?;
                 }
                 let mut last = None;
-                let off = talk.wait(MAX_CHANGE, |frame| match odrive::decode_answer(frame) {
+                let off = query.wait(MAX_CHANGE, |frame| match odrive::decode_answer(frame) {
                     Ok((from, odrive::Answer::Heartbeat { errors, state })) if from == node => {
                         last = Some((errors & !odrive::WATCHDOG_TIMER_EXPIRED, state));
                         (last == Some((0, odrive::State::Idle))).then_some(())
                     }
                     _ => None,
                 })?;
-                off.ok_or_else(|| stuck(format!("{last:?} (errors, state)")))
+                off.ok_or_else(|| switch_off_error(format!("{last:?} (errors, state)")))
             }
             Family::Cia402 { node, .. } => {
-                let until = clock::now() + MAX_CHANGE;
+                let deadline = clock::now() + MAX_CHANGE;
                 loop {
-                    let statusword = talk.get(node, cia402::STATUSWORD)?;
+                    let statusword = query.get(node, cia402::STATUSWORD)?;
                     let [low, high, ..] = statusword.to_le_bytes();
-                    let state = talk.said(cia402::State::from_statusword(u16::from_le_bytes([low, high])))?;
-                    let wanted = match state {
+                    let state = query.map_error(cia402::State::from_statusword(u16::from_le_bytes([low, high])))?;
+                    let requested = match state {
                         cia402::State::SwitchOnDisabled => return Ok(()),
                         cia402::State::Fault => {
-                            log::warn!("{}: it has a fault, which is reset", talk.name());
-                            cia402::Order::ResetFault
+                            log::warn!("{}: it has a fault, which is reset", query.name());
+                            cia402::StateCommand::ResetFault
                         }
-                        _ => cia402::Order::DisableVoltage,
+                        _ => cia402::StateCommand::DisableVoltage,
                     };
-                    if clock::now() > until {
-                        return Err(stuck(format!("{state:?}")));
+                    if clock::now() > deadline {
+                        return Err(switch_off_error(format!("{state:?}")));
                     }
                     // A reset counts when its bit rises.
-                    for order in [cia402::Order::DisableVoltage, wanted] {
-                        talk.set(node, cia402::CONTROLWORD, order.controlword().into())?;
+                    for state_command in [cia402::StateCommand::DisableVoltage, requested] {
+                        query.set(node, cia402::CONTROLWORD, state_command.controlword().into())?;
                     }
                 }
             }
@@ -387,41 +400,42 @@ impl Mover {
     }
 
     /// What commands mean to it.
-    fn set_mode(&self, talk: &Talk<'_>, plan: &Plan) -> Result<(), Error> {
-        let differs = |told: String| Err(talk.fault(format!("its mode was set and reads back as {told}")));
+    fn set_mode(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
+        let mode_mismatch =
+            |reported: String| Err(query.fault(format!("its mode was set and reads back as {reported}")));
         match self.motor.config().family {
             Family::Damiao { motor, feedback } => {
-                let wanted = damiao::Value::Whole(damiao::MIT_MODE);
-                let access = Access::Write(Register::ControlMode, wanted);
-                talk.send(damiao::encode_register(&RegisterMessage { motor, access }, None))?;
-                match talk.register(motor, feedback, Register::ControlMode)? {
-                    told if told == wanted => Ok(()),
-                    told => differs(format!("{told:?}")),
+                let requested = damiao::Value::Integer(damiao::MIT_MODE);
+                let access = Access::Write(Register::ControlMode, requested);
+                query.send(damiao::encode_register(&RegisterMessage { motor, access }, None))?;
+                match query.register(motor, feedback, Register::ControlMode)? {
+                    reported if reported == requested => Ok(()),
+                    reported => mode_mismatch(format!("{reported:?}")),
                 }
             }
             Family::Robstride { motor, .. } => {
-                let wanted = robstride::Value::Whole(robstride::MOTION_MODE);
-                talk.robstride(motor, &Request::Write(Parameter::RunMode, wanted), self.motor.limits())?;
-                match talk.parameter(motor, Parameter::RunMode, self.motor.limits())? {
-                    told if told == wanted => Ok(()),
-                    told => differs(format!("{told:?}")),
+                let requested = robstride::Value::Integer(robstride::MOTION_MODE);
+                query.robstride(motor, &Request::Write(Parameter::RunMode, requested), self.motor.limits())?;
+                match query.parameter(motor, Parameter::RunMode, self.motor.limits())? {
+                    reported if reported == requested => Ok(()),
+                    reported => mode_mismatch(format!("{reported:?}")),
                 }
             }
             Family::TMotor { .. } => Ok(()),
             Family::Odrive { node } => {
-                talk.send(odrive::encode_request(node, &odrive::Request::SetMode(odrive::Control::Position)))
+                query.send(odrive::encode_request(node, &odrive::Request::SetMode(odrive::Control::Position)))
             }
-            Family::Cia402 { node, .. } => set_drive_mode(talk, node, plan.period),
+            Family::Cia402 { node, .. } => set_drive_mode(query, node, plan.period),
         }
     }
 }
 
 /// What a motor tells whose own timeout has passed.
-const LOST: &str = "nothing of us came to it for longer than its timeout";
+const COMMUNICATION_LOST: &str = "nothing of us came to it for longer than its timeout";
 
 /// An order to a drive outside the cycle.
-fn order(node: canopen::Node, order: cia402::Order) -> Result<Frame, CanError> {
-    canopen::encode_write(node, cia402::CONTROLWORD, order.controlword().into())
+fn state_command(node: canopen::Node, state_command: cia402::StateCommand) -> Result<Frame, CanError> {
+    canopen::encode_write(node, cia402::CONTROLWORD, state_command.controlword().into())
 }
 
 /// The state in a drive's second PDO.
@@ -434,31 +448,32 @@ fn state_of(frame: &Frame, node: canopen::Node) -> Option<cia402::State> {
 }
 
 /// A position at every SYNC, and the state told at every SYNC.
-fn set_drive_mode(talk: &Talk<'_>, node: canopen::Node, period: Duration) -> Result<(), Error> {
-    let supported = talk.get(node, cia402::SUPPORTED_MODES)?;
+fn set_drive_mode(query: &MotorQuery<'_>, node: canopen::Node, period: Duration) -> Result<(), Error> {
+    let supported = query.get(node, cia402::SUPPORTED_MODES)?;
     if !cia402::Mode::CyclicPosition.is_in(supported) {
-        return Err(talk.fault(format!(
+        return Err(query.fault(format!(
             "the drive has no cyclic synchronous position mode (object 0x6502 is {supported:#x}), and no other is spoken"
         )));
     }
-    talk.set(node, cia402::MODE, cia402::Mode::CyclicPosition as i64)?;
-    let until = clock::now() + MAX_CHANGE;
-    while talk.get(node, cia402::MODE_DISPLAY)? != cia402::Mode::CyclicPosition as u32 {
-        if clock::now() > until {
-            return Err(talk.fault("the drive does not change to cyclic synchronous position mode"));
+    query.set(node, cia402::MODE, cia402::Mode::CyclicPosition as i64)?;
+    let deadline = clock::now() + MAX_CHANGE;
+    while query.get(node, cia402::MODE_DISPLAY)? != cia402::Mode::CyclicPosition as u32 {
+        if clock::now() > deadline {
+            return Err(query.fault("the drive does not change to cyclic synchronous position mode"));
         }
     }
     // The period is whole milliseconds where there are drives; one that does not interpolate has no such object.
     let millis = i64::try_from(period.as_millis()).unwrap_or(i64::MAX);
     for (object, value) in [(cia402::INTERPOLATION_PERIOD, millis), (cia402::INTERPOLATION_EXPONENT, -3)] {
-        match talk.try_set(node, object, value)? {
+        match query.try_set(node, object, value)? {
             Err(CanError::Aborted { code: NO_SUCH_OBJECT, .. }) => break,
-            done => talk.said(done)?,
+            result => query.map_error(result)?,
         }
     }
-    let mut entries = every_sync(Pdo::First, Direction::Receive, node, &[cia402::CONTROLWORD, cia402::TARGET_POSITION]);
-    entries.extend(every_sync(Pdo::Second, Direction::Transmit, node, &[cia402::STATUSWORD]));
-    start_drive(talk, node, &entries)
+    let mut entries =
+        map_pdo_at_every_sync(Pdo::First, Direction::Receive, node, &[cia402::CONTROLWORD, cia402::TARGET_POSITION]);
+    entries.extend(map_pdo_at_every_sync(Pdo::Second, Direction::Transmit, node, &[cia402::STATUSWORD]));
+    start_drive(query, node, &entries)
 }
 
 #[cfg(test)]
@@ -470,7 +485,7 @@ mod tests {
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
     /// Behind a gear of 4, turning the other way.
-    fn mover(family: Family) -> Mover {
+    fn movable_motor(family: Family) -> MovableMotor {
         let config = MotorConfig {
             joint: "elbow".to_owned(),
             bus_ix: 0,
@@ -481,28 +496,28 @@ mod tests {
             gains: Some(Gains { stiffness_nm_rad: 160.0, damping_nm_s_rad: 16.0 }),
         };
         let motor = Motor::with_limits(config, LIMITS);
-        Mover { motor, health: None, drive: cia402::State::NotReadyToSwitchOn }
+        MovableMotor { motor, health: None, drive: cia402::State::NotReadyToSwitchOn }
     }
 
-    fn damiao() -> Mover {
-        mover(Family::Damiao { motor: 1, feedback: 0x11 })
+    fn damiao() -> MovableMotor {
+        movable_motor(Family::Damiao { motor: 1, feedback: 0x11 })
     }
 
     #[test]
-    fn commands_are_of_the_motor_in_front_of_the_gear() {
+    fn commands_are_in_motor_coordinates() {
         let sent = damiao().command(1.0, 0.25).expect("numbers");
         let got = mit::decode(sent.data().try_into().expect("eight bytes"), &LIMITS);
         // Half a count of 16 and 12 bits.
         assert!((got.position_rad + 2.0).abs() < 2e-4 && (got.velocity_rad_s + 1.0).abs() < 8e-3, "{got:?}");
         assert!((got.kp_nm_rad - 10.0).abs() < 0.07 && (got.kd_nm_s_rad - 1.0).abs() < 7e-4, "{got:?}");
         assert!(got.torque_nm.abs() < 3e-3, "{got:?}");
-        let damped = damiao().leave(OnLoss::Damp, 1.0).expect("numbers");
-        let got = mit::decode(damped[0].data().try_into().expect("eight bytes"), &LIMITS);
+        let damping_frames = damiao().shutdown(OnLoss::Damp, 1.0).expect("numbers");
+        let got = mit::decode(damping_frames[0].data().try_into().expect("eight bytes"), &LIMITS);
         assert!(got.kp_nm_rad == 0.0 && (got.kd_nm_s_rad - 1.0).abs() < 7e-4, "{got:?}");
     }
 
     #[test]
-    fn a_joint_goes_no_further_and_no_faster_than_its_motors_counts() {
+    fn joint_limits_are_clamped_to_motor_range() {
         let wide = MotionLimits { position: [-9.0, f64::INFINITY], velocity: 20.0, acceleration: 1.0, jerk: 1.0 };
         let limits = damiao().limits(&wide);
         assert_eq!((limits.position, limits.velocity), ([0.5 - 3.125, 0.5 + 3.125], 7.5));
@@ -511,24 +526,24 @@ mod tests {
     }
 
     #[test]
-    fn a_drive_is_brought_to_obey_by_its_commands_and_not_out_of_a_fault() {
+    fn commands_enable_drive_but_do_not_reset_faults() {
         let node = canopen::Node::new(5).expect("a node");
         let units = cia402::Units { counts_per_turn: 65_536.0, rated_torque_nm: 1.0 };
-        let mut drive = mover(Family::Cia402 { node, units });
-        let mut tell = |state: cia402::State| {
+        let mut drive = movable_motor(Family::Cia402 { node, units });
+        let mut process_state = |state: cia402::State| {
             let id = Pdo::Second.id(Direction::Transmit, node);
-            let told = Frame::classic(id, &state.statusword().to_le_bytes()).expect("two bytes");
-            assert_eq!(drive.hear(&told), None, "it is no position");
+            let reported = Frame::classic(id, &state.statusword().to_le_bytes()).expect("two bytes");
+            assert_eq!(drive.process_frame(&reported), None, "it is no position");
             let command = drive.command(0.5, 0.0).expect("numbers");
             assert_eq!((command.id(), &command.data()[2..]), (Pdo::First.id(Direction::Receive, node), &[0; 4][..]));
             (command.data()[0], drive.health().cloned())
         };
-        assert_eq!(tell(cia402::State::SwitchOnDisabled), (0x06, Some(Health::Off)));
-        assert_eq!(tell(cia402::State::ReadyToSwitchOn), (0x07, Some(Health::Off)));
-        assert_eq!(tell(cia402::State::SwitchedOn), (0x0F, Some(Health::Off)));
-        assert_eq!(tell(cia402::State::OperationEnabled), (0x0F, Some(Health::Obeys)));
+        assert_eq!(process_state(cia402::State::SwitchOnDisabled), (0x06, Some(Health::Off)));
+        assert_eq!(process_state(cia402::State::ReadyToSwitchOn), (0x07, Some(Health::Off)));
+        assert_eq!(process_state(cia402::State::SwitchedOn), (0x0F, Some(Health::Off)));
+        assert_eq!(process_state(cia402::State::OperationEnabled), (0x0F, Some(Health::Enabled)));
         for state in [cia402::State::Fault, cia402::State::QuickStopActive] {
-            let (controlword, health) = tell(state);
+            let (controlword, health) = process_state(state);
             assert!(controlword == 0 && matches!(health, Some(Health::Fault(_))), "{state:?} {health:?}");
         }
     }

@@ -1,7 +1,7 @@
 //! Questions to one motor and its answers, while nothing else reads the bus: what is done before a cycle begins.
 
 use super::ROBSTRIDE_HOST;
-use super::bus::{Arrived, Bus, WireErrors};
+use super::bus::{Bus, BusEvent, WireErrors};
 use super::config::MotorConfig;
 use crate::wire::can::canopen::{self, Object, SdoAnswer};
 use crate::wire::can::damiao::{self, Access, Register, RegisterMessage};
@@ -15,16 +15,16 @@ use std::time::Duration;
 /// How long an answer may take; on a full bus at 1 Mbit/s a frame waits for some milliseconds.
 const MAX_ANSWER: Duration = Duration::from_millis(50);
 /// How often a question is asked before the motor counts as silent.
-const MAX_ASKED: usize = 4;
+const MAX_ATTEMPTS: usize = 4;
 
 /// A conversation with one motor.
-pub(super) struct Talk<'a> {
+pub(super) struct MotorQuery<'a> {
     bus: &'a Bus,
     config: &'a MotorConfig,
     errors: Cell<WireErrors>,
 }
 
-impl<'a> Talk<'a> {
+impl<'a> MotorQuery<'a> {
     pub(super) fn new(bus: &'a Bus, config: &'a MotorConfig) -> Self {
         Self { bus, config, errors: Cell::default() }
     }
@@ -39,40 +39,40 @@ impl<'a> Talk<'a> {
     }
 
     /// What a codec said, as an error of this motor.
-    pub(super) fn said<T>(&self, result: Result<T, CanError>) -> Result<T, Error> {
+    pub(super) fn map_error<T>(&self, result: Result<T, CanError>) -> Result<T, Error> {
         result.map_err(|error| self.fault(error.to_string()))
     }
 
     /// Sends what a codec made.
     pub(super) fn send(&self, frame: Result<Frame, CanError>) -> Result<(), Error> {
-        let frame = self.said(frame)?;
+        let frame = self.map_error(frame)?;
         match self.bus.send(&frame)? {
             true => Ok(()),
             false => Err(self.fault("nothing can be sent: the interface's queue stays full")),
         }
     }
 
-    /// The first frame within a time that `answers`.
+    /// The first frame within a time that `matches`.
     pub(super) fn wait<T>(
         &self,
-        within: Duration,
-        mut answers: impl FnMut(&Frame) -> Option<T>,
+        timeout_limit: Duration,
+        mut matches: impl FnMut(&Frame) -> Option<T>,
     ) -> Result<Option<T>, Error> {
-        let until = clock::now() + within;
+        let deadline = clock::now() + timeout_limit;
         loop {
-            let left = until.duration_since(clock::now());
-            if left.is_zero() {
+            let remaining = deadline.duration_since(clock::now());
+            if remaining.is_zero() {
                 return Ok(None);
             }
-            match self.bus.receive(left)? {
-                Some((_, Arrived::Frame(frame))) => {
-                    if let Some(answer) = answers(&frame) {
+            match self.bus.receive(remaining)? {
+                Some((_, BusEvent::Frame(frame))) => {
+                    if let Some(answer) = matches(&frame) {
                         return Ok(Some(answer));
                     }
                 }
-                Some((_, Arrived::Errors(more))) => {
+                Some((_, BusEvent::Errors(new_errors))) => {
                     let mut errors = self.errors.get();
-                    errors.add(&more);
+                    errors.add(&new_errors);
                     self.errors.set(errors);
                 }
                 None => {}
@@ -81,17 +81,21 @@ impl<'a> Talk<'a> {
     }
 
     /// Asks until an answer comes, some times.
-    pub(super) fn ask<T>(&self, question: &Frame, mut answers: impl FnMut(&Frame) -> Option<T>) -> Result<T, Error> {
-        for _ in 0..MAX_ASKED {
-            self.bus.send(question)?;
-            if let Some(answer) = self.wait(MAX_ANSWER, &mut answers)? {
+    pub(super) fn request_answer<T>(
+        &self,
+        poll_frame: &Frame,
+        mut matches: impl FnMut(&Frame) -> Option<T>,
+    ) -> Result<T, Error> {
+        for _ in 0..MAX_ATTEMPTS {
+            self.bus.send(poll_frame)?;
+            if let Some(answer) = self.wait(MAX_ANSWER, &mut matches)? {
                 return Ok(answer);
             }
         }
         let errors = self.errors.get();
         // Not every controller's driver tells that frames are not acknowledged; all tell what their counters come to by that.
         Err(self.fault(match errors.n_unacknowledged + errors.n_passive + errors.n_bus_off {
-            0 => format!("no answer to {MAX_ASKED} questions; is the motor powered and its number right?"),
+            0 => format!("no answer to {MAX_ATTEMPTS} questions; is the motor powered and its number right?"),
             _ => "nobody acknowledges frames: the others are off, at another bit rate, or the bus is cut or not terminated"
                 .to_owned(),
         }))
@@ -99,12 +103,12 @@ impl<'a> Talk<'a> {
 
     /// What a register of a Damiao motor holds.
     pub(super) fn register(&self, motor: u16, feedback: u16, register: Register) -> Result<damiao::Value, Error> {
-        let question = RegisterMessage { motor, access: Access::Read(register) };
-        let question = self.said(damiao::encode_register(&question, None))?;
-        let answer_id = self.said(Id::standard(feedback.into()))?;
-        self.ask(&question, |frame| match damiao::decode_register(frame) {
-            Ok(RegisterMessage { motor: from, access: Access::Told(told, value) })
-                if frame.id() == answer_id && from == motor && told == register =>
+        let poll_frame = RegisterMessage { motor, access: Access::Read(register) };
+        let poll_frame = self.map_error(damiao::encode_register(&poll_frame, None))?;
+        let answer_id = self.map_error(Id::standard(feedback.into()))?;
+        self.request_answer(&poll_frame, |frame| match damiao::decode_register(frame) {
+            Ok(RegisterMessage { motor: from, access: Access::Reported(reported, value) })
+                if frame.id() == answer_id && from == motor && reported == register =>
             {
                 Some(value)
             }
@@ -124,12 +128,14 @@ impl<'a> Talk<'a> {
         parameter: Parameter,
         limits: &Limits,
     ) -> Result<robstride::Value, Error> {
-        let question = robstride::encode_request(ROBSTRIDE_HOST, motor, &Request::Read(parameter), limits);
-        self.ask(&self.said(question)?, |frame| match robstride::decode_answer(frame, ROBSTRIDE_HOST, limits) {
-            Ok(robstride::Answer::Parameter { motor: from, parameter: told, value }) => {
-                (from == motor && told == parameter).then_some(value)
+        let poll_frame = robstride::encode_request(ROBSTRIDE_HOST, motor, &Request::Read(parameter), limits);
+        self.request_answer(&self.map_error(poll_frame)?, |frame| {
+            match robstride::decode_answer(frame, ROBSTRIDE_HOST, limits) {
+                Ok(robstride::Answer::Parameter { motor: from, parameter: reported, value }) => {
+                    (from == motor && reported == parameter).then_some(value)
+                }
+                _ => None,
             }
-            _ => None,
         })
     }
 
@@ -138,38 +144,39 @@ impl<'a> Talk<'a> {
         &self,
         node: odrive::Node,
         request: &odrive::Request,
-        answers: impl Fn(odrive::Answer) -> Option<T>,
+        matches: impl Fn(odrive::Answer) -> Option<T>,
     ) -> Result<T, Error> {
-        let question = self.said(odrive::encode_request(node, request))?;
-        self.ask(&question, |frame| match odrive::decode_answer(frame) {
-            Ok((from, answer)) if from == node => answers(answer),
+        let poll_frame = self.map_error(odrive::encode_request(node, request))?;
+        self.request_answer(&poll_frame, |frame| match odrive::decode_answer(frame) {
+            Ok((from, answer)) if from == node => matches(answer),
             _ => None,
         })
     }
 
     /// What an object of a CANopen node holds; its upper bytes are 0 where it is shorter.
     pub(super) fn get(&self, node: canopen::Node, object: Object) -> Result<u32, Error> {
-        let answer = self.ask(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
-            Ok((from, SdoAnswer::Value { object: told, raw })) => {
-                (from == node && (told.index, told.subindex) == (object.index, object.subindex)).then_some(Ok(raw))
-            }
-            Err(error @ (CanError::Aborted { index, .. } | CanError::Segmented { index, .. })) => {
-                (index == object.index).then_some(Err(error))
-            }
-            _ => None,
-        })?;
-        self.said(answer)
+        let answer =
+            self.request_answer(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
+                Ok((from, SdoAnswer::Value { object: reported, raw })) => (from == node
+                    && (reported.index, reported.subindex) == (object.index, object.subindex))
+                    .then_some(Ok(raw)),
+                Err(error @ (CanError::Aborted { index, .. } | CanError::Segmented { index, .. })) => {
+                    (index == object.index).then_some(Err(error))
+                }
+                _ => None,
+            })?;
+        self.map_error(answer)
     }
 
     /// Sets an object of a CANopen node and reads it back.
     pub(super) fn set_and_check(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
         self.set(node, object, value)?;
         let bits = u32::MAX >> (32 - 8 * u32::from(object.n_bytes));
-        let told = self.get(node, object)? & bits;
-        match i64::from(told) == value & i64::from(bits) {
+        let reported = self.get(node, object)? & bits;
+        match i64::from(reported) == value & i64::from(bits) {
             true => Ok(()),
             false => Err(self.fault(format!(
-                "object {:#06x}:{:02x} was set to {value} and reads back as {told:#x}",
+                "object {:#06x}:{:02x} was set to {value} and reads back as {reported:#x}",
                 object.index, object.subindex
             ))),
         }
@@ -178,7 +185,7 @@ impl<'a> Talk<'a> {
     /// Sets an object of a CANopen node.
     pub(super) fn set(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
         let answer = self.try_set(node, object, value)?;
-        self.said(answer)
+        self.map_error(answer)
     }
 
     /// The same, where the node may refuse it.
@@ -188,8 +195,8 @@ impl<'a> Talk<'a> {
         object: Object,
         value: i64,
     ) -> Result<Result<(), CanError>, Error> {
-        let question = self.said(canopen::encode_write(node, object, value))?;
-        self.ask(&question, |frame| match canopen::decode_sdo(frame) {
+        let poll_frame = self.map_error(canopen::encode_write(node, object, value))?;
+        self.request_answer(&poll_frame, |frame| match canopen::decode_sdo(frame) {
             Ok((from, SdoAnswer::Written { index, subindex })) => {
                 (from == node && (index, subindex) == (object.index, object.subindex)).then_some(Ok(()))
             }

@@ -12,7 +12,7 @@
 //! - T-Motor AK: nothing; the last command is obeyed for ever. Source: CubeMars AK Series Module Product Manual, MIT mode.
 
 use super::config::{Family, MotorConfig};
-use super::talk::Talk;
+use super::query::MotorQuery;
 use crate::Error;
 use crate::motion::OnLoss;
 use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT};
@@ -25,7 +25,7 @@ use std::time::Duration;
 
 /// What all motors of an arm are set to.
 #[derive(Clone, Debug)]
-pub(super) struct Plan {
+pub(super) struct WatchdogPlan {
     pub(super) on_loss: OnLoss,
     pub(super) timeout: Duration,
     pub(super) accept_no_watchdog: bool,
@@ -37,7 +37,7 @@ pub(super) struct Plan {
     pub(super) period: Duration,
 }
 
-impl Plan {
+impl WatchdogPlan {
     /// Whether a motor notices by itself that nothing comes any more.
     pub(super) fn has_watchdog(&self, family: &Family) -> bool {
         match family {
@@ -61,11 +61,11 @@ impl Plan {
                  arm.motion.accept_no_watchdog = true"
             ));
         }
-        let can = can_do(&config.family, has_watchdog);
+        let can = supported_actions(&config.family, has_watchdog);
         if !can.contains(&self.on_loss) {
-            let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.word())).collect();
-            let wanted = self.on_loss.word();
-            return fault(format!("arm.motion.on_loss is {wanted:?}, and this motor can only {}", can.join(" or ")));
+            let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.name())).collect();
+            let requested = self.on_loss.name();
+            return fault(format!("arm.motion.on_loss is {requested:?}, and this motor can only {}", can.join(" or ")));
         }
         if config.gains.is_none() && has_gains(&config.family) {
             return fault("moving it needs its stiffness_nm_rad and damping_nm_s_rad".to_owned());
@@ -80,7 +80,7 @@ fn has_gains(family: &Family) -> bool {
 }
 
 /// What motors do by their own watchdogs; or, without one, what they can be told while there still is somebody to tell it.
-fn can_do(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
+fn supported_actions(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
     match (family, has_watchdog) {
         (Family::Cia402 { .. }, _) | (Family::Odrive { .. }, false) => &[OnLoss::Hold, OnLoss::Release],
         (Family::TMotor { .. }, _) => &[OnLoss::Hold, OnLoss::Damp, OnLoss::Release],
@@ -89,45 +89,46 @@ fn can_do(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
 }
 
 /// Sets the watchdog of a motor that is switched off, and reads it back; one that reads back otherwise is an error.
-pub(super) fn set(talk: &Talk<'_>, family: &Family, limits: &Limits, plan: &Plan) -> Result<(), Error> {
+pub(super) fn set(query: &MotorQuery<'_>, family: &Family, limits: &Limits, plan: &WatchdogPlan) -> Result<(), Error> {
     let seconds = plan.timeout.as_secs_f64();
-    let differs = |told: String| {
-        Err(talk.fault(format!("its timeout was set to {seconds} s and reads back as {told}; it is not switched on")))
+    let mismatch = |reported: String| {
+        Err(query
+            .fault(format!("its timeout was set to {seconds} s and reads back as {reported}; it is not switched on")))
     };
     match *family {
         Family::Damiao { motor, feedback } => {
-            let wanted = damiao::Value::Whole(talk.said(damiao::timeout_ticks(seconds))?);
-            let message = RegisterMessage { motor, access: Access::Write(Register::Timeout, wanted) };
-            talk.send(damiao::encode_register(&message, None))?;
-            match talk.register(motor, feedback, Register::Timeout)? {
-                told if told == wanted => Ok(()),
-                told => differs(format!("{told:?} ticks")),
+            let requested = damiao::Value::Integer(query.map_error(damiao::timeout_ticks(seconds))?);
+            let message = RegisterMessage { motor, access: Access::Write(Register::Timeout, requested) };
+            query.send(damiao::encode_register(&message, None))?;
+            match query.register(motor, feedback, Register::Timeout)? {
+                reported if reported == requested => Ok(()),
+                reported => mismatch(format!("{reported:?} ticks")),
             }
         }
         Family::Robstride { motor, .. } => {
-            let wanted = talk.said(robstride::timeout(seconds))?;
-            talk.robstride(motor, &robstride::Request::Write(Parameter::Timeout, wanted), limits)?;
-            match talk.parameter(motor, Parameter::Timeout, limits)? {
-                told if told == wanted => Ok(()),
-                told => differs(format!("{told:?} ticks")),
+            let requested = query.map_error(robstride::timeout(seconds))?;
+            query.robstride(motor, &robstride::Request::Write(Parameter::Timeout, requested), limits)?;
+            match query.parameter(motor, Parameter::Timeout, limits)? {
+                reported if reported == requested => Ok(()),
+                reported => mismatch(format!("{reported:?} ticks")),
             }
         }
         Family::Odrive { node } => match &plan.endpoints {
-            Some(endpoints) => set_axis(talk, node, endpoints, plan.timeout, differs),
+            Some(endpoints) => set_axis(query, node, endpoints, plan.timeout, mismatch),
             None => Ok(()),
         },
         Family::Cia402 { node, .. } => {
             let millis = u16::try_from(plan.timeout.as_millis()).unwrap_or(u16::MAX);
             let heartbeat = canopen::consumer_heartbeat(plan.host, millis);
-            talk.set_and_check(node, CONSUMER_HEARTBEAT, heartbeat.into())?;
+            query.set_and_check(node, CONSUMER_HEARTBEAT, heartbeat.into())?;
             let reaction = match plan.on_loss {
                 OnLoss::Hold => {
-                    talk.set_and_check(node, cia402::QUICK_STOP_OPTION, cia402::STAY_STOPPED)?;
+                    query.set_and_check(node, cia402::QUICK_STOP_OPTION, cia402::STAY_STOPPED)?;
                     cia402::ABORT_BY_QUICK_STOP
                 }
                 OnLoss::Damp | OnLoss::Release => cia402::ABORT_BY_DISABLING,
             };
-            talk.set_and_check(node, cia402::ABORT_CONNECTION, reaction)
+            query.set_and_check(node, cia402::ABORT_CONNECTION, reaction)
         }
         Family::TMotor { .. } => Ok(()),
     }
@@ -135,19 +136,19 @@ pub(super) fn set(talk: &Talk<'_>, family: &Family, limits: &Limits, plan: &Plan
 
 /// The watchdog of an `ODrive` axis, after its firmware was found to be that of the endpoints: other numbers set other things.
 fn set_axis(
-    talk: &Talk<'_>,
+    query: &MotorQuery<'_>,
     node: odrive::Node,
     endpoints: &Endpoints,
     timeout: Duration,
-    differs: impl Fn(String) -> Result<(), Error>,
+    mismatch: impl Fn(String) -> Result<(), Error>,
 ) -> Result<(), Error> {
     let version = odrive::Request::Ask(odrive::Code::Version);
-    let (hardware, firmware) = talk.axis(node, &version, |answer| match answer {
+    let (hardware, firmware) = query.axis(node, &version, |answer| match answer {
         odrive::Answer::Version { hardware, firmware } => Some((hardware, firmware)),
         _ => None,
     })?;
-    if !endpoints.are_of(hardware, firmware) {
-        return Err(talk.fault(format!(
+    if !endpoints.match_versions(hardware, firmware) {
+        return Err(query.fault(format!(
             "it runs firmware {firmware:?} on hardware {hardware:?}, and arm.motion.odrive_endpoints is of firmware {} on hardware {}",
             endpoints.firmware, endpoints.hardware
         )));
@@ -158,13 +159,13 @@ fn set_axis(
         (endpoints.enable_watchdog, [1, 0, 0, 0], 1),
     ];
     for (number, bytes, n_bytes) in settings {
-        talk.send(odrive::encode_request(node, &odrive::Request::WriteEndpoint(number, bytes)))?;
-        let told = talk.axis(node, &odrive::Request::ReadEndpoint(number), |answer| match answer {
-            odrive::Answer::Endpoint(told, bytes) => (told == number).then_some(bytes),
+        query.send(odrive::encode_request(node, &odrive::Request::WriteEndpoint(number, bytes)))?;
+        let reported = query.axis(node, &odrive::Request::ReadEndpoint(number), |answer| match answer {
+            odrive::Answer::Endpoint(reported, bytes) => (reported == number).then_some(bytes),
             _ => None,
         })?;
-        if told[..n_bytes] != bytes[..n_bytes] {
-            return differs(format!("{told:?} in endpoint {number}"));
+        if reported[..n_bytes] != bytes[..n_bytes] {
+            return mismatch(format!("{reported:?} in endpoint {number}"));
         }
     }
     Ok(())
@@ -176,7 +177,12 @@ mod tests {
     use super::*;
     use crate::wire::can::{odrive, tmotor};
 
-    fn told(family: Family, on_loss: OnLoss, accept_no_watchdog: bool, endpoints: Option<Endpoints>) -> Option<String> {
+    fn reported(
+        family: Family,
+        on_loss: OnLoss,
+        accept_no_watchdog: bool,
+        endpoints: Option<Endpoints>,
+    ) -> Option<String> {
         let gains = Some(Gains { stiffness_nm_rad: 1.0, damping_nm_s_rad: 1.0 });
         let config = MotorConfig {
             joint: "elbow".to_owned(),
@@ -187,7 +193,7 @@ mod tests {
             offset_rad: 0.0,
             gains,
         };
-        let plan = Plan {
+        let plan = WatchdogPlan {
             on_loss,
             timeout: Duration::from_millis(100),
             accept_no_watchdog,
@@ -199,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn what_each_family_cannot_do_is_told_with_what_it_can() {
+    fn unsupported_fail_safe_reports_supported_ones() {
         let units = cia402::Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 };
         let drive = Family::Cia402 { node: canopen::Node::new(1).expect("a node"), units };
         let damiao = Family::Damiao { motor: 1, feedback: 2 };
@@ -217,19 +223,21 @@ mod tests {
             (odrive, OnLoss::Release, Some("arm.motion.odrive_endpoints")),
             (ak, OnLoss::Release, Some("accept_no_watchdog = true")),
         ] {
-            let told = told(family, on_loss, false, None);
-            let is_as_expected = match (&told, expected) {
-                (Some(told), Some(expected)) => told.contains(expected) && told.contains("\"elbow\" on \"can0\""),
-                (told, expected) => told.is_none() && expected.is_none(),
+            let reported = reported(family, on_loss, false, None);
+            let is_as_expected = match (&reported, expected) {
+                (Some(reported), Some(expected)) => {
+                    reported.contains(expected) && reported.contains("\"elbow\" on \"can0\"")
+                }
+                (reported, expected) => reported.is_none() && expected.is_none(),
             };
-            assert!(is_as_expected, "{family:?} {on_loss:?}: {told:?}");
+            assert!(is_as_expected, "{family:?} {on_loss:?}: {reported:?}");
         }
         for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
-            assert_eq!(told(ak, on_loss, true, None), None, "it was accepted");
+            assert_eq!(reported(ak, on_loss, true, None), None, "it was accepted");
         }
-        let endpoints = Some(super::super::played::endpoints());
-        assert_eq!(told(odrive, OnLoss::Release, false, endpoints.clone()), None);
-        assert!(told(odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog only lets go");
-        assert_eq!(told(odrive, OnLoss::Hold, true, None), None);
+        let endpoints = Some(super::super::emulated::endpoints());
+        assert_eq!(reported(odrive, OnLoss::Release, false, endpoints.clone()), None);
+        assert!(reported(odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog only lets go");
+        assert_eq!(reported(odrive, OnLoss::Hold, true, None), None);
     }
 }

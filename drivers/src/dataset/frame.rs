@@ -1,7 +1,7 @@
 //! One posed photo of a dataset, and the decoding of its files.
 
 use crate::Error;
-use crate::decode::decode_whole;
+use crate::decode::decode_complete;
 use image::{DynamicImage, ImageReader};
 use kinematics::{Intrinsics, Stamp, Transform};
 use std::path::{Path, PathBuf};
@@ -31,7 +31,7 @@ pub struct DepthFile {
     /// The file.
     pub path: PathBuf,
     /// Metres per count; a count of 0 is unknown.
-    pub metres_per_count: f64,
+    pub meters_per_count: f64,
     /// Pose of the depth camera when the depth image was taken.
     pub world_from_camera: Transform,
 }
@@ -59,16 +59,16 @@ pub struct DepthImage {
 impl DatasetFrame {
     /// Decodes the files of this frame; depth that does not decode costs the depth, not the photo.
     pub fn load(&self) -> Result<FrameImages, Error> {
-        let mut rgba = decoded(&self.image_path)?.into_rgba8();
+        let mut rgba = decode_file(&self.image_path)?.into_rgba8();
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
             pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
         }
         if let Some(mask_path) = &self.mask_path {
-            let mask = decoded(mask_path)?.into_luma8();
+            let mask = decode_file(mask_path)?.into_luma8();
             self.require_size(mask_path, [mask.width(), mask.height()])?;
-            for (pixel, keep) in rgba.pixels_mut().zip(mask.pixels()) {
-                pixel.0[3] = if keep.0[0] == 0 { 0 } else { pixel.0[3] };
+            for (pixel, mask_pixel) in rgba.pixels_mut().zip(mask.pixels()) {
+                pixel.0[3] = if mask_pixel.0[0] == 0 { 0 } else { pixel.0[3] };
             }
         }
         let (depth, depth_error) = match self.depth.as_ref().map(|file| self.load_depth(file)) {
@@ -80,14 +80,14 @@ impl DatasetFrame {
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
-        let DynamicImage::ImageLuma16(counts) = decoded(&file.path)? else {
+        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path)? else {
             return Err(Error::NotDepth { path: file.path.clone() });
         };
         #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
-        let metres_from_count = |count: &u16| (f64::from(*count) * file.metres_per_count) as f32;
+        let meters_from_count = |count: &u16| (f64::from(*count) * file.meters_per_count) as f32;
         Ok(DepthImage {
             intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),
-            depth_m: counts.as_raw().iter().map(metres_from_count).collect(),
+            depth_m: counts.as_raw().iter().map(meters_from_count).collect(),
         })
     }
 
@@ -101,21 +101,21 @@ impl DatasetFrame {
 }
 
 /// Width and height of an image, from its first bytes.
-pub(super) fn size_of(path: &Path) -> Result<[u32; 2], Error> {
-    let size = reader(path)?.into_dimensions().map_err(|source| not_decodable(path, source))?;
+pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
+    let size = open_image(path)?.into_dimensions().map_err(|source| decode_error(path, source))?;
     Ok(size.into())
 }
 
-fn decoded(path: &Path) -> Result<DynamicImage, Error> {
+fn decode_file(path: &Path) -> Result<DynamicImage, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
-    decode_whole(&bytes, None).map_err(|source| not_decodable(path, source))
+    decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
 }
 
-fn reader(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
+fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
     let open = || ImageReader::open(path)?.with_guessed_format();
     open().map_err(|source| Error::Open { path: path.to_owned(), source })
 }
 
-fn not_decodable(path: &Path, source: image::ImageError) -> Error {
+fn decode_error(path: &Path, source: image::ImageError) -> Error {
     Error::DatasetImage { path: path.to_owned(), source }
 }

@@ -54,20 +54,20 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
 }
 
 /// Poses beyond this are slips of the pen, metres.
-const FAR_M: f64 = 1e4;
+const MAX_POSITION_M: f64 = 1e4;
 
 /// What was left out while reading.
 #[derive(Debug, Default)]
-struct LeftOut {
+struct SkippedFrames {
     missing: Vec<String>,
     /// With the reason, and so below.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
 }
 
-impl LeftOut {
+impl SkippedFrames {
     /// Names told in a note.
-    const NAMED: usize = 5;
+    const MAX_NAMED: usize = 5;
 
     /// The dataset, once there is something in it.
     fn dataset(self, path: &Path, frames: Vec<DatasetFrame>, mut notes: Vec<String>) -> Result<Dataset, Error> {
@@ -78,30 +78,30 @@ impl LeftOut {
             return Err(Error::EmptyDataset { path: path.to_owned(), n_missing, n_unusable, first_reason });
         }
         if n_missing > 0 {
-            let (images, are) = plural(n_missing, "image");
-            notes.push(format!("{images} {are} not there: {}", first_names(&self.missing)));
+            let (images, verb) = plural(n_missing, "image");
+            notes.push(format!("{images} {verb} not there: {}", first_names(&self.missing)));
         }
-        notes.extend(cannot_be_used(&self.unusable));
-        let losses = cannot_be_used(&self.broken).into_iter().collect();
+        notes.extend(unusable_note(&self.unusable));
+        let losses = unusable_note(&self.broken).into_iter().collect();
         Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes, losses })
     }
 }
 
-fn cannot_be_used(images: &[(String, String)]) -> Option<String> {
+fn unusable_note(images: &[(String, String)]) -> Option<String> {
     let named: Vec<_> = images.iter().map(|(name, reason)| format!("{name} ({reason})")).collect();
     let (n_images, _) = plural(images.len(), "image");
     (!named.is_empty()).then(|| format!("{n_images} cannot be used: {}", first_names(&named)))
 }
 
-/// `1 image` and `is`, `2 images` and `are`.
-fn plural(n: usize, what: &str) -> (String, &'static str) {
-    if n == 1 { (format!("1 {what}"), "is") } else { (format!("{n} {what}s"), "are") }
+/// `1 image` and `is`, `2 images` and `verb`.
+fn plural(n: usize, noun: &str) -> (String, &'static str) {
+    if n == 1 { (format!("1 {noun}"), "is") } else { (format!("{n} {noun}s"), "are") }
 }
 
 /// The first names, and that there are more.
 fn first_names(names: &[String]) -> String {
-    let more = if names.len() > LeftOut::NAMED { ", ..." } else { "" };
-    format!("{}{more}", names[..names.len().min(LeftOut::NAMED)].join(", "))
+    let more = if names.len() > SkippedFrames::MAX_NAMED { ", ..." } else { "" };
+    format!("{}{more}", names[..names.len().min(SkippedFrames::MAX_NAMED)].join(", "))
 }
 
 #[cfg(test)]

@@ -2,8 +2,8 @@
 //!
 //! Their cameras look along -z with y up (OpenGL); poses are turned to ours here and nowhere else.
 
-use super::frame::size_of;
-use super::{Dataset, DatasetFrame, DepthFile, FAR_M, LeftOut, plural};
+use super::frame::image_size_px;
+use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// Name of the file that makes a folder one of these.
 pub const FILE_NAME: &str = "transforms.json";
 /// Depth counts are millimetres unless the file says otherwise.
-const DEFAULT_METRES_PER_COUNT: f64 = 0.001;
+const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
 /// Extensions tried when a path has none.
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
@@ -27,34 +27,35 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
     let text = std::fs::read_to_string(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
-    let wrong = |reason: String| Error::DatasetFile { path: file.clone(), reason };
+    let file_error = |reason: String| Error::DatasetFile { path: file.clone(), reason };
     if !text.trim_start().starts_with('{') {
-        return Err(wrong("neither a recording (.mcap) nor a dataset folder nor a transforms.json".to_owned()));
+        return Err(file_error("neither a recording (.mcap) nor a dataset folder nor a transforms.json".to_owned()));
     }
-    let mut document: Document = serde_json::from_str(&nan_as_null(&text)).map_err(|error| wrong(error.to_string()))?;
+    let mut document: Document =
+        serde_json::from_str(&nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
     document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
-    let metres_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METRES_PER_COUNT);
-    if !(metres_per_count.is_finite() && metres_per_count > 0.0) {
-        return Err(wrong(format!("depth_unit_scale_factor is {metres_per_count}, must be above 0")));
+    let meters_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METERS_PER_COUNT);
+    if !(meters_per_count.is_finite() && meters_per_count > 0.0) {
+        return Err(file_error(format!("depth_unit_scale_factor is {meters_per_count}, must be above 0")));
     }
 
-    let (mut frames, mut left_out, mut notes) = (Vec::new(), LeftOut::default(), Vec::new());
+    let (mut frames, mut skipped, mut notes) = (Vec::new(), SkippedFrames::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
         if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
-            left_out.unusable.push((entry.file_path.clone(), "listed twice, the first counts".to_owned()));
+            skipped.unusable.push((entry.file_path.clone(), "listed twice, the first counts".to_owned()));
             continue;
         }
-        let in_frame = |reason: String| wrong(format!("frame {:?}: {reason}", entry.file_path));
-        let rows = rows_of(&entry.transform_matrix).map_err(in_frame)?;
-        let depth_rows = entry.depth_transform_matrix.as_ref().map(rows_of).transpose().map_err(in_frame)?;
-        let Some(image_path) = existing(&folder, &entry.file_path) else {
-            left_out.missing.push(entry.file_path.clone());
+        let frame_error = |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
+        let rows = rows_of(&entry.transform_matrix).map_err(frame_error)?;
+        let depth_rows = entry.depth_transform_matrix.as_ref().map(rows_of).transpose().map_err(frame_error)?;
+        let Some(image_path) = find_image(&folder, &entry.file_path) else {
+            skipped.missing.push(entry.file_path.clone());
             continue;
         };
-        let size_px = match size_of(&image_path) {
+        let size_px = match image_size_px(&image_path) {
             Ok(size_px) => size_px,
             Err(error) => {
-                left_out.broken.push((entry.file_path.clone(), reason_of(&error)));
+                skipped.broken.push((entry.file_path.clone(), reason_of(&error)));
                 continue;
             }
         };
@@ -63,20 +64,25 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let (world_from_camera, depth_pose) = match poses {
             Ok(poses) => poses,
             Err(reason) => {
-                left_out.broken.push((entry.file_path.clone(), reason));
+                skipped.broken.push((entry.file_path.clone(), reason));
                 continue;
             }
         };
-        if let Some(far_m) = [Some(world_from_camera), depth_pose].into_iter().flatten().find_map(far_m) {
-            left_out.broken.push((entry.file_path.clone(), format!("a pose {far_m:e} m away, at most {FAR_M:e} m")));
+        if let Some(excessive_distance_m) =
+            [Some(world_from_camera), depth_pose].into_iter().flatten().find_map(excessive_distance_m)
+        {
+            skipped.broken.push((
+                entry.file_path.clone(),
+                format!("a pose {excessive_distance_m:e} m away, at most {MAX_POSITION_M:e} m"),
+            ));
             continue;
         }
         let camera = entry.camera.or(&document.camera);
-        let intrinsics = camera.intrinsics(size_px).map_err(in_frame)?;
-        if notes.is_empty() && camera.size_px().is_some_and(|told| told != size_px) {
+        let intrinsics = camera.intrinsics(size_px).map_err(frame_error)?;
+        if notes.is_empty() && camera.size_px().is_some_and(|reported| reported != size_px) {
             notes.push(format!("images are {}x{}, not as told; lens parameters follow", size_px[0], size_px[1]));
         }
-        let depth_path = entry.depth_file_path.as_ref().and_then(|name| existing(&folder, name));
+        let depth_path = entry.depth_file_path.as_ref().and_then(|name| find_image(&folder, name));
         frames.push(DatasetFrame {
             name: entry.file_path.clone(),
             intrinsics,
@@ -85,32 +91,32 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             image_path,
             depth: depth_path.map(|path| DepthFile {
                 path,
-                metres_per_count,
+                meters_per_count,
                 world_from_camera: depth_pose.unwrap_or(world_from_camera),
             }),
             mask_path: entry.mask_path.as_ref().map(|name| folder.join(name)),
         });
     }
-    let n_lost_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
-    if n_lost_depth > 0 {
-        let (images, are) = plural(n_lost_depth, "depth image");
-        notes.push(format!("{images} {are} not there"));
+    let n_missing_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
+    if n_missing_depth > 0 {
+        let (images, verb) = plural(n_missing_depth, "depth image");
+        notes.push(format!("{images} {verb} not there"));
     }
-    left_out.dataset(&folder, frames, notes)
+    skipped.dataset(&folder, frames, notes)
 }
 
 /// The whole file; keys we do not know are left alone.
 #[derive(Deserialize)]
 struct Document {
-    frames: Vec<Entry>,
+    frames: Vec<FrameEntry>,
     depth_unit_scale_factor: Option<f64>,
     #[serde(flatten)]
-    camera: Camera,
+    camera: CameraEntry,
 }
 
 /// One frame; its own lens parameters go before the common ones.
 #[derive(Deserialize)]
-struct Entry {
+struct FrameEntry {
     file_path: String,
     depth_file_path: Option<String>,
     mask_path: Option<String>,
@@ -118,7 +124,7 @@ struct Entry {
     /// Our own key: where the depth camera was, when that is not where the photo was taken.
     depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
-    camera: Camera,
+    camera: CameraEntry,
 }
 
 /// Rows of a pose; null where the file has no finite number.
@@ -126,47 +132,47 @@ type Matrix = Vec<Vec<Option<f64>>>;
 
 /// Lens parameters as the file names them.
 #[derive(Clone, Default, Deserialize)]
-struct Camera {
+struct CameraEntry {
     camera_model: Option<String>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     w: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     h: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     fl_x: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     fl_y: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     cx: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     cy: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     camera_angle_x: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     k1: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     k2: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     k3: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     k4: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     p1: Option<f64>,
-    #[serde(default, deserialize_with = "finite")]
+    #[serde(default, deserialize_with = "deserialize_finite")]
     p2: Option<f64>,
     is_fisheye: Option<bool>,
 }
 
 /// A number that is there and finite; what is not there is no error.
-fn finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
+fn deserialize_finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
     let number = Option::<f64>::deserialize(from)?;
     number.map(Some).ok_or_else(|| D::Error::custom("a parameter of the lens is not a finite number"))
 }
 
-impl Entry {
+impl FrameEntry {
     fn lacks_depth(&self, folder: &Path) -> bool {
-        let there = |name: &String| existing(folder, name).is_some();
-        there(&self.file_path) && self.depth_file_path.as_ref().is_some_and(|name| !there(name))
+        let exists = |name: &String| find_image(folder, name).is_some();
+        exists(&self.file_path) && self.depth_file_path.as_ref().is_some_and(|name| !exists(name))
     }
 }
 
@@ -186,9 +192,9 @@ fn world_from_camera(rows: &[f64; 16]) -> Result<Transform, String> {
 }
 
 /// How far away along an axis a pose lies that is too far.
-fn far_m(pose: Transform) -> Option<f64> {
-    let far_m = pose.translation.vector.amax();
-    (far_m > FAR_M).then_some(far_m)
+fn excessive_distance_m(pose: Transform) -> Option<f64> {
+    let excessive_distance_m = pose.translation.vector.amax();
+    (excessive_distance_m > MAX_POSITION_M).then_some(excessive_distance_m)
 }
 
 /// Half a turn about x: theirs looks along -z with y up, ours along z with y down.
@@ -197,7 +203,7 @@ pub fn opengl_from_camera() -> Transform {
     Transform::from_parts(Vector3::zeros().into(), half_turn)
 }
 
-impl Camera {
+impl CameraEntry {
     /// These parameters where given, else the common ones.
     fn or(&self, common: &Self) -> Self {
         let model = || self.camera_model.clone().or_else(|| common.camera_model.clone());
@@ -232,15 +238,15 @@ impl Camera {
         let [width, height] = size_px.map(f64::from);
         let from_angle = || self.camera_angle_x.map(|angle_rad| 0.5 * width / (0.5 * angle_rad).tan());
         let focal_x = self.fl_x.or_else(from_angle).ok_or("no focal length: neither fl_x nor camera_angle_x")?;
-        let told = Intrinsics {
+        let reported = Intrinsics {
             size_px,
             focal_px: [focal_x, self.fl_y.unwrap_or(focal_x)],
             principal_px: [self.cx.unwrap_or(0.5 * width), self.cy.unwrap_or(0.5 * height)],
             lens: self.lens()?,
             rectified: false,
         };
-        told.validate().map_err(|error| error.to_string())?;
-        Ok(told.resized(image_px))
+        reported.validate().map_err(|error| error.to_string())?;
+        Ok(reported.resized(image_px))
     }
 
     fn lens(&self) -> Result<Lens, String> {
@@ -264,10 +270,10 @@ impl Camera {
 }
 
 /// The file of this name, or with an extension added where it has none.
-fn existing(folder: &Path, name: &str) -> Option<PathBuf> {
-    let as_told = folder.join(name);
-    if as_told.is_file() {
-        return Some(as_told);
+fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
+    let as_named = folder.join(name);
+    if as_named.is_file() {
+        return Some(as_named);
     }
     let candidates = EXTENSIONS.into_iter().map(|extension| folder.join(format!("{name}.{extension}")));
     candidates.into_iter().find(|path| path.is_file())

@@ -39,12 +39,12 @@ fn save_counts(path: &Path, size_px: [u32; 2], counts: &[u16]) {
     image::save_buffer(path, &bytes, size_px[0], size_px[1], ExtendedColorType::L16).unwrap();
 }
 
-fn complaint(folder: &tempfile::TempDir) -> String {
+fn read_error(folder: &tempfile::TempDir) -> String {
     read(folder.path()).unwrap_err().to_string()
 }
 
 #[test]
-fn fox_is_read_without_the_photos_that_do_not_exist() {
+fn fox_is_read_without_missing_photos() {
     let Some(folder) = test_data::folder("fox") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
@@ -57,8 +57,8 @@ fn fox_is_read_without_the_photos_that_do_not_exist() {
     );
     assert_eq!((first.intrinsics.size_px, first.intrinsics.principal_px), ([540, 960], [277.279, 482.634]));
     // The file's camera looks along the third column turned round, with its second column up.
-    let look = first.world_from_camera * Vector3::z();
-    assert!((look - Vector3::new(-0.442_090_026, 0.894_068_914, 0.072_091_785)).norm() < 1e-6, "{look}");
+    let forward = first.world_from_camera * Vector3::z();
+    assert!((forward - Vector3::new(-0.442_090_026, 0.894_068_914, 0.072_091_785)).norm() < 1e-6, "{forward}");
     let down = first.world_from_camera * Vector3::y();
     assert!(down.z < -0.99, "{down}");
     assert_eq!(first.load().unwrap().rgba_srgb.len(), 540 * 960 * 4);
@@ -66,7 +66,7 @@ fn fox_is_read_without_the_photos_that_do_not_exist() {
 }
 
 #[test]
-fn redkitchen_has_depth_in_metres() {
+fn redkitchen_has_depth_in_meters() {
     let Some(folder) = test_data::folder("redkitchen") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.notes.len()), (50, 0, 0));
@@ -77,7 +77,7 @@ fn redkitchen_has_depth_in_metres() {
 }
 
 #[test]
-fn poses_are_turned_to_our_axes_and_frames_sorted() {
+fn poses_are_converted_and_frames_sorted() {
     let (folder, mut document) = small_folder();
     document["frames"][1]["transform_matrix"][0][3] = json!(2.0);
     write_transforms(&folder, &document);
@@ -118,7 +118,7 @@ fn lens_parameters_follow_the_size_of_the_images() {
 }
 
 #[test]
-fn masks_and_depth_of_another_size_are_decoded() {
+fn masks_and_resized_depth_are_decoded() {
     let (folder, mut document) = small_folder();
     GrayImage::from_fn(8, 6, |x, _| Luma([if x < 2 { 0 } else { 200 }])).save(folder.path().join("mask.png")).unwrap();
     save_counts(&folder.path().join("depth.png"), [4, 3], &[0, 500, 1000, 65535, 0, 0, 0, 0, 0, 0, 0, 2000]);
@@ -138,7 +138,7 @@ fn masks_and_depth_of_another_size_are_decoded() {
 }
 
 #[test]
-fn missing_and_garbage_images_are_left_out_and_counted() {
+fn missing_and_garbage_images_are_skipped_and_counted() {
     let (folder, mut document) = small_folder();
     let mut entry = document["frames"][0].clone();
     entry["file_path"] = json!("garbage.jpg");
@@ -154,15 +154,15 @@ fn missing_and_garbage_images_are_left_out_and_counted() {
     for name in ["a.png", "b.png"] {
         std::fs::remove_file(folder.path().join(name)).unwrap();
     }
-    let text = complaint(&folder);
+    let text = read_error(&folder);
     assert!(text.contains("no usable image: 3 are not there, 1 cannot be used (garbage.jpg: "), "{text}");
 }
 
 #[test]
-fn a_photo_that_is_listed_twice_counts_once() {
+fn duplicate_photo_is_used_once() {
     let (folder, mut document) = small_folder();
-    let again = document["frames"][0].clone();
-    document["frames"].as_array_mut().unwrap().push(again);
+    let duplicate = document["frames"][0].clone();
+    document["frames"].as_array_mut().unwrap().push(duplicate);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_unusable), (2, 1));
@@ -170,7 +170,7 @@ fn a_photo_that_is_listed_twice_counts_once() {
 }
 
 #[test]
-fn a_photo_that_breaks_off_fails_by_name() {
+fn truncated_photo_error_names_it() {
     let (folder, document) = small_folder();
     write_transforms(&folder, &document);
     let photo = folder.path().join("a.png");
@@ -182,7 +182,7 @@ fn a_photo_that_breaks_off_fails_by_name() {
 }
 
 #[test]
-fn a_pose_further_away_than_any_robot_goes_costs_its_frame() {
+fn implausibly_far_pose_skips_frame() {
     let (folder, mut document) = small_folder();
     document["frames"][1]["transform_matrix"][2][3] = json!(1e30);
     write_transforms(&folder, &document);
@@ -192,7 +192,7 @@ fn a_pose_further_away_than_any_robot_goes_costs_its_frame() {
 }
 
 #[test]
-fn depth_that_does_not_decode_costs_the_depth_only() {
+fn undecodable_depth_keeps_photo() {
     let (folder, mut document) = small_folder();
     document["frames"][1]["depth_file_path"] = json!("depth.png");
     std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
@@ -203,37 +203,42 @@ fn depth_that_does_not_decode_costs_the_depth_only() {
 }
 
 #[test]
-fn a_bad_camera_names_the_frame() {
+fn invalid_camera_error_names_frame() {
     let (folder, document) = small_folder();
     write_transforms(&folder, &document);
     let good = document.to_string();
-    let with = |from: &str, to: &str| {
+    let error_after_replacing = |from: &str, to: &str| {
         assert!(good.contains(from), "{from} is not in {good}");
         std::fs::write(folder.path().join("transforms.json"), good.replacen(from, to, 1)).unwrap();
-        complaint(&folder)
+        read_error(&folder)
     };
-    assert!(with("[1.0,0.0,0.0,0.0]", "[1.0,0.0,0.0]").contains("has 15 numbers"));
-    assert!(with("\"aabb_scale\":16", "\"camera_model\":\"EQUIRECTANGULAR\"").contains("EQUIRECTANGULAR"));
-    assert!(with("\"aabb_scale\":16", "\"k4\":0.1").contains("k4 is 0.1"));
-    assert!(with("\"fl_x\":5.0", "\"fl_x\":-5.0").contains("focal length x is -5"));
-    assert!(with("\"fl_x\":5.0,", "").contains("no focal length"));
-    assert!(with("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0").contains("must be above 0"));
-    assert!(with("\"frames\"", "\"frame\"").contains("missing field `frames`"));
-    assert!(with("{", "").contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json"));
-    assert!(with("}", "").contains("transforms.json"));
+    assert!(error_after_replacing("[1.0,0.0,0.0,0.0]", "[1.0,0.0,0.0]").contains("has 15 numbers"));
+    assert!(
+        error_after_replacing("\"aabb_scale\":16", "\"camera_model\":\"EQUIRECTANGULAR\"").contains("EQUIRECTANGULAR")
+    );
+    assert!(error_after_replacing("\"aabb_scale\":16", "\"k4\":0.1").contains("k4 is 0.1"));
+    assert!(error_after_replacing("\"fl_x\":5.0", "\"fl_x\":-5.0").contains("focal length x is -5"));
+    assert!(error_after_replacing("\"fl_x\":5.0,", "").contains("no focal length"));
+    assert!(error_after_replacing("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0").contains("must be above 0"));
+    assert!(error_after_replacing("\"frames\"", "\"frame\"").contains("missing field `frames`"));
+    assert!(
+        error_after_replacing("{", "")
+            .contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json")
+    );
+    assert!(error_after_replacing("}", "").contains("transforms.json"));
 }
 
 #[test]
-fn lens_parameters_that_are_no_numbers_are_not_taken_for_absent_ones() {
+fn nan_lens_parameter_is_an_error() {
     let (folder, document) = small_folder();
     let text = document.to_string().replace("\"fl_y\":6.0", "\"fl_y\":NaN");
     assert!(text.contains("NaN"));
     std::fs::write(folder.path().join("transforms.json"), text).unwrap();
-    assert!(complaint(&folder).contains("not a finite number"), "{}", complaint(&folder));
+    assert!(read_error(&folder).contains("not a finite number"), "{}", read_error(&folder));
 }
 
 #[test]
-fn an_image_with_a_bad_pose_is_left_out_and_told() {
+fn invalid_pose_skips_image_with_note() {
     let (folder, document) = small_folder();
     // As Python writes it, which is no JSON.
     for (row, reason) in [
@@ -242,51 +247,51 @@ fn an_image_with_a_bad_pose_is_left_out_and_told() {
         ("[2.0,0.0,0.0,0.0]", "not rigid"),
         ("[-1.0,0.0,0.0,0.0]", "not rigid"),
     ] {
-        let spoiled = document.to_string().replacen("[1.0,0.0,0.0,0.0]", row, 1);
-        std::fs::write(folder.path().join("transforms.json"), spoiled).unwrap();
+        let corrupted = document.to_string().replacen("[1.0,0.0,0.0,0.0]", row, 1);
+        std::fs::write(folder.path().join("transforms.json"), corrupted).unwrap();
         let dataset = read(folder.path()).unwrap();
-        let [told] = &dataset.losses[..] else { panic!("{:?}", dataset.losses) };
-        assert!(told.contains("b.png (") && told.contains(reason), "{told}");
+        let [note] = &dataset.losses[..] else { panic!("{:?}", dataset.losses) };
+        assert!(note.contains("b.png (") && note.contains(reason), "{note}");
         assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
     }
 }
 
 #[test]
-fn a_folder_of_neither_kind_is_refused_in_one_sentence() {
+fn unknown_folder_is_rejected() {
     let folder = tempfile::tempdir().unwrap();
-    let text = complaint(&folder);
+    let text = read_error(&folder);
     assert!(text.ends_with("it holds neither transforms.json (nerfstudio) nor rgb.txt (TUM RGB-D)"), "{text}");
 }
 
 /// A TUM folder: four photos, three with poses near them, depth for two of them.
 fn tum_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    std::fs::create_dir(at("rgb")).unwrap();
-    std::fs::create_dir(at("depth")).unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    std::fs::create_dir(path_of("rgb")).unwrap();
+    std::fs::create_dir(path_of("depth")).unwrap();
     for photo in ["1.000000", "1.100000", "1.200000", "9.000000"] {
-        RgbImage::new(8, 6).save(at(&format!("rgb/{photo}.png"))).unwrap();
+        RgbImage::new(8, 6).save(path_of(&format!("rgb/{photo}.png"))).unwrap();
     }
     for depth in ["1.015000", "1.110000"] {
-        save_counts(&at(&format!("depth/{depth}.png")), [8, 6], &[5000; 48]);
+        save_counts(&path_of(&format!("depth/{depth}.png")), [8, 6], &[5000; 48]);
     }
     let list = |names: &[&str], kind: &str| {
         let lines = names.iter().map(|name| format!("{name} {kind}/{name}.png\n"));
         format!("# timestamp filename\n{}", lines.collect::<String>())
     };
     let photos = ["1.000000", "1.100000", "1.200000", "1.300000", "9.000000"];
-    std::fs::write(at("rgb.txt"), list(&photos, "rgb")).unwrap();
-    std::fs::write(at("depth.txt"), list(&["1.015000", "1.110000"], "depth")).unwrap();
+    std::fs::write(path_of("rgb.txt"), list(&photos, "rgb")).unwrap();
+    std::fs::write(path_of("depth.txt"), list(&["1.015000", "1.110000"], "depth")).unwrap();
     // Along x at 1 m/s, every 10 ms from just before to just after the photos.
     let poses =
         (0..=25).map(|ix| format!("{:.4} {} 2 3 0 0 0 1\n", 0.995 + 0.01 * f64::from(ix), 0.01 * f64::from(ix)));
-    std::fs::write(at("groundtruth.txt"), poses.collect::<String>()).unwrap();
-    std::fs::write(at("calibration.txt"), "500 501 3.5 2.5\n").unwrap();
+    std::fs::write(path_of("groundtruth.txt"), poses.collect::<String>()).unwrap();
+    std::fs::write(path_of("calibration.txt"), "500 501 3.5 2.5\n").unwrap();
     folder
 }
 
 #[test]
-fn tum_photos_take_the_pose_between_readings_and_the_nearest_depth() {
+fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     let folder = tum_folder();
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
@@ -304,10 +309,10 @@ fn tum_photos_take_the_pose_between_readings_and_the_nearest_depth() {
 }
 
 #[test]
-fn tum_cameras_come_from_the_file_or_the_name_of_the_folder() {
+fn tum_intrinsics_come_from_file_or_folder_name() {
     let folder = tum_folder();
     std::fs::remove_file(folder.path().join("calibration.txt")).unwrap();
-    assert!(complaint(&folder).contains("no lens parameters"));
+    assert!(read_error(&folder).contains("no lens parameters"));
     let named = folder.path().join("rgbd_dataset_freiburg1_desk");
     std::fs::create_dir(&named).unwrap();
     for name in ["rgb", "depth", "rgb.txt", "depth.txt", "groundtruth.txt"] {
@@ -321,26 +326,26 @@ fn tum_cameras_come_from_the_file_or_the_name_of_the_folder() {
 }
 
 #[test]
-fn broken_tum_lists_name_the_line() {
+fn broken_tum_list_error_names_line() {
     let folder = tum_folder();
     std::fs::write(folder.path().join("rgb.txt"), "# list\nnoon rgb/1.png\n").unwrap();
-    assert!(complaint(&folder).contains("line 2: \"noon\" is no time in seconds"));
+    assert!(read_error(&folder).contains("line 2: \"noon\" is no time in seconds"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0\n").unwrap();
-    assert!(complaint(&folder).contains("nothing follows the time"));
+    assert!(read_error(&folder).contains("nothing follows the time"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.000000.png\n").unwrap();
     std::fs::write(folder.path().join("groundtruth.txt"), "1.0 nan 0 0 0 0 0 1\n").unwrap();
-    assert!(complaint(&folder).contains("no pose within 20 ms"), "a pose that is none does not count");
+    assert!(read_error(&folder).contains("no pose within 20 ms"), "a pose that is none does not count");
     std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
     assert_eq!(read(folder.path()).unwrap().frames.len(), 1);
 }
 
 #[test]
-fn tum_stamps_and_poses_beyond_all_bounds_are_no_neighbours() {
+fn tum_extreme_stamps_and_poses_are_not_matched() {
     let folder = tum_folder();
-    let put = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
-    put("rgb.txt", "1.0 rgb/1.000000.png\n9223372036 rgb/1.100000.png\n");
-    put("depth.txt", "-9223372036 depth/1.015000.png\n");
-    put("groundtruth.txt", "-9223372036 0 0 0 0 0 0 1\n0.995 1e308 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n");
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("rgb.txt", "1.0 rgb/1.000000.png\n9223372036 rgb/1.100000.png\n");
+    write("depth.txt", "-9223372036 depth/1.015000.png\n");
+    write("groundtruth.txt", "-9223372036 0 0 0 0 0 0 1\n0.995 1e308 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n");
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
     assert!(dataset.frames[0].depth.is_none());

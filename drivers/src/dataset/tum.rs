@@ -2,8 +2,8 @@
 //!
 //! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats on the benchmark's pages.
 
-use super::frame::size_of;
-use super::{Dataset, DatasetFrame, DepthFile, FAR_M, LeftOut};
+use super::frame::image_size_px;
+use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -17,7 +17,7 @@ const POSE_LIST: &str = "groundtruth.txt";
 const CAMERA_FILE: &str = "calibration.txt";
 /// Readings further apart in time than this do not belong together.
 const MAX_GAP_NANOS: i64 = 20_000_000;
-const METRES_PER_COUNT: f64 = 1.0 / 5000.0;
+const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
 
 /// The benchmark's cameras by a part of the folder's name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
 const CAMERAS: [(&str, [f64; 9]); 3] = [
@@ -41,25 +41,25 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         false => Vec::new(),
     };
     let poses = Poses::read(folder)?;
-    let (mut frames, mut left_out) = (Vec::new(), LeftOut::default());
+    let (mut frames, mut skipped) = (Vec::new(), SkippedFrames::default());
     let mut n_without_depth = 0;
     for (stamp, name) in colors {
         let image_path = folder.join(&name);
         if !image_path.is_file() {
-            left_out.missing.push(name);
+            skipped.missing.push(name);
             continue;
         }
         let Some(world_from_camera) = poses.at(stamp) else {
-            left_out.unusable.push((name, "no pose within 20 ms".to_owned()));
+            skipped.unusable.push((name, "no pose within 20 ms".to_owned()));
             continue;
         };
-        let Ok(size_px) = size_of(&image_path) else {
-            left_out.broken.push((name, "not an image".to_owned()));
+        let Ok(size_px) = image_size_px(&image_path) else {
+            skipped.broken.push((name, "not an image".to_owned()));
             continue;
         };
         let depth = nearest(&depths, stamp).and_then(|(depth_stamp, depth_name)| {
             let (path, pose) = (folder.join(depth_name), poses.at(*depth_stamp)?);
-            path.is_file().then_some(DepthFile { path, metres_per_count: METRES_PER_COUNT, world_from_camera: pose })
+            path.is_file().then_some(DepthFile { path, meters_per_count: METERS_PER_COUNT, world_from_camera: pose })
         });
         n_without_depth += usize::from(depth.is_none());
         let intrinsics = Intrinsics { size_px, ..camera.clone() };
@@ -70,7 +70,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
         n => vec![format!("{n} photos have no depth image within 20 ms")],
     };
-    left_out.dataset(folder, frames, notes)
+    skipped.dataset(folder, frames, notes)
 }
 
 /// Lens parameters; the size is filled in from each photo.
@@ -78,7 +78,7 @@ fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
     let path = folder.join(CAMERA_FILE);
     let numbers = match std::fs::read_to_string(&path) {
         Ok(text) => camera_numbers(&text).map_err(|reason| Error::DatasetFile { path, reason })?,
-        Err(_) => camera_by_name(folder).ok_or_else(|| Error::NoCamera { path: folder.to_owned() })?,
+        Err(_) => camera_by_name(folder).ok_or_else(|| Error::NoIntrinsics { path: folder.to_owned() })?,
     };
     let [fx, fy, cx, cy, k1, k2, p1, p2, k3] = numbers;
     let lens = if numbers[4..] == [0.0; 5] { Lens::Pinhole } else { Lens::BrownConrady([k1, k2, p1, p2, k3]) };
@@ -102,8 +102,8 @@ fn camera_numbers(text: &str) -> Result<[f64; 9], String> {
 }
 
 fn camera_by_name(folder: &Path) -> Option<[f64; 9]> {
-    let whole = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    let name = whole.file_name()?.to_string_lossy().to_lowercase();
+    let integer = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    let name = integer.file_name()?.to_string_lossy().to_lowercase();
     CAMERAS.iter().find(|(part, _)| name.contains(part)).map(|(_, numbers)| *numbers)
 }
 
@@ -115,12 +115,12 @@ fn stamped_lines(folder: &Path, list: &str) -> Result<Vec<(Stamp, Vec<String>)>,
     for (line_ix, line) in text.lines().enumerate() {
         let mut words = line.split_whitespace().map(str::to_owned);
         let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
-        let wrong =
+        let line_error =
             |what: &str| Error::DatasetFile { path: path.clone(), reason: format!("line {}: {what}", line_ix + 1) };
-        let stamp = stamp_of(&first).ok_or_else(|| wrong(&format!("{first:?} is no time in seconds")))?;
+        let stamp = stamp_of(&first).ok_or_else(|| line_error(&format!("{first:?} is no time in seconds")))?;
         let rest: Vec<String> = words.collect();
         if rest.is_empty() {
-            return Err(wrong("nothing follows the time"));
+            return Err(line_error("nothing follows the time"));
         }
         lines.push((stamp, rest));
     }
@@ -135,8 +135,8 @@ fn stamped_names(folder: &Path, list: &str) -> Result<Vec<(Stamp, String)>, Erro
 
 /// Seconds since 1970 with decimals; read as two whole numbers, since f64 would round to a quarter of a microsecond.
 fn stamp_of(word: &str) -> Option<Stamp> {
-    let (whole, decimals) = word.split_once('.').unwrap_or((word, ""));
-    let secs: i64 = whole.parse().ok()?;
+    let (integer, decimals) = word.split_once('.').unwrap_or((word, ""));
+    let secs: i64 = integer.parse().ok()?;
     let nine_digits: String = decimals.chars().chain(std::iter::repeat('0')).take(9).collect();
     let nanos: i64 = nine_digits.chars().all(|digit| digit.is_ascii_digit()).then(|| nine_digits.parse().ok())??;
     Some(Stamp(secs.checked_mul(1_000_000_000)?.checked_add(nanos)?))
@@ -157,19 +157,19 @@ impl Poses {
     fn read(folder: &Path) -> Result<Self, Error> {
         let path = folder.join(POSE_LIST);
         let poses = stamped_lines(folder, POSE_LIST)?.into_iter().filter_map(|(stamp, words)| {
-            let wrong = |what: &str| Error::DatasetFile {
+            let line_error = |what: &str| Error::DatasetFile {
                 path: path.clone(),
                 reason: format!("pose at {:.4} s: {what}", stamp.0 as f64 * 1e-9),
             };
             let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
             let [x, y, z, qx, qy, qz, qw] = numbers[..] else {
-                return Some(Err(wrong("expected tx ty tz qx qy qz qw")));
+                return Some(Err(line_error("expected tx ty tz qx qy qz qw")));
             };
             let rotation = Quaternion::new(qw, qx, qy, qz);
             // Written so that no number is no pose.
-            let is_near = [x, y, z].iter().all(|along| along.abs() <= FAR_M);
+            let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);
             if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
-                log::warn!("{}", wrong("left out: not finite, too far, or its quaternion is not of length 1"));
+                log::warn!("{}", line_error("left out: not finite, too far, or its quaternion is not of length 1"));
                 return None;
             }
             let rotation = UnitQuaternion::new_normalize(rotation);

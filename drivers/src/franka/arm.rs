@@ -1,14 +1,14 @@
 //! An arm that is read: a thread takes the robot's states, the caller gets them as joint states.
 
 #[cfg(any(test, fuzzing))]
-pub(crate) mod hostile;
+pub(crate) mod fuzz;
 
-use super::mover::{Mover, Timed};
-use super::session::{Session, sentence};
-use super::state::{MAX_STATE_BYTES, Numbered, decode, pose};
-use super::{N_JOINTS, Statistics, realtime};
-use crate::udp::order::{Order, Place};
-use crate::wire::datagram::{Clock, Head};
+use super::motion_loop::{MotionLoop, StampedState};
+use super::session::{Session, error_text};
+use super::state::{MAX_STATE_BYTES, NumberedState, decode, pose};
+use super::{N_JOINTS, StateStatistics, realtime};
+use crate::udp::sequence::{SequencePosition, SequenceTracker};
+use crate::wire::datagram::{Clock, DatagramHeader};
 use crate::{Arm, Error, clock};
 use franka::{FciVersion, RobotMode, RobotState};
 use kinematics::{Chain, JointState, Stamp, Transform};
@@ -23,11 +23,11 @@ const MAX_WAITING: usize = 1000;
 /// A robot that says nothing for so long is lost.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 /// Where our forward kinematics and the robot's own differ by more, one of them is of another robot.
-const MAX_OFF_M: f64 = 2e-3;
-const MAX_OFF_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
+const MAX_POSE_ERROR_M: f64 = 2e-3;
+const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
 /// A robot that was not answered for so long has given up: what came meanwhile is not answered any more.
-const MAX_AWAY: Duration = Duration::from_millis(20);
+const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
 /// An arm as the rig file has it.
 #[derive(Clone, Debug)]
@@ -52,15 +52,15 @@ pub struct FrankaArm {
 
 #[derive(Debug, Default)]
 struct Shared {
-    state: Mutex<Waiting>,
+    state: Mutex<StateQueue>,
     arrived: Condvar,
 }
 
 /// What lies between the thread and the caller.
 #[derive(Debug, Default)]
-struct Waiting {
+struct StateQueue {
     queue: VecDeque<JointState>,
-    statistics: Statistics,
+    statistics: StateStatistics,
     error: Option<Error>,
     stop: bool,
 }
@@ -74,7 +74,7 @@ impl FrankaArm {
     /// The same, with what moves the arm by its states, made once there is one.
     pub(super) fn open_with(
         config: &ArmConfig,
-        mover: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<Mover>, String>,
+        motion_loop: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<MotionLoop>, String>,
     ) -> Result<Self, Error> {
         let address = &config.address;
         let fault = |reason| Error::Fci { address: address.clone(), reason };
@@ -85,14 +85,14 @@ impl FrankaArm {
         let session = Arc::new(Session::open(address)?);
         let Session { network, version } = &*session;
         let version = *version;
-        let until = clock::now() + MAX_SILENCE;
+        let deadline = clock::now() + MAX_SILENCE;
         let mut buffer = [0; MAX_STATE_BYTES];
         let first = loop {
             // Whatever went wrong, a state may still come.
             let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
             match decode(version, &buffer[..n]) {
                 Some(first) => break first.state,
-                None if clock::now() < until => {}
+                None if clock::now() < deadline => {}
                 None => {
                     return Err(fault(format!(
                         "it sends no states: do UDP datagrams to port {} of this computer pass its firewall?",
@@ -102,14 +102,14 @@ impl FrankaArm {
             }
         };
         check_kinematics(config, &first).map_err(fault)?;
-        let mover = mover(&session, &first).map_err(fault)?;
-        let mut line = Line::new(address.clone(), version, mover);
-        line.tell_mode(&first);
+        let motion_loop = motion_loop(&session, &first).map_err(fault)?;
+        let mut reader = StateReader::new(address.clone(), version, motion_loop);
+        reader.log_mode(&first);
         let shared = Arc::new(Shared::default());
         let device = format!("arm at {address}");
         let reading = Arc::clone(&shared);
         let name = "franka".to_owned();
-        let thread = std::thread::Builder::new().name(name).spawn(move || line.run(&session, &reading));
+        let thread = std::thread::Builder::new().name(name).spawn(move || reader.run(&session, &reading));
         let thread = thread.map_err(|source| Error::Thread { device: device.clone(), source })?;
         log::info!("{device}: speaks version {} of FCI", if version == FciVersion::V5 { 5 } else { 10 });
         Ok(Self { device, names: config.joint_names.clone(), version, shared, thread: Some(thread) })
@@ -121,7 +121,7 @@ impl FrankaArm {
     }
 
     /// What became of the states so far.
-    pub fn statistics(&self) -> Statistics {
+    pub fn statistics(&self) -> StateStatistics {
         self.shared.lock().statistics.clone()
     }
 }
@@ -133,7 +133,7 @@ impl Arm for FrankaArm {
 
     /// Stamped by the robot's own clock, mapped to ours; efforts are the measured torques at the links, gravity among them.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
-        let until = Instant::now() + timeout;
+        let deadline = Instant::now() + timeout;
         let mut state = self.shared.lock();
         loop {
             if let Some(joints) = state.queue.pop_front() {
@@ -142,11 +142,11 @@ impl Arm for FrankaArm {
             if let Some(error) = state.error.take() {
                 return Err(error);
             }
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() {
+            let remaining = deadline.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return Err(Error::NoJoints { waited: timeout });
             }
-            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
@@ -165,20 +165,20 @@ impl Drop for FrankaArm {
 /// Compares the flange's pose by the rig file with that by the robot.
 fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
     let chain = &config.chain;
-    let said = |error: kinematics::Error| error.to_string();
-    let order = chain.order_in(&config.joint_names).map_err(said)?;
-    let q: Vec<f64> = order.iter().map(|ix| state.q[*ix]).collect();
-    let ours = chain.forward(&q).map_err(said)?;
+    let chain_error = |error: kinematics::Error| error.to_string();
+    let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
+    let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
+    let ours = chain.forward(&q).map_err(chain_error)?;
     let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is no pose: {error}"));
     let (base_from_ee, flange_from_ee) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
-    let theirs = base_from_ee * flange_from_ee.inverse();
-    let (off_m, off_rad) = difference(&ours, &theirs);
-    if off_m <= MAX_OFF_M && off_rad <= MAX_OFF_RAD {
+    let reported = base_from_ee * flange_from_ee.inverse();
+    let (error_m, error_rad) = difference(&ours, &reported);
+    if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
         return Ok(());
     }
-    let (ee_off_m, ee_off_rad) = difference(&ours, &base_from_ee);
+    let (ee_error_m, ee_error_rad) = difference(&ours, &base_from_ee);
     let tip = chain.tip_link();
-    let usually = if ee_off_m <= MAX_OFF_M && ee_off_rad <= MAX_OFF_RAD {
+    let likely_cause = if ee_error_m <= MAX_POSE_ERROR_M && ee_error_rad <= MAX_POSE_ERROR_RAD {
         format!(
             "{tip:?} is where the robot has its end effector: arm.flange_link must name the flange, F_T_EE lies between them"
         )
@@ -186,14 +186,14 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
         format!(
             "usual causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk since, \
              arm.joints has another order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
-            told_difference(ee_off_m, ee_off_rad)
+            format_difference(ee_error_m, ee_error_rad)
         )
     };
     Err(format!(
-        "the rig file puts {tip:?} at {}, the robot its flange (O_T_EE without F_T_EE) at {}, {} away; {usually}",
-        told(&ours),
-        told(&theirs),
-        told_difference(off_m, off_rad)
+        "the rig file puts {tip:?} at {}, the robot its flange (O_T_EE without F_T_EE) at {}, {} away; {likely_cause}",
+        format_pose(&ours),
+        format_pose(&reported),
+        format_difference(error_m, error_rad)
     ))
 }
 
@@ -202,11 +202,11 @@ fn difference(a: &Transform, b: &Transform) -> (f64, f64) {
     (a_from_b.translation.vector.norm(), a_from_b.rotation.angle())
 }
 
-fn told_difference(off_m: f64, off_rad: f64) -> String {
-    format!("{:.1} mm and {:.2} degrees", off_m * 1e3, off_rad.to_degrees())
+fn format_difference(error_m: f64, error_rad: f64) -> String {
+    format!("{:.1} mm and {:.2} degrees", error_m * 1e3, error_rad.to_degrees())
 }
 
-fn told(pose: &Transform) -> String {
+fn format_pose(pose: &Transform) -> String {
     let [x, y, z] = pose.translation.vector.into();
     let (roll, pitch, yaw) = pose.rotation.euler_angles();
     let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_degrees);
@@ -214,24 +214,24 @@ fn told(pose: &Transform) -> String {
 }
 
 /// What the reading thread keeps between states.
-struct Line {
+struct StateReader {
     address: String,
     version: FciVersion,
-    order: Order,
+    sequence: SequenceTracker,
     mode: RobotMode,
-    mover: Option<Mover>,
+    motion_loop: Option<MotionLoop>,
 }
 
-impl Line {
-    fn new(address: String, version: FciVersion, mover: Option<Mover>) -> Self {
-        Self { address, version, order: Order::default(), mode: RobotMode::Other, mover }
+impl StateReader {
+    fn new(address: String, version: FciVersion, motion_loop: Option<MotionLoop>) -> Self {
+        Self { address, version, sequence: SequenceTracker::default(), mode: RobotMode::Other, motion_loop }
     }
 
     fn run(mut self, session: &Session, shared: &Shared) {
-        realtime::claim(&format!("arm at {}", self.address));
+        realtime::request_realtime(&format!("arm at {}", self.address));
         if let Err(reason) = self.read(session, shared) {
-            if let Some(mover) = &mut self.mover {
-                mover.lose(&reason);
+            if let Some(motion_loop) = &mut self.motion_loop {
+                motion_loop.handle_disconnect(&reason);
             }
             shared.lock().error = Some(Error::Fci { address: self.address, reason });
             shared.arrived.notify_all();
@@ -244,35 +244,35 @@ impl Line {
         let mut buffer = [0; MAX_STATE_BYTES];
         // What waited meanwhile arrives at once, and says nothing on the robot's clock.
         while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
-        let mut heard = clock::now();
+        let mut last_received = clock::now();
         loop {
             let mut received = network.udp.blocking_receive(&mut buffer).ok();
             let at = clock::now();
-            let is_fresh = at.duration_since(heard) <= MAX_AWAY;
+            let is_fresh = at.duration_since(last_received) <= MAX_RESPONSE_GAP;
             let mut newest = None;
             while let Some(n) = received {
                 // From anywhere else it is no state.
                 let from = network.udp_peer().filter(|peer| peer.ip() == network.server_ip);
                 let state = from.zip(decode(self.version, &buffer[..n]));
-                if !self.hear(shared, state, at, &mut newest) {
+                if !self.handle_datagram(shared, state, at, &mut newest) {
                     return Ok(());
                 }
                 received = network.udp.try_receive(&mut buffer).unwrap_or(None);
             }
             if let Some((from, numbered, stamp)) = newest {
-                heard = at;
+                last_received = at;
                 shared.arrived.notify_all();
-                self.tell_mode(&numbered.state);
-                if let Some(mover) = &mut self.mover {
-                    mover.turn(&Timed { numbered: &numbered, stamp, from, is_fresh });
+                self.log_mode(&numbered.state);
+                if let Some(motion_loop) = &mut self.motion_loop {
+                    motion_loop.cycle(&StampedState { numbered: &numbered, stamp, from, is_fresh });
                 }
                 continue;
             }
             if shared.lock().stop {
                 return Ok(());
             }
-            network.tcp.throw_if_connection_closed().map_err(|error| sentence(&error))?;
-            let silence = at.duration_since(heard);
+            network.tcp.throw_if_connection_closed().map_err(|error| error_text(&error))?;
+            let silence = at.duration_since(last_received);
             if silence > MAX_SILENCE {
                 return Err(format!("it has sent no state for {silence:.1?}"));
             }
@@ -280,50 +280,50 @@ impl Line {
     }
 
     /// Takes a datagram, or counts it as no state; whether to go on.
-    fn hear(
+    fn handle_datagram(
         &mut self,
         shared: &Shared,
-        state: Option<(SocketAddr, Numbered)>,
+        state: Option<(SocketAddr, NumberedState)>,
         at: Stamp,
-        newest: &mut Option<(SocketAddr, Numbered, Stamp)>,
+        newest: &mut Option<(SocketAddr, NumberedState, Stamp)>,
     ) -> bool {
-        let mut waiting = shared.lock();
+        let mut state_queue = shared.lock();
         match state {
             Some((from, numbered)) => {
-                if let Some(stamp) = self.take(&mut waiting, &numbered, at) {
+                if let Some(stamp) = self.take(&mut state_queue, &numbered, at) {
                     *newest = Some((from, numbered, stamp));
                 }
             }
-            None => waiting.statistics.n_refused += 1,
+            None => state_queue.statistics.n_rejected += 1,
         }
-        !waiting.stop
+        !state_queue.stop
     }
 
     /// Puts a state into the queue, if it is later than all before; when it was told, by our clock.
-    fn take(&mut self, waiting: &mut Waiting, numbered: &Numbered, at: Stamp) -> Option<Stamp> {
-        let Numbered { number, state } = numbered;
-        let statistics = &mut waiting.statistics;
-        match self.order.place(*number, at) {
-            Place::New { n_lost } => statistics.n_lost += n_lost,
-            Place::Restart => statistics.n_restarts += 1,
-            Place::Newest | Place::Late => {
+    fn take(&mut self, state_queue: &mut StateQueue, numbered: &NumberedState, at: Stamp) -> Option<Stamp> {
+        let NumberedState { number, state } = numbered;
+        let statistics = &mut state_queue.statistics;
+        match self.sequence.position(*number, at) {
+            SequencePosition::New { n_lost } => statistics.n_lost += n_lost,
+            SequencePosition::Restart => statistics.n_restarts += 1,
+            SequencePosition::Current | SequencePosition::Late => {
                 statistics.n_late += 1;
                 return None;
             }
         }
         // The robot counts its states by its own clock, one a millisecond.
         let stamp_nanos = i64::try_from(*number).unwrap_or(i64::MAX).saturating_mul(NANOS_PER_STATE);
-        let head = Head { seq: *number, clock: Clock::Device, stamp_nanos };
-        let Some(stamp) = self.order.stamp(&head, at) else {
-            statistics.n_refused += 1;
+        let header = DatagramHeader { seq: *number, clock: Clock::Device, stamp_nanos };
+        let Some(stamp) = self.sequence.stamp(&header, at) else {
+            statistics.n_rejected += 1;
             return None;
         };
         statistics.count(at.duration_since(stamp));
-        if waiting.queue.len() >= MAX_WAITING {
-            waiting.queue.pop_front();
+        if state_queue.queue.len() >= MAX_WAITING {
+            state_queue.queue.pop_front();
             statistics.n_dropped += 1;
         }
-        waiting.queue.push_back(JointState {
+        state_queue.queue.push_back(JointState {
             stamp,
             position: state.q.to_vec(),
             velocity: state.dq.to_vec(),
@@ -333,7 +333,7 @@ impl Line {
     }
 
     /// Logs what the robot is doing whenever that changes.
-    fn tell_mode(&mut self, state: &RobotState) {
+    fn log_mode(&mut self, state: &RobotState) {
         if state.robot_mode == self.mode {
             return;
         }
@@ -351,7 +351,7 @@ impl Line {
 
 impl Shared {
     /// The state, also after a thread panicked while it held it: the queue is never left half changed.
-    fn lock(&self) -> MutexGuard<'_, Waiting> {
+    fn lock(&self) -> MutexGuard<'_, StateQueue> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

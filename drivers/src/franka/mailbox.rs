@@ -8,23 +8,23 @@ use std::time::{Duration, Instant};
 
 /// Orders go to the thread, what came of them comes back.
 #[derive(Debug)]
-pub(super) struct Desk {
-    board: Mutex<Board>,
+pub(super) struct MotionMailbox {
+    mailbox_state: Mutex<MailboxState>,
     changed: Condvar,
 }
 
 #[derive(Debug)]
-pub(super) struct Board {
+pub(super) struct MailboxState {
     /// The newest order that the thread has not taken.
-    pub(super) order: Option<Order>,
+    pub(super) order: Option<MotionOrder>,
     /// Number of a motion that the robot let begin and the thread has not taken.
-    pub(super) begun: Option<u32>,
+    pub(super) started_motion: Option<u32>,
     /// Whether one runs, or is about to, that takes orders.
-    pub(super) takes_orders: bool,
+    pub(super) accepts_orders: bool,
     /// Whether none runs, and the next may begin.
     pub(super) is_idle: bool,
     /// Whether a motion ends as soon as the arm is at rest.
-    pub(super) is_leaving: bool,
+    pub(super) is_shutting_down: bool,
     /// Whether the robot was lost, for good.
     pub(super) is_lost: bool,
     pub(super) motion: Motion,
@@ -33,51 +33,56 @@ pub(super) struct Board {
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Order {
-    Head(JointTarget),
+pub(super) enum MotionOrder {
+    SetTarget(JointTarget),
     Stop,
 }
 
-impl Default for Desk {
+impl Default for MotionMailbox {
     fn default() -> Self {
-        let board = Board {
+        let mailbox_state = MailboxState {
             order: None,
-            begun: None,
-            takes_orders: false,
+            started_motion: None,
+            accepts_orders: false,
             is_idle: true,
-            is_leaving: false,
+            is_shutting_down: false,
             is_lost: false,
-            motion: Motion::Held,
+            motion: Motion::Holding,
             mode: RobotMode::Other,
             statistics: MotionStatistics::default(),
         };
-        Self { board: Mutex::new(board), changed: Condvar::new() }
+        Self { mailbox_state: Mutex::new(mailbox_state), changed: Condvar::new() }
     }
 }
 
-impl Desk {
+impl MotionMailbox {
     /// The board, also after a thread panicked while it held it: no order is left half written.
-    pub(super) fn lock(&self) -> MutexGuard<'_, Board> {
-        self.board.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(super) fn lock(&self) -> MutexGuard<'_, MailboxState> {
+        self.mailbox_state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Changes what the thread tells, and wakes who waits for that.
-    pub(super) fn tell(&self, change: impl FnOnce(&mut Board)) {
+    pub(super) fn update(&self, change: impl FnOnce(&mut MailboxState)) {
         change(&mut self.lock());
         self.changed.notify_all();
     }
 
     /// Waits until something is so; `None` where that takes too long.
-    pub(super) fn wait(&self, patience: Duration, is_so: impl Fn(&Board) -> bool) -> Option<MutexGuard<'_, Board>> {
-        let until = Instant::now() + patience;
-        let mut board = self.lock();
-        while !is_so(&board) {
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() {
+    pub(super) fn wait(
+        &self,
+        timeout: Duration,
+        condition: impl Fn(&MailboxState) -> bool,
+    ) -> Option<MutexGuard<'_, MailboxState>> {
+        let deadline = Instant::now() + timeout;
+        let mut mailbox_state = self.lock();
+        while !condition(&mailbox_state) {
+            let remaining = deadline.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return None;
             }
-            board = self.changed.wait_timeout(board, left).unwrap_or_else(PoisonError::into_inner).0;
+            mailbox_state =
+                self.changed.wait_timeout(mailbox_state, remaining).unwrap_or_else(PoisonError::into_inner).0;
         }
-        Some(board)
+        Some(mailbox_state)
     }
 }

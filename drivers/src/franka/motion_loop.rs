@@ -1,13 +1,13 @@
 //! The part of an arm's thread that moves it: in comes a state, out goes where the joints are to be a millisecond later.
 
-use super::desk::{Desk, Order};
 use super::limits::RobotLimits;
-use super::reference::{Fate, Reference};
-use super::request::{self, Verdict};
-use super::session::{Session, sentence};
-use super::state::Numbered;
+use super::mailbox::{MotionMailbox, MotionOrder};
+use super::reference::{CommandFate, Reference};
+use super::request::{self, MotionResponse};
+use super::session::{Session, error_text};
+use super::state::NumberedState;
 use crate::clock;
-use crate::motion::{Generator, Motion, MotionLimits};
+use crate::motion::{Motion, MotionLimits, TrajectoryGenerator};
 use franka::{RobotMode, RobotState};
 use kinematics::Stamp;
 use std::net::SocketAddr;
@@ -16,29 +16,29 @@ use std::time::Duration;
 
 const STEP: Duration = Duration::from_millis(1);
 /// A motion that has been at rest for so many states ends, so that a person may guide the arm by hand.
-const MAX_HELD: u32 = 1000;
+const MAX_AT_REST: u32 = 1000;
 /// States after which a motion must have begun. Source: FCI documentation.
-const MAX_UNTIL_BEGUN: u32 = 1000;
+const MAX_STATES_UNTIL_START: u32 = 1000;
 /// States within which a robot says why a motion is over.
-const MAX_UNTIL_TOLD: u32 = 100;
+const MAX_STATES_UNTIL_RESPONSE: u32 = 100;
 /// The robot tells how many of its last 100 commands came in time: not before so many states.
-const N_JUDGED: u64 = 100;
+const N_SUCCESS_WINDOW: u64 = 100;
 
 /// Moves an arm by its states.
 #[derive(Debug)]
-pub(super) struct Mover {
+pub(super) struct MotionLoop {
     device: String,
     session: Arc<Session>,
-    desk: Arc<Desk>,
+    mailbox: Arc<MotionMailbox>,
     robot: RobotLimits,
     limits: Vec<MotionLimits>,
-    phase: Phase,
+    motion_state: MotionState,
     mode: RobotMode,
 }
 
 /// A state that came in order, and when it was told by our clock.
-pub(super) struct Timed<'a> {
-    pub(super) numbered: &'a Numbered,
+pub(super) struct StampedState<'a> {
+    pub(super) numbered: &'a NumberedState,
     pub(super) stamp: Stamp,
     pub(super) from: SocketAddr,
     /// Whether it just came; otherwise it may be from before the robot gave up on us, and is not answered.
@@ -46,16 +46,16 @@ pub(super) struct Timed<'a> {
 }
 
 #[derive(Debug)]
-enum Phase {
+enum MotionState {
     Idle,
     /// The robot let a motion begin; no state says so yet.
     Beginning {
         id: u32,
         n_waited: u32,
     },
-    Running(Box<Running>),
+    ActiveMotion(Box<ActiveMotion>),
     /// A motion is over by the robot's states; what it says of that is still to come.
-    Over {
+    Ending {
         id: u32,
         n_waited: u32,
         reason: Option<String>,
@@ -63,54 +63,54 @@ enum Phase {
 }
 
 #[derive(Debug)]
-struct Running {
+struct ActiveMotion {
     id: u32,
-    generator: Generator,
+    generator: TrajectoryGenerator,
     reference: Reference,
     /// Number of the newest state.
     number: u64,
     /// What it was answered.
     sent: Option<[f64; super::N_JOINTS]>,
     n_cycles: u64,
-    n_held: u32,
+    n_at_rest: u32,
     is_ending: bool,
 }
 
-impl Mover {
+impl MotionLoop {
     pub(super) fn new(
         device: String,
         session: Arc<Session>,
-        desk: Arc<Desk>,
+        mailbox: Arc<MotionMailbox>,
         robot: RobotLimits,
         limits: Vec<MotionLimits>,
     ) -> Self {
-        Self { device, session, desk, robot, limits, phase: Phase::Idle, mode: RobotMode::Other }
+        Self { device, session, mailbox, robot, limits, motion_state: MotionState::Idle, mode: RobotMode::Other }
     }
 
     /// One state: the newest that came.
-    pub(super) fn turn(&mut self, timed: &Timed<'_>) {
-        let state = &timed.numbered.state;
+    pub(super) fn cycle(&mut self, stamped: &StampedState<'_>) {
+        let state = &stamped.numbered.state;
         self.take_mode(state);
-        self.phase = match std::mem::replace(&mut self.phase, Phase::Idle) {
-            Phase::Idle => match self.desk.lock().begun.take() {
-                Some(id) => Phase::Beginning { id, n_waited: 0 },
-                None => Phase::Idle,
+        self.motion_state = match std::mem::replace(&mut self.motion_state, MotionState::Idle) {
+            MotionState::Idle => match self.mailbox.lock().started_motion.take() {
+                Some(id) => MotionState::Beginning { id, n_waited: 0 },
+                None => MotionState::Idle,
             },
-            Phase::Beginning { id, n_waited } => self.begin(id, n_waited, timed),
-            Phase::Running(running) if state.robot_mode != RobotMode::Move => {
-                self.desk.tell(|board| board.takes_orders = false);
-                Phase::Over { id: running.id, n_waited: 0, reason: cause(state) }
+            MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
+            MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
+                self.mailbox.update(|mailbox_state| mailbox_state.accepts_orders = false);
+                MotionState::Ending { id: active.id, n_waited: 0, reason: cause(state) }
             }
-            Phase::Running(running) => self.run(running, timed),
-            Phase::Over { id, n_waited, reason } => self.conclude(id, n_waited, reason),
+            MotionState::ActiveMotion(active) => self.run(active, stamped),
+            MotionState::Ending { id, n_waited, reason } => self.conclude(id, n_waited, reason),
         };
     }
 
     /// The robot is lost: it stops by itself.
-    pub(super) fn lose(&mut self, reason: &str) {
-        self.phase = Phase::Idle;
-        self.desk.tell(|board| board.is_lost = true);
-        self.stop_for(format!("lost: {reason}"));
+    pub(super) fn handle_disconnect(&mut self, reason: &str) {
+        self.motion_state = MotionState::Idle;
+        self.mailbox.update(|mailbox_state| mailbox_state.is_lost = true);
+        self.stop_because(format!("lost: {reason}"));
     }
 
     /// Tells a mode that stops the arm outside of any motion, once; in a motion its end tells more.
@@ -120,171 +120,182 @@ impl Mover {
             return;
         }
         self.mode = mode;
-        self.desk.tell(|board| board.mode = mode);
-        if let (Phase::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
-            (&self.phase, mode, cause(state))
+        self.mailbox.update(|mailbox_state| mailbox_state.mode = mode);
+        if let (MotionState::Idle, RobotMode::Reflex | RobotMode::UserStopped, Some(reason)) =
+            (&self.motion_state, mode, cause(state))
         {
-            self.stop_for(reason);
+            self.stop_because(reason);
         }
     }
 
-    fn begin(&mut self, id: u32, n_waited: u32, timed: &Timed<'_>) -> Phase {
-        let Timed { numbered, .. } = timed;
+    fn start_motion(&mut self, id: u32, n_waited: u32, stamped: &StampedState<'_>) -> MotionState {
+        let StampedState { numbered, .. } = stamped;
         if numbered.state.robot_mode != RobotMode::Move {
             return match request::outcome(&self.session, id) {
-                Ok(None) if n_waited < MAX_UNTIL_BEGUN => Phase::Beginning { id, n_waited: n_waited + 1 },
+                Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning { id, n_waited: n_waited + 1 },
                 Ok(None) => self.halt(id, "it let a motion begin that did not".to_owned()),
-                Ok(Some(Verdict::Refused(why))) => self.over(cause(&numbered.state).or(Some(why))),
-                Ok(Some(_)) => self.over(cause(&numbered.state).or(Some("it ended a motion by itself".to_owned()))),
-                Err(why) => self.over(Some(why)),
+                Ok(Some(MotionResponse::Rejected(why))) => self.finish(cause(&numbered.state).or(Some(why))),
+                Ok(Some(_)) => self.finish(cause(&numbered.state).or(Some("it ended a motion by itself".to_owned()))),
+                Err(why) => self.finish(Some(why)),
             };
         }
         let reference = Reference::at_rest(&numbered.state);
-        let generator = match Generator::new(&self.limits, &reference.position_rad, STEP) {
+        let generator = match TrajectoryGenerator::new(&self.limits, &reference.position_rad, STEP) {
             Ok(generator) => generator,
             Err(why) => return self.halt(id, why),
         };
-        self.desk.lock().statistics.n_motions += 1;
-        let running = Running {
+        self.mailbox.lock().statistics.n_motions += 1;
+        let active = ActiveMotion {
             id,
             generator,
             reference,
             number: numbered.number,
             sent: None,
             n_cycles: 0,
-            n_held: 0,
+            n_at_rest: 0,
             is_ending: false,
         };
-        self.run(Box::new(running), timed)
+        self.run(Box::new(active), stamped)
     }
 
     /// A millisecond of a motion.
-    fn run(&mut self, mut running: Box<Running>, timed: &Timed<'_>) -> Phase {
-        let Numbered { number, state } = timed.numbered;
-        let n_states = number.saturating_sub(running.number);
+    fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
+        let NumberedState { number, state } = stamped.numbered;
+        let n_states = number.saturating_sub(active.number);
         let (reference, fate) = match n_states {
-            0 => (running.reference, Fate::Followed),
-            n => running.reference.later(running.sent, n, state),
+            0 => (active.reference, CommandFate::Followed),
+            n => active.reference.advance(active.sent, n, state),
         };
-        (running.reference, running.number, running.sent) = (reference, *number, None);
-        let order = self.consult(&mut running, n_states, fate, timed);
-        let position_rad = match self.shape(&mut running, order.as_ref(), fate) {
+        (active.reference, active.number, active.sent) = (reference, *number, None);
+        let order = self.take_order(&mut active, n_states, fate, stamped);
+        let position_rad = match self.next_position(&mut active, order.as_ref(), fate) {
             Ok(position_rad) => position_rad,
-            Err(why) => return self.halt(running.id, why),
+            Err(why) => return self.halt(active.id, why),
         };
-        if timed.is_fresh {
-            self.send(&mut running, timed, position_rad);
+        if stamped.is_fresh {
+            self.send(&mut active, stamped, position_rad);
         }
-        Phase::Running(running)
+        MotionState::ActiveMotion(active)
     }
 
     /// Counts the state, takes the order that there is, and tells whether the arm is at rest.
-    fn consult(&self, running: &mut Running, n_states: u64, fate: Fate, timed: &Timed<'_>) -> Option<Order> {
-        running.n_cycles += 1;
-        let mut board = self.desk.lock();
-        board.statistics.n_cycles += 1;
-        board.statistics.n_lost += n_states.saturating_sub(1);
-        board.statistics.n_stale += u64::from(!timed.is_fresh);
-        if let Fate::Missed(n) = fate {
-            board.statistics.n_missed += n;
+    fn take_order(
+        &self,
+        active: &mut ActiveMotion,
+        n_states: u64,
+        fate: CommandFate,
+        stamped: &StampedState<'_>,
+    ) -> Option<MotionOrder> {
+        active.n_cycles += 1;
+        let mut mailbox_state = self.mailbox.lock();
+        mailbox_state.statistics.n_cycles += 1;
+        mailbox_state.statistics.n_lost += n_states.saturating_sub(1);
+        mailbox_state.statistics.n_stale += u64::from(!stamped.is_fresh);
+        if let CommandFate::Missed(n) = fate {
+            mailbox_state.statistics.n_missed += n;
         }
-        if running.n_cycles > N_JUDGED {
-            board.statistics.count_told(timed.numbered.state.control_command_success_rate);
+        if active.n_cycles > N_SUCCESS_WINDOW {
+            mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
-        let order = board.order.take();
-        let is_held = running.generator.is_held() && order.is_none();
-        running.n_held = if is_held { running.n_held + 1 } else { 0 };
-        if is_held && (running.n_held > MAX_HELD || board.is_leaving) {
-            (running.is_ending, board.takes_orders) = (true, false);
+        let order = mailbox_state.order.take();
+        let is_at_rest = active.generator.is_at_rest() && order.is_none();
+        active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
+        if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
+            (active.is_ending, mailbox_state.accepts_orders) = (true, false);
         }
-        let motion = if is_held { Motion::Held } else { Motion::Moving };
-        if board.motion != motion {
-            board.motion = motion;
+        let motion = if is_at_rest { Motion::Holding } else { Motion::Moving };
+        if mailbox_state.motion != motion {
+            mailbox_state.motion = motion;
         }
         order
     }
 
     /// Where the joints are to be next.
-    fn shape(
+    fn next_position(
         &self,
-        running: &mut Running,
-        order: Option<&Order>,
-        fate: Fate,
+        active: &mut ActiveMotion,
+        order: Option<&MotionOrder>,
+        fate: CommandFate,
     ) -> Result<[f64; super::N_JOINTS], String> {
-        let Running { generator, reference, .. } = running;
+        let ActiveMotion { generator, reference, .. } = active;
         match order {
-            Some(Order::Head(target)) => drop(generator.head_for(target)?),
-            Some(Order::Stop) => generator.stop(),
+            Some(MotionOrder::SetTarget(target)) => drop(generator.set_target(target)?),
+            Some(MotionOrder::Stop) => generator.stop(),
             None => {}
         }
         // At rest the robot stays where it is, whatever was lost.
-        if fate != Fate::Followed && !generator.is_held() {
+        if fate != CommandFate::Followed && !generator.is_at_rest() {
             generator.resume(&reference.setpoint())?;
         }
-        let wanted = generator.step()?.position;
-        let wanted = wanted.try_into().map_err(|_| "the setpoint is of another arm".to_owned())?;
-        let (position_rad, is_limited) = self.robot.limited(wanted, reference)?;
+        let desired = generator.step()?.position;
+        let desired = desired.try_into().map_err(|_| "the setpoint is of another arm".to_owned())?;
+        let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
             generator.resume(&reference.sent(position_rad).setpoint())?;
-            self.desk.lock().statistics.n_limited += 1;
+            self.mailbox.lock().statistics.n_limited += 1;
         }
         Ok(position_rad)
     }
 
-    fn send(&self, running: &mut Running, timed: &Timed<'_>, position_rad: [f64; super::N_JOINTS]) {
+    fn send(&self, active: &mut ActiveMotion, stamped: &StampedState<'_>, position_rad: [f64; super::N_JOINTS]) {
         let Session { network, version } = &*self.session;
-        let datagram = request::command(*version, running.number, &position_rad, running.is_ending);
-        match network.udp.send(timed.from, &datagram) {
+        let datagram = request::command(*version, active.number, &position_rad, active.is_ending);
+        match network.udp.send(stamped.from, &datagram) {
             Ok(()) => {
-                running.sent = Some(position_rad);
-                self.desk.lock().statistics.count(clock::now().duration_since(timed.stamp));
+                active.sent = Some(position_rad);
+                self.mailbox.lock().statistics.count(clock::now().duration_since(stamped.stamp));
             }
             // As good as lost on the way: the robot goes on without.
-            Err(error) => log::debug!("{}: a command did not go out: {}", self.device, sentence(&error)),
+            Err(error) => log::debug!("{}: a command did not go out: {}", self.device, error_text(&error)),
         }
     }
 
     /// Has the robot brake.
-    fn halt(&self, id: u32, reason: String) -> Phase {
+    fn halt(&self, id: u32, reason: String) -> MotionState {
         let reason = match request::halt(&self.session) {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
         };
-        self.desk.tell(|board| board.takes_orders = false);
-        Phase::Over { id, n_waited: 0, reason: Some(reason) }
+        self.mailbox.update(|mailbox_state| mailbox_state.accepts_orders = false);
+        MotionState::Ending { id, n_waited: 0, reason: Some(reason) }
     }
 
     /// Takes what the robot says of a motion that is over.
-    fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>) -> Phase {
+    fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>) -> MotionState {
         let reason = match request::outcome(&self.session, id) {
-            Ok(None) if n_waited < MAX_UNTIL_TOLD => return Phase::Over { id, n_waited: n_waited + 1, reason },
-            Ok(Some(Verdict::Ended)) => reason,
-            Ok(Some(Verdict::Refused(why))) => Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})"))),
-            Ok(None | Some(Verdict::Begun)) => {
+            Ok(None) if n_waited < MAX_STATES_UNTIL_RESPONSE => {
+                return MotionState::Ending { id, n_waited: n_waited + 1, reason };
+            }
+            Ok(Some(MotionResponse::Finished)) => reason,
+            Ok(Some(MotionResponse::Rejected(why))) => {
+                Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
+            }
+            Ok(None | Some(MotionResponse::Started)) => {
                 Some(reason.unwrap_or_else(|| "it ended a motion and does not say why".to_owned()))
             }
             Err(why) => Some(reason.unwrap_or(why)),
         };
-        self.over(reason)
+        self.finish(reason)
     }
 
     /// No motion runs any more; with a reason it stopped by itself.
-    fn over(&self, reason: Option<String>) -> Phase {
+    fn finish(&self, reason: Option<String>) -> MotionState {
         match reason {
-            Some(reason) => self.stop_for(reason),
-            None => self.desk.tell(|board| {
-                (board.is_idle, board.takes_orders, board.order, board.motion) = (true, false, None, Motion::Held);
+            Some(reason) => self.stop_because(reason),
+            None => self.mailbox.update(|mailbox_state| {
+                (mailbox_state.is_idle, mailbox_state.accepts_orders, mailbox_state.order, mailbox_state.motion) =
+                    (true, false, None, Motion::Holding);
             }),
         }
-        Phase::Idle
+        MotionState::Idle
     }
 
-    fn stop_for(&self, reason: String) {
+    fn stop_because(&self, reason: String) {
         log::warn!("{}: {reason}", self.device);
-        self.desk.tell(|board| {
+        self.mailbox.update(|mailbox_state| {
             // An order from before is not for an arm that was recovered.
-            (board.is_idle, board.takes_orders, board.order) = (true, false, None);
-            board.motion = Motion::Stopped { reason };
+            (mailbox_state.is_idle, mailbox_state.accepts_orders, mailbox_state.order) = (true, false, None);
+            mailbox_state.motion = Motion::Stopped { reason };
         });
     }
 }
@@ -298,6 +309,6 @@ fn cause(state: &RobotState) -> Option<String> {
             Some(format!("stopped by a reflex: {}", names.join(", ")))
         }
         RobotMode::Idle | RobotMode::Move | RobotMode::AutomaticErrorRecovery => None,
-        mode => request::hindrance(mode).map(str::to_owned),
+        mode => request::blocking_reason(mode).map(str::to_owned),
     }
 }

@@ -1,11 +1,11 @@
 //! An arm that is moved: motions begin with the first target and end a second after the arm came to rest.
 
-use super::desk::{Board, Desk, Order};
-use super::limits::{RobotLimits, into_range};
-use super::mover::Mover;
+use super::limits::{RobotLimits, clamp_to_range};
+use super::mailbox::{MailboxState, MotionMailbox, MotionOrder};
+use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::session::Session;
-use super::{ArmConfig, FrankaArm, MotionStatistics, Statistics};
+use super::{ArmConfig, FrankaArm, MotionStatistics, StateStatistics};
 use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use crate::{Arm, Error};
 use franka::{FciVersion, RobotMode};
@@ -16,9 +16,9 @@ use std::time::Duration;
 /// A robot stops by itself after 20 ms without a command.
 const ROBOT_TIMEOUT: Duration = Duration::from_millis(20);
 /// How long an arm may take to come to rest and end its motion.
-const MAX_STOPPING: Duration = Duration::from_secs(5);
+const STOP_TIMEOUT: Duration = Duration::from_secs(5);
 /// How long states may say otherwise after the robot answered.
-const MAX_SETTLING: Duration = Duration::from_secs(2);
+const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A Franka arm that is moved by joint positions, under the robot's own joint impedance controller.
 ///
@@ -29,7 +29,7 @@ pub struct MovableFrankaArm {
     address: String,
     arm: FrankaArm,
     session: Arc<Session>,
-    desk: Arc<Desk>,
+    mailbox: Arc<MotionMailbox>,
     contact: ContactConfig,
     limits: Vec<MotionLimits>,
     is_set: bool,
@@ -60,8 +60,8 @@ impl MovableFrankaArm {
     pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
         let address = config.address.clone();
         Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
-        let desk = Arc::new(Desk::default());
-        let made = OnceLock::new();
+        let mailbox = Arc::new(MotionMailbox::default());
+        let connected = OnceLock::new();
         let arm = FrankaArm::open_with(config, |session, first| {
             let robot = match session.version {
                 FciVersion::V5 => RobotLimits::panda(),
@@ -70,23 +70,23 @@ impl MovableFrankaArm {
             let limits = robot.allowed(&motion.limits)?;
             let device = format!("arm at {}", config.address);
             // The closure is called once.
-            let _ = made.set((Arc::clone(session), limits.clone()));
-            let mut mover = Mover::new(device, Arc::clone(session), Arc::clone(&desk), robot, limits);
-            mover.take_mode(first);
-            Ok(Some(mover))
+            let _ = connected.set((Arc::clone(session), limits.clone()));
+            let mut motion_loop = MotionLoop::new(device, Arc::clone(session), Arc::clone(&mailbox), robot, limits);
+            motion_loop.take_mode(first);
+            Ok(Some(motion_loop))
         })?;
-        let (session, limits) = made.into_inner().expect("an arm that is open has a session");
-        Ok(Self { address, arm, session, desk, contact: contact.clone(), limits, is_set: false })
+        let (session, limits) = connected.into_inner().expect("an arm that is open has a session");
+        Ok(Self { address, arm, session, mailbox, contact: contact.clone(), limits, is_set: false })
     }
 
     /// What became of the states so far.
-    pub fn statistics(&self) -> Statistics {
+    pub fn statistics(&self) -> StateStatistics {
         self.arm.statistics()
     }
 
     /// What became of the commands so far.
     pub fn motion_statistics(&self) -> MotionStatistics {
-        self.desk.lock().statistics.clone()
+        self.mailbox.lock().statistics.clone()
     }
 
     /// What is asked of the joints at most, in their order.
@@ -99,36 +99,38 @@ impl MovableFrankaArm {
     }
 
     /// Begins a motion that heads for a target.
-    fn begin(&mut self, target: &JointTarget) -> Result<(), Error> {
+    fn start_motion(&mut self, target: &JointTarget) -> Result<(), Error> {
         // A motion that is just ending ends first.
-        let Some(board) = self.desk.wait(MAX_STOPPING, |board| board.is_idle) else {
+        let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle) else {
             return Err(self.fault("a motion before this does not end"));
         };
-        let mode = board.mode;
-        let refusal = refusal(&board);
-        drop(board);
-        if let Some(why) = refusal.or_else(|| request::hindrance(mode).map(str::to_owned)) {
+        let mode = mailbox_state.mode;
+        let refusal = refusal(&mailbox_state);
+        drop(mailbox_state);
+        if let Some(why) = refusal.or_else(|| request::blocking_reason(mode).map(str::to_owned)) {
             return Err(self.fault(why));
         }
         if !self.is_set {
             request::set(&self.session, &self.contact).map_err(|why| self.fault(why))?;
             self.is_set = true;
         }
-        let id = request::begin(&self.session);
+        let id = request::start_motion(&self.session);
         let id = id.map_err(|why| self.fault(format!("it lets no motion begin: {why}")))?;
-        self.desk.tell(|board| {
-            (board.begun, board.takes_orders, board.is_idle) = (Some(id), true, false);
-            (board.order, board.motion) = (Some(Order::Head(target.clone())), Motion::Moving);
+        self.mailbox.update(|mailbox_state| {
+            (mailbox_state.started_motion, mailbox_state.accepts_orders, mailbox_state.is_idle) =
+                (Some(id), true, false);
+            (mailbox_state.order, mailbox_state.motion) =
+                (Some(MotionOrder::SetTarget(target.clone())), Motion::Moving);
         });
         Ok(())
     }
 }
 
 /// Why an arm takes no target.
-fn refusal(board: &Board) -> Option<String> {
-    match &board.motion {
+fn refusal(mailbox_state: &MailboxState) -> Option<String> {
+    match &mailbox_state.motion {
         Motion::Stopped { reason } => Some(format!("it takes no target before it is recovered: {reason}")),
-        Motion::Held | Motion::Moving => None,
+        Motion::Holding | Motion::Moving => None,
     }
 }
 
@@ -144,68 +146,73 @@ impl Arm for MovableFrankaArm {
 
 impl MovableArm for MovableFrankaArm {
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error> {
-        let target = into_range(target, &self.limits).map_err(|why| self.fault(why))?;
-        let mut board = self.desk.lock();
-        if let Some(why) = refusal(&board) {
-            drop(board);
+        let target = clamp_to_range(target, &self.limits).map_err(|why| self.fault(why))?;
+        let mut mailbox_state = self.mailbox.lock();
+        if let Some(why) = refusal(&mailbox_state) {
+            drop(mailbox_state);
             return Err(self.fault(why));
         }
-        if board.takes_orders {
-            (board.order, board.motion) = (Some(Order::Head(target.clone())), Motion::Moving);
+        if mailbox_state.accepts_orders {
+            (mailbox_state.order, mailbox_state.motion) =
+                (Some(MotionOrder::SetTarget(target.clone())), Motion::Moving);
             return Ok(target);
         }
-        drop(board);
-        self.begin(&target)?;
+        drop(mailbox_state);
+        self.start_motion(&target)?;
         Ok(target)
     }
 
     fn motion(&self) -> Motion {
-        self.desk.lock().motion.clone()
+        self.mailbox.lock().motion.clone()
     }
 
     fn stop(&mut self) -> Result<(), Error> {
-        let mut board = self.desk.lock();
-        if board.takes_orders {
-            board.order = Some(Order::Stop);
+        let mut mailbox_state = self.mailbox.lock();
+        if mailbox_state.accepts_orders {
+            mailbox_state.order = Some(MotionOrder::Stop);
         }
         Ok(())
     }
 
     /// Clears the reflex where one stopped it; a person has to release a user stop or unlock joints first, and is told so.
     fn recover(&mut self) -> Result<(), Error> {
-        let Some(board) = self.desk.wait(MAX_STOPPING, |board| board.is_idle || board.is_lost) else {
+        let Some(mailbox_state) =
+            self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)
+        else {
             return Err(self.fault("a motion runs"));
         };
-        let (mode, is_lost, motion) = (board.mode, board.is_lost, board.motion.clone());
-        drop(board);
+        let (mode, is_lost, motion) = (mailbox_state.mode, mailbox_state.is_lost, mailbox_state.motion.clone());
+        drop(mailbox_state);
         match (motion, mode) {
             (Motion::Stopped { reason }, _) if is_lost => return Err(self.fault(reason)),
             (Motion::Stopped { .. }, RobotMode::Reflex) => {
                 request::recover(&self.session).map_err(|why| self.fault(why))?;
             }
             (Motion::Stopped { .. }, mode) => {
-                if let Some(why) = request::hindrance(mode) {
+                if let Some(why) = request::blocking_reason(mode) {
                     return Err(self.fault(why));
                 }
             }
-            (Motion::Held | Motion::Moving, _) => return Ok(()),
+            (Motion::Holding | Motion::Moving, _) => return Ok(()),
         }
         // States from before may still be on their way.
-        let Some(mut board) = self.desk.wait(MAX_SETTLING, |board| board.mode == RobotMode::Idle) else {
+        let Some(mut mailbox_state) =
+            self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| mailbox_state.mode == RobotMode::Idle)
+        else {
             return Err(self.fault("it says that it recovered, and is not ready"));
         };
-        board.motion = Motion::Held;
+        mailbox_state.motion = Motion::Holding;
         Ok(())
     }
 }
 
 impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
-        self.desk.tell(|board| {
-            board.is_leaving = true;
-            board.order = board.takes_orders.then_some(Order::Stop);
+        self.mailbox.update(|mailbox_state| {
+            mailbox_state.is_shutting_down = true;
+            mailbox_state.order = mailbox_state.accepts_orders.then_some(MotionOrder::Stop);
         });
-        if self.desk.wait(MAX_STOPPING, |board| board.is_idle || board.is_lost).is_none() {
+        if self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost).is_none() {
             log::warn!("arm at {}: its motion does not end", self.address);
         }
         let statistics = self.motion_statistics();

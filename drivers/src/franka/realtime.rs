@@ -10,18 +10,18 @@ const PRIORITY: i32 = 80;
 ///
 /// Memory that it asks for later stays as it is: images and models are large, and nothing at 1 kHz waits for them. What is not
 /// allowed is logged, and the thread works without.
-pub(super) fn claim(device: &str) {
-    let mut refused = Vec::new();
+pub(super) fn request_realtime(device: &str) {
+    let mut denied = Vec::new();
     if let Err(reason) = set_current_thread_scheduler_priority(PRIORITY) {
-        refused.push(format!("real-time priority ({})", reason.trim_start_matches("libfranka: ")));
+        denied.push(format!("real-time priority ({})", reason.trim_start_matches("libfranka: ")));
     }
     if let Err(error) = mlockall(MlockAllFlags::CURRENT | MlockAllFlags::ONFAULT) {
-        refused.push(format!("locked memory ({error})"));
+        denied.push(format!("locked memory ({error})"));
     }
-    if !refused.is_empty() {
-        let refused = refused.join(" and ");
+    if !denied.is_empty() {
+        let denied = denied.join(" and ");
         log::warn!(
-            "{device}: works without {refused}; states may be read late. `fieldrig doctor` tells what mends that"
+            "{device}: works without {denied}; states may be read late. `fieldrig doctor` tells what mends that"
         );
     }
 }

@@ -6,9 +6,9 @@ use crate::motion::Setpoint;
 use franka::RobotState;
 
 /// A robot that is wanted further from where we think it is, is wanted elsewhere; below this is what FCI 10 rounds off, up to 8 rad.
-const NEAR_RAD: f64 = 4e-7;
+const POSITION_TOLERANCE_RAD: f64 = 4e-7;
 /// The same of rates, up to 8 rad/s.
-const NEAR_RAD_S: f64 = 1e-6;
+const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
 /// A robot may tell where it was wanted so many steps ago: `franka-sim` tells what its joints' own thread has taken.
 const MAX_BEHIND: f64 = 3.0;
 /// After so many commands that do not come in a row the robot stops. Source: FCI documentation, "Real-time control commands".
@@ -24,7 +24,7 @@ pub(super) struct Reference {
 
 /// What became of a command, by the states after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Fate {
+pub(super) enum CommandFate {
     /// The robot follows it.
     Followed,
     /// The robot went on without so many of them.
@@ -39,7 +39,7 @@ impl Reference {
         Self { position_rad: state.q_d, velocity_rad_s: [0.0; N_JOINTS], acceleration_rad_s2: [0.0; N_JOINTS] }
     }
 
-    fn told(state: &RobotState) -> Self {
+    fn reported(state: &RobotState) -> Self {
         Self { position_rad: state.q_d, velocity_rad_s: state.dq_d, acceleration_rad_s2: state.ddq_d }
     }
 
@@ -68,42 +68,49 @@ impl Reference {
     /// a command that did not arrive is within that rounding, the rates that the robot tells say so: of them it is seen a thousand
     /// times better. Rates that are still those of before prove nothing: `franka-sim` tells those of its joints, which are at rest
     /// for a while after their target is not.
-    pub(super) fn later(&self, sent: Option<[f64; N_JOINTS]>, n_states: u64, state: &RobotState) -> (Self, Fate) {
-        let told = Self::told(state);
+    pub(super) fn advance(
+        &self,
+        sent: Option<[f64; N_JOINTS]>,
+        n_states: u64,
+        state: &RobotState,
+    ) -> (Self, CommandFate) {
+        let reported = Self::reported(state);
         if n_states > MAX_MISSED {
-            return (told, Fate::Unknown);
+            return (reported, CommandFate::Unknown);
         }
-        let go_on = |from: Self, n: u64| (0..n).fold(from, |reference, _| reference.missed());
+        let extrapolate = |from: Self, n: u64| (0..n).fold(from, |reference, _| reference.missed());
         let is_near = |reference: &Self| {
-            let both = reference.position_rad.into_iter().zip(told.position_rad);
-            both.into_iter().all(|(ours, theirs)| (ours - theirs).abs() <= NEAR_RAD)
+            let pairs = reference.position_rad.into_iter().zip(reported.position_rad);
+            pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= POSITION_TOLERANCE_RAD)
         };
-        let has_rates = |reference: &Self| {
-            let both = reference.velocity_rad_s.into_iter().zip(told.velocity_rad_s);
-            both.into_iter().all(|(ours, theirs)| (ours - theirs).abs() <= NEAR_RAD_S)
+        let matches_rates = |reference: &Self| {
+            let pairs = reference.velocity_rad_s.into_iter().zip(reported.velocity_rad_s);
+            pairs.into_iter().all(|(own, robot)| (own - robot).abs() <= VELOCITY_TOLERANCE_RAD_S)
         };
         let n_after = n_states.saturating_sub(1);
-        let with = sent.map(|position_rad| go_on(self.sent(position_rad), n_after)).filter(is_near);
-        let without = go_on(*self, n_states);
-        match with {
-            Some(with) if !has_rates(&with) && has_rates(&without) && !has_rates(self) => {
-                (without, Fate::Missed(n_states))
+        let if_received = sent.map(|position_rad| extrapolate(self.sent(position_rad), n_after)).filter(is_near);
+        let if_missed = extrapolate(*self, n_states);
+        match if_received {
+            Some(if_received) if !matches_rates(&if_received) && matches_rates(&if_missed) && !matches_rates(self) => {
+                (if_missed, CommandFate::Missed(n_states))
             }
-            Some(with) if n_after == 0 => (with, Fate::Followed),
-            Some(with) => (with, Fate::Missed(n_after)),
-            None => match sent.map(|position_rad| go_on(self.sent(position_rad), n_after)) {
-                _ if is_near(&without) => (without, Fate::Missed(n_states)),
-                Some(with) if n_after == 0 && with.is_shortly_after(&told) => (with, Fate::Followed),
-                _ => (told, Fate::Unknown),
+            Some(if_received) if n_after == 0 => (if_received, CommandFate::Followed),
+            Some(if_received) => (if_received, CommandFate::Missed(n_after)),
+            None => match sent.map(|position_rad| extrapolate(self.sent(position_rad), n_after)) {
+                _ if is_near(&if_missed) => (if_missed, CommandFate::Missed(n_states)),
+                Some(if_received) if n_after == 0 && if_received.is_shortly_after(&reported) => {
+                    (if_received, CommandFate::Followed)
+                }
+                _ => (reported, CommandFate::Unknown),
             },
         }
     }
 
     /// Whether each joint may have been there a few steps ago.
-    fn is_shortly_after(&self, told: &Self) -> bool {
-        let joints = self.position_rad.into_iter().zip(self.velocity_rad_s).zip(told.position_rad);
-        joints.into_iter().all(|((ours, velocity), theirs)| {
-            (ours - theirs).abs() <= NEAR_RAD + MAX_BEHIND * STEP_SECS * velocity.abs()
+    fn is_shortly_after(&self, reported: &Self) -> bool {
+        let joints = self.position_rad.into_iter().zip(self.velocity_rad_s).zip(reported.position_rad);
+        joints.into_iter().all(|((own, velocity), robot)| {
+            (own - robot).abs() <= POSITION_TOLERANCE_RAD + MAX_BEHIND * STEP_SECS * velocity.abs()
         })
     }
 
@@ -147,60 +154,60 @@ mod tests {
     }
 
     #[test]
-    fn commands_that_a_robot_follows_and_misses_are_told_apart_though_it_rounds() {
+    fn followed_and_missed_commands_are_distinguished() {
         let (reference, next) = moving(600.0);
         let followed = reference.sent(next);
         assert!((followed.acceleration_rad_s2[0] - 1.3).abs() < 1e-6, "{followed:?}");
-        assert_eq!(reference.later(Some(next), 1, &state(&followed)), (followed, Fate::Followed));
+        assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
         let missed = reference.missed();
-        assert_eq!(reference.later(Some(next), 1, &state(&missed)), (missed, Fate::Missed(1)));
-        assert_eq!(reference.later(None, 1, &state(&missed)), (missed, Fate::Missed(1)));
+        assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
+        assert_eq!(reference.advance(None, 1, &state(&missed)), (missed, CommandFate::Missed(1)));
         let two_later = followed.missed().missed();
-        assert_eq!(reference.later(Some(next), 3, &state(&two_later)), (two_later, Fate::Missed(2)));
+        assert_eq!(reference.advance(Some(next), 3, &state(&two_later)), (two_later, CommandFate::Missed(2)));
         let three_later = missed.missed().missed();
-        assert_eq!(reference.later(Some(next), 3, &state(&three_later)), (three_later, Fate::Missed(3)));
+        assert_eq!(reference.advance(Some(next), 3, &state(&three_later)), (three_later, CommandFate::Missed(3)));
     }
 
     #[test]
-    fn what_is_lost_in_the_rounding_of_positions_is_seen_in_the_rates() {
+    fn missed_commands_are_detected_from_velocities() {
         let (reference, next) = moving(20.0);
         let (missed, followed) = (reference.missed(), reference.sent(next));
-        assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < NEAR_RAD);
-        assert_eq!(reference.later(Some(next), 1, &state(&missed)), (missed, Fate::Missed(1)));
-        assert_eq!(reference.later(Some(next), 1, &state(&followed)), (followed, Fate::Followed));
+        assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < POSITION_TOLERANCE_RAD);
+        assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
+        assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
         // A robot whose rates are none of ours is taken to follow, as its position says.
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
-        assert_eq!(reference.later(Some(next), 1, &state(&smoothed)), (followed, Fate::Followed));
+        assert_eq!(reference.advance(Some(next), 1, &state(&smoothed)), (followed, CommandFate::Followed));
     }
 
     #[test]
-    fn joints_still_at_rest_do_not_prove_that_a_command_was_missed() {
+    fn joints_at_rest_do_not_imply_missed_command() {
         let rest = Reference {
             position_rad: [1.9; N_JOINTS],
             velocity_rad_s: [0.0; N_JOINTS],
             acceleration_rad_s2: [0.0; N_JOINTS],
         };
         let first = rest.sent([1.9 + 20.0 * STEP_SECS.powi(3) / 6.0; N_JOINTS]);
-        let told = state(&Reference { position_rad: first.position_rad, ..rest });
-        assert_eq!(rest.later(Some(first.position_rad), 1, &told), (first, Fate::Followed));
+        let reported = state(&Reference { position_rad: first.position_rad, ..rest });
+        assert_eq!(rest.advance(Some(first.position_rad), 1, &reported), (first, CommandFate::Followed));
     }
 
     #[test]
-    fn a_robot_that_tells_late_where_it_is_wanted_is_taken_to_follow() {
+    fn delayed_reports_count_as_followed() {
         let (reference, next) = moving(20.0);
         let followed = reference.sent(next);
-        assert_eq!(reference.later(Some(next), 1, &state(&reference)), (followed, Fate::Followed));
+        assert_eq!(reference.advance(Some(next), 1, &state(&reference)), (followed, CommandFate::Followed));
     }
 
     #[test]
-    fn a_robot_that_is_wanted_elsewhere_is_believed() {
+    fn reported_reference_overrides_ours() {
         let (reference, next) = moving(20.0);
-        let mut elsewhere = reference.sent(next);
-        elsewhere.position_rad[3] += 1e-2;
-        let told = state(&elsewhere);
-        assert_eq!(reference.later(Some(next), 1, &told), (Reference::told(&told), Fate::Unknown));
+        let mut displaced = reference.sent(next);
+        displaced.position_rad[3] += 1e-2;
+        let reported = state(&displaced);
+        assert_eq!(reference.advance(Some(next), 1, &reported), (Reference::reported(&reported), CommandFate::Unknown));
         let followed = state(&reference.sent(next));
-        assert_eq!(reference.later(Some(next), 30, &followed).1, Fate::Unknown, "after a long silence");
+        assert_eq!(reference.advance(Some(next), 30, &followed).1, CommandFate::Unknown, "after a long silence");
     }
 }

@@ -1,7 +1,7 @@
 //! What is asked of a controller over TCP and of a motion over UDP, in either version of FCI.
 
 use super::N_JOINTS;
-use super::session::{Session, answer, sentence};
+use super::session::{Session, answer, error_text};
 use franka::wire::robot::{v5, v10};
 use franka::wire::{HeaderLayout, f64s_to_wire, message_payload};
 use franka::{FciVersion, FrankaError, RobotMode};
@@ -43,10 +43,10 @@ impl Default for ContactConfig {
 
 /// What became of a motion that a robot let begin, or did not.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Verdict {
-    Begun,
-    Ended,
-    Refused(String),
+pub(super) enum MotionResponse {
+    Started,
+    Finished,
+    Rejected(String),
 }
 
 /// The description that a robot of FCI 10 serves of itself, a URDF.
@@ -55,7 +55,7 @@ pub(super) fn description(session: &Session) -> Result<String, String> {
     match payload.split_first() {
         Some((0, text)) => Ok(String::from_utf8_lossy(text).into_owned()),
         Some((status, _)) => {
-            Err(format!("it does not describe itself: {}", told(v10::CommandStatus::from_u8(*status))))
+            Err(format!("it does not describe itself: {}", status_text(v10::CommandStatus::from_u8(*status))))
         }
         None => Err("its answer to the question for its description is empty".to_owned()),
     }
@@ -75,8 +75,12 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
         let answer = ask(session, number, payload, MAX_ANSWER)?;
         match (session.version, first(&answer)?) {
             (_, 0) => Ok(()),
-            (FciVersion::V5, status) => Err(format!("{what}: {}", told(v5::GetterSetterStatus::from_u8(status)))),
-            (FciVersion::V10, status) => Err(format!("{what}: {}", told(v10::GetterSetterStatus::from_u8(status)))),
+            (FciVersion::V5, status) => {
+                Err(format!("{what}: {}", status_text(v5::GetterSetterStatus::from_u8(status))))
+            }
+            (FciVersion::V10, status) => {
+                Err(format!("{what}: {}", status_text(v10::GetterSetterStatus::from_u8(status))))
+            }
         }
     };
     let command = number(v5::Command::SetCollisionBehavior, v10::Command::SetCollisionBehavior);
@@ -87,25 +91,25 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
 }
 
 /// Asks for a motion by joint positions under the robot's own joint impedance; its number, once the robot lets it begin.
-pub(super) fn begin(session: &Session) -> Result<u32, String> {
+pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     let (translation, rotation, elbow) = ANY_DEVIATION;
     let deviation = || v10::Deviation::new(translation, rotation, elbow);
-    let stiff = v10::MoveControllerMode::JointImpedance;
+    let impedance_mode = v10::MoveControllerMode::JointImpedance;
     let request = match session.version {
         FciVersion::V5 => {
             let mode = v5::MoveMotionGeneratorMode::JointPosition;
-            v5::MoveRequest::new(stiff, mode, deviation(), deviation()).as_bytes().to_vec()
+            v5::MoveRequest::new(impedance_mode, mode, deviation(), deviation()).as_bytes().to_vec()
         }
         FciVersion::V10 => {
             let mode = v10::MoveMotionGeneratorMode::JointPosition;
-            v10::MoveRequest::new(stiff, mode, deviation(), deviation()).as_bytes().to_vec()
+            v10::MoveRequest::new(impedance_mode, mode, deviation(), deviation()).as_bytes().to_vec()
         }
     };
     let id = send(session, v10::Command::Move.to_u32(), &request)?;
-    match verdict(session.version, &wait(session, id, MAX_ANSWER)?) {
-        Verdict::Begun => Ok(id),
-        Verdict::Ended => Err("it ended the motion before it began".to_owned()),
-        Verdict::Refused(why) => Err(why),
+    match decode_response(session.version, &wait(session, id, MAX_ANSWER)?) {
+        MotionResponse::Started => Ok(id),
+        MotionResponse::Finished => Err("it ended the motion before it began".to_owned()),
+        MotionResponse::Rejected(why) => Err(why),
     }
 }
 
@@ -115,9 +119,9 @@ pub(super) fn halt(session: &Session) -> Result<(), String> {
 }
 
 /// What became of a motion, if the robot has said so.
-pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<Verdict>, String> {
-    let message = session.network.tcp.try_receive_response(id).map_err(|error| sentence(&error))?;
-    Ok(message.map(|message| verdict(session.version, message_payload(HeaderLayout::Robot, &message))))
+pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionResponse>, String> {
+    let message = session.network.tcp.try_receive_response(id).map_err(|error| error_text(&error))?;
+    Ok(message.map(|message| decode_response(session.version, message_payload(HeaderLayout::Robot, &message))))
 }
 
 /// Clears a reflex.
@@ -129,8 +133,8 @@ pub(super) fn recover(session: &Session) -> Result<(), String> {
     let answer = ask(session, number, &[], MAX_RECOVERY)?;
     let why = match (session.version, first(&answer)?) {
         (_, 0) => return Ok(()),
-        (FciVersion::V5, status) => told(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
-        (FciVersion::V10, status) => told(v10::AutomaticErrorRecoveryStatus::from_u8(status)),
+        (FciVersion::V5, status) => status_text(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
+        (FciVersion::V10, status) => status_text(v10::AutomaticErrorRecoveryStatus::from_u8(status)),
     };
     Err(format!("it does not recover: {why}"))
 }
@@ -152,7 +156,7 @@ pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_J
 }
 
 /// Why a robot in that mode lets no motion begin, and what a person does about it; `None` where it is ready.
-pub(super) fn hindrance(mode: RobotMode) -> Option<&'static str> {
+pub(super) fn blocking_reason(mode: RobotMode) -> Option<&'static str> {
     match mode {
         RobotMode::Idle => None,
         RobotMode::Guiding => Some("it is guided by hand: let go of the buttons at its hand"),
@@ -167,33 +171,35 @@ pub(super) fn hindrance(mode: RobotMode) -> Option<&'static str> {
 }
 
 /// What the status of a motion stands for.
-fn verdict(version: FciVersion, payload: &[u8]) -> Verdict {
-    let Some(status) = payload.first() else { return Verdict::Refused("its answer to a motion is empty".to_owned()) };
+fn decode_response(version: FciVersion, payload: &[u8]) -> MotionResponse {
+    let Some(status) = payload.first() else {
+        return MotionResponse::Rejected("its answer to a motion is empty".to_owned());
+    };
     let name = match version {
         FciVersion::V5 => v5::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
         FciVersion::V10 => franka::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
     };
     match name.as_deref() {
-        Some("MotionStarted") => Verdict::Begun,
-        Some("Success") => Verdict::Ended,
-        Some(name) => Verdict::Refused(words(name)),
-        None => Verdict::Refused(format!("status {status}")),
+        Some("MotionStarted") => MotionResponse::Started,
+        Some("Success") => MotionResponse::Finished,
+        Some(name) => MotionResponse::Rejected(split_words(name)),
+        None => MotionResponse::Rejected(format!("status {status}")),
     }
 }
 
-fn ask(session: &Session, command: u32, payload: &[u8], patience: Duration) -> Result<Vec<u8>, String> {
+fn ask(session: &Session, command: u32, payload: &[u8], timeout: Duration) -> Result<Vec<u8>, String> {
     let id = send(session, command, payload)?;
-    wait(session, id, patience)
+    wait(session, id, timeout)
 }
 
 fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> {
-    session.network.tcp.send_request(command, payload).map_err(|error| sentence(&error))
+    session.network.tcp.send_request(command, payload).map_err(|error| error_text(&error))
 }
 
 /// The payload of the answer.
-fn wait(session: &Session, id: u32, patience: Duration) -> Result<Vec<u8>, String> {
-    let answered = answer(&session.network, id, patience).map_err(|error: FrankaError| sentence(&error))?;
-    let message = answered.ok_or_else(|| format!("it does not answer within {patience:?}"))?;
+fn wait(session: &Session, id: u32, timeout: Duration) -> Result<Vec<u8>, String> {
+    let response = answer(&session.network, id, timeout).map_err(|error: FrankaError| error_text(&error))?;
+    let message = response.ok_or_else(|| format!("it does not answer within {timeout:?}"))?;
     Ok(message_payload(HeaderLayout::Robot, &message).to_vec())
 }
 
@@ -202,20 +208,20 @@ fn first(payload: &[u8]) -> Result<u8, String> {
 }
 
 /// A status by libfranka's name for it, in words.
-fn told<T: std::fmt::Debug>(status: Option<T>) -> String {
-    status.map_or_else(|| "an unknown status".to_owned(), |status| words(&format!("{status:?}")))
+fn status_text<T: std::fmt::Debug>(status: Option<T>) -> String {
+    status.map_or_else(|| "an unknown status".to_owned(), |status| split_words(&format!("{status:?}")))
 }
 
 /// `CommandNotPossibleRejected` as "command not possible rejected".
-fn words(name: &str) -> String {
-    let mut words = String::new();
+fn split_words(name: &str) -> String {
+    let mut split_words = String::new();
     for letter in name.chars() {
-        if letter.is_uppercase() && !words.is_empty() {
-            words.push(' ');
+        if letter.is_uppercase() && !split_words.is_empty() {
+            split_words.push(' ');
         }
-        words.extend(letter.to_lowercase());
+        split_words.extend(letter.to_lowercase());
     }
-    words
+    split_words
 }
 
 #[cfg(test)]
@@ -223,17 +229,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_status_has_another_number_in_either_version() {
-        assert_eq!(verdict(FciVersion::V5, &[1]), Verdict::Begun);
-        assert_eq!(verdict(FciVersion::V10, &[0]), Verdict::Ended);
-        let refused = |version, status| match verdict(version, &[status]) {
-            Verdict::Refused(why) => why,
+    fn status_numbers_differ_between_versions() {
+        assert_eq!(decode_response(FciVersion::V5, &[1]), MotionResponse::Started);
+        assert_eq!(decode_response(FciVersion::V10, &[0]), MotionResponse::Finished);
+        let refused = |version, status| match decode_response(version, &[status]) {
+            MotionResponse::Rejected(why) => why,
             other => panic!("{other:?}"),
         };
         assert_eq!(refused(FciVersion::V5, 3), "command not possible rejected");
         assert_eq!(refused(FciVersion::V5, 6), "reflex aborted");
         assert!(refused(FciVersion::V10, 3).contains("safety functions"));
         assert_eq!(refused(FciVersion::V10, 99), "status 99");
-        assert!(matches!(verdict(FciVersion::V10, &[]), Verdict::Refused(_)));
+        assert!(matches!(decode_response(FciVersion::V10, &[]), MotionResponse::Rejected(_)));
     }
 }

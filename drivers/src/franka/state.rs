@@ -8,10 +8,10 @@ use zerocopy::FromBytes;
 /// Longer than the longest state, so that one that is too long is seen to be.
 pub(super) const MAX_STATE_BYTES: usize = size_of::<v5::RobotState>() + 1;
 /// Joints turn less far from zero than this; beyond it a number is noise.
-const MOST_RAD: f64 = 10.0;
+const MAX_RAD: f64 = 10.0;
 
 /// A state, with its number: one more with every millisecond of the robot's clock.
-pub(super) struct Numbered {
+pub(super) struct NumberedState {
     pub(super) number: u64,
     pub(super) state: RobotState,
 }
@@ -26,7 +26,7 @@ pub(super) fn n_bytes(version: FciVersion) -> usize {
 }
 
 /// Reads a datagram; `None` where it is none of that version, or its joints are no angles.
-pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<Numbered> {
+pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState> {
     let (number, state) = match version {
         FciVersion::V5 => {
             let wire = v5::RobotState::read_from_bytes(bytes).ok()?;
@@ -37,9 +37,9 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<Numbered> {
             (wire.message_id.get(), RobotState::from_wire(&wire))
         }
     };
-    let are_angles = state.q.iter().all(|angle| angle.abs() <= MOST_RAD);
+    let are_angles = state.q.iter().all(|angle| angle.abs() <= MAX_RAD);
     let are_numbers = state.dq.iter().chain(&state.tau_J).all(|number| number.is_finite());
-    (are_angles && are_numbers).then_some(Numbered { number, state })
+    (are_angles && are_numbers).then_some(NumberedState { number, state })
 }
 
 /// A pose that is told as a 4x4 matrix, column major.

@@ -1,6 +1,6 @@
 //! Over real sockets of the loopback interface: our driver, and franka-rs as a client that moves, against played robots.
 
-use super::played::{Joints, Limits, Owner, PlayedRobot, RobotConfig, Wanted};
+use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
 use franka::{ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
 pub(super) const FREE_PORT: &str = "127.0.0.1:0";
 /// Long, as a busy machine may be slow; nothing waits so long where all is well.
-pub(super) const PATIENCE: Duration = Duration::from_secs(20);
+pub(super) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
 pub(super) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
@@ -21,11 +21,15 @@ pub(super) fn chain(tip: &str) -> Chain {
     Chain::from_urdf(URDF, "link0", tip).unwrap()
 }
 
-pub(super) fn robot(version: FciVersion, owner: Owner) -> PlayedRobot {
+pub(super) fn robot(version: FciVersion, joint_simulator: JointSimulator) -> EmulatedRobot {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let flange_from_ee = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
     let address = FREE_PORT.parse().unwrap();
-    PlayedRobot::start(RobotConfig { address, version, chain: chain("link8"), flange_from_ee, limits }, owner).unwrap()
+    EmulatedRobot::start(
+        RobotConfig { address, version, chain: chain("link8"), flange_from_ee, limits },
+        joint_simulator,
+    )
+    .unwrap()
 }
 
 pub(super) fn config(address: SocketAddr) -> ArmConfig {
@@ -34,7 +38,7 @@ pub(super) fn config(address: SocketAddr) -> ArmConfig {
 }
 
 /// Joints that swing by themselves; what they do is a function of the time.
-fn swing_at(stamp: Stamp) -> Joints {
+fn swinging_joints_at(stamp: Stamp) -> Joints {
     const RATE_RAD_S: f64 = 2.0;
     let phase = RATE_RAD_S * (stamp.0 as f64 * 1e-9);
     Joints {
@@ -46,68 +50,68 @@ fn swing_at(stamp: Stamp) -> Joints {
 }
 
 /// Joints that are where they are wanted.
-pub(super) fn obedient() -> Owner {
+pub(super) fn ideal_joints() -> JointSimulator {
     let mut is_first = true;
-    Box::new(move |_, wanted: &Wanted| {
-        let position_rad = if std::mem::take(&mut is_first) { REST_RAD } else { wanted.position_rad };
-        Joints { position_rad, velocity_rad_s: wanted.velocity_rad_s, ..Joints::default() }
+    Box::new(move |_, commanded: &CommandedJoints| {
+        let position_rad = if std::mem::take(&mut is_first) { REST_RAD } else { commanded.position_rad };
+        Joints { position_rad, velocity_rad_s: commanded.velocity_rad_s, ..Joints::default() }
     })
 }
 
 #[test]
-fn ten_thousand_states_of_either_version_come_through() {
+fn ten_thousand_states_are_received_in_both_versions() {
     // Loopback loses nothing; what is missing is what a busy machine did not get to send or take in time.
-    const LEAST_FRAC: f64 = 0.99;
+    const MIN_FRAC: f64 = 0.99;
     // Where the swing is, told by stamps that are late by at most the wake-up of one thread.
-    const LATE_SECS: f64 = 5e-3;
+    const MAX_LATE_SECS: f64 = 5e-3;
     for version in VERSIONS {
-        let played = robot(version, Box::new(|stamp, _| swing_at(stamp)));
-        let mut arm = FrankaArm::open(&config(played.address())).unwrap();
+        let emulated = robot(version, Box::new(|stamp, _| swinging_joints_at(stamp)));
+        let mut arm = FrankaArm::open(&config(emulated.address())).unwrap();
         assert_eq!(arm.version(), version);
         let mut last = None;
-        let mut worst: f64 = 0.0;
+        let mut max_error: f64 = 0.0;
         for ix in 0..10_000 {
-            let state = arm.read(PATIENCE).unwrap();
+            let state = arm.read(TEST_TIMEOUT).unwrap();
             assert!(last.is_none_or(|last| state.stamp > last));
             last = Some(state.stamp);
-            let truth = swing_at(state.stamp);
+            let truth = swinging_joints_at(state.stamp);
             if ix > 1000 {
-                let offs = state.position.iter().zip(truth.position_rad).map(|(told, is)| (told - is).abs());
-                worst = offs.fold(worst, f64::max);
+                let errors = state.position.iter().zip(truth.position_rad).map(|(reported, is)| (reported - is).abs());
+                max_error = errors.fold(max_error, f64::max);
             }
             assert_eq!(state.effort, truth.torque_nm);
         }
         let statistics = arm.statistics();
-        eprintln!("{version:?}: {statistics}; positions at their stamps within {worst:.1e} rad");
-        assert!(statistics.success_frac() > LEAST_FRAC, "{version:?}: {statistics}");
-        assert!(worst < 0.4 * LATE_SECS, "{version:?}: {worst} rad; {statistics}");
+        eprintln!("{version:?}: {statistics}; positions at their stamps within {max_error:.1e} rad");
+        assert!(statistics.success_frac() > MIN_FRAC, "{version:?}: {statistics}");
+        assert!(max_error < 0.4 * MAX_LATE_SECS, "{version:?}: {max_error} rad; {statistics}");
     }
 }
 
 #[test]
-fn one_client_is_taken_and_the_next_hears_what_to_do() {
-    let played = robot(FciVersion::V5, obedient());
-    let first = FrankaArm::open(&config(played.address())).unwrap();
-    let refused = FrankaArm::open(&config(played.address())).unwrap_err().to_string();
-    assert!(refused.contains("one client") && refused.contains("arm.driver = \"udp\""), "{refused}");
+fn second_client_is_rejected_with_advice() {
+    let emulated = robot(FciVersion::V5, ideal_joints());
+    let first = FrankaArm::open(&config(emulated.address())).unwrap();
+    let second_client = FrankaArm::open(&config(emulated.address())).unwrap_err().to_string();
+    assert!(second_client.contains("one client") && second_client.contains("arm.driver = \"udp\""), "{second_client}");
     drop(first);
     // The controller notices within a millisecond or a few.
-    let until = Instant::now() + PATIENCE;
-    while let Err(error) = FrankaArm::open(&config(played.address())) {
-        assert!(Instant::now() < until, "{error}");
+    let deadline = Instant::now() + TEST_TIMEOUT;
+    while let Err(error) = FrankaArm::open(&config(emulated.address())) {
+        assert!(Instant::now() < deadline, "{error}");
     }
-    let address = played.address();
-    drop(played);
+    let address = emulated.address();
+    drop(emulated);
     let absent = FrankaArm::open(&config(address)).unwrap_err().to_string();
     assert!(absent.contains(&address.to_string()) && absent.contains("FCI"), "{absent}");
 }
 
 #[test]
-fn a_controller_that_does_not_answer_or_speaks_otherwise_is_an_error() {
+fn unresponsive_or_unsupported_controller_is_error() {
     let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
     let address = listener.local_addr().unwrap();
-    let silent = FrankaArm::open(&config(address)).unwrap_err().to_string();
-    assert!(silent.contains("does not answer") && silent.contains("udp"), "{silent}");
+    let no_answer = FrankaArm::open(&config(address)).unwrap_err().to_string();
+    assert!(no_answer.contains("does not answer") && no_answer.contains("udp"), "{no_answer}");
     for (answer, expected) in [(vec![1, 7, 0], "version 7"), (vec![9, 10, 0], "status 9"), (vec![0], "too short")] {
         let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
         let address = listener.local_addr().unwrap();
@@ -127,30 +131,30 @@ fn a_controller_that_does_not_answer_or_speaks_otherwise_is_an_error() {
 }
 
 #[test]
-fn another_flange_than_the_robots_is_an_error_that_tells_both() {
-    let played = robot(FciVersion::V10, obedient());
-    let with_tip = |tip| ArmConfig { chain: chain(tip), ..config(played.address()) };
-    let at_hand = FrankaArm::open(&with_tip("link7")).unwrap_err().to_string();
+fn flange_mismatch_reports_both_poses() {
+    let emulated = robot(FciVersion::V10, ideal_joints());
+    let with_tip = |tip| ArmConfig { chain: chain(tip), ..config(emulated.address()) };
+    let wrong_tip = FrankaArm::open(&with_tip("link7")).unwrap_err().to_string();
     for part in ["\"link7\"", "107.0 mm", "arm.flange_link", "F_T_EE", "yaw"] {
-        assert!(at_hand.contains(part), "{part} is missing: {at_hand}");
+        assert!(wrong_tip.contains(part), "{part} is missing: {wrong_tip}");
     }
-    let mut turned = config(played.address());
-    turned.joint_names.swap(1, 3);
-    assert!(FrankaArm::open(&turned).unwrap_err().to_string().contains("order"));
-    let few = ArmConfig { joint_names: vec!["joint1".to_owned()], ..config(played.address()) };
-    assert!(FrankaArm::open(&few).unwrap_err().to_string().contains("1 joints"));
+    let mut swapped = config(emulated.address());
+    swapped.joint_names.swap(1, 3);
+    assert!(FrankaArm::open(&swapped).unwrap_err().to_string().contains("order"));
+    let too_few_joints = ArmConfig { joint_names: vec!["joint1".to_owned()], ..config(emulated.address()) };
+    assert!(FrankaArm::open(&too_few_joints).unwrap_err().to_string().contains("1 joints"));
 }
 
 #[test]
-fn a_robot_that_goes_away_is_told() {
-    let played = robot(FciVersion::V10, obedient());
-    let mut arm = FrankaArm::open(&config(played.address())).unwrap();
-    arm.read(PATIENCE).unwrap();
-    drop(played);
-    let until = Instant::now() + PATIENCE;
+fn lost_robot_is_an_error() {
+    let emulated = robot(FciVersion::V10, ideal_joints());
+    let mut arm = FrankaArm::open(&config(emulated.address())).unwrap();
+    arm.read(TEST_TIMEOUT).unwrap();
+    drop(emulated);
+    let deadline = Instant::now() + TEST_TIMEOUT;
     let lost = loop {
-        match arm.read(PATIENCE) {
-            Ok(_) => assert!(Instant::now() < until),
+        match arm.read(TEST_TIMEOUT) {
+            Ok(_) => assert!(Instant::now() < deadline),
             Err(error) => break error,
         }
     };
@@ -159,7 +163,7 @@ fn a_robot_that_goes_away_is_told() {
 }
 
 /// A smooth way by `by_rad` of one joint in `secs`, as a share of the time (a quintic, at rest at both ends).
-fn way(frac: f64, by_rad: f64) -> f64 {
+fn quintic(frac: f64, by_rad: f64) -> f64 {
     by_rad * frac.powi(3) * (10.0 - 15.0 * frac + 6.0 * frac * frac)
 }
 
@@ -167,9 +171,9 @@ fn way(frac: f64, by_rad: f64) -> f64 {
 ///
 /// On a machine so busy that the client is not woken for 20 ms the robot stops, as it should; then the motion begins anew.
 fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
-    const MAX_BEGUN: usize = 5;
+    const MAX_ATTEMPTS: usize = 5;
     let mut result = Ok(());
-    for _ in 0..MAX_BEGUN {
+    for _ in 0..MAX_ATTEMPTS {
         result = move_once(client, goal_rad, secs);
         match &result {
             Err(FrankaError::Control(stopped))
@@ -192,7 +196,7 @@ fn move_once(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError
             time += period.as_secs_f64();
             let frac = (time / secs).min(1.0);
             let mut q = start;
-            q[3] += way(frac, goal_rad - start[3]);
+            q[3] += quintic(frac, goal_rad - start[3]);
             let mut output = JointPositions::new(q);
             output.motion_finished = frac >= 1.0;
             output
@@ -206,21 +210,21 @@ fn move_once(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError
 /// Clears a reflex, and waits for a state that says so: those from before may still be on their way.
 fn recover(client: &Robot) {
     client.automatic_error_recovery().unwrap();
-    let until = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TEST_TIMEOUT;
     loop {
         let state = client.read_once().unwrap();
         if state.robot_mode == RobotMode::Idle && !state.current_errors.any() {
             return;
         }
-        assert!(Instant::now() < until, "{:?}", state.robot_mode);
+        assert!(Instant::now() < deadline, "{:?}", state.robot_mode);
     }
 }
 
 #[test]
-fn a_motion_within_limits_arrives_and_one_beyond_ends_in_a_reflex_until_recovery() {
+fn motion_beyond_limits_triggers_reflex_until_recovery() {
     for version in VERSIONS {
-        let played = robot(version, obedient());
-        let client = Robot::new(&played.address().to_string(), RealtimeConfig::Ignore).unwrap();
+        let emulated = robot(version, ideal_joints());
+        let client = Robot::new(&emulated.address().to_string(), RealtimeConfig::Ignore).unwrap();
         assert_eq!(client.fci_version(), version);
         move_to(&client, REST_RAD[3] + 0.1, 1.0).unwrap();
         let arrived = client.read_once().unwrap();
@@ -232,11 +236,12 @@ fn a_motion_within_limits_arrives_and_one_beyond_ends_in_a_reflex_until_recovery
             other => panic!("{other:?}"),
         };
         assert_eq!(stopped.move_status, Some(MoveStatus::ReflexAborted));
-        let is_told = |errors: &franka::Errors| errors.names().iter().any(|name| name.contains("discontinuity"));
-        assert!(is_told(&stopped.last_motion_errors), "{:?}", stopped.last_motion_errors.names());
+        let reports_discontinuity =
+            |errors: &franka::Errors| errors.names().iter().any(|name| name.contains("discontinuity"));
+        assert!(reports_discontinuity(&stopped.last_motion_errors), "{:?}", stopped.last_motion_errors.names());
         let state = client.read_once().unwrap();
         assert_eq!(state.robot_mode, RobotMode::Reflex);
-        assert!(is_told(&state.current_errors));
+        assert!(reports_discontinuity(&state.current_errors));
         assert!(move_to(&client, REST_RAD[3], 1.0).is_err(), "no motion before the recovery");
         recover(&client);
         move_to(&client, REST_RAD[3], 1.0).unwrap();
@@ -244,22 +249,22 @@ fn a_motion_within_limits_arrives_and_one_beyond_ends_in_a_reflex_until_recovery
 }
 
 #[test]
-fn contacts_beyond_what_a_client_allows_end_a_motion() {
-    let touch_nm = Arc::new(Mutex::new(0.0));
-    let touched = Arc::clone(&touch_nm);
-    let mut obey = obedient();
-    let owner: Owner = Box::new(move |stamp, wanted| {
-        let mut joints = obey(stamp, wanted);
-        let is_on_its_way = wanted.velocity_rad_s[3].abs() > 0.01;
-        joints.external_torque_nm[2] = if is_on_its_way { *touched.lock().unwrap() } else { 0.0 };
+fn contact_above_threshold_ends_motion() {
+    let contact_nm = Arc::new(Mutex::new(0.0));
+    let contact = Arc::clone(&contact_nm);
+    let mut follow_command = ideal_joints();
+    let joint_simulator: JointSimulator = Box::new(move |stamp, commanded| {
+        let mut joints = follow_command(stamp, commanded);
+        let is_moving = commanded.velocity_rad_s[3].abs() > 0.01;
+        joints.external_torque_nm[2] = if is_moving { *contact.lock().unwrap() } else { 0.0 };
         joints
     });
-    let played = robot(FciVersion::V10, owner);
-    let client = Robot::new(&played.address().to_string(), RealtimeConfig::Ignore).unwrap();
+    let emulated = robot(FciVersion::V10, joint_simulator);
+    let client = Robot::new(&emulated.address().to_string(), RealtimeConfig::Ignore).unwrap();
     client.set_collision_behavior_simple([5.0; 7], [10.0; 7], [20.0; 6], [40.0; 6]).unwrap();
-    *touch_nm.lock().unwrap() = 9.0;
+    *contact_nm.lock().unwrap() = 9.0;
     move_to(&client, REST_RAD[3] + 0.05, 0.5).unwrap();
-    *touch_nm.lock().unwrap() = 11.0;
+    *contact_nm.lock().unwrap() = 11.0;
     match move_to(&client, REST_RAD[3], 0.5) {
         Err(FrankaError::Control(stopped)) => assert_eq!(stopped.last_motion_errors.names(), ["joint_reflex"]),
         other => panic!("{other:?}"),
@@ -267,7 +272,7 @@ fn contacts_beyond_what_a_client_allows_end_a_motion() {
 }
 
 #[test]
-fn cut_and_random_bytes_neither_stop_a_robot_nor_a_client() {
+fn malformed_bytes_stop_neither_robot_nor_client() {
     let mut random = 0x9E37_79B9_7F4A_7C15_u64;
     let mut byte = move || {
         random ^= random << 13;
@@ -275,10 +280,10 @@ fn cut_and_random_bytes_neither_stop_a_robot_nor_a_client() {
         random ^= random << 17;
         random.to_le_bytes()[3]
     };
-    let played = robot(FciVersion::V10, obedient());
+    let emulated = robot(FciVersion::V10, ideal_joints());
     // Commands: headers of all kinds, with lengths that fit and do not, cut anywhere.
     for ix in 0..300_u32 {
-        let mut stream = TcpStream::connect(played.address()).unwrap();
+        let mut stream = TcpStream::connect(emulated.address()).unwrap();
         let n = usize::from(byte()) * 2;
         let mut bytes: Vec<u8> = (0..n).map(|_| byte()).collect();
         if ix % 3 > 0 {
@@ -291,17 +296,17 @@ fn cut_and_random_bytes_neither_stop_a_robot_nor_a_client() {
         // It may hang up in the middle, and while another is there it does so at once.
         let _ = stream.write_all(&bytes);
     }
-    let until = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TEST_TIMEOUT;
     let mut arm = loop {
-        match FrankaArm::open(&config(played.address())) {
+        match FrankaArm::open(&config(emulated.address())) {
             Ok(arm) => break arm,
-            Err(error) => assert!(Instant::now() < until, "{error}"),
+            Err(error) => assert!(Instant::now() < deadline, "{error}"),
         }
     };
-    arm.read(PATIENCE).unwrap();
+    arm.read(TEST_TIMEOUT).unwrap();
     drop(arm);
     // Commands of motions: a client that gets states sends junk to where they come from.
-    let (stream, states) = raw_client(&played);
+    let (stream, states) = raw_client(&emulated);
     let mut state = [0; 2000];
     let (n_bytes, from) = states.recv_from(&mut state).unwrap();
     for _ in 0..1000 {
@@ -310,7 +315,7 @@ fn cut_and_random_bytes_neither_stop_a_robot_nor_a_client() {
         states.send_to(&bytes, from).unwrap();
     }
     states.recv_from(&mut state).unwrap();
-    drop((stream, played));
+    drop((stream, emulated));
     // States: a controller that sends junk between good ones.
     let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
     let address = listener.local_addr().unwrap();
@@ -335,33 +340,33 @@ fn cut_and_random_bytes_neither_stop_a_robot_nor_a_client() {
     });
     let mut arm = FrankaArm::open(&config(address)).unwrap();
     for _ in 0..150 {
-        assert_eq!(arm.read(PATIENCE).unwrap().position.len(), N_JOINTS);
+        assert_eq!(arm.read(TEST_TIMEOUT).unwrap().position.len(), N_JOINTS);
     }
     let statistics = arm.statistics();
-    assert!(statistics.n_refused > 100 && statistics.n_lost == 0, "{statistics}");
+    assert!(statistics.n_rejected > 100 && statistics.n_lost == 0, "{statistics}");
     thread.join().unwrap();
 }
 
 /// A client that says hello and nothing more; the second socket gets states.
-fn raw_client(played: &PlayedRobot) -> (TcpStream, UdpSocket) {
+fn raw_client(emulated: &EmulatedRobot) -> (TcpStream, UdpSocket) {
     let states = UdpSocket::bind(FREE_PORT).unwrap();
-    states.set_read_timeout(Some(PATIENCE)).unwrap();
+    states.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     let port = states.local_addr().unwrap().port().to_le_bytes();
     let hello = [&[0; 8][..], &16_u32.to_le_bytes(), &10_u16.to_le_bytes(), &port].concat();
-    let until = Instant::now() + PATIENCE;
+    let deadline = Instant::now() + TEST_TIMEOUT;
     loop {
         // Until the one before is gone it sends us away.
-        let mut stream = TcpStream::connect(played.address()).unwrap();
+        let mut stream = TcpStream::connect(emulated.address()).unwrap();
         let mut answer = [0; 15];
         if stream.write_all(&hello).and_then(|()| stream.read_exact(&mut answer)).is_ok() {
             return (stream, states);
         }
-        assert!(Instant::now() < until);
+        assert!(Instant::now() < deadline);
     }
 }
 
 #[test]
-fn states_that_are_none_are_refused() {
+fn invalid_states_are_rejected() {
     use super::state::{MAX_STATE_BYTES, decode};
     use franka::wire::robot::{v5, v10};
     use zerocopy::IntoBytes;

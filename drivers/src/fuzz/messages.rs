@@ -6,21 +6,21 @@ use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 /// A byte that says what, then one message. What can be read is the same once it was written and read again.
 pub fn messages(mut bytes: &[u8]) {
     let [kind] = take(&mut bytes);
-    let again = |written: Vec<u8>, rewritten: Option<Vec<u8>>| assert_eq!(Some(written), rewritten);
+    let assert_round_trip = |encoded: Vec<u8>, reencoded: Option<Vec<u8>>| assert_eq!(Some(encoded), reencoded);
     match kind % 8 {
         kind @ 0..2 => {
             let schema = [descriptor::COMPRESSED_IMAGE, descriptor::RAW_IMAGE][usize::from(kind)];
             let Ok(image) = foxglove::decode_image(schema.name, bytes) else { return };
-            let written = foxglove::encode_image(&image);
+            let encoded = foxglove::encode_image(&image);
             let schema = foxglove::schema_of(image.format);
-            let read = foxglove::decode_image(schema.name, &written).ok();
-            again(written, read.map(|image| foxglove::encode_image(&image)));
+            let read = foxglove::decode_image(schema.name, &encoded).ok();
+            assert_round_trip(encoded, read.map(|image| foxglove::encode_image(&image)));
         }
         2 => {
             let Ok((stamp, pose)) = foxglove::decode_transform(bytes) else { return };
-            let written = foxglove::encode_transform("a", "b", stamp, &pose);
-            let read = foxglove::decode_transform(&written).ok();
-            again(written, read.map(|(stamp, pose)| foxglove::encode_transform("a", "b", stamp, &pose)));
+            let encoded = foxglove::encode_transform("a", "b", stamp, &pose);
+            let read = foxglove::decode_transform(&encoded).ok();
+            assert_round_trip(encoded, read.map(|(stamp, pose)| foxglove::encode_transform("a", "b", stamp, &pose)));
         }
         3 => drop(foxglove::decode_true_pose(bytes)),
         4 => {
@@ -30,15 +30,15 @@ pub fn messages(mut bytes: &[u8]) {
         }
         5 => {
             let Ok(state) = joint_state::decode(bytes) else { return };
-            let written = joint_state::encode(&state);
-            let read = joint_state::decode(&written).ok();
-            again(written, read.map(|state| joint_state::encode(&state)));
+            let encoded = joint_state::encode(&state);
+            let read = joint_state::decode(&encoded).ok();
+            assert_round_trip(encoded, read.map(|state| joint_state::encode(&state)));
         }
         _ => {
             let Ok(scan) = point_cloud::decode(bytes) else { return };
-            let written = point_cloud::encode(&scan);
-            let read = point_cloud::decode(&written).ok();
-            again(written, read.map(|scan| point_cloud::encode(&scan)));
+            let encoded = point_cloud::encode(&scan);
+            let read = point_cloud::decode(&encoded).ok();
+            assert_round_trip(encoded, read.map(|scan| point_cloud::encode(&scan)));
         }
     }
 }

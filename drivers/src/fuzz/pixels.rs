@@ -14,7 +14,7 @@ const FORMATS: [PixelFormat; 9] = [
     PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: COLORS },
     PixelFormat::Yuv { layout: YuvLayout::Uyvy, colors: COLORS },
     PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: COLORS },
-    PixelFormat::DepthU16 { metres_per_count: 0.001 },
+    PixelFormat::DepthU16 { meters_per_count: 0.001 },
 ];
 
 /// A byte of format, width, height and bytes from row to row in two bytes each, little-endian, then the image's own bytes.
@@ -35,8 +35,8 @@ pub fn pixels(mut bytes: &[u8]) {
         exposure_secs: None,
         n_skipped: 0,
     };
-    if let Ok(whole) = jpeg::first_image(bytes) {
-        assert!(whole.starts_with(&[0xff, 0xd8]) && whole.ends_with(&[0xff, 0xd9]));
+    if let Ok(jpeg_bytes) = jpeg::first_image(bytes) {
+        assert!(jpeg_bytes.starts_with(&[0xff, 0xd8]) && jpeg_bytes.ends_with(&[0xff, 0xd9]));
     }
     for image in [Ok(image.clone()), image.pack_rows(bytes_per_line.into())].into_iter().flatten() {
         if let Ok(rgb) = image.decode_rgb() {

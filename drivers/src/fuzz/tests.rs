@@ -1,7 +1,7 @@
 //! The seeds of the folder `fuzz`, as they are and spoilt, through every reader.
 
 use super::*;
-use crate::recording::{About, Recorder};
+use crate::recording::{Recorder, RecordingMetadata};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample};
 use crate::{can, franka, udp};
@@ -22,12 +22,12 @@ const READERS: [(&str, Reader); 9] = [
     ("tum", tum),
 ];
 
-fn folder_of(name: &str) -> PathBuf {
+fn seed_folder(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/seeds").join(name)
 }
 
-fn seeds_of(name: &str) -> Vec<Vec<u8>> {
-    let folder = folder_of(name);
+fn load_seeds(name: &str) -> Vec<Vec<u8>> {
+    let folder = seed_folder(name);
     let mut paths: Vec<_> = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
     paths.sort();
     assert!(!paths.is_empty(), "{folder:?} has no seeds");
@@ -35,38 +35,38 @@ fn seeds_of(name: &str) -> Vec<Vec<u8>> {
 }
 
 /// The bytes spoilt once more: a cut, a piece twice, two pieces swapped, bytes and bits at random.
-fn spoil(bytes: &mut Vec<u8>, random: &mut Random) {
+fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
     if bytes.is_empty() {
         return bytes.push(7);
     }
-    let mut places = [(); 3].map(|()| random.below(bytes.len() + 1));
-    places.sort_unstable();
-    let [a, b, c] = places;
+    let mut positions = [(); 3].map(|()| random.below(bytes.len() + 1));
+    positions.sort_unstable();
+    let [a, b, c] = positions;
     match random.below(6) {
         0 => bytes.truncate(b),
         1 => drop(bytes.drain(a..b)),
         2 => drop(bytes.splice(b..b, bytes[a..b].to_vec())),
         3 => bytes[a..c].rotate_left(b - a),
         4 => bytes[b.min(c.saturating_sub(1))..c].iter_mut().take(4).for_each(|byte| *byte = random.byte()),
-        _ => bytes[a.min(places[2].saturating_sub(1))] ^= 1 << random.below(8),
+        _ => bytes[a.min(positions[2].saturating_sub(1))] ^= 1 << random.below(8),
     }
 }
 
 #[test]
-fn seeds_cut_doubled_reordered_and_at_random_never_panic() {
-    /// Each a few of [`spoil`]; a reader of files takes 50 us for one.
-    const N_SPOILT: usize = 400;
+fn corrupted_seeds_never_panic() {
+    /// Each a few of [`corrupt`]; a reader of files takes 50 us for one.
+    const N_CORRUPTED: usize = 400;
     for (name, read) in READERS {
         let mut random = Random(5);
-        for seed in seeds_of(name) {
+        for seed in load_seeds(name) {
             read(&seed);
-            for _ in 0..N_SPOILT {
+            for _ in 0..N_CORRUPTED {
                 let mut bytes = seed.clone();
-                (0..=random.below(4)).for_each(|_| spoil(&mut bytes, &mut random));
+                (0..=random.below(4)).for_each(|_| corrupt(&mut bytes, &mut random));
                 read(&bytes);
             }
         }
-        for _ in 0..N_SPOILT {
+        for _ in 0..N_CORRUPTED {
             let bytes: Vec<u8> = (0..random.below(300)).map(|_| random.byte()).collect();
             read(&bytes);
         }
@@ -78,20 +78,20 @@ fn seeds_cut_doubled_reordered_and_at_random_never_panic() {
 #[ignore = "writes the seeds that are made here anew"]
 fn write_seeds() {
     let write = |name: &str, seed: &str, bytes: &[u8]| {
-        std::fs::create_dir_all(folder_of(name)).unwrap();
-        std::fs::write(folder_of(name).join(seed), bytes).unwrap();
+        std::fs::create_dir_all(seed_folder(name)).unwrap();
+        std::fs::write(seed_folder(name).join(seed), bytes).unwrap();
     };
-    write("can", "talk", &can::hostile::encode_frames(&can::hostile::tests::talk()));
-    write("udp", "talk", &udp::hostile::tests::talk().join(&b'\n'));
-    for (name, version) in ["v5", "v10"].into_iter().zip(franka::hostile::tests::VERSIONS) {
-        let datagrams = franka::played::hostile::tests::state_datagrams(version, 1);
-        write("fci_states", name, &franka::hostile::tests::with_lengths(&datagrams));
-        write("fci_client", name, &franka::played::hostile::tests::talk(version).concat());
+    write("can", "talk", &can::fuzz::encode_frames(&can::fuzz::tests::example_traffic()));
+    write("udp", "talk", &udp::fuzz::tests::example_traffic().join(&b'\n'));
+    for (name, version) in ["v5", "v10"].into_iter().zip(franka::fuzz::tests::VERSIONS) {
+        let datagrams = franka::emulated::fuzz::tests::state_datagrams(version, 1);
+        write("fci_states", name, &franka::fuzz::tests::with_length_prefixes(&datagrams));
+        write("fci_client", name, &franka::emulated::fuzz::tests::example_traffic(version).concat());
     }
     for (name, bytes) in images() {
         write("pixels", name, &bytes);
     }
-    for (kind, (name, bytes)) in (0_u8..).zip(each_message()) {
+    for (kind, (name, bytes)) in (0_u8..).zip(one_of_each_message()) {
         write("messages", name, &[&[kind], &bytes[..]].concat());
     }
     write("recording", "rig.mcap", &small_recording());
@@ -110,13 +110,13 @@ fn images() -> Vec<(&'static str, Vec<u8>)> {
     };
     let jpeg = file(image::ImageFormat::Jpeg);
     // Motion JPEG leaves the tables of the Huffman codes out.
-    let mut bare = Vec::new();
+    let mut without_tables = Vec::new();
     let mut rest = &jpeg[..];
     while let [0xff, 0xc4, high, low, ..] | [0xff, _, high, low, ..] = *rest {
         let is_segment = !matches!(rest[1], 0xd8 | 0xda);
         let n = if is_segment { 2 + usize::from(u16::from_be_bytes([high, low])) } else { 2 };
         if rest[1] != 0xc4 {
-            bare.extend(&rest[..n]);
+            without_tables.extend(&rest[..n]);
         }
         let is_scan = rest[1] == 0xda;
         rest = &rest[n..];
@@ -124,10 +124,10 @@ fn images() -> Vec<(&'static str, Vec<u8>)> {
             break;
         }
     }
-    bare.extend(rest);
+    without_tables.extend(rest);
     vec![
         ("jpeg", head(0, 0, &jpeg)),
-        ("jpeg-without-tables", head(0, 0, &bare)),
+        ("jpeg-without-tables", head(0, 0, &without_tables)),
         ("png", head(1, 0, &file(image::ImageFormat::Png))),
         ("rgb", head(2, 48, &rgb)),
         ("yuyv-padded", head(5, 40, &[90; 40 * 8])),
@@ -151,9 +151,9 @@ fn scan() -> RangeScan {
 }
 
 /// One of each message, in the order of the kinds of [`messages`].
-fn each_message() -> Vec<(&'static str, Vec<u8>)> {
+fn one_of_each_message() -> Vec<(&'static str, Vec<u8>)> {
     let pose = Transform::new([0.1, 0.2, -0.3].into(), [0.3, 0.0, 1.0].into());
-    let depth = PixelFormat::DepthU16 { metres_per_count: 0.001 };
+    let depth = PixelFormat::DepthU16 { meters_per_count: 0.001 };
     let [compressed, raw] = [image(PixelFormat::Png, &[1, 2, 3]), image(depth, &[4; 8])];
     assert_eq!(foxglove::schema_of(raw.format).name, descriptor::RAW_IMAGE.name);
     vec![
@@ -178,8 +178,12 @@ fn small_recording() -> Vec<u8> {
         rectified: false,
     };
     let names = ["a".to_owned(), "b".to_owned()];
-    let about = About { files: &[("rig.toml", b"[arm]\n")], cameras: &[("wrist", &intrinsics)], joint_names: &names };
-    let mut recorder = Recorder::create(&path, &about).unwrap();
+    let recording_metadata = RecordingMetadata {
+        files: &[("rig.toml", b"[arm]\n")],
+        cameras: &[("wrist", &intrinsics)],
+        joint_names: &names,
+    };
+    let mut recorder = Recorder::create(&path, &recording_metadata).unwrap();
     let base = BasePose { stamp: Stamp(6), world_from_base: Transform::identity() };
     let samples = [
         Sample::Joints(joints()),

@@ -2,7 +2,7 @@
 
 mod generator;
 
-pub use generator::{Generator, Setpoint};
+pub use generator::{Setpoint, TrajectoryGenerator};
 
 use crate::{Arm, Error};
 use kinematics::urdf::JointLimits;
@@ -19,7 +19,7 @@ pub struct JointTarget {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Motion {
     /// It is held where it was last sent, or where it was found.
-    Held,
+    Holding,
     /// It is on its way.
     Moving,
     /// It stopped by itself or was lost, and takes no target before [`MovableArm::recover`].
@@ -61,7 +61,7 @@ pub enum OnLoss {
 
 impl OnLoss {
     /// As rig files have it.
-    pub fn word(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Hold => "hold",
             Self::Damp => "damp",

@@ -1,7 +1,7 @@
 //! Such a camera as the rest of the program sees it: images while it is plugged in, waiting while it is not, and never for ever.
 
-use super::gaps::Gaps;
-use super::worker::{Frame, Told, Worker};
+use super::gap_estimator::GapEstimator;
+use super::worker::{Frame, Worker, WorkerEvent};
 use super::{Config, Problem};
 use crate::outage::Outage;
 use crate::v4l2::Delivery;
@@ -18,9 +18,9 @@ const MAX_OPENING: Duration = Duration::from_secs(8);
 /// Between two tries to find a lost camera again.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// Threads that hang in a call and cannot be ended: past these no further one is begun.
-const MAX_HANGING: usize = 8;
+const MAX_ABANDONED: usize = 8;
 /// How long a thread that streams may take to notice that it is to end.
-const MAX_ENDING: Duration = Duration::from_secs(1);
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A camera that streams.
 ///
@@ -31,11 +31,11 @@ const MAX_ENDING: Duration = Duration::from_secs(1);
 pub struct NokhwaCamera {
     config: Config,
     name: Arc<str>,
-    link: Link,
-    gaps: Gaps,
+    connection: Connection,
+    gap_estimator: GapEstimator,
     counts: Counts,
     /// Threads that were left behind.
-    left_behind: Vec<Weak<()>>,
+    abandoned: Vec<Weak<()>>,
     outage: Option<Outage>,
 }
 
@@ -49,19 +49,19 @@ pub struct Counts {
     /// Times that it was found again.
     pub n_reconnections: u32,
     /// Calls that hung and were left behind.
-    pub n_left_behind: u32,
+    pub n_abandoned: u32,
 }
 
 #[derive(Debug)]
-enum Link {
-    Up {
+enum Connection {
+    Connected {
         worker: Worker,
         alive: Weak<()>,
         /// Since when nothing came.
-        quiet_since: Instant,
-        streams: bool,
+        last_image_at: Instant,
+        is_streaming: bool,
     },
-    Down,
+    Disconnected,
 }
 
 impl NokhwaCamera {
@@ -70,27 +70,29 @@ impl NokhwaCamera {
         let now = Instant::now();
         let mut camera = Self {
             name: config.name.as_str().into(),
-            gaps: Gaps::new(config.rate_hz),
+            gap_estimator: GapEstimator::new(config.rate_hz),
             config,
-            link: Link::Down,
+            connection: Connection::Disconnected,
             counts: Counts::default(),
-            left_behind: Vec::new(),
+            abandoned: Vec::new(),
             outage: None,
         };
         camera.start().map_err(|problem| camera.error(problem))?;
-        let Link::Up { worker, streams, quiet_since, .. } = &mut camera.link else { unreachable!("just started") };
+        let Connection::Connected { worker, is_streaming, last_image_at, .. } = &mut camera.connection else {
+            unreachable!("just started")
+        };
         match worker.next(now + MAX_OPENING) {
-            Some(Told::Streams(what)) => {
-                (*streams, *quiet_since) = (true, Instant::now());
+            Some(WorkerEvent::Streaming(what)) => {
+                (*is_streaming, *last_image_at) = (true, Instant::now());
                 log::info!(
                     "camera {:?}: {what}; stamped as images arrive, lost ones are estimated from that",
                     camera.config.name
                 );
                 Ok(camera)
             }
-            Some(Told::Ended(problem)) => Err(camera.error(problem)),
-            Some(Told::Frame(_)) => unreachable!("a thread says first that it streams"),
-            None => Err(camera.error(Problem::Hangs { what: "open it", waited: MAX_OPENING })),
+            Some(WorkerEvent::Failed(problem)) => Err(camera.error(problem)),
+            Some(WorkerEvent::Frame(_)) => unreachable!("a thread says first that it streams"),
+            None => Err(camera.error(Problem::Hung { what: "open it", waited: MAX_OPENING })),
         }
     }
 
@@ -104,46 +106,49 @@ impl NokhwaCamera {
     }
 
     fn start(&mut self) -> Result<(), Problem> {
-        self.left_behind.retain(|alive| alive.strong_count() > 0);
-        if self.left_behind.len() >= MAX_HANGING {
-            return Err(Problem::TooManyHang { n_hanging: self.left_behind.len() });
+        self.abandoned.retain(|alive| alive.strong_count() > 0);
+        if self.abandoned.len() >= MAX_ABANDONED {
+            return Err(Problem::TooManyAbandoned { n_abandoned_threads: self.abandoned.len() });
         }
         let alive = Arc::new(());
         let weak = Arc::downgrade(&alive);
         let worker = Worker::start(&self.config, alive)?;
-        self.link = Link::Up { worker, alive: weak, quiet_since: Instant::now(), streams: false };
+        self.connection =
+            Connection::Connected { worker, alive: weak, last_image_at: Instant::now(), is_streaming: false };
         Ok(())
     }
 
     /// One step of waiting for an image of a camera that is there or being opened.
-    fn wait_for_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
-        let Link::Up { worker, quiet_since, streams, .. } = &mut self.link else { return Ok(None) };
-        let patience = match streams {
+    fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
+        let Connection::Connected { worker, last_image_at, is_streaming, .. } = &mut self.connection else {
+            return Ok(None);
+        };
+        let timeout = match is_streaming {
             true => MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz)),
             false => MAX_OPENING,
         };
-        let gives_up = *quiet_since + patience;
-        match worker.next(deadline.min(gives_up)) {
-            Some(Told::Frame(mut frame)) => {
+        let gives_up_at = *last_image_at + timeout;
+        match worker.next(deadline.min(gives_up_at)) {
+            Some(WorkerEvent::Frame(mut frame)) => {
                 if self.config.delivery == Delivery::Newest {
-                    while let Some(Told::Frame(newer)) = worker.next(Instant::now()) {
+                    while let Some(WorkerEvent::Frame(newer)) = worker.next(Instant::now()) {
                         frame = newer;
                     }
                 }
-                *quiet_since = Instant::now();
+                *last_image_at = Instant::now();
                 Ok(Some(self.image_of(frame)))
             }
-            Some(Told::Streams(what)) => {
-                (*streams, *quiet_since) = (true, Instant::now());
+            Some(WorkerEvent::Streaming(what)) => {
+                (*is_streaming, *last_image_at) = (true, Instant::now());
                 let waited = self.outage.map_or(Duration::ZERO, |outage| outage.since.elapsed());
                 log::info!("camera {:?}: there again after {waited:.1?}: {what}", self.config.name);
                 self.counts.n_reconnections += 1;
                 Ok(None)
             }
-            Some(Told::Ended(problem)) => self.lose(problem).map(|()| None),
-            None if Instant::now() >= gives_up => {
-                let what = if *streams { "have its next image" } else { "open it" };
-                self.lose(Problem::Hangs { what, waited: patience }).map(|()| None)
+            Some(WorkerEvent::Failed(problem)) => self.handle_disconnect(problem).map(|()| None),
+            None if Instant::now() >= gives_up_at => {
+                let what = if *is_streaming { "have its next image" } else { "open it" };
+                self.handle_disconnect(Problem::Hung { what, waited: timeout }).map(|()| None)
             }
             None => Ok(None),
         }
@@ -151,7 +156,7 @@ impl NokhwaCamera {
 
     fn image_of(&mut self, frame: Frame) -> Image {
         let Frame { arrival, format, bytes } = frame;
-        let n_skipped = self.gaps.n_lost_before(arrival);
+        let n_skipped = self.gap_estimator.n_lost_before(arrival);
         self.outage = None;
         self.counts.n_images += 1;
         self.counts.n_skipped += n_skipped;
@@ -167,35 +172,35 @@ impl NokhwaCamera {
     }
 
     /// Leaves the thread to itself; whether that is for good it does not tell. Fails when the camera has been lost for too long.
-    fn lose(&mut self, why: Problem) -> Result<(), Error> {
-        if let Link::Up { alive, .. } = std::mem::replace(&mut self.link, Link::Down)
-            && matches!(why, Problem::Hangs { .. })
+    fn handle_disconnect(&mut self, problem: Problem) -> Result<(), Error> {
+        if let Connection::Connected { alive, .. } = std::mem::replace(&mut self.connection, Connection::Disconnected)
+            && matches!(problem, Problem::Hung { .. })
         {
-            self.counts.n_left_behind += 1;
-            self.left_behind.push(alive);
+            self.counts.n_abandoned += 1;
+            self.abandoned.push(alive);
         }
         let is_new = self.outage.is_none();
         let Outage { since, n_tries, .. } = Outage::of(&mut self.outage);
         if is_new {
-            log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+            log::warn!("camera {:?}: {problem}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
             return Ok(());
         }
         let waited = since.elapsed();
         if waited < self.config.reconnect_for {
-            log::debug!("camera {:?}: {why}", self.config.name);
+            log::debug!("camera {:?}: {problem}", self.config.name);
             return Ok(());
         }
-        Err(self.error(Problem::Lost { waited, n_tries, last: Box::new(why) }))
+        Err(self.error(Problem::Lost { waited, n_tries, last: Box::new(problem) }))
     }
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
+        let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
         let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
-        if !outage.try_again(pause, deadline) {
+        if !outage.wait_for_retry(pause, deadline) {
             return Ok(());
         }
-        self.start().or_else(|problem| self.lose(problem))
+        self.start().or_else(|problem| self.handle_disconnect(problem))
     }
 }
 
@@ -211,10 +216,10 @@ impl Camera for NokhwaCamera {
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
         let deadline = Instant::now() + timeout;
         loop {
-            match &self.link {
-                Link::Down => self.reconnect(deadline)?,
-                Link::Up { .. } => {
-                    if let Some(image) = self.wait_for_image(deadline)? {
+            match &self.connection {
+                Connection::Disconnected => self.reconnect(deadline)?,
+                Connection::Connected { .. } => {
+                    if let Some(image) = self.poll_image(deadline)? {
                         return Ok(image);
                     }
                 }
@@ -232,12 +237,14 @@ impl Camera for NokhwaCamera {
 
 impl Drop for NokhwaCamera {
     fn drop(&mut self) {
-        let Link::Up { worker, alive, .. } = std::mem::replace(&mut self.link, Link::Down) else {
+        let Connection::Connected { worker, alive, .. } =
+            std::mem::replace(&mut self.connection, Connection::Disconnected)
+        else {
             return;
         };
         drop(worker);
         // Until it has, nobody else can open the camera; a thread that hangs is left behind.
-        let until = Instant::now() + MAX_ENDING;
+        let until = Instant::now() + SHUTDOWN_TIMEOUT;
         while alive.strong_count() > 0 && Instant::now() < until {
             std::thread::sleep(Duration::from_millis(5));
         }

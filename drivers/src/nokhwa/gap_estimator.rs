@@ -5,16 +5,16 @@ use kinematics::Stamp;
 /// Images this many periods later than they should be follow a loss; what comes less late was held up.
 const LATE_PERIODS: f64 = 0.75;
 /// Share of its lateness that an image moves what is expected of the next ones: cameras are not exactly as fast as they say.
-const LEAK: f64 = 0.05;
+const DRIFT_GAIN: f64 = 0.05;
 
 /// When the images of one camera are due: they may come late, never early.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Gaps {
+pub(super) struct GapEstimator {
     period_secs: f64,
     due: Option<Stamp>,
 }
 
-impl Gaps {
+impl GapEstimator {
     pub(super) fn new(rate_hz: f64) -> Self {
         Self { period_secs: 1.0 / rate_hz, due: None }
     }
@@ -27,10 +27,10 @@ impl Gaps {
         };
         let late_periods = stamp.secs_since(due) / self.period_secs;
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
-        let held_up_secs = (late_periods - lost_periods) * self.period_secs;
+        let delayed_secs = (late_periods - lost_periods) * self.period_secs;
         // One that came before it was due tells that the ones before were held up.
-        let moved_secs = if held_up_secs < 0.0 { held_up_secs } else { LEAK * held_up_secs };
-        self.due = Some(due.plus_secs((1.0 + lost_periods) * self.period_secs + moved_secs));
+        let correction_secs = if delayed_secs < 0.0 { delayed_secs } else { DRIFT_GAIN * delayed_secs };
+        self.due = Some(due.plus_secs((1.0 + lost_periods) * self.period_secs + correction_secs));
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "not negative; the cast saturates")]
         let n_lost = lost_periods as u64;
         n_lost
@@ -42,26 +42,26 @@ mod tests {
     use super::*;
 
     /// Images lost by the estimate, of those whose stamps are told in milliseconds.
-    fn lost(rate_hz: f64, millis: impl IntoIterator<Item = f64>) -> u64 {
-        let mut gaps = Gaps::new(rate_hz);
-        millis.into_iter().map(|millis| gaps.n_lost_before(Stamp::from_secs(millis * 1e-3))).sum()
+    fn n_lost(rate_hz: f64, millis: impl IntoIterator<Item = f64>) -> u64 {
+        let mut gap_estimator = GapEstimator::new(rate_hz);
+        millis.into_iter().map(|millis| gap_estimator.n_lost_before(Stamp::from_secs(millis * 1e-3))).sum()
     }
 
     #[test]
-    fn gaps_are_counted_and_jitter_is_not() {
-        assert_eq!(lost(25.0, [0.0, 40.0, 80.0, 160.0, 200.0]), 1);
-        assert_eq!(lost(25.0, [0.0, 40.0, 1080.0, 1120.0]), 25);
+    fn gaps_are_counted_but_jitter_is_not() {
+        assert_eq!(n_lost(25.0, [0.0, 40.0, 80.0, 160.0, 200.0]), 1);
+        assert_eq!(n_lost(25.0, [0.0, 40.0, 1080.0, 1120.0]), 25);
         // Held up, one after the other, and then on time again.
-        assert_eq!(lost(25.0, [0.0, 65.0, 105.0, 122.0, 160.0]), 0);
+        assert_eq!(n_lost(25.0, [0.0, 65.0, 105.0, 122.0, 160.0]), 0);
         let jitter = |ix: u32| f64::from(ix) * 40.0 + f64::from(ix * ix % 27);
-        assert_eq!(lost(25.0, (0..1000).map(jitter)), 0);
-        assert_eq!(lost(25.0, (0..1000).filter(|ix| ix % 7 != 3).map(jitter)), 143);
+        assert_eq!(n_lost(25.0, (0..1000).map(jitter)), 0);
+        assert_eq!(n_lost(25.0, (0..1000).filter(|ix| ix % 7 != 3).map(jitter)), 143);
     }
 
     #[test]
-    fn a_camera_a_little_slower_or_faster_than_it_says_loses_nothing() {
+    fn rate_mismatch_is_not_counted_as_loss() {
         for rate_hz in [29.9, 29.97, 30.1] {
-            assert_eq!(lost(30.0, (0..10_000).map(|ix| f64::from(ix) * 1e3 / rate_hz)), 0, "{rate_hz}");
+            assert_eq!(n_lost(30.0, (0..10_000).map(|ix| f64::from(ix) * 1e3 / rate_hz)), 0, "{rate_hz}");
         }
     }
 }

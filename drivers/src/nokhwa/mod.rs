@@ -2,10 +2,10 @@
 //!
 //! A call for an image may never return, and cannot be broken off: `worker.rs` makes it on a thread of its own, `camera.rs` watches
 //! over it, leaves a thread that hangs behind and begins anew. Images are the device's own bytes. Their numbers are not told:
-//! `gaps.rs` estimates from stamps how many were lost.
+//! `gap_estimator.rs` estimates from stamps how many were lost.
 
 mod camera;
-mod gaps;
+mod gap_estimator;
 mod worker;
 
 pub use camera::{Counts, NokhwaCamera};
@@ -40,12 +40,12 @@ pub struct Config {
 #[non_exhaustive]
 pub enum Problem {
     /// Nothing that is plugged in goes by this name.
-    #[error("no camera goes by {device:?}; there are: {there}")]
+    #[error("no camera goes by {device:?}; there are: {connected}")]
     NoDevice {
         /// Name of the rig file.
         device: String,
         /// Names and numbers of those that are plugged in.
-        there: String,
+        connected: String,
     },
     /// Its format cannot be read here.
     #[error("{format} cannot be had from nokhwa: mjpeg, yuyv, nv12, rgb and bgr can")]
@@ -60,10 +60,10 @@ pub enum Problem {
         rate_hz: f64,
     },
     /// It does not stream as wanted.
-    #[error("{wanted} cannot be had: {reason}")]
+    #[error("{requested} cannot be had: {reason}")]
     Refused {
         /// Format, size and rate.
-        wanted: String,
+        requested: String,
         /// What nokhwa says.
         reason: String,
     },
@@ -75,17 +75,17 @@ pub enum Problem {
     },
     /// A call has not come back for too long, and was left alone.
     #[error("a call to {what} has not come back for {waited:.1?} and was left behind")]
-    Hangs {
+    Hung {
         /// What was asked for.
         what: &'static str,
         /// For how long.
         waited: Duration,
     },
     /// So many calls hang that no further one is made.
-    #[error("{n_hanging} calls hang; plug the camera in anew, or end the program")]
-    TooManyHang {
+    #[error("{n_abandoned_threads} calls hang; plug the camera in anew, or end the program")]
+    TooManyAbandoned {
         /// How many.
-        n_hanging: usize,
+        n_abandoned_threads: usize,
     },
     /// It did not come back in time.
     #[error("not there again after {waited:.1?} and {n_tries} tries: {last}")]

@@ -15,23 +15,23 @@ use std::time::Instant;
 /// Images that may wait for the caller: a quarter of a second at 30 Hz.
 const MAX_WAITING: usize = 8;
 /// What cameras mean by YUV where they do not say.
-const USUAL_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
+const DEFAULT_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
 /// What formats are called here and there, best first.
 const FORMATS: [(V4l2Format, FrameFormat, PixelFormat); 5] = [
-    (V4l2Format::Yuyv, FrameFormat::YUYV, PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: USUAL_COLORS }),
-    (V4l2Format::Nv12, FrameFormat::NV12, PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: USUAL_COLORS }),
+    (V4l2Format::Yuyv, FrameFormat::YUYV, PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: DEFAULT_COLORS }),
+    (V4l2Format::Nv12, FrameFormat::NV12, PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: DEFAULT_COLORS }),
     (V4l2Format::Mjpeg, FrameFormat::MJPEG, PixelFormat::Jpeg),
     (V4l2Format::Rgb, FrameFormat::RAWRGB, PixelFormat::Rgb8),
     (V4l2Format::Bgr, FrameFormat::RAWBGR, PixelFormat::Bgr8),
 ];
 
 /// What the thread has to say.
-pub(super) enum Told {
+pub(super) enum WorkerEvent {
     /// It streams; what, for people.
-    Streams(String),
+    Streaming(String),
     Frame(Frame),
     /// The last that comes.
-    Ended(Problem),
+    Failed(Problem),
 }
 
 /// An image as it came.
@@ -56,7 +56,7 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    queue: VecDeque<Told>,
+    queue: VecDeque<WorkerEvent>,
     /// The caller is gone.
     stop: bool,
 }
@@ -71,31 +71,31 @@ impl Worker {
     /// Begins to open the camera, and then to stream. `alive` is held for as long as the thread lives.
     pub(super) fn start(config: &Config, alive: Arc<()>) -> Result<Self, Problem> {
         let shared = Arc::new(Shared::default());
-        let (config, telling) = (config.clone(), Arc::clone(&shared));
+        let (config, sender) = (config.clone(), Arc::clone(&shared));
         let thread = std::thread::Builder::new().name(format!("nokhwa {}", config.name)).spawn(move || {
             let _alive = alive;
-            if let Err(problem) = stream(&config, &telling) {
-                telling.tell(Told::Ended(problem));
+            if let Err(problem) = stream(&config, &sender) {
+                sender.send(WorkerEvent::Failed(problem));
             }
         });
         match thread {
             Ok(_) => Ok(Self { shared }),
-            Err(error) => Err(Problem::Refused { wanted: "a thread".to_owned(), reason: error.to_string() }),
+            Err(error) => Err(Problem::Refused { requested: "a thread".to_owned(), reason: error.to_string() }),
         }
     }
 
     /// The oldest that was told and not taken; `None` when there was nothing until then.
-    pub(super) fn next(&self, until: Instant) -> Option<Told> {
+    pub(super) fn next(&self, until: Instant) -> Option<WorkerEvent> {
         let mut state = self.shared.lock();
         loop {
-            if let Some(told) = state.queue.pop_front() {
-                return Some(told);
+            if let Some(event) = state.queue.pop_front() {
+                return Some(event);
             }
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() {
+            let remaining = until.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return None;
             }
-            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
@@ -113,12 +113,12 @@ impl Shared {
     }
 
     /// The oldest image goes where there are too many: it is missed by its stamp. Whether the caller still listens.
-    fn tell(&self, told: Told) -> bool {
+    fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.lock();
         if state.queue.len() >= MAX_WAITING {
             state.queue.pop_front();
         }
-        state.queue.push_back(told);
+        state.queue.push_back(event);
         self.arrived.notify_all();
         !state.stop
     }
@@ -130,12 +130,13 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     let (mut camera, format) = open(config, index)?;
     let unplugged = |error: nokhwa::NokhwaError| Problem::Unplugged { reason: error.to_string() };
     camera.open_stream().map_err(unplugged)?;
-    let mut listens = shared.tell(Told::Streams(format!("{}, {}", camera.info().human_name(), wanted(config, format))));
-    while listens {
+    let mut is_receiving =
+        shared.send(WorkerEvent::Streaming(format!("{}, {}", camera.info().human_name(), requested(config, format))));
+    while is_receiving {
         let buffer = camera.frame().map_err(unplugged)?;
         let arrival = clock::now();
-        let bytes = trimmed(buffer.buffer(), format, config.intrinsics.size_px);
-        listens = shared.tell(Told::Frame(Frame { arrival, format: pixels(format), bytes }));
+        let bytes = trim(buffer.buffer(), format, config.intrinsics.size_px);
+        is_receiving = shared.send(WorkerEvent::Frame(Frame { arrival, format: pixels(format), bytes }));
     }
     Ok(())
 }
@@ -148,16 +149,16 @@ fn find(device: &str) -> Result<CameraIndex, Problem> {
     let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
     // Some have several nodes: the first is the one for images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
-    let is_it = |camera: &&CameraInfo| camera.human_name() == device;
-    let is_part = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
-    match cameras.iter().find(is_it).or_else(|| cameras.iter().find(is_part)) {
+    let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
+    let is_partial_match = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
+    match cameras.iter().find(is_exact_match).or_else(|| cameras.iter().find(is_partial_match)) {
         Some(camera) => Ok(camera.index().clone()),
         None => {
             let names = cameras.iter().map(|camera| format!("{:?} ({})", camera.human_name(), camera.index()));
-            let there = names.collect::<Vec<_>>().join(", ");
+            let connected = names.collect::<Vec<_>>().join(", ");
             Err(Problem::NoDevice {
                 device: device.to_owned(),
-                there: if there.is_empty() { "none".into() } else { there },
+                connected: if connected.is_empty() { "none".into() } else { connected },
             })
         }
     }
@@ -180,7 +181,9 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
     }
     let [width, height] = config.intrinsics.size_px;
     let mut reason = None;
-    for (name, format, _) in FORMATS.iter().filter(|(name, ..)| config.format.is_none_or(|wanted| wanted == *name)) {
+    for (name, format, _) in
+        FORMATS.iter().filter(|(name, ..)| config.format.is_none_or(|requested| requested == *name))
+    {
         let exact = CameraFormat::new(Resolution::new(width, height), *format, whole_hz);
         let formats = [*format];
         let request = RequestedFormat::with_formats(RequestedFormatType::Exact(exact), &formats);
@@ -192,13 +195,14 @@ fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Pro
     match (config.format, reason) {
         (Some(format), None) => Err(Problem::Format { format: format.name() }),
         (format, reason) => Err(Problem::Refused {
-            wanted: format.map_or_else(|| format!("{width}x{height} at {rate_hz} Hz"), |format| wanted(config, format)),
+            requested: format
+                .map_or_else(|| format!("{width}x{height} at {rate_hz} Hz"), |format| requested(config, format)),
             reason: reason.unwrap_or_default(),
         }),
     }
 }
 
-fn wanted(config: &Config, format: V4l2Format) -> String {
+fn requested(config: &Config, format: V4l2Format) -> String {
     let [width, height] = config.intrinsics.size_px;
     format!("{} {width}x{height} at {} Hz", format.name(), config.rate_hz)
 }
@@ -209,10 +213,10 @@ fn pixels(format: V4l2Format) -> PixelFormat {
 }
 
 /// An image without what lies behind it: on Linux the whole buffer comes, however short the image in it.
-fn trimmed(buffer: &[u8], format: V4l2Format, size_px: [u32; 2]) -> Vec<u8> {
+fn trim(buffer: &[u8], format: V4l2Format, size_px: [u32; 2]) -> Vec<u8> {
     let n_bytes = match pixels(format).raw_size(size_px) {
         Some([row_bytes, n_rows]) => row_bytes.saturating_mul(n_rows),
-        None => jpeg::end_of_first(buffer).unwrap_or(buffer.len()),
+        None => jpeg::first_image_end(buffer).unwrap_or(buffer.len()),
     };
     buffer[..buffer.len().min(n_bytes)].to_vec()
 }

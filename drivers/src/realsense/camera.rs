@@ -1,8 +1,8 @@
 //! A RealSense camera as the rest of the program sees it: images while it is plugged in, waiting while it is not.
 
 use super::find;
-use super::running::{Next, Running};
 use super::sdk::Context;
+use super::session::{Next, Session};
 use super::{Calibration, Config, Pace, Problem};
 use crate::outage::{Outage, n_between};
 use crate::{Camera, Error, Image};
@@ -25,7 +25,7 @@ const TRIES_BEFORE_RESET: u32 = 3;
 #[derive(Debug)]
 pub struct RealsenseCamera {
     config: Config,
-    link: Link,
+    connection: Connection,
     calibration: Calibration,
     counts: Counts,
     /// Stamps of the last images, depth last, across reconnections.
@@ -50,21 +50,21 @@ pub struct Counts {
 }
 
 #[derive(Debug)]
-enum Link {
-    Up(Box<Running>),
-    Down,
+enum Connection {
+    Connected(Box<Session>),
+    Disconnected,
 }
 
 impl RealsenseCamera {
     /// Opens a camera or a file, sets it up as the rig file says, and starts its streams.
     pub fn open(config: Config) -> Result<Self, Error> {
-        let running = Running::start(&config)
+        let session = Session::start(&config)
             .map_err(|problem| Error::Realsense { camera: config.name.clone(), problem: Box::new(problem) })?;
-        log::info!("camera {:?}: {}", config.name, running.describe());
+        log::info!("camera {:?}: {}", config.name, session.describe());
         Ok(Self {
-            calibration: running.calibration().clone(),
+            calibration: session.calibration().clone(),
             config,
-            link: Link::Up(Box::new(running)),
+            connection: Connection::Connected(Box::new(session)),
             counts: Counts::default(),
             last: [None; 2],
             outage: None,
@@ -83,27 +83,27 @@ impl RealsenseCamera {
     }
 
     /// One step of waiting for an image of a camera that is there.
-    fn wait_for_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
-        let Link::Up(running) = &mut self.link else { return Ok(None) };
-        match running.next(deadline) {
+    fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
+        let Connection::Connected(session) = &mut self.connection else { return Ok(None) };
+        match session.next(deadline) {
             Ok(Next::Image(image)) => return Ok(Some(self.count(image))),
             Ok(Next::End) => return Err(Error::Ended { camera: self.config.name.clone() }),
-            Ok(Next::Later(left)) => return Err(Error::NotDue { camera: self.config.name.clone(), left }),
-            Ok(Next::Nothing) => {}
-            Err(problem) => return self.lose(problem).map(|()| None),
+            Ok(Next::NotDue(remaining)) => return Err(Error::NotDue { camera: self.config.name.clone(), remaining }),
+            Ok(Next::NoImage) => {}
+            Err(problem) => return self.handle_disconnect(problem).map(|()| None),
         }
-        let waited = running.silent_for();
+        let waited = session.time_since_image();
         let is_camera = self.config.file.is_none();
         if is_camera && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz)) {
-            self.lose(Problem::Silent { waited })?;
+            self.handle_disconnect(Problem::Silent { waited })?;
         }
         Ok(None)
     }
 
     fn count(&mut self, mut image: Image) -> Image {
         let last = self.last[usize::from(image.is_depth())].replace(image.stamp);
-        let is_first_again = matches!(&self.link, Link::Up(running) if running.n_images() == 1);
-        if let (true, Some(last)) = (is_first_again, last) {
+        let is_first_since_open = matches!(&self.connection, Connection::Connected(session) if session.n_images() == 1);
+        if let (true, Some(last)) = (is_first_since_open, last) {
             image.n_skipped = image.n_skipped.max(n_between(last, image.stamp, self.config.rate_hz));
         }
         (self.outage, self.n_resets) = (None, 0);
@@ -113,34 +113,34 @@ impl RealsenseCamera {
     }
 
     /// Lets go of the device before it is looked for. A file has no second try.
-    fn lose(&mut self, why: Problem) -> Result<(), Error> {
+    fn handle_disconnect(&mut self, cause: Problem) -> Result<(), Error> {
         if self.config.file.is_some() {
-            return Err(Error::Realsense { camera: self.config.name.clone(), problem: Box::new(why) });
+            return Err(Error::Realsense { camera: self.config.name.clone(), problem: Box::new(cause) });
         }
         let outage = Outage::of(&mut self.outage);
-        self.link = Link::Down;
+        self.connection = Connection::Disconnected;
         if outage.n_tries > 0 {
-            return self.give_up_if_late(outage, why);
+            return self.fail_if_overdue(outage, cause);
         }
-        log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        log::warn!("camera {:?}: {cause}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
         Ok(())
     }
 
     /// The error of a camera that was lost for longer than the rig file allows.
-    fn give_up_if_late(&self, Outage { since, n_tries, .. }: Outage, why: Problem) -> Result<(), Error> {
+    fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, cause: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
-            log::debug!("camera {camera:?}: {why}");
+            log::debug!("camera {camera:?}: {cause}");
             return Ok(());
         }
-        let problem = Problem::Lost { waited, n_tries, n_resets: self.n_resets, last: Box::new(why) };
+        let problem = Problem::Lost { waited, n_tries, n_resets: self.n_resets, last: Box::new(cause) };
         Err(Error::Realsense { camera, problem: Box::new(problem) })
     }
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
-        if !outage.try_again(RETRY_PAUSE, deadline) {
+        let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
+        if !outage.wait_for_retry(RETRY_PAUSE, deadline) {
             return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
         if outage.n_tries.is_multiple_of(TRIES_BEFORE_RESET) && reset(&self.config) {
@@ -149,15 +149,15 @@ impl RealsenseCamera {
             return Ok(());
         }
         let outage = *outage;
-        match Running::start(&self.config) {
-            Ok(running) => {
+        match Session::start(&self.config) {
+            Ok(session) => {
                 let (camera, waited) = (&self.config.name, outage.since.elapsed());
-                log::info!("camera {camera:?}: there again after {waited:?}: {}", running.describe());
+                log::info!("camera {camera:?}: there again after {waited:?}: {}", session.describe());
                 self.counts.n_reconnections += 1;
-                self.link = Link::Up(Box::new(running));
+                self.connection = Connection::Connected(Box::new(session));
                 Ok(())
             }
-            Err(problem) => self.give_up_if_late(outage, problem),
+            Err(problem) => self.fail_if_overdue(outage, problem),
         }
     }
 }
@@ -182,13 +182,13 @@ impl Camera for RealsenseCamera {
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
         let deadline = Instant::now() + timeout;
         loop {
-            match &self.link {
-                Link::Down => self.reconnect(deadline)?,
-                Link::Up(_) => {
-                    if let Some(image) = self.wait_for_image(deadline)? {
+            match &self.connection {
+                Connection::Disconnected => self.reconnect(deadline)?,
+                Connection::Connected(_) => {
+                    if let Some(image) = self.poll_image(deadline)? {
                         return Ok(image);
                     }
-                    if matches!(self.link, Link::Up(_)) {
+                    if matches!(self.connection, Connection::Connected(_)) {
                         return Err(Error::NoImage { camera: self.config.name.clone(), waited: timeout });
                     }
                 }

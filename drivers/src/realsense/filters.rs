@@ -10,7 +10,7 @@ use std::fmt::Display;
 use std::time::Duration;
 
 /// Filters work on the caller's thread, so what they made is there at once.
-const MAX_WORK: Duration = Duration::from_secs(1);
+const FILTER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Filters in the order in which depth passes them.
 #[derive(Debug, Default)]
@@ -30,32 +30,32 @@ unsafe impl Send for Filters {}
 impl Filters {
     pub(super) fn new(filters: &[Filter]) -> Result<Self, Problem> {
         let block = |filter: &Filter| match filter {
-            Filter::Spatial => SpatialFilter::new(1).map(Block::Spatial).map_err(refused),
-            Filter::Temporal => TemporalFilter::new(1).map(Block::Temporal).map_err(refused),
-            Filter::HoleFilling => HoleFillingFilter::new(1).map(Block::HoleFilling).map_err(refused),
+            Filter::Spatial => SpatialFilter::new(1).map(Block::Spatial).map_err(filter_problem),
+            Filter::Temporal => TemporalFilter::new(1).map(Block::Temporal).map_err(filter_problem),
+            Filter::HoleFilling => HoleFillingFilter::new(1).map(Block::HoleFilling).map_err(filter_problem),
         };
         filters.iter().map(block).collect::<Result<_, _>>().map(Self)
     }
 
-    pub(super) fn are_none(&self) -> bool {
+    pub(super) fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
     /// A depth image that has passed all of them.
-    pub(super) fn pass(&mut self, frame: Frame) -> Result<DepthFrame, Problem> {
+    pub(super) fn apply(&mut self, frame: Frame) -> Result<DepthFrame, Problem> {
         let mut frame = as_depth(frame)?;
         for block in &mut self.0 {
             frame = match block {
-                Block::Spatial(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
-                Block::Temporal(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
-                Block::HoleFilling(filter) => filter.queue(frame).and_then(|()| filter.wait(MAX_WORK)),
+                Block::Spatial(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
+                Block::Temporal(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
+                Block::HoleFilling(filter) => filter.queue(frame).and_then(|()| filter.wait(FILTER_TIMEOUT)),
             }
-            .map_err(refused)?;
+            .map_err(filter_problem)?;
         }
         Ok(frame)
     }
 }
 
-fn refused(error: impl Display) -> Problem {
+fn filter_problem(error: impl Display) -> Problem {
     Problem::Library { what: "filter depth", reason: error.to_string() }
 }

@@ -6,7 +6,7 @@ use realsense_rust::kind::Rs2CameraInfo;
 
 /// A camera that is plugged in.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Found {
+pub struct FoundCamera {
     /// What it calls itself.
     pub name: String,
     /// Its serial number, which a rig file names.
@@ -19,7 +19,7 @@ pub struct Found {
     pub usb: Option<String>,
 }
 
-impl Found {
+impl FoundCamera {
     pub(super) fn of(device: &Device) -> Self {
         let info = |kind| device.info.info(kind).map(|text| text.to_string_lossy().into_owned());
         Self {
@@ -39,7 +39,7 @@ impl Found {
     /// Whether its firmware is older than the library wants.
     pub fn has_old_firmware(&self) -> bool {
         let numbers = |version: &str| version.split('.').map(|part| part.parse().unwrap_or(0)).collect::<Vec<u32>>();
-        self.recommended_firmware.as_deref().is_some_and(|wanted| numbers(&self.firmware) < numbers(wanted))
+        self.recommended_firmware.as_deref().is_some_and(|requested| numbers(&self.firmware) < numbers(requested))
     }
 
     /// Name and serial number, for people.
@@ -49,20 +49,20 @@ impl Found {
 }
 
 /// All that are plugged in.
-pub fn cameras() -> Result<Vec<Found>, Problem> {
-    Ok(Context::new()?.devices()?.iter().map(Found::of).collect())
+pub fn cameras() -> Result<Vec<FoundCamera>, Problem> {
+    Ok(Context::new()?.devices()?.iter().map(FoundCamera::of).collect())
 }
 
 /// The camera with a serial number, or the only one that there is where that is empty.
 pub(super) fn camera(context: &Context, serial: &str) -> Result<Device, Problem> {
     let mut devices = context.devices()?;
-    let found: Vec<Found> = devices.iter().map(Found::of).collect();
-    let fits = |found: &Found| serial.is_empty() || found.serial == serial;
-    let there = || found.iter().map(Found::describe).collect();
-    match found.iter().filter(|found| fits(found)).count() {
-        0 => Err(Problem::NoDevice { serial: serial.to_owned(), there: there() }),
-        1 => Ok(devices.swap_remove(found.iter().position(fits).expect("it was counted"))),
-        _ => Err(Problem::Ambiguous { there: there() }),
+    let found: Vec<FoundCamera> = devices.iter().map(FoundCamera::of).collect();
+    let is_match = |found: &FoundCamera| serial.is_empty() || found.serial == serial;
+    let connected = || found.iter().map(FoundCamera::describe).collect();
+    match found.iter().filter(|found| is_match(found)).count() {
+        0 => Err(Problem::NoDevice { serial: serial.to_owned(), connected: connected() }),
+        1 => Ok(devices.swap_remove(found.iter().position(is_match).expect("it was counted"))),
+        _ => Err(Problem::Ambiguous { connected: connected() }),
     }
 }
 
@@ -71,12 +71,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn old_firmware_and_slow_ports_are_seen() {
-        let found = |firmware: &str, wanted: Option<&str>, usb: Option<&str>| Found {
+    fn old_firmware_and_usb2_are_detected() {
+        let found = |firmware: &str, requested: Option<&str>, usb: Option<&str>| FoundCamera {
             name: "Intel RealSense D435I".into(),
             serial: "123".into(),
             firmware: firmware.into(),
-            recommended_firmware: wanted.map(str::to_owned),
+            recommended_firmware: requested.map(str::to_owned),
             usb: usb.map(str::to_owned),
         };
         assert!(found("5.9.15.1", Some("5.16.0.1"), None).has_old_firmware());
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_that_is_not_plugged_in_is_named() {
+    fn missing_camera_error_names_it() {
         let context = Context::new().expect("the library starts without a camera");
         let message = camera(&context, "no such serial").expect_err("none is there").to_string();
         assert!(message.contains("no such serial"), "{message}");

@@ -9,36 +9,36 @@ use nalgebra::{Matrix3, Matrix5, Rotation3, Translation3, UnitQuaternion, Vector
 use realsense_sys as sys;
 
 /// A model of ours that is fitted to one of the library's may be off by so much of a pixel; a D455's is by 0.04.
-const MAX_OFF_PX: f64 = 0.5;
+const MAX_FIT_ERROR_PX: f64 = 0.5;
 /// Points along each side of the image that a fit goes through.
-const N_FITTED: u32 = 24;
+const N_FIT_POINTS: u32 = 24;
 
 /// The library's intrinsics as ours.
 ///
 /// Brown-Conrady and Kannala-Brandt are the same models. The library's "modified" and "inverse" Brown-Conrady (all D4xx colour
 /// cameras say the latter, mostly with coefficients of zero) are other polynomials: they are fitted by ours.
-pub(super) fn intrinsics(told: &sys::rs2_intrinsics, stream: &'static str) -> Result<Intrinsics, Problem> {
+pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Result<Intrinsics, Problem> {
     let lens_problem = |model: &str| Problem::Lens { stream, model: model.to_owned() };
-    let size_px = [told.width, told.height].map(|side| u32::try_from(side).unwrap_or(0));
+    let size_px = [raw.width, raw.height].map(|side| u32::try_from(side).unwrap_or(0));
     let mut intrinsics = Intrinsics {
         size_px,
-        focal_px: [told.fx, told.fy].map(f64::from),
-        principal_px: [told.ppx, told.ppy].map(|centre| f64::from(centre) + 0.5),
+        focal_px: [raw.fx, raw.fy].map(f64::from),
+        principal_px: [raw.ppx, raw.ppy].map(|center| f64::from(center) + 0.5),
         lens: Lens::Pinhole,
         rectified: false,
     };
-    let k = told.coeffs.map(f64::from);
-    intrinsics.lens = match told.model {
+    let k = raw.coeffs.map(f64::from);
+    intrinsics.lens = match raw.model {
         sys::rs2_distortion_RS2_DISTORTION_KANNALA_BRANDT4 => Lens::KannalaBrandt([k[0], k[1], k[2], k[3]]),
         _ if k == [0.0; 5] => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_NONE => Lens::Pinhole,
         sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY => Lens::BrownConrady(k),
         sys::rs2_distortion_RS2_DISTORTION_INVERSE_BROWN_CONRADY => {
-            fitted(&intrinsics, |distorted| (polynomial(&k, distorted), distorted))
+            fit_brown_conrady(&intrinsics, |distorted| (polynomial(&k, distorted), distorted))
                 .ok_or_else(|| lens_problem("inverse Brown-Conrady, too strong for a fit"))?
         }
         sys::rs2_distortion_RS2_DISTORTION_MODIFIED_BROWN_CONRADY => {
-            fitted(&intrinsics, |ray| (ray, modified(&k, ray)))
+            fit_brown_conrady(&intrinsics, |ray| (ray, modified(&k, ray)))
                 .ok_or_else(|| lens_problem("modified Brown-Conrady, too strong for a fit"))?
         }
         sys::rs2_distortion_RS2_DISTORTION_FTHETA => return Err(lens_problem("F-theta")),
@@ -49,7 +49,7 @@ pub(super) fn intrinsics(told: &sys::rs2_intrinsics, stream: &'static str) -> Re
 }
 
 /// Ours as the library's, where it has the same model.
-pub(super) fn told(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
+pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() { Lens::Pinhole } else { intrinsics.lens };
     let (model, k) = match lens {
         Lens::Pinhole => (sys::rs2_distortion_RS2_DISTORTION_NONE, [0.0; 5]),
@@ -59,17 +59,17 @@ pub(super) fn told(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
         }
     };
     let [width, height] = intrinsics.size_px.map(|side| i32::try_from(side).unwrap_or(i32::MAX));
-    let [ppx, ppy] = intrinsics.principal_px.map(|centre| narrow(centre - 0.5));
+    let [ppx, ppy] = intrinsics.principal_px.map(|center| narrow(center - 0.5));
     let [fx, fy] = intrinsics.focal_px.map(narrow);
     sys::rs2_intrinsics { width, height, ppx, ppy, fx, fy, model, coeffs: k.map(narrow) }
 }
 
 /// `to_from_from` of the library's extrinsics between two streams.
-pub(super) fn transform(told: &sys::rs2_extrinsics) -> Transform {
-    let rotation = Matrix3::from_column_slice(&told.rotation.map(f64::from));
+pub(super) fn transform(raw: &sys::rs2_extrinsics) -> Transform {
+    let rotation = Matrix3::from_column_slice(&raw.rotation.map(f64::from));
     // Single precision leaves it a little skewed.
     let rotation = Rotation3::from_matrix_eps(&rotation, 1e-12, 100, Rotation3::identity());
-    let [x, y, z] = told.translation.map(f64::from);
+    let [x, y, z] = raw.translation.map(f64::from);
     Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
@@ -107,38 +107,44 @@ fn modified(k: &[f64; 5], [x, y]: [f64; 2]) -> [f64; 2] {
 /// Our Brown-Conrady lens that does the same as another model, by least squares over the image; `None` where none does.
 ///
 /// `pair` gives, for a position on the plane `z` = 1 as a pinhole sees it, a ray and where that is seen.
-fn fitted(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2], [f64; 2])) -> Option<Lens> {
+fn fit_brown_conrady(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2], [f64; 2])) -> Option<Lens> {
     let mut pairs = Vec::new();
-    for row in 0..=N_FITTED {
-        for column in 0..=N_FITTED {
-            let side = |axis: usize, step: u32| f64::from(pinhole.size_px[axis] * step) / f64::from(N_FITTED);
-            let at = pinhole.unproject([side(0, column), side(1, row)])?;
-            pairs.push(pair([at.x, at.y]));
+    for row in 0..=N_FIT_POINTS {
+        for column in 0..=N_FIT_POINTS {
+            let side = |axis: usize, step: u32| f64::from(pinhole.size_px[axis] * step) / f64::from(N_FIT_POINTS);
+            let ray_at = pinhole.unproject([side(0, column), side(1, row)])?;
+            pairs.push(pair([ray_at.x, ray_at.y]));
         }
     }
     // What the lens adds to a ray is linear in its coefficients.
-    let (mut squares, mut products) = (Matrix5::zeros(), Vector5::zeros());
-    for ([x, y], seen) in &pairs {
+    let (mut normal_matrix, mut rhs) = (Matrix5::zeros(), Vector5::zeros());
+    for ([x, y], distorted_point) in &pairs {
         let r2 = x * x + y * y;
         let powers = [r2, r2 * r2, r2 * r2 * r2];
-        let by_axis = [
-            (Vector5::new(x * powers[0], x * powers[1], 2.0 * x * y, r2 + 2.0 * x * x, x * powers[2]), seen[0] - x),
-            (Vector5::new(y * powers[0], y * powers[1], r2 + 2.0 * y * y, 2.0 * x * y, y * powers[2]), seen[1] - y),
+        let equations = [
+            (
+                Vector5::new(x * powers[0], x * powers[1], 2.0 * x * y, r2 + 2.0 * x * x, x * powers[2]),
+                distorted_point[0] - x,
+            ),
+            (
+                Vector5::new(y * powers[0], y * powers[1], r2 + 2.0 * y * y, 2.0 * x * y, y * powers[2]),
+                distorted_point[1] - y,
+            ),
         ];
-        for (row, added) in by_axis {
-            squares += row * row.transpose();
-            products += row * added;
+        for (row, displacement) in equations {
+            normal_matrix += row * row.transpose();
+            rhs += row * displacement;
         }
     }
-    let [k1, k2, p1, p2, k3] = squares.cholesky()?.solve(&products).into();
+    let [k1, k2, p1, p2, k3] = normal_matrix.cholesky()?.solve(&rhs).into();
     let k = [k1, k2, p1, p2, k3];
-    let off_px = pairs.iter().map(|(ray, seen)| {
+    let fit_error_px = pairs.iter().map(|(ray, distorted_point)| {
         let ours = polynomial(&k, *ray);
-        (0..2).map(|axis| ((ours[axis] - seen[axis]) * pinhole.focal_px[axis]).abs()).fold(0.0, f64::max)
+        (0..2).map(|axis| ((ours[axis] - distorted_point[axis]) * pinhole.focal_px[axis]).abs()).fold(0.0, f64::max)
     });
-    let off_px = off_px.fold(0.0, f64::max);
-    log::debug!("a lens model of the library is met to {off_px:.4} px");
-    (off_px < MAX_OFF_PX).then_some(Lens::BrownConrady(k))
+    let fit_error_px = fit_error_px.fold(0.0, f64::max);
+    log::debug!("a lens model of the library is met to {fit_error_px:.4} px");
+    (fit_error_px < MAX_FIT_ERROR_PX).then_some(Lens::BrownConrady(k))
 }
 
 #[cfg(test)]
@@ -158,10 +164,10 @@ mod tests {
     };
 
     /// By how much the fit of this lens is off.
-    const FITTED_OFF_PX: f64 = 0.05;
+    const FIT_TOLERANCE_PX: f64 = 0.05;
 
     #[test]
-    fn every_model_sees_what_the_library_says_it_sees() {
+    fn every_lens_model_matches_library() {
         let models = [
             sys::rs2_distortion_RS2_DISTORTION_NONE,
             sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY,
@@ -169,30 +175,33 @@ mod tests {
             sys::rs2_distortion_RS2_DISTORTION_INVERSE_BROWN_CONRADY,
         ];
         for model in models {
-            let told = sys::rs2_intrinsics { model, ..D455 };
-            let ours = intrinsics(&told, "color").expect("a lens like any");
-            let k = told.coeffs.map(f64::from);
+            let raw = sys::rs2_intrinsics { model, ..D455 };
+            let ours = intrinsics(&raw, "color").expect("a lens like any");
+            let k = raw.coeffs.map(f64::from);
             for row in (0..=720).step_by(90) {
                 for column in (0..=1280).step_by(80) {
                     // The library's own pixel, its centre whole.
                     let pixel = [f64::from(column), f64::from(row)];
                     let plane = [
-                        (pixel[0] - f64::from(told.ppx)) / f64::from(told.fx),
-                        (pixel[1] - f64::from(told.ppy)) / f64::from(told.fy),
+                        (pixel[0] - f64::from(raw.ppx)) / f64::from(raw.fx),
+                        (pixel[1] - f64::from(raw.ppy)) / f64::from(raw.fy),
                     ];
-                    let (ray, seen) = match model {
+                    let (ray, distorted_point) = match model {
                         sys::rs2_distortion_RS2_DISTORTION_NONE => (plane, plane),
                         sys::rs2_distortion_RS2_DISTORTION_BROWN_CONRADY => (plane, polynomial(&k, plane)),
                         sys::rs2_distortion_RS2_DISTORTION_MODIFIED_BROWN_CONRADY => (plane, modified(&k, plane)),
                         _ => (polynomial(&k, plane), plane),
                     };
                     let got = ours.project(&nalgebra::Vector3::new(ray[0], ray[1], 1.0)).expect("before the camera");
-                    let wanted = [
-                        seen[0] * f64::from(told.fx) + f64::from(told.ppx) + 0.5,
-                        seen[1] * f64::from(told.fy) + f64::from(told.ppy) + 0.5,
+                    let expected = [
+                        distorted_point[0] * f64::from(raw.fx) + f64::from(raw.ppx) + 0.5,
+                        distorted_point[1] * f64::from(raw.fy) + f64::from(raw.ppy) + 0.5,
                     ];
                     for axis in 0..2 {
-                        assert!((got[axis] - wanted[axis]).abs() < FITTED_OFF_PX, "{model}: {got:?}, not {wanted:?}");
+                        assert!(
+                            (got[axis] - expected[axis]).abs() < FIT_TOLERANCE_PX,
+                            "{model}: {got:?}, not {expected:?}"
+                        );
                     }
                 }
             }
@@ -200,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn lenses_and_poses_come_back_and_strange_lenses_are_refused() {
+    fn lenses_and_poses_round_trip_and_unknown_models_fail() {
         for lens in [
             Lens::Pinhole,
             Lens::BrownConrady([0.125, -0.25, 0.001953125, -0.0009765625, 0.0625]),
@@ -213,7 +222,7 @@ mod tests {
                 lens,
                 rectified: false,
             };
-            assert_eq!(intrinsics(&told(&ours), "color").expect("a lens of ours"), ours);
+            assert_eq!(intrinsics(&raw(&ours), "color").expect("a lens of ours"), ours);
         }
         let fisheye = sys::rs2_intrinsics { model: sys::rs2_distortion_RS2_DISTORTION_FTHETA, ..D455 };
         assert!(intrinsics(&fisheye, "color").expect_err("no such model").to_string().contains("F-theta"));
@@ -221,7 +230,7 @@ mod tests {
             Translation3::new(0.0148, 0.0002, -0.0003),
             UnitQuaternion::from_euler_angles(0.01, -0.02, 0.03),
         );
-        let back = transform(&extrinsics(&pose)).inverse() * pose;
-        assert!(back.translation.vector.norm() < 1e-8 && back.rotation.angle() < 1e-6, "{back}");
+        let error = transform(&extrinsics(&pose)).inverse() * pose;
+        assert!(error.translation.vector.norm() < 1e-8 && error.rotation.angle() < 1e-6, "{error}");
     }
 }

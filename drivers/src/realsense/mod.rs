@@ -2,7 +2,7 @@
 //!
 //! What a rig file says of them (`config.rs`, `problem.rs`) is there always; the rest needs the cargo feature `realsense`.
 //! `sdk.rs` is the part of the library that `realsense-rust` leaves out, `lens.rs` and `stamps.rs` say what its numbers mean,
-//! `options.rs` sets a camera up; `running.rs` moves bytes, `camera.rs` survives an unplugged cable. `played/` writes files as a
+//! `options.rs` sets a camera up; `session.rs` moves bytes, `camera.rs` survives an unplugged cable. `emulated/` writes files as a
 //! simulated camera.
 
 mod config;
@@ -10,6 +10,8 @@ mod problem;
 
 #[cfg(feature = "realsense")]
 mod camera;
+#[cfg(feature = "realsense")]
+pub mod emulated;
 #[cfg(feature = "realsense")]
 mod filters;
 #[cfg(feature = "realsense")]
@@ -19,11 +21,9 @@ mod lens;
 #[cfg(feature = "realsense")]
 mod options;
 #[cfg(feature = "realsense")]
-pub mod played;
-#[cfg(feature = "realsense")]
-mod running;
-#[cfg(feature = "realsense")]
 mod sdk;
+#[cfg(feature = "realsense")]
+mod session;
 #[cfg(feature = "realsense")]
 mod stamps;
 #[cfg(feature = "realsense")]
@@ -33,7 +33,7 @@ mod streams;
 pub use camera::{Counts, RealsenseCamera};
 pub use config::{Config, Filter, Pace, Settings, Stream};
 #[cfg(feature = "realsense")]
-pub use find::{Found, cameras};
+pub use find::{FoundCamera, cameras};
 pub use problem::Problem;
 #[cfg(feature = "realsense")]
 pub use streams::{Calibration, DepthCalibration};

@@ -6,7 +6,7 @@ use realsense_rust::kind::{Rs2CameraInfo, Rs2Option};
 use realsense_sys as sys;
 
 /// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
-const EXPOSURE_OFF_FRAC: f32 = 0.1;
+const EXPOSURE_TOLERANCE_FRAC: f32 = 0.1;
 /// Colour cameras beside a depth camera count their exposure like any webcam; depth cameras count microseconds.
 const RGB_MODULE: &str = "RGB Camera";
 const RGB_MICROS_PER_COUNT: f64 = 100.0;
@@ -19,75 +19,75 @@ pub(super) fn exposure_micros_per_count(sensor: &Sensor) -> f64 {
 
 /// Sets a camera up and reads everything back; `image_sensor` is that of the images that are not depth.
 pub(super) fn apply(settings: &Settings, device: &mut Device, image_sensor: usize) -> Result<Vec<String>, Problem> {
-    let mut told = Vec::new();
+    let mut applied = Vec::new();
     for sensor in &mut device.sensors {
         // The camera's clock is mapped here: the library's own mapping believes late arrivals.
-        set_if_there(sensor, Rs2Option::GlobalTimeEnabled, 0.0);
+        set_if_supported(sensor, Rs2Option::GlobalTimeEnabled, 0.0);
     }
-    if let Some(sensor) = device.sensors.iter_mut().find(|sensor| is_there(sensor, Rs2Option::DepthUnits)) {
+    if let Some(sensor) = device.sensors.iter_mut().find(|sensor| is_supported(sensor, Rs2Option::DepthUnits)) {
         // A preset changes what the others say, so it comes first.
         if let Some(name) = &settings.preset {
             let value = preset(sensor, name)?;
             set(sensor, "realsense.preset", Rs2Option::VisualPreset, value, 0.0)?;
-            told.push(format!("preset {name:?}"));
+            applied.push(format!("preset {name:?}"));
         }
         if let Some(power) = settings.laser_power {
             laser(sensor, power)?;
-            told.push(format!("laser power {power}"));
+            applied.push(format!("laser power {power}"));
         }
     } else if settings.preset.is_some() || settings.laser_power.is_some() {
         return Err(Problem::NoSetting { setting: "realsense.preset or laser_power: it has no depth" });
     }
-    told.extend(picture(settings, &mut device.sensors[image_sensor])?);
-    Ok(told)
+    applied.extend(apply_image_settings(settings, &mut device.sensors[image_sensor])?);
+    Ok(applied)
 }
 
 /// The picture of the images that are not depth.
-fn picture(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<String>, Problem> {
-    let mut told = Vec::new();
+fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<String>, Problem> {
+    let mut applied = Vec::new();
     // Automatic exposure may not lower the rate.
-    set_if_there(sensor, Rs2Option::AutoExposurePriority, 0.0);
+    set_if_supported(sensor, Rs2Option::AutoExposurePriority, 0.0);
     match (settings.exposure_micros, settings.gain) {
-        (None, None) => set_if_there(sensor, Rs2Option::EnableAutoExposure, 1.0),
+        (None, None) => set_if_supported(sensor, Rs2Option::EnableAutoExposure, 1.0),
         (None, Some(gain)) => {
             return Err(Problem::SettingRange {
                 setting: "realsense.gain",
-                wanted: gain.to_string(),
+                requested: gain.to_string(),
                 allowed: "a gain only together with exposure_micros: automatic exposure sets both".into(),
             });
         }
         (Some(micros), gain) => {
-            set_if_there(sensor, Rs2Option::EnableAutoExposure, 0.0);
+            set_if_supported(sensor, Rs2Option::EnableAutoExposure, 0.0);
             let counts = narrow(micros / exposure_micros_per_count(sensor));
-            set(sensor, "exposure_micros", Rs2Option::Exposure, counts, counts * EXPOSURE_OFF_FRAC)?;
-            told.push(format!("exposure {micros} us"));
+            set(sensor, "exposure_micros", Rs2Option::Exposure, counts, counts * EXPOSURE_TOLERANCE_FRAC)?;
+            applied.push(format!("exposure {micros} us"));
             if let Some(gain) = gain {
                 set(sensor, "realsense.gain", Rs2Option::Gain, narrow(gain.into()), 0.0)?;
-                told.push(format!("gain {gain}"));
+                applied.push(format!("gain {gain}"));
             }
         }
     }
     match settings.white_balance_kelvin {
-        None => set_if_there(sensor, Rs2Option::EnableAutoWhiteBalance, 1.0),
+        None => set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 1.0),
         Some(kelvin) => {
-            set_if_there(sensor, Rs2Option::EnableAutoWhiteBalance, 0.0);
+            set_if_supported(sensor, Rs2Option::EnableAutoWhiteBalance, 0.0);
             set(sensor, "realsense.white_balance_kelvin", Rs2Option::WhiteBalance, narrow(kelvin.into()), 50.0)?;
-            told.push(format!("white balance {kelvin} K"));
+            applied.push(format!("white balance {kelvin} K"));
         }
     }
     if let Some(brightness) = settings.brightness {
         set(sensor, "realsense.brightness", Rs2Option::Brightness, narrow(brightness.into()), 0.0)?;
-        told.push(format!("brightness {brightness}"));
+        applied.push(format!("brightness {brightness}"));
     }
-    Ok(told)
+    Ok(applied)
 }
 
 fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
     const KEY: &str = "realsense.laser_power";
-    if power == 0.0 && is_there(sensor, Rs2Option::EmitterEnabled) {
+    if power == 0.0 && is_supported(sensor, Rs2Option::EmitterEnabled) {
         return set(sensor, KEY, Rs2Option::EmitterEnabled, 0.0, 0.0);
     }
-    set_if_there(sensor, Rs2Option::EmitterEnabled, 1.0);
+    set_if_supported(sensor, Rs2Option::EmitterEnabled, 1.0);
     let step = sensor.options.get_option_range(Rs2Option::LaserPower).map_or(0.0, |range| range.step);
     set(sensor, KEY, Rs2Option::LaserPower, narrow(power), step)
 }
@@ -95,48 +95,54 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
 /// The number of a preset that the camera has by this name; spaces, underscores and capitals do not matter.
 fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
     const KEY: &str = "realsense.preset";
-    let plain = |name: &str| name.to_lowercase().replace(['_', '-'], " ");
+    let normalized = |name: &str| name.to_lowercase().replace(['_', '-'], " ");
     let range = sensor.options.get_option_range(Rs2Option::VisualPreset).ok_or(Problem::NoSetting { setting: KEY })?;
     let mut names = Vec::new();
     let mut value = range.min;
     while value <= range.max {
         if let Some(known) = sensor.value_name(sys::rs2_option_RS2_OPTION_VISUAL_PRESET, value) {
-            if plain(&known) == plain(name) {
+            if normalized(&known) == normalized(name) {
                 return Ok(value);
             }
             names.push(format!("{known:?}"));
         }
         value += range.step.max(1.0);
     }
-    Err(Problem::SettingRange { setting: KEY, wanted: format!("{name:?}"), allowed: names.join(", ") })
+    Err(Problem::SettingRange { setting: KEY, requested: format!("{name:?}"), allowed: names.join(", ") })
 }
 
-fn is_there(sensor: &Sensor, option: Rs2Option) -> bool {
+fn is_supported(sensor: &Sensor, option: Rs2Option) -> bool {
     sensor.options.supports_option(option)
 }
 
 /// What the rig file does not ask for may be refused.
-fn set_if_there(sensor: &mut Sensor, option: Rs2Option, value: f32) {
-    if is_there(sensor, option)
+fn set_if_supported(sensor: &mut Sensor, option: Rs2Option, value: f32) {
+    if is_supported(sensor, option)
         && let Err(error) = sensor.options.set_option(option, value)
     {
         log::debug!("{option:?}: {error}");
     }
 }
 
-/// Sets what the rig file asks for, and reads it back; `slack` is how far off that may be.
-fn set(sensor: &mut Sensor, setting: &'static str, option: Rs2Option, value: f32, slack: f32) -> Result<(), Problem> {
+/// Sets what the rig file asks for, and reads it back; `tolerance` is how far off that may be.
+fn set(
+    sensor: &mut Sensor,
+    setting: &'static str,
+    option: Rs2Option,
+    value: f32,
+    tolerance: f32,
+) -> Result<(), Problem> {
     let Some(range) = sensor.options.get_option_range(option) else { return Err(Problem::NoSetting { setting }) };
     if !(range.min..=range.max).contains(&value) {
         let allowed = format!("{} to {} in the camera's units", range.min, range.max);
-        return Err(Problem::SettingRange { setting, wanted: value.to_string(), allowed });
+        return Err(Problem::SettingRange { setting, requested: value.to_string(), allowed });
     }
     sensor
         .options
         .set_option(option, value)
         .map_err(|error| Problem::Library { what: setting, reason: error.to_string() })?;
     match sensor.options.get_option(option) {
-        Some(got) if (got - value).abs() > slack => Err(Problem::ReadBack { setting, wanted: value, got }),
+        Some(got) if (got - value).abs() > tolerance => Err(Problem::ReadBack { setting, requested: value, got }),
         _ => Ok(()),
     }
 }

@@ -19,20 +19,20 @@ pub enum Problem {
     #[error(
         "no RealSense camera {}is plugged in; there {}",
         if serial.is_empty() { String::new() } else { format!("with the serial number {serial:?} ") },
-        if there.is_empty() { "is none at all (`lsusb -d 8086:` shows them; udev rules of the SDK let them be opened)".to_owned() }
-        else { format!("are {}", there.join(", ")) }
+        if connected.is_empty() { "is none at all (`lsusb -d 8086:` shows them; udev rules of the SDK let them be opened)".to_owned() }
+        else { format!("are {}", connected.join(", ")) }
     )]
     NoDevice {
         /// Serial number of the rig file; empty where it names none.
         serial: String,
         /// Names and serial numbers of those that are.
-        there: Vec<String>,
+        connected: Vec<String>,
     },
     /// Several are plugged in and the rig file does not say which.
-    #[error("several RealSense cameras are plugged in, write device = \"SERIAL\" with one of: {}", there.join(", "))]
+    #[error("several RealSense cameras are plugged in, write device = \"SERIAL\" with one of: {}", connected.join(", "))]
     Ambiguous {
         /// Names and serial numbers.
-        there: Vec<String>,
+        connected: Vec<String>,
     },
     /// A recorded file cannot be played.
     #[error("cannot play {path:?}: {reason}")]
@@ -43,10 +43,10 @@ pub enum Problem {
         reason: String,
     },
     /// It does not offer what is asked for.
-    #[error("it does not offer {wanted}; it offers {offered}")]
+    #[error("it does not offer {requested}; it offers {offered}")]
     NoMode {
         /// Stream, size and rate of the rig file.
-        wanted: String,
+        requested: String,
         /// All that it has of that stream.
         offered: String,
     },
@@ -57,22 +57,22 @@ pub enum Problem {
         setting: &'static str,
     },
     /// The rig file sets something to a value that the camera does not know.
-    #[error("{setting} is {wanted}, it takes {allowed}")]
+    #[error("{setting} is {requested}, it takes {allowed}")]
     SettingRange {
         /// Name of the key.
         setting: &'static str,
         /// Asked for, in the units of the key.
-        wanted: String,
+        requested: String,
         /// What there is.
         allowed: String,
     },
     /// It took a setting and tells another one.
-    #[error("{setting} was set to {wanted} and reads {got}")]
+    #[error("{setting} was set to {requested} and reads {got}")]
     ReadBack {
         /// Name of the key.
         setting: &'static str,
         /// What was set, in the camera's units.
-        wanted: f32,
+        requested: f32,
         /// What it tells.
         got: f32,
     },

@@ -36,7 +36,7 @@ pub(super) fn call<T>(what: &'static str, call: impl FnOnce(*mut *mut sys::rs2_e
 }
 
 /// What must not be null after a call without an error.
-pub(super) fn made<T>(what: &'static str, pointer: *mut T) -> Result<NonNull<T>, Problem> {
+pub(super) fn non_null<T>(what: &'static str, pointer: *mut T) -> Result<NonNull<T>, Problem> {
     NonNull::new(pointer).ok_or_else(|| Problem::Library { what, reason: "it gave nothing".into() })
 }
 
@@ -49,12 +49,12 @@ unsafe impl Send for Context {}
 
 /// Held while a device is made. The library notes in one list of the process how its streams lie to each other, and two threads that
 /// add to it at once write into freed memory (librealsense 2.56.5, `extrinsics_graph::register_extrinsics`).
-static MAKING: Mutex<()> = Mutex::new(());
+static DEVICE_CREATION: Mutex<()> = Mutex::new(());
 
 /// Keeps other threads from making devices meanwhile.
-pub(super) fn making() -> MutexGuard<'static, ()> {
+pub(super) fn device_creation_lock() -> MutexGuard<'static, ()> {
     // There is nothing behind it that a thread that panicked could have left half done.
-    MAKING.lock().unwrap_or_else(PoisonError::into_inner)
+    DEVICE_CREATION.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Context {
@@ -66,14 +66,14 @@ impl Context {
             let version = call(WHAT, |error| sys::rs2_get_api_version(error))?;
             call(WHAT, |error| sys::rs2_create_context(version, error))?
         };
-        Ok(Self(made(WHAT, context)?))
+        Ok(Self(non_null(WHAT, context)?))
     }
 
     /// All cameras that are plugged in.
     pub(super) fn devices(&self) -> Result<Vec<Device>, Problem> {
         const WHAT: &str = "list devices";
         let any = sys::RS2_PRODUCT_LINE_ANY_INTEL.cast_signed();
-        let _alone = making();
+        let _guard = device_creation_lock();
         // SAFETY: the context lives; the list is freed below, and devices outlive it.
         unsafe {
             let list = call(WHAT, |error| sys::rs2_query_devices_ex(self.0.as_ptr(), any, error))?;
@@ -88,17 +88,17 @@ impl Context {
 
     /// A recorded file as a device that plays as fast as its images are taken.
     pub(super) fn file(&self, path: &Path) -> Result<Device, Problem> {
-        let refused = |reason: String| Problem::File { path: path.to_owned(), reason };
+        let file_problem = |reason: String| Problem::File { path: path.to_owned(), reason };
         if let Err(error) = std::fs::File::open(path) {
-            return Err(refused(error.to_string()));
+            return Err(file_problem(error.to_string()));
         }
-        let name = path_name(path).map_err(refused)?;
-        let _alone = making();
+        let name = path_name(path).map_err(file_problem)?;
+        let _guard = device_creation_lock();
         // SAFETY: the context lives, the name ends with a zero; the device is checked and then ours.
         let device = unsafe {
             let device =
                 call("play a file", |error| sys::rs2_context_add_device(self.0.as_ptr(), name.as_ptr(), error));
-            let device = Device::new(device.map_err(|problem| refused(problem.to_string()))?)?;
+            let device = Device::new(device.map_err(|problem| file_problem(problem.to_string()))?)?;
             call("play as fast as it is read", |error| {
                 sys::rs2_playback_device_set_real_time(device.raw.as_ptr(), 0, error);
             })?;
@@ -139,14 +139,14 @@ impl Device {
     /// The pointer must be a device that nobody else frees, or null.
     pub(super) unsafe fn new(device: *mut sys::rs2_device) -> Result<Self, Problem> {
         const WHAT: &str = "list the sensors of a device";
-        let raw = made("open a device", device)?;
+        let raw = non_null("open a device", device)?;
         let info = Info::from(raw);
         // SAFETY: the device lives in `info`; the list is freed below, and sensors outlive it.
         let sensors = unsafe {
             let list = call(WHAT, |error| sys::rs2_query_sensors(raw.as_ptr(), error))?;
             let n_sensors = call(WHAT, |error| sys::rs2_get_sensors_count(list, error));
             let sensor =
-                |ix| Ok(Sensor::new(made(WHAT, call(WHAT, |error| sys::rs2_create_sensor(list, ix, error))?)?));
+                |ix| Ok(Sensor::new(non_null(WHAT, call(WHAT, |error| sys::rs2_create_sensor(list, ix, error))?)?));
             let sensors = n_sensors.and_then(|n_sensors| (0..n_sensors).map(sensor).collect());
             sys::rs2_delete_sensor_list(list);
             sensors
@@ -166,10 +166,10 @@ impl Device {
     }
 
     /// Holds a file back, or lets it go on.
-    pub(super) fn hold(&self, is_held: bool) -> Result<(), Problem> {
+    pub(super) fn set_paused(&self, is_paused: bool) -> Result<(), Problem> {
         // SAFETY: the device lives; for one that is no file it is an error.
         call("hold a file", |error| unsafe {
-            match is_held {
+            match is_paused {
                 true => sys::rs2_playback_device_pause(self.raw.as_ptr(), error),
                 false => sys::rs2_playback_device_resume(self.raw.as_ptr(), error),
             }
@@ -203,12 +203,12 @@ impl Sensor {
         const WHAT: &str = "list the modes of a sensor";
         // SAFETY: the sensor lives; `Modes` frees the list and keeps it as long as pointers into it.
         unsafe {
-            let list = made(WHAT, call(WHAT, |error| sys::rs2_get_stream_profiles(self.raw.as_ptr(), error))?)?;
+            let list = non_null(WHAT, call(WHAT, |error| sys::rs2_get_stream_profiles(self.raw.as_ptr(), error))?)?;
             let mut modes = Modes { list, modes: Vec::new() };
             let n_modes = call(WHAT, |error| sys::rs2_get_stream_profiles_count(list.as_ptr(), error))?;
             for ix in 0..n_modes {
                 let profile = call(WHAT, |error| sys::rs2_get_stream_profile(list.as_ptr(), ix, error))?;
-                modes.modes.extend(Mode::read(made(WHAT, profile.cast_mut())?)?);
+                modes.modes.extend(Mode::read(non_null(WHAT, profile.cast_mut())?)?);
             }
             Ok(modes)
         }
@@ -362,7 +362,7 @@ impl Queue {
         const WHAT: &str = "make a queue";
         // SAFETY: only numbers go in.
         let queue = call(WHAT, |error| unsafe { sys::rs2_create_frame_queue(capacity.into(), error) })?;
-        Ok(Self(made(WHAT, queue)?))
+        Ok(Self(non_null(WHAT, queue)?))
     }
 
     /// The next image, or `None` when none came in time.
@@ -372,9 +372,9 @@ impl Queue {
         let mut frame = null_mut();
         // SAFETY: the queue lives; a frame that came is ours, and `Frame` frees it.
         unsafe {
-            let has_come =
+            let has_arrived =
                 call(WHAT, |error| sys::rs2_try_wait_for_frame(self.0.as_ptr(), millis, &raw mut frame, error))?;
-            let Some(frame) = NonNull::new(frame).filter(|_| has_come != 0) else { return Ok(None) };
+            let Some(frame) = NonNull::new(frame).filter(|_| has_arrived != 0) else { return Ok(None) };
             match Frame::try_from(frame) {
                 Ok(frame) => Ok(Some(frame)),
                 Err(error) => {

@@ -1,11 +1,11 @@
 //! A RealSense camera that streams, or a file that plays: from the library's frames to stamped images.
 
 use super::filters::Filters;
-use super::find::{self, Found};
+use super::find::{self, FoundCamera};
 use super::options;
 use super::sdk::{Context, Device, Frame, Queue, bytes};
-use super::stamps::{Stamps, Told};
-use super::streams::{self, Calibration, Started};
+use super::stamps::{FrameTime, Stamps};
+use super::streams::{self, ActiveStreams, Calibration};
 use super::{Config, Problem};
 use crate::{Error, Image, PixelFormat, clock};
 use realsense_rust::frame::{FrameEx, ImageFrame};
@@ -19,30 +19,30 @@ const N_WAITING: u8 = 16;
 /// How soon the end of a file is noticed.
 const POLL: Duration = Duration::from_millis(100);
 /// How soon the end of a stop is noticed.
-const DRAIN: Duration = Duration::from_millis(10);
+const DRAIN_POLL: Duration = Duration::from_millis(10);
 /// A file that has given no image for this long is at its end, or holds none.
-const MAX_BEGIN: Duration = Duration::from_secs(2);
+const MAX_STARTUP: Duration = Duration::from_secs(2);
 /// Exposures of depth are told in microseconds.
 const DEPTH_SECS_PER_COUNT: f64 = 1e-6;
 
 /// A device that streams.
 #[derive(Debug)]
-pub(super) struct Running {
+pub(super) struct Session {
     camera: Arc<str>,
     stamps: Stamps,
     filters: Filters,
-    counted: [Counted; 2],
+    counter: [FrameCounter; 2],
     /// Of a file: taken and not due yet.
-    early: Option<Image>,
+    pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
-    began: Instant,
+    started_at: Instant,
     last_image: Instant,
     n_images: u64,
     /// Of a file: due before it was opened.
-    n_past: u64,
-    described: String,
-    started: Started,
+    n_before_open: u64,
+    description: String,
+    started: ActiveStreams,
     device: Device,
     /// After what runs into it.
     queue: Queue,
@@ -52,22 +52,22 @@ pub(super) struct Running {
 
 /// What came of one kind of image: colour or infrared, and depth.
 #[derive(Clone, Copy, Debug, Default)]
-struct Counted {
+struct FrameCounter {
     last_number: Option<u64>,
-    n_untold: u64,
+    n_unreported: u64,
 }
 
 /// What one wait led to.
 pub(super) enum Next {
     Image(Image),
-    Nothing,
+    NoImage,
     /// The next image of the file is due so much later.
-    Later(Duration),
+    NotDue(Duration),
     /// The file is at its end.
     End,
 }
 
-impl Running {
+impl Session {
     /// Finds the device of a config, sets it up and starts its streams.
     pub(super) fn start(config: &Config) -> Result<Self, Problem> {
         let context = Context::new()?;
@@ -75,30 +75,30 @@ impl Running {
             Some(path) => context.file(path)?,
             None => find::camera(&context, &config.serial)?,
         };
-        let found = Found::of(&device);
+        let found = FoundCamera::of(&device);
         let queue = Queue::new(N_WAITING)?;
         let started = streams::start(config, &device, &queue)?;
-        let mut described = format!("{}, {}", found.describe(), started.described);
+        let mut description = format!("{}, {}", found.describe(), started.description);
         if config.file.is_none() {
-            warn_of(&config.name, &found);
-            let told = options::apply(&config.settings, &mut device, started.image_sensor);
-            let told = told.inspect_err(|_| started.stop(&device))?;
-            described = format!("{described}; set and read back: {}", told.join(", "));
+            warn_of_device(&config.name, &found);
+            let frame_time = options::apply(&config.settings, &mut device, started.image_sensor);
+            let frame_time = frame_time.inspect_err(|_| started.stop(&device))?;
+            description = format!("{description}; set and read back: {}", frame_time.join(", "));
         }
         let micros_per_count = options::exposure_micros_per_count(&device.sensors[started.image_sensor]);
         Ok(Self {
             camera: config.name.as_str().into(),
             stamps: Stamps::new(config),
             filters: Filters::new(&config.filters)?,
-            counted: [Counted::default(); 2],
-            early: None,
+            counter: [FrameCounter::default(); 2],
+            pending: None,
             image_secs_per_count: micros_per_count * 1e-6,
             is_file: config.file.is_some(),
-            began: Instant::now(),
+            started_at: Instant::now(),
             last_image: Instant::now(),
             n_images: 0,
-            n_past: 0,
-            described,
+            n_before_open: 0,
+            description,
             started,
             device,
             queue,
@@ -108,7 +108,7 @@ impl Running {
 
     /// Device, modes and settings, for people.
     pub(super) fn describe(&self) -> &str {
-        &self.described
+        &self.description
     }
 
     pub(super) fn calibration(&self) -> &Calibration {
@@ -121,58 +121,58 @@ impl Running {
     }
 
     /// Since when no image came.
-    pub(super) fn silent_for(&self) -> Duration {
+    pub(super) fn time_since_image(&self) -> Duration {
         self.last_image.elapsed()
     }
 
     /// The next image of any stream; an error means that the device is lost.
     pub(super) fn next(&mut self, deadline: Instant) -> Result<Next, Problem> {
         loop {
-            if let Some(image) = self.early.take_if(|image| self.stamps.is_due(image.stamp)) {
-                return Ok(Next::Image(self.give(image)));
+            if let Some(image) = self.pending.take_if(|image| self.stamps.is_due(image.stamp)) {
+                return Ok(Next::Image(self.deliver(image)));
             }
-            let left = deadline.saturating_duration_since(Instant::now());
-            if let Some(image) = &self.early {
+            let remaining = deadline.saturating_duration_since(Instant::now());
+            if let Some(image) = &self.pending {
                 let due_in = Duration::from_nanos(image.stamp.0.saturating_sub(clock::now().0).max(0).unsigned_abs());
-                if left.is_zero() {
-                    return Ok(Next::Later(due_in));
+                if remaining.is_zero() {
+                    return Ok(Next::NotDue(due_in));
                 }
-                std::thread::sleep(left.min(due_in));
+                std::thread::sleep(remaining.min(due_in));
                 continue;
             }
             // Asked before: what came until then is in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
-            match self.queue.wait(left.min(POLL))? {
+            match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
                     let image = self.image(frame)?;
                     if image.is_none() {
                         continue;
                     }
-                    self.early = image;
+                    self.pending = image;
                 }
-                None if has_stopped && (self.n_images > 0 || self.began.elapsed() > MAX_BEGIN) => {
-                    self.tell_past("all of the");
+                None if has_stopped && (self.n_images > 0 || self.started_at.elapsed() > MAX_STARTUP) => {
+                    self.warn_of_images_before_open("all of the");
                     return Ok(Next::End);
                 }
-                None if left <= POLL => return Ok(Next::Nothing),
+                None if remaining <= POLL => return Ok(Next::NoImage),
                 None => {}
             }
         }
     }
 
     /// Says once how many images of a file came too early for us.
-    fn tell_past(&mut self, which: &str) {
-        let n_past = std::mem::take(&mut self.n_past);
-        if n_past > 0 {
+    fn warn_of_images_before_open(&mut self, which: &str) {
+        let n_before_open = std::mem::take(&mut self.n_before_open);
+        if n_before_open > 0 {
             log::warn!(
-                "camera {:?}: {which} images of its file, {n_past}, were due before it was opened: they are passed over",
+                "camera {:?}: {which} images of its file, {n_before_open}, were due before it was opened: they are passed over",
                 self.camera
             );
         }
     }
 
-    fn give(&mut self, image: Image) -> Image {
-        self.tell_past("the first");
+    fn deliver(&mut self, image: Image) -> Image {
+        self.warn_of_images_before_open("the first");
         self.last_image = Instant::now();
         self.n_images += 1;
         image
@@ -182,67 +182,67 @@ impl Running {
     fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
         let arrival = clock::now();
         let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
-        let counted = &mut self.counted[usize::from(is_depth)];
+        let counter = &mut self.counter[usize::from(is_depth)];
         let number = frame.frame_number();
-        match counted.last_number.replace(number) {
+        match counter.last_number.replace(number) {
             // The library gives the last image of a stream again in some cases.
             Some(last) if last == number => return Ok(None),
-            Some(last) if number > last => counted.n_untold += number - last - 1,
+            Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
         }
         let (format, secs_per_count) = match (is_depth, &self.started.calibration.depth) {
             (true, Some(depth)) => {
-                (PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count }, DEPTH_SECS_PER_COUNT)
+                (PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count }, DEPTH_SECS_PER_COUNT)
             }
             (true, None) => return Ok(None),
             (false, _) => (self.started.format, self.image_secs_per_count),
         };
-        let told = Told::of(&frame);
+        let frame_time = FrameTime::of(&frame);
         #[expect(clippy::cast_precision_loss, reason = "an exposure lasts less than a day")]
         let exposure_secs =
             frame.metadata(Rs2FrameMetadata::ActualExposure).map(|counts| counts as f64 * secs_per_count);
         let image = Image {
             camera: Arc::clone(&self.camera),
-            stamp: self.stamps.stamp(&told, arrival),
+            stamp: self.stamps.stamp(&frame_time, arrival),
             size_px: [0; 2],
             format,
             data: Arc::new([]),
             exposure_secs,
-            n_skipped: std::mem::take(&mut counted.n_untold),
+            n_skipped: std::mem::take(&mut counter.n_unreported),
         };
-        if self.stamps.is_of_before(image.stamp) {
-            self.n_past += 1;
+        if self.stamps.is_before_open(image.stamp) {
+            self.n_before_open += 1;
             return Ok(None);
         }
-        let image = if is_depth && !self.filters.are_none() {
-            filled(image, &self.filters.pass(frame)?)
+        let image = if is_depth && !self.filters.is_empty() {
+            with_pixels(image, &self.filters.apply(frame)?)
         } else {
-            filled(image, &frame)
+            with_pixels(image, &frame)
         };
         image.map(Some).map_err(|error| Problem::Library { what: "give a whole image", reason: error.to_string() })
     }
 }
 
 /// An image with the bytes of a frame.
-fn filled<Kind>(image: Image, frame: &ImageFrame<Kind>) -> Result<Image, Error> {
+fn with_pixels<Kind>(image: Image, frame: &ImageFrame<Kind>) -> Result<Image, Error> {
     let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
     let size_px = [side(frame.width()), side(frame.height())];
     Image { size_px, data: bytes(frame).into(), ..image }.pack_rows(frame.stride())
 }
 
-fn warn_of(camera: &str, found: &Found) {
+fn warn_of_device(camera: &str, found: &FoundCamera) {
     if found.is_on_usb2() {
         log::warn!(
             "camera {camera:?}: it runs at USB 2, which carries few of its modes: use a USB 3 port and the cable that came with it"
         );
     }
     if found.has_old_firmware() {
-        let wanted = found.recommended_firmware.as_deref().unwrap_or_default();
-        log::warn!("camera {camera:?}: its firmware {} is older than the library wants ({wanted})", found.firmware);
+        let requested = found.recommended_firmware.as_deref().unwrap_or_default();
+        log::warn!("camera {camera:?}: its firmware {} is older than the library wants ({requested})", found.firmware);
     }
 }
 
-impl Drop for Running {
+impl Drop for Session {
     /// The reader of a file waits for room in the queue, and the library's stop for that reader: so the queue is emptied meanwhile.
     fn drop(&mut self) {
         let (queue, is_stopped) = (&self.queue, AtomicBool::new(false));
@@ -250,7 +250,7 @@ impl Drop for Running {
             scope.spawn(|| {
                 while !is_stopped.load(Ordering::Relaxed) {
                     // What still comes is not wanted any more.
-                    let _ = queue.wait(DRAIN);
+                    let _ = queue.wait(DRAIN_POLL);
                 }
             });
             self.started.stop(&self.device);

@@ -15,7 +15,7 @@ const NANOS_PER_MILLI: f64 = 1e6;
 
 /// What the library says of one frame's time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Told {
+pub(super) struct FrameTime {
     /// Mid-exposure by the camera's clock, microseconds.
     pub(super) mid_exposure_micros: Option<i64>,
     /// The library's own stamp, milliseconds.
@@ -24,7 +24,7 @@ pub(super) struct Told {
     pub(super) is_device_clock: bool,
 }
 
-impl Told {
+impl FrameTime {
     pub(super) fn of(frame: &impl FrameEx) -> Self {
         Self {
             mid_exposure_micros: frame.metadata(Rs2FrameMetadata::SensorTimestamp),
@@ -46,7 +46,7 @@ pub(super) struct Stamps {
     map: ClockMap,
     /// First time of a file, nanoseconds of the file, and when it came.
     first: Option<(i64, Stamp)>,
-    warned: bool,
+    has_warned: bool,
 }
 
 impl Stamps {
@@ -59,24 +59,24 @@ impl Stamps {
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,
-            warned: false,
+            has_warned: false,
         }
     }
 
     /// The stamp of an image that came just now.
-    pub(super) fn stamp(&mut self, told: &Told, arrival: Stamp) -> Stamp {
-        let device_nanos = self.device_nanos(told);
+    pub(super) fn stamp(&mut self, frame_time: &FrameTime, arrival: Stamp) -> Stamp {
+        let device_nanos = self.device_nanos(frame_time);
         let Some(pace) = self.pace else {
             return device_nanos.map_or(arrival, |nanos| self.map.stamp(nanos, arrival));
         };
         // A file without a camera's clock has at least the library's stamps in order.
-        let nanos = device_nanos.unwrap_or_else(|| nanos_of(told.millis));
+        let nanos = device_nanos.unwrap_or_else(|| nanos_of(frame_time.millis));
         match pace {
             Pace::Fast => Stamp(nanos),
             Pace::Clock => Stamp(nanos.saturating_add(self.offset_nanos)),
             Pace::RealTime => {
-                let (first_nanos, began) = *self.first.get_or_insert((nanos, arrival));
-                Stamp(began.0.saturating_add(nanos.saturating_sub(first_nanos)))
+                let (first_nanos, started_at) = *self.first.get_or_insert((nanos, arrival));
+                Stamp(started_at.0.saturating_add(nanos.saturating_sub(first_nanos)))
             }
         }
     }
@@ -87,26 +87,26 @@ impl Stamps {
     }
 
     /// Whether an image was due before the file was opened: nobody waited for it, and it is none that is late.
-    pub(super) fn is_of_before(&self, stamp: Stamp) -> bool {
+    pub(super) fn is_before_open(&self, stamp: Stamp) -> bool {
         self.pace == Some(Pace::Clock) && stamp < self.opened
     }
 
     /// Time of the camera's clock, nanoseconds since it began; `None`, told once, where it does not tell.
-    fn device_nanos(&mut self, told: &Told) -> Option<i64> {
-        if let Some(micros) = told.mid_exposure_micros {
+    fn device_nanos(&mut self, frame_time: &FrameTime) -> Option<i64> {
+        if let Some(micros) = frame_time.mid_exposure_micros {
             // A simulated camera has wider counts, which do not start again.
-            let is_wide = micros > i64::from(u32::MAX);
-            return Some(if is_wide { micros.saturating_mul(1000) } else { self.micros.nanos(low_bits(micros)) });
+            let is_64_bit = micros > i64::from(u32::MAX);
+            return Some(if is_64_bit { micros.saturating_mul(1000) } else { self.micros.nanos(low_bits(micros)) });
         }
-        let warned = std::mem::replace(&mut self.warned, true);
+        let has_warned = std::mem::replace(&mut self.has_warned, true);
         let camera = &self.camera;
-        if told.is_device_clock {
-            if !warned {
+        if frame_time.is_device_clock {
+            if !has_warned {
                 log::warn!("camera {camera:?}: it does not tell mid-exposure: stamps are those of the readout's begin");
             }
-            return Some(nanos_of(told.millis));
+            return Some(nanos_of(frame_time.millis));
         }
-        if !warned {
+        if !has_warned {
             log::warn!(
                 "camera {camera:?}: its images come without metadata (the kernel's uvcvideo is not patched; the SDK's scripts \
                  do it, or its RSUSB backend): they are stamped as they arrive"
@@ -140,16 +140,16 @@ mod tests {
             micros: WrappingMicros::new(),
             map: ClockMap::new(),
             first: None,
-            warned: false,
+            has_warned: false,
         }
     }
 
-    fn told(micros: i64) -> Told {
-        Told { mid_exposure_micros: Some(micros), millis: 0.0, is_device_clock: true }
+    fn frame_time(micros: i64) -> FrameTime {
+        FrameTime { mid_exposure_micros: Some(micros), millis: 0.0, is_device_clock: true }
     }
 
     #[test]
-    fn a_cameras_clock_is_mapped_to_ours_across_its_wrap() {
+    fn camera_clock_is_mapped_across_wraparound() {
         let mut stamps = stamps(None);
         let begin = i64::from(u32::MAX) - 500_000;
         for image in 0..100_i64 {
@@ -159,40 +159,41 @@ mod tests {
             let micros = if wrapped < 20_000 { wrapped - (1 << 32) } else { wrapped };
             let late_nanos = 5_000_000 + (image % 7) * 3_000_000;
             let arrival = Stamp(since_micros * 1000 + late_nanos);
-            let off_nanos = stamps.stamp(&told(micros), arrival).0 - since_micros * 1000;
+            let error_nanos = stamps.stamp(&frame_time(micros), arrival).0 - since_micros * 1000;
             // The least latency cannot be seen; jitter must not be.
-            assert!((off_nanos - 5_000_000).abs() < 200_000, "image {image}: {off_nanos}");
+            assert!((error_nanos - 5_000_000).abs() < 200_000, "image {image}: {error_nanos}");
         }
     }
 
     #[test]
-    fn a_file_keeps_its_own_stamps_or_begins_when_it_is_played() {
+    fn file_stamps_follow_pace() {
         let later = 123_456;
-        for (pace, wanted) in [
+        for (pace, expected) in [
             (Pace::Fast, [7_000_000_000, 7_123_456_000]),
             (Pace::Clock, [7_000_000_005, 7_123_456_005]),
             (Pace::RealTime, [99, 99 + 123_456_000]),
         ] {
             let mut stamps = stamps(Some(pace));
             let got = [(0, 99), (later, 5_000)]
-                .map(|(since, arrival)| stamps.stamp(&told(7_000_000 + since), Stamp(arrival)).0);
-            assert_eq!(got, wanted, "{pace:?}");
+                .map(|(since_micros, arrival)| stamps.stamp(&frame_time(7_000_000 + since_micros), Stamp(arrival)).0);
+            assert_eq!(got, expected, "{pace:?}");
             assert_eq!(stamps.is_due(Stamp(i64::MAX)), pace == Pace::Fast);
         }
         // Counts of a simulated camera go on.
-        let mut wide = stamps(Some(Pace::Fast));
-        let edge = i64::from(u32::MAX);
-        let got = [edge - 1, edge + 1, edge + 3].map(|micros| wide.stamp(&told(micros), Stamp(0)).0 / 1000);
-        assert_eq!(got, [edge - 1, edge + 1, edge + 3]);
+        let mut emulated_clock = stamps(Some(Pace::Fast));
+        let wrap = i64::from(u32::MAX);
+        let got =
+            [wrap - 1, wrap + 1, wrap + 3].map(|micros| emulated_clock.stamp(&frame_time(micros), Stamp(0)).0 / 1000);
+        assert_eq!(got, [wrap - 1, wrap + 1, wrap + 3]);
     }
 
     #[test]
-    fn without_metadata_the_librarys_stamp_or_the_arrival_counts() {
-        let plain = |is_device_clock| Told { mid_exposure_micros: None, millis: 12.5, is_device_clock };
+    fn without_metadata_library_stamp_or_arrival_is_used() {
+        let plain = |is_device_clock| FrameTime { mid_exposure_micros: None, millis: 12.5, is_device_clock };
         assert_eq!(stamps(None).stamp(&plain(false), Stamp(77)), Stamp(77));
         let mut live = stamps(None);
         live.stamp(&plain(true), Stamp(1_000));
-        let later = Told { millis: 22.5, ..plain(true) };
+        let later = FrameTime { millis: 22.5, ..plain(true) };
         assert_eq!(live.stamp(&later, Stamp(90_000_000)), Stamp(10_001_000));
         assert_eq!(stamps(Some(Pace::Fast)).stamp(&plain(false), Stamp(77)), Stamp(12_500_000));
     }

@@ -38,12 +38,12 @@ pub struct DepthCalibration {
     /// Pose of the depth camera in the frame of the other images.
     pub camera_from_depth: Transform,
     /// Metres per count.
-    pub metres_per_count: f64,
+    pub meters_per_count: f64,
 }
 
-/// Streams that run; [`Started::stop`] ends them.
+/// Streams that run; [`ActiveStreams::stop`] ends them.
 #[derive(Debug)]
-pub(super) struct Started {
+pub(super) struct ActiveStreams {
     pub(super) calibration: Calibration,
     /// How the bytes of images are to be read.
     pub(super) format: PixelFormat,
@@ -52,13 +52,13 @@ pub(super) struct Started {
     /// Sensors that run.
     sensors: BTreeSet<usize>,
     /// Modes, for people.
-    pub(super) described: String,
+    pub(super) description: String,
     /// The modes that run point into these.
     _modes: Vec<Modes>,
 }
 
 /// One stream wanted.
-struct Wanted {
+struct StreamRequest {
     name: &'static str,
     stream: sys::rs2_stream,
     size_px: [u32; 2],
@@ -66,16 +66,16 @@ struct Wanted {
     formats: Vec<sys::rs2_format>,
 }
 
-impl Wanted {
+impl StreamRequest {
     fn fits(&self, mode: &Mode, rate_hz: Option<f64>) -> bool {
         mode.size_px == self.size_px
             && rate_hz.is_none_or(|rate_hz| (f64::from(mode.rate_hz) - rate_hz).abs() < 0.5)
             && self.formats.contains(&mode.format)
-            && self.is_of(mode)
+            && self.is_of_stream(mode)
     }
 
     /// Whether a mode is of this stream; of two infrared cameras the left one is meant, where depth is seen from.
-    fn is_of(&self, mode: &Mode) -> bool {
+    fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
     }
@@ -93,12 +93,13 @@ impl Wanted {
         let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
         let rank = |place: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*place).format);
         all().filter(|place| self.fits(mode_at(*place), rate_hz)).min_by_key(rank).ok_or_else(|| {
-            let offered: BTreeSet<String> = all().map(mode_at).filter(|mode| self.is_of(mode)).map(describe).collect();
+            let offered: BTreeSet<String> =
+                all().map(mode_at).filter(|mode| self.is_of_stream(mode)).map(describe).collect();
             let offered: Vec<_> = offered.into_iter().collect();
             let [width, height] = self.size_px;
             let rate = rate_hz.map_or(String::new(), |rate_hz| format!(" at {rate_hz} Hz"));
             Problem::NoMode {
-                wanted: format!("{} {width}x{height}{rate}", self.name),
+                requested: format!("{} {width}x{height}{rate}", self.name),
                 offered: if offered.is_empty() { format!("no {}", self.name) } else { offered.join(", ") },
             }
         })
@@ -106,17 +107,17 @@ impl Wanted {
 }
 
 /// Opens the streams of a rig file into a queue.
-pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<Started, Problem> {
+pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<ActiveStreams, Problem> {
     let modes: Vec<Modes> = device.sensors.iter().map(|sensor| sensor.modes()).collect::<Result<_, _>>()?;
     let (name, stream) = match config.stream {
         Stream::Color => ("color", sys::rs2_stream_RS2_STREAM_COLOR),
         Stream::Infrared => ("infrared", sys::rs2_stream_RS2_STREAM_INFRARED),
     };
     let formats = FORMATS.map(|(format, ..)| format).to_vec();
-    let image = Wanted { name, stream, size_px: config.size_px, formats }.choose(config, &modes)?;
+    let image = StreamRequest { name, stream, size_px: config.size_px, formats }.choose(config, &modes)?;
     let depth = config.depth_size_px.map(|size_px| {
         let (stream, format) = (sys::rs2_stream_RS2_STREAM_DEPTH, sys::rs2_format_RS2_FORMAT_Z16);
-        Wanted { name: "depth", stream, size_px, formats: vec![format] }.choose(config, &modes)
+        StreamRequest { name: "depth", stream, size_px, formats: vec![format] }.choose(config, &modes)
     });
     let depth = depth.transpose()?;
     let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
@@ -124,9 +125,9 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<S
         intrinsics: lens::intrinsics(&mode_at(image).intrinsics()?, name)?,
         depth: depth.map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image))).transpose()?,
     };
-    let places: Vec<_> = std::iter::once(image).chain(depth).collect();
-    let described: Vec<_> = places.iter().map(|place| describe(mode_at(*place))).collect();
-    let started = Started {
+    let chosen: Vec<_> = std::iter::once(image).chain(depth).collect();
+    let description: Vec<_> = chosen.iter().map(|place| describe(mode_at(*place))).collect();
+    let started = ActiveStreams {
         calibration,
         format: FORMATS
             .iter()
@@ -134,27 +135,28 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<S
             .expect("one of these was chosen")
             .2,
         image_sensor: image.0,
-        sensors: places.iter().map(|(sensor, _)| *sensor).collect(),
-        described: described.join(" and "),
+        sensors: chosen.iter().map(|(sensor, _)| *sensor).collect(),
+        description: description.join(" and "),
         _modes: Vec::new(),
     };
     for sensor in &started.sensors {
-        let its: Vec<_> = places.iter().filter(|place| place.0 == *sensor).map(|place| mode_at(*place)).collect();
-        device.sensors[*sensor].open(&its).inspect_err(|_| started.stop(device))?;
+        let sensor_modes: Vec<_> =
+            chosen.iter().filter(|place| place.0 == *sensor).map(|place| mode_at(*place)).collect();
+        device.sensors[*sensor].open(&sensor_modes).inspect_err(|_| started.stop(device))?;
     }
     started.run(device, queue, config.file.is_some()).inspect_err(|_| started.stop(device))?;
-    Ok(Started { _modes: modes, ..started })
+    Ok(ActiveStreams { _modes: modes, ..started })
 }
 
-impl Started {
+impl ActiveStreams {
     /// Lets all that is open run. A file gives what comes first to those that run first, so it is held until all do.
     fn run(&self, device: &Device, queue: &Queue, is_file: bool) -> Result<(), Problem> {
         if is_file {
-            device.hold(true)?;
+            device.set_paused(true)?;
         }
         self.sensors.iter().try_for_each(|sensor| device.sensors[*sensor].start(queue))?;
         if is_file {
-            device.hold(false)?;
+            device.set_paused(false)?;
         }
         Ok(())
     }
@@ -171,16 +173,18 @@ fn depth_calibration(
     depth: &Mode,
     image: &Mode,
 ) -> Result<DepthCalibration, Problem> {
-    let refused = |reason: String| Problem::Library { what: "tell how depth and images lie", reason };
-    let extrinsics = depth.profile()?.extrinsics(&image.profile()?).map_err(|error| refused(error.to_string()))?;
+    let calibration_problem = |reason: String| Problem::Library { what: "tell how depth and images lie", reason };
+    let extrinsics =
+        depth.profile()?.extrinsics(&image.profile()?).map_err(|error| calibration_problem(error.to_string()))?;
     let scale = device.sensors[sensor].options.get_option(Rs2Option::DepthUnits);
-    let scale = scale.ok_or_else(|| refused("it tells no depth units".into()))?;
+    let scale = scale.ok_or_else(|| calibration_problem("it tells no depth units".into()))?;
     // Single precision means the shortest decimal that it stands for: 0.001, not 0.001000000047.
-    let metres_per_count = scale.to_string().parse().map_err(|_| refused("its depth units are no number".into()))?;
+    let meters_per_count =
+        scale.to_string().parse().map_err(|_| calibration_problem("its depth units are no number".into()))?;
     Ok(DepthCalibration {
         intrinsics: lens::intrinsics(&depth.intrinsics()?, "depth")?,
         camera_from_depth: lens::transform(&extrinsics.0),
-        metres_per_count,
+        meters_per_count,
     })
 }
 

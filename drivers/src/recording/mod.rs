@@ -9,7 +9,7 @@ mod topic;
 mod writer;
 
 pub use reader::Recording;
-pub use writer::{About, Recorder};
+pub use writer::{Recorder, RecordingMetadata};
 
 /// The rig file of a recording, an attachment.
 pub const RIG_FILE: &str = "rig.toml";

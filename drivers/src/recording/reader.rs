@@ -4,7 +4,7 @@
 //! before the cut.
 
 use super::record::Record;
-use super::records::{Broken, Raw, Records};
+use super::records::{RawRecord, ReadError, Records};
 use super::topic::{JOINT_NAMES, Topic};
 use crate::wire::{Malformed, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Error, Image, Sample, Source, TruthImage};
@@ -90,7 +90,7 @@ impl Recording {
         while !self.ended {
             match self.records.next() {
                 Ok(None) => self.ended = true,
-                Ok(Some(Raw { opcode, bytes })) => match Record::decode(opcode, &bytes) {
+                Ok(Some(RawRecord { opcode, bytes })) => match Record::decode(opcode, &bytes) {
                     Ok(record) => {
                         if let Some(sample) = self.take(record)? {
                             self.n_samples += 1;
@@ -99,16 +99,17 @@ impl Recording {
                     }
                     Err(error) => self.end_damaged(&format!("is damaged ({error})")),
                 },
-                Err(Broken::Read(source)) => return Err(Error::Replay { path: self.path.clone(), source }),
-                Err(broken) => self.end_damaged(&broken.to_string()),
+                Err(ReadError::Read(source)) => return Err(Error::Replay { path: self.path.clone(), source }),
+                Err(read_error) => self.end_damaged(&read_error.to_string()),
             }
         }
         Ok(None)
     }
 
-    fn end_damaged(&mut self, how: &str) {
+    fn end_damaged(&mut self, description: &str) {
         self.ended = true;
-        self.damage = Some(format!("the recording {:?} {how} after {} readable samples", self.path, self.n_samples));
+        self.damage =
+            Some(format!("the recording {:?} {description} after {} readable samples", self.path, self.n_samples));
     }
 
     /// Takes in one record; gives a sample when one is complete.

@@ -36,9 +36,9 @@ pub(super) enum Record<'a> {
 
 /// What is wrong with a record.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
-pub(super) enum Wrong {
+pub(super) enum RecordError {
     #[error("a record ends inside a field")]
-    CutOff,
+    Truncated,
     #[error("a name is not UTF-8")]
     Text,
     #[error("the checksum of attachment {name:?} is wrong")]
@@ -46,7 +46,7 @@ pub(super) enum Wrong {
 }
 
 impl<'a> Record<'a> {
-    pub(super) fn decode(opcode: u8, bytes: &'a [u8]) -> Result<Self, Wrong> {
+    pub(super) fn decode(opcode: u8, bytes: &'a [u8]) -> Result<Self, RecordError> {
         let mut fields = Fields(bytes);
         Ok(match opcode {
             SCHEMA => Self::Schema { id: fields.two()?, name: fields.text()? },
@@ -72,10 +72,10 @@ impl<'a> Record<'a> {
                 let (name, _media_type) = (fields.text()?, fields.text()?);
                 let n_bytes = fields.eight()?;
                 let data = fields.bytes(n_bytes)?;
-                let summed = &bytes[..bytes.len() - fields.0.len()];
-                let told = fields.four()?;
-                if told != 0 && told != crc32fast::hash(summed) {
-                    return Err(Wrong::Checksum { name: name.chars().take(100).collect() });
+                let checksummed = &bytes[..bytes.len() - fields.0.len()];
+                let stored_crc = fields.four()?;
+                if stored_crc != 0 && stored_crc != crc32fast::hash(checksummed) {
+                    return Err(RecordError::Checksum { name: name.chars().take(100).collect() });
                 }
                 Self::Attachment { name, data }
             }
@@ -88,34 +88,34 @@ impl<'a> Record<'a> {
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {
-    fn bytes(&mut self, n_bytes: u64) -> Result<&'a [u8], Wrong> {
-        let n_bytes = usize::try_from(n_bytes).map_err(|_| Wrong::CutOff)?;
-        let (field, rest) = self.0.split_at_checked(n_bytes).ok_or(Wrong::CutOff)?;
+    fn bytes(&mut self, n_bytes: u64) -> Result<&'a [u8], RecordError> {
+        let n_bytes = usize::try_from(n_bytes).map_err(|_| RecordError::Truncated)?;
+        let (field, rest) = self.0.split_at_checked(n_bytes).ok_or(RecordError::Truncated)?;
         self.0 = rest;
         Ok(field)
     }
 
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Wrong> {
-        let (field, rest) = self.0.split_first_chunk().ok_or(Wrong::CutOff)?;
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], RecordError> {
+        let (field, rest) = self.0.split_first_chunk().ok_or(RecordError::Truncated)?;
         self.0 = rest;
         Ok(*field)
     }
 
-    fn two(&mut self) -> Result<u16, Wrong> {
+    fn two(&mut self) -> Result<u16, RecordError> {
         self.array().map(u16::from_le_bytes)
     }
 
-    fn four(&mut self) -> Result<u32, Wrong> {
+    fn four(&mut self) -> Result<u32, RecordError> {
         self.array().map(u32::from_le_bytes)
     }
 
-    fn eight(&mut self) -> Result<u64, Wrong> {
+    fn eight(&mut self) -> Result<u64, RecordError> {
         self.array().map(u64::from_le_bytes)
     }
 
-    fn text(&mut self) -> Result<&'a str, Wrong> {
+    fn text(&mut self) -> Result<&'a str, RecordError> {
         let n_bytes = self.four()?.into();
-        std::str::from_utf8(self.bytes(n_bytes)?).map_err(|_| Wrong::Text)
+        std::str::from_utf8(self.bytes(n_bytes)?).map_err(|_| RecordError::Text)
     }
 }
 
@@ -133,34 +133,42 @@ mod tests {
     }
 
     #[test]
-    fn records_are_read_and_cut_ones_are_not() {
+    fn records_decode_and_truncated_ones_fail() {
         let entries = [text("joint_names"), text("a,b")].concat();
         let n_entries = u32::try_from(entries.len()).expect("short").to_le_bytes();
         let channel = [&[7, 0, 3, 0][..], &text("/joints"), &text("json"), &n_entries, &entries].concat();
         let schema = [&[3, 0][..], &text("s"), &text("jsonschema"), &text("{}")].concat();
-        let whole = attachment(crc32fast::hash);
+        let complete = attachment(crc32fast::hash);
         let metadata = BTreeMap::from([("joint_names", "a,b")]);
         for (opcode, bytes, expected) in [
             (CHANNEL, &channel, Record::Channel { id: 7, schema_id: 3, topic: "/joints", metadata }),
             (SCHEMA, &schema, Record::Schema { id: 3, name: "s" }),
-            (ATTACHMENT, &whole, Record::Attachment { name: "rig.toml", data: b"abc" }),
+            (ATTACHMENT, &complete, Record::Attachment { name: "rig.toml", data: b"abc" }),
         ] {
             assert_eq!(Record::decode(opcode, bytes), Ok(expected));
             for n_bytes in 0..7 {
-                assert_eq!(Record::decode(opcode, &bytes[..n_bytes]), Err(Wrong::CutOff), "{opcode}: {n_bytes} bytes");
+                assert_eq!(
+                    Record::decode(opcode, &bytes[..n_bytes]),
+                    Err(RecordError::Truncated),
+                    "{opcode}: {n_bytes} bytes"
+                );
             }
         }
         assert_eq!(Record::decode(0x0B, &[]), Ok(Record::Other));
-        assert_eq!(Record::decode(ATTACHMENT, &attachment(|_| 0)), Record::decode(ATTACHMENT, &whole), "none is told");
+        assert_eq!(
+            Record::decode(ATTACHMENT, &attachment(|_| 0)),
+            Record::decode(ATTACHMENT, &complete),
+            "none is told"
+        );
         let damaged = attachment(|_| 1);
-        let wrong = Record::decode(ATTACHMENT, &damaged);
-        assert_eq!(wrong, Err(Wrong::Checksum { name: "rig.toml".to_owned() }));
+        let checksum_error = Record::decode(ATTACHMENT, &damaged);
+        assert_eq!(checksum_error, Err(RecordError::Checksum { name: "rig.toml".to_owned() }));
     }
 
     #[test]
-    fn a_length_of_gigabytes_takes_no_memory() {
+    fn huge_length_allocates_no_memory() {
         let huge = [&[7, 0, 3, 0][..], &u32::MAX.to_le_bytes(), b"/joints"].concat();
-        assert_eq!(Record::decode(CHANNEL, &huge), Err(Wrong::CutOff));
-        assert_eq!(Record::decode(SCHEMA, &[1, 0, 1, 0, 0, 0, 0xff]), Err(Wrong::Text));
+        assert_eq!(Record::decode(CHANNEL, &huge), Err(RecordError::Truncated));
+        assert_eq!(Record::decode(SCHEMA, &[1, 0, 1, 0, 0, 0, 0xff]), Err(RecordError::Text));
     }
 }

@@ -9,7 +9,7 @@ use std::io::Read;
 /// Longer records than this are taken for damage; the largest real one is one image.
 const MAX_RECORD_BYTES: u64 = 512 << 20;
 /// What is set aside before any byte of a record came.
-const MAX_AHEAD_BYTES: u64 = 1 << 20;
+const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
 /// Before a record: its opcode and its length.
 const HEAD_BYTES: usize = 1 + 8;
 /// Of a chunk before its compression's name: times, length, checksum, length of the name.
@@ -20,17 +20,17 @@ const CHUNK: u8 = 0x06;
 
 /// Why a file ends before its end.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum Broken {
+pub(super) enum ReadError {
     #[error("is cut off")]
-    CutOff,
+    Truncated,
     #[error("is damaged (a record of {n_bytes} bytes)")]
     TooLong { n_bytes: u64 },
     #[error("is damaged (the parts of a chunk are longer than the chunk)")]
-    BeyondChunk,
-    #[error("is damaged (the checksum of a chunk is {told:#010x}, its bytes give {is:#010x})")]
-    Checksum { told: u32, is: u32 },
-    #[error("cannot be read (its chunks are compressed by {by:?})")]
-    Compressed { by: String },
+    ExceedsChunk,
+    #[error("is damaged (the checksum of a chunk is {reported:#010x}, its bytes give {computed:#010x})")]
+    Checksum { reported: u32, computed: u32 },
+    #[error("cannot be read (its chunks are compressed by {compression:?})")]
+    Compressed { compression: String },
     #[error("cannot be read")]
     Read(#[from] std::io::Error),
 }
@@ -47,7 +47,7 @@ pub(super) struct Records<R> {
 #[derive(Debug)]
 struct Chunk {
     /// Bytes of its records that are left.
-    n_left: u64,
+    n_remaining: u64,
     /// Bytes behind them.
     n_padding: u64,
     /// Of all its records; 0 where the writer does not tell.
@@ -56,7 +56,7 @@ struct Chunk {
 }
 
 /// One record's opcode and its bytes.
-pub(super) struct Raw {
+pub(super) struct RawRecord {
     pub(super) opcode: u8,
     pub(super) bytes: Vec<u8>,
 }
@@ -67,78 +67,81 @@ impl<R: Read> Records<R> {
     }
 
     /// The next record; `None` behind the footer. After an error there is nothing more.
-    pub(super) fn next(&mut self) -> Result<Option<Raw>, Broken> {
+    pub(super) fn next(&mut self) -> Result<Option<RawRecord>, ReadError> {
         let next = if self.ended { Ok(None) } else { self.read() };
         self.ended |= !matches!(next, Ok(Some(_)));
         next
     }
 
-    fn read(&mut self) -> Result<Option<Raw>, Broken> {
+    fn read(&mut self) -> Result<Option<RawRecord>, ReadError> {
         loop {
-            if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_left == 0) {
-                let is = chunk.hasher.finalize();
-                if chunk.checksum != 0 && chunk.checksum != is {
-                    return Err(Broken::Checksum { told: chunk.checksum, is });
+            if let Some(chunk) = self.chunk.take_if(|chunk| chunk.n_remaining == 0) {
+                let computed = chunk.hasher.finalize();
+                if chunk.checksum != 0 && chunk.checksum != computed {
+                    return Err(ReadError::Checksum { reported: chunk.checksum, computed });
                 }
                 self.skip(chunk.n_padding)?;
             }
             let [opcode, length @ ..] = self.array::<HEAD_BYTES>()?;
             let n_bytes = u64::from_le_bytes(length);
             if let Some(chunk) = &mut self.chunk {
-                let n_whole = n_bytes.saturating_add(HEAD_BYTES as u64);
-                chunk.n_left = chunk.n_left.checked_sub(n_whole).ok_or(Broken::BeyondChunk)?;
+                let n_total = n_bytes.saturating_add(HEAD_BYTES as u64);
+                chunk.n_remaining = chunk.n_remaining.checked_sub(n_total).ok_or(ReadError::ExceedsChunk)?;
                 let bytes = bytes_of(&mut self.input, n_bytes)?;
                 chunk.hasher.update(&[opcode]);
                 chunk.hasher.update(&length);
                 chunk.hasher.update(&bytes);
-                return Ok(Some(Raw { opcode, bytes }));
+                return Ok(Some(RawRecord { opcode, bytes }));
             }
             match opcode {
                 CHUNK => self.chunk = Some(self.begin_chunk(n_bytes)?),
                 FOOTER => return Ok(None),
-                _ => return Ok(Some(Raw { opcode, bytes: bytes_of(&mut self.input, n_bytes)? })),
+                _ => return Ok(Some(RawRecord { opcode, bytes: bytes_of(&mut self.input, n_bytes)? })),
             }
         }
     }
 
-    fn begin_chunk(&mut self, n_bytes: u64) -> Result<Chunk, Broken> {
+    fn begin_chunk(&mut self, n_bytes: u64) -> Result<Chunk, ReadError> {
         let head = self.array::<CHUNK_HEAD_BYTES>()?;
         let four = |at: usize| u32::from_le_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
         let (checksum, n_name) = (four(24), u64::from(four(28)));
         let name = bytes_of(&mut self.input, n_name)?;
-        let n_left = u64::from_le_bytes(self.array()?);
+        let n_remaining = u64::from_le_bytes(self.array()?);
         if !name.is_empty() {
-            return Err(Broken::Compressed { by: String::from_utf8_lossy(&name).chars().take(20).collect() });
+            return Err(ReadError::Compressed {
+                compression: String::from_utf8_lossy(&name).chars().take(20).collect(),
+            });
         }
         let n_head = CHUNK_HEAD_BYTES as u64 + 8;
-        let n_padding = n_bytes.checked_sub(n_head).and_then(|n| n.checked_sub(n_left)).ok_or(Broken::BeyondChunk)?;
-        Ok(Chunk { n_left, n_padding, checksum, hasher: Hasher::new() })
+        let n_padding =
+            n_bytes.checked_sub(n_head).and_then(|n| n.checked_sub(n_remaining)).ok_or(ReadError::ExceedsChunk)?;
+        Ok(Chunk { n_remaining, n_padding, checksum, hasher: Hasher::new() })
     }
 
-    fn array<const N: usize>(&mut self) -> Result<[u8; N], Broken> {
+    fn array<const N: usize>(&mut self) -> Result<[u8; N], ReadError> {
         let mut bytes = [0; N];
         self.input.read_exact(&mut bytes).map_err(|error| match error.kind() {
-            std::io::ErrorKind::UnexpectedEof => Broken::CutOff,
+            std::io::ErrorKind::UnexpectedEof => ReadError::Truncated,
             _ => error.into(),
         })?;
         Ok(bytes)
     }
 
-    fn skip(&mut self, n_bytes: u64) -> Result<(), Broken> {
+    fn skip(&mut self, n_bytes: u64) -> Result<(), ReadError> {
         let n_skipped = std::io::copy(&mut self.input.by_ref().take(n_bytes), &mut std::io::sink())?;
-        if n_skipped == n_bytes { Ok(()) } else { Err(Broken::CutOff) }
+        if n_skipped == n_bytes { Ok(()) } else { Err(ReadError::Truncated) }
     }
 }
 
 /// So many bytes; memory grows with those that come.
-fn bytes_of(input: &mut impl Read, n_bytes: u64) -> Result<Vec<u8>, Broken> {
+fn bytes_of(input: &mut impl Read, n_bytes: u64) -> Result<Vec<u8>, ReadError> {
     if n_bytes > MAX_RECORD_BYTES {
-        return Err(Broken::TooLong { n_bytes });
+        return Err(ReadError::TooLong { n_bytes });
     }
-    let n_ahead = usize::try_from(n_bytes.min(MAX_AHEAD_BYTES)).expect("a megabyte");
-    let mut bytes = Vec::with_capacity(n_ahead);
+    let n_preallocated = usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("a megabyte");
+    let mut bytes = Vec::with_capacity(n_preallocated);
     input.take(n_bytes).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 == n_bytes { Ok(bytes) } else { Err(Broken::CutOff) }
+    if bytes.len() as u64 == n_bytes { Ok(bytes) } else { Err(ReadError::Truncated) }
 }
 
 #[cfg(test)]
@@ -150,9 +153,10 @@ mod tests {
     }
 
     /// A chunk of records that says so much about their length, with three bytes behind them.
-    fn chunk(records: &[u8], told_bytes: u64, checksum: u32, compression: &str) -> Vec<u8> {
+    fn chunk(records: &[u8], reported_bytes: u64, checksum: u32, compression: &str) -> Vec<u8> {
         let n_name = u32::try_from(compression.len()).expect("short").to_le_bytes();
-        let head = [&[0; 24][..], &checksum.to_le_bytes(), &n_name, compression.as_bytes(), &told_bytes.to_le_bytes()];
+        let head =
+            [&[0; 24][..], &checksum.to_le_bytes(), &n_name, compression.as_bytes(), &reported_bytes.to_le_bytes()];
         record(CHUNK, &[&head.concat()[..], records, &[9; 3]].concat())
     }
 
@@ -161,34 +165,38 @@ mod tests {
         let mut all = Vec::new();
         loop {
             match records.next() {
-                Ok(Some(Raw { opcode, bytes })) => all.push((opcode, bytes)),
+                Ok(Some(RawRecord { opcode, bytes })) => all.push((opcode, bytes)),
                 Ok(None) => return (all, None),
-                Err(broken) => {
+                Err(read_error) => {
                     assert!(matches!(records.next(), Ok(None)), "nothing after an error");
-                    return (all, Some(broken.to_string()));
+                    return (all, Some(read_error.to_string()));
                 }
             }
         }
     }
 
     #[test]
-    fn records_in_and_between_chunks_come_in_order() {
+    fn records_inside_and_outside_chunks_are_in_order() {
         let inner = [record(5, b"five"), record(4, b"")].concat();
         let n_inner = inner.len() as u64;
         let checksum = crc32fast::hash(&inner);
         let footer = record(FOOTER, &[0; 20]);
-        let whole = [record(1, b"one"), chunk(&inner, n_inner, checksum, ""), record(7, b"seven"), footer].concat();
+        let file = [record(1, b"one"), chunk(&inner, n_inner, checksum, ""), record(7, b"seven"), footer].concat();
         let expected: Vec<(u8, Vec<u8>)> =
             [(1, "one"), (5, "five"), (4, ""), (7, "seven")].map(|(opcode, text)| (opcode, text.into())).into();
-        assert_eq!(read(&whole), (expected.clone(), None));
-        for n_bytes in 0..whole.len() - 28 {
-            let (before, told) = read(&whole[..n_bytes]);
-            assert_eq!((&before[..], told.as_deref()), (&expected[..before.len()], Some("is cut off")), "{n_bytes}");
+        assert_eq!(read(&file), (expected.clone(), None));
+        for n_bytes in 0..file.len() - 28 {
+            let (before, reported) = read(&file[..n_bytes]);
+            assert_eq!(
+                (&before[..], reported.as_deref()),
+                (&expected[..before.len()], Some("is cut off")),
+                "{n_bytes}"
+            );
         }
     }
 
     #[test]
-    fn lengths_and_checksums_that_contradict_are_told() {
+    fn inconsistent_lengths_and_checksums_are_errors() {
         let inner = record(5, b"five");
         let n_inner = inner.len() as u64;
         for (bytes, reason) in [
@@ -200,8 +208,8 @@ mod tests {
             ([&[3][..], &u64::MAX.to_le_bytes()].concat(), "a record of 18446744073709551615 bytes"),
             ([&[3][..], &(400_u64 << 20).to_le_bytes()].concat(), "is cut off"),
         ] {
-            let told = read(&[bytes, record(1, b"one")].concat()).1.expect(reason);
-            assert!(told.contains(reason), "{told}, not {reason}");
+            let reported = read(&[bytes, record(1, b"one")].concat()).1.expect(reason);
+            assert!(reported.contains(reason), "{reported}, not {reason}");
         }
     }
 }

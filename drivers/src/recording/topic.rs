@@ -108,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_topic_is_found_by_its_name() {
+    fn topics_round_trip_through_names() {
         let camera = || "wrist".to_owned();
         for topic in [
             Topic::Color(camera()),

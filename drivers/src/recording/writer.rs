@@ -5,7 +5,7 @@
 use super::reader::Recording;
 use super::topic::{Encoding, JOINT_NAMES, Topic};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
-use crate::{Error, Image, Kept, PixelFormat, Sample, Source, TruthImage};
+use crate::{Error, Image, PixelFormat, RecordedSpan, Sample, Source, TruthImage};
 use kinematics::{Intrinsics, Stamp};
 use mcap::McapError;
 use mcap::records::MessageHeader;
@@ -19,7 +19,7 @@ const FLUSH_NANOS: i64 = 1_000_000_000;
 
 /// What a recording says about its rig before the first sample.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct About<'a> {
+pub struct RecordingMetadata<'a> {
     /// Files kept inside, by name: the settled rig file, the robot's description.
     pub files: &'a [(&'a str, &'a [u8])],
     /// Cameras and their lenses.
@@ -44,7 +44,7 @@ pub struct Recorder {
     n_samples: u64,
     stamps: Option<[Stamp; 2]>,
     /// What the closed chunks hold.
-    kept: Kept,
+    recorded: RecordedSpan,
     open_bytes: u64,
     open_since: Option<Stamp>,
 }
@@ -54,27 +54,28 @@ impl<W: Write + Seek + Send> Sink for W {}
 
 impl Recorder {
     /// Begins a recording in a new file; an existing one is refused, for it may be the very recording that is replayed.
-    pub fn create(path: &Path, about: &About<'_>) -> Result<Self, Error> {
+    pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
             _ => Error::Open { path: path.to_owned(), source },
         })?;
-        let recorder = Self::to(Box::new(BufWriter::new(file)), path, about);
+        let recorder = Self::to(Box::new(BufWriter::new(file)), path, recording_metadata);
         if recorder.is_err() {
             remove_stub(path);
         }
         recorder
     }
 
-    fn to(sink: Box<dyn Sink>, path: &Path, about: &About<'_>) -> Result<Self, Error> {
-        let recorder = |error| Error::Record { path: path.to_owned(), kept: Kept::default(), source: cause(error) };
+    fn to(sink: Box<dyn Sink>, path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
+        let recorder =
+            |error| Error::Record { path: path.to_owned(), recorded: RecordedSpan::default(), source: io_error(error) };
         let options = mcap::WriteOptions::new()
             .profile("fieldrig")
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
             .disable_seeking(true);
         let mut mcap = options.create(sink).map_err(recorder)?;
-        for (name, data) in about.files {
+        for (name, data) in recording_metadata.files {
             let attachment = mcap::Attachment {
                 log_time: 0,
                 create_time: 0,
@@ -89,16 +90,16 @@ impl Recorder {
             path: path.to_owned(),
             mcap: Some(mcap),
             channels: BTreeMap::new(),
-            cameras: about
+            cameras: recording_metadata
                 .cameras
                 .iter()
                 .map(|(name, intrinsics)| ((*name).to_owned(), (*intrinsics).clone()))
                 .collect(),
-            joint_names: about.joint_names.join(","),
+            joint_names: recording_metadata.joint_names.join(","),
             n_messages: 0,
             n_samples: 0,
             stamps: None,
-            kept: Kept::default(),
+            recorded: RecordedSpan::default(),
             open_bytes: 0,
             open_since: None,
         })
@@ -106,21 +107,21 @@ impl Recorder {
 
     /// Appends one sample.
     pub fn write(&mut self, sample: &Sample) -> Result<(), Error> {
-        self.try_write(sample).map_err(|error| self.broken(error))
+        self.try_write(sample).map_err(|error| self.fail(error))
     }
 
     /// Writes the index that viewers seek by, and tells whether everything could be written.
     ///
     /// Gives what was kept: everything.
-    pub fn finish(mut self) -> Result<Kept, Error> {
+    pub fn finish(mut self) -> Result<RecordedSpan, Error> {
         let closed = self.close_chunk().and_then(|()| self.mcap()?.finish().map(drop));
-        closed.map_err(|error| self.broken(error))?;
+        closed.map_err(|error| self.fail(error))?;
         let flushed = self.mcap.take().map_or(Ok(()), |mcap| mcap.into_inner().flush());
-        flushed.map_err(|error| self.broken(McapError::Io(error)))?;
-        if self.kept.n_samples == 0 {
+        flushed.map_err(|error| self.fail(McapError::Io(error)))?;
+        if self.recorded.n_samples == 0 {
             remove_stub(&self.path);
         }
-        Ok(self.kept)
+        Ok(self.recorded)
     }
 
     fn mcap(&mut self) -> mcap::McapResult<&mut mcap::Writer<Box<dyn Sink>>> {
@@ -128,21 +129,21 @@ impl Recorder {
     }
 
     /// Closes the file after a failure; the error reports how much of it can be read. A file without samples is removed.
-    fn broken(&mut self, error: McapError) -> Error {
+    fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
             // The truncated chunk also holds some samples, so the readable samples are counted.
-            self.kept = readable(&self.path);
-            if self.kept.n_samples == 0 {
+            self.recorded = readable(&self.path);
+            if self.recorded.n_samples == 0 {
                 remove_stub(&self.path);
             }
         }
-        Error::Record { path: self.path.clone(), kept: self.kept, source: cause(error) }
+        Error::Record { path: self.path.clone(), recorded: self.recorded, source: io_error(error) }
     }
 
     /// Brings everything written so far into the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
-        self.kept = Kept { n_samples: self.n_samples, seconds: length_secs(self.stamps) };
+        self.recorded = RecordedSpan { n_samples: self.n_samples, seconds: duration_secs(self.stamps) };
         self.open_bytes = 0;
         Ok(())
     }
@@ -155,13 +156,13 @@ impl Recorder {
         }
         for (camera, intrinsics) in std::mem::take(&mut self.cameras) {
             let message = foxglove::encode_calibration(&camera, stamp, &intrinsics);
-            self.put(Topic::Calibration(camera), descriptor::CAMERA_CALIBRATION, stamp, &message)?;
+            self.write_message(Topic::Calibration(camera), descriptor::CAMERA_CALIBRATION, stamp, &message)?;
         }
         match sample {
             Sample::Image(image) => {
                 let camera = image.camera.to_string();
                 let topic = if image.is_depth() { Topic::Depth(camera) } else { Topic::Color(camera) };
-                self.put_image(topic, image)?;
+                self.write_image(topic, image)?;
             }
             Sample::Joints(state) => {
                 let channel = self.joints_channel()?;
@@ -169,17 +170,17 @@ impl Recorder {
             }
             Sample::Base(pose) => {
                 let message = foxglove::encode_transform("world", "base", stamp, &pose.world_from_base);
-                self.put(Topic::Base, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+                self.write_message(Topic::Base, descriptor::FRAME_TRANSFORM, stamp, &message)?;
             }
             Sample::BaseTruth(pose) => {
                 let message = foxglove::encode_transform("world", "base_truth", stamp, &pose.world_from_base);
-                self.put(Topic::TrueBase, descriptor::FRAME_TRANSFORM, stamp, &message)?;
+                self.write_message(Topic::TrueBase, descriptor::FRAME_TRANSFORM, stamp, &message)?;
             }
             Sample::Range(scan) => {
                 let message = point_cloud::encode(scan);
-                self.put(Topic::Range(scan.scanner.to_string()), descriptor::POINT_CLOUD, stamp, &message)?;
+                self.write_message(Topic::Range(scan.scanner.to_string()), descriptor::POINT_CLOUD, stamp, &message)?;
             }
-            Sample::Truth(truth) => self.put_truth(truth)?,
+            Sample::Truth(truth) => self.write_truth(truth)?,
         }
         self.n_samples += 1;
         self.stamps = Some(with_stamp(self.stamps, stamp));
@@ -191,30 +192,36 @@ impl Recorder {
         Ok(())
     }
 
-    fn put_truth(&mut self, truth: &TruthImage) -> mcap::McapResult<()> {
+    fn write_truth(&mut self, truth: &TruthImage) -> mcap::McapResult<()> {
         let camera = || truth.image.camera.to_string();
         let stamp = truth.image.stamp;
-        self.put_image(Topic::TrueColor(camera()), &truth.image)?;
+        self.write_image(Topic::TrueColor(camera()), &truth.image)?;
         if !truth.depth_m.is_empty() {
             let message = foxglove::encode_depth_m(&camera(), stamp, truth.image.size_px, &truth.depth_m);
-            self.put(Topic::TrueDepth(camera()), descriptor::RAW_IMAGE, stamp, &message)?;
+            self.write_message(Topic::TrueDepth(camera()), descriptor::RAW_IMAGE, stamp, &message)?;
         }
         let message = foxglove::encode_true_pose(&camera(), stamp, &truth.world_from_camera, truth.psnr_ceiling);
-        self.put(Topic::TruePose(camera()), descriptor::FRAME_TRANSFORM, stamp, &message)
+        self.write_message(Topic::TruePose(camera()), descriptor::FRAME_TRANSFORM, stamp, &message)
     }
 
-    fn put_image(&mut self, topic: Topic, image: &Image) -> mcap::McapResult<()> {
+    fn write_image(&mut self, topic: Topic, image: &Image) -> mcap::McapResult<()> {
         let encoding = Encoding::protobuf(foxglove::schema_of(image.format));
         let channel = match image.format {
-            PixelFormat::DepthU16 { metres_per_count } => {
-                self.channel(topic, encoding, "metres_per_count", &metres_per_count.to_string())?
+            PixelFormat::DepthU16 { meters_per_count } => {
+                self.channel(topic, encoding, "meters_per_count", &meters_per_count.to_string())?
             }
             _ => self.channel(topic, encoding, "", "")?,
         };
         self.append(channel, image.stamp, &foxglove::encode_image(image))
     }
 
-    fn put(&mut self, topic: Topic, schema: descriptor::Schema, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
+    fn write_message(
+        &mut self,
+        topic: Topic,
+        schema: descriptor::Schema,
+        stamp: Stamp,
+        message: &[u8],
+    ) -> mcap::McapResult<()> {
         let channel = self.channel(topic, Encoding::protobuf(schema), "", "")?;
         self.append(channel, stamp, message)
     }
@@ -258,7 +265,7 @@ impl std::fmt::Debug for Recorder {
 }
 
 /// Counts what can be read of a truncated recording.
-fn readable(path: &Path) -> Kept {
+fn readable(path: &Path) -> RecordedSpan {
     let (mut n_samples, mut stamps) = (0, None);
     if let Ok(mut recording) = Recording::open(path) {
         while let Ok(Some(sample)) = recording.next_sample() {
@@ -266,7 +273,7 @@ fn readable(path: &Path) -> Kept {
             stamps = Some(with_stamp(stamps, sample.stamp()));
         }
     }
-    Kept { n_samples, seconds: length_secs(stamps) }
+    RecordedSpan { n_samples, seconds: duration_secs(stamps) }
 }
 
 /// The range of stamps extended by one stamp.
@@ -275,12 +282,12 @@ fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
     [first.min(stamp), last.max(stamp)]
 }
 
-fn length_secs(range: Option<[Stamp; 2]>) -> f64 {
+fn duration_secs(range: Option<[Stamp; 2]>) -> f64 {
     range.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9)
 }
 
 /// The file's own error where there is one: the rest is the format's, and says less.
-fn cause(error: McapError) -> std::io::Error {
+fn io_error(error: McapError) -> std::io::Error {
     match error {
         McapError::Io(io) => io,
         other => std::io::Error::other(other),
@@ -312,18 +319,18 @@ mod tests {
     use std::io::{Error as IoError, SeekFrom};
 
     /// A file on a disk that is full after some bytes.
-    struct Full {
+    struct FullDisk {
         file: File,
-        left: usize,
+        remaining: usize,
     }
 
-    impl Write for Full {
+    impl Write for FullDisk {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-            let n_bytes = bytes.len().min(self.left);
+            let n_bytes = bytes.len().min(self.remaining);
             if n_bytes == 0 && !bytes.is_empty() {
                 return Err(IoError::from(ErrorKind::StorageFull));
             }
-            self.left -= n_bytes;
+            self.remaining -= n_bytes;
             self.file.write(&bytes[..n_bytes])
         }
 
@@ -332,29 +339,30 @@ mod tests {
         }
     }
 
-    impl Seek for Full {
+    impl Seek for FullDisk {
         fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
             self.file.seek(to)
         }
     }
 
     #[test]
-    fn a_full_disk_is_told_and_what_was_written_before_stays_readable() {
+    fn full_disk_is_error_and_written_samples_stay_readable() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let file = File::create(&path).expect("a new file");
-        let sink = Box::new(BufWriter::new(Full { file, left: 300_000 }));
-        let mut recorder = Recorder::to(sink, &path, &About::default()).expect("room for the header");
+        let sink = Box::new(BufWriter::new(FullDisk { file, remaining: 300_000 }));
+        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default()).expect("room for the header");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
             Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
         };
-        let told = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        let Error::Record { kept, .. } = told else { panic!("{told}") };
-        let sentence = format!("run.mcap\", which keeps the first {:.1} s ({} samples)", kept.seconds, kept.n_samples);
-        assert!(told.to_string().ends_with(&sentence), "{told}");
-        let cause = std::error::Error::source(&told).map(ToString::to_string);
-        assert!(cause.is_some_and(|cause| cause.contains("no storage space")), "{told:?}");
+        let error = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
+        let Error::Record { recorded, .. } = error else { panic!("{error}") };
+        let expected_end =
+            format!("run.mcap\", which keeps the first {:.1} s ({} samples)", recorded.seconds, recorded.n_samples);
+        assert!(error.to_string().ends_with(&expected_end), "{error}");
+        let io_error = std::error::Error::source(&error).map(ToString::to_string);
+        assert!(io_error.is_some_and(|io_error| io_error.contains("no storage space")), "{error:?}");
         assert!(recorder.write(&reading(0)).is_err(), "it stays failed");
         drop(recorder);
         let mut recording = Recording::open(&path).expect("a recording");
@@ -364,8 +372,11 @@ mod tests {
             n_samples += 1;
         }
         // Samples of the truncated chunk count too: the error reports what can be read.
-        assert!(kept.n_samples > 1000 && n_samples.unsigned_abs() == kept.n_samples, "{n_samples} of {kept:?}");
-        assert!((kept.seconds - 1e-3 * (kept.n_samples - 1) as f64).abs() < 1e-9, "{kept:?}");
+        assert!(
+            recorded.n_samples > 1000 && n_samples.unsigned_abs() == recorded.n_samples,
+            "{n_samples} of {recorded:?}"
+        );
+        assert!((recorded.seconds - 1e-3 * (recorded.n_samples - 1) as f64).abs() < 1e-9, "{recorded:?}");
         assert!(recording.damage().is_some());
     }
 
@@ -373,16 +384,16 @@ mod tests {
     fn a_recording_without_samples_leaves_no_file() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
-        let recorder = Recorder::create(&path, &About::default()).expect("a new file");
-        assert_eq!(recorder.finish().expect("room on the disk"), Kept::default());
+        let recorder = Recorder::create(&path, &RecordingMetadata::default()).expect("a new file");
+        assert_eq!(recorder.finish().expect("room on the disk"), RecordedSpan::default());
         assert!(!path.exists());
-        let sink = Box::new(Full { file: File::create(&path).expect("a new file"), left: 1000 });
-        let mut recorder = Recorder::to(sink, &path, &About::default()).expect("room for the header");
+        let sink = Box::new(FullDisk { file: File::create(&path).expect("a new file"), remaining: 1000 });
+        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default()).expect("room for the header");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
             Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
         };
-        let told = (0..2000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        assert!(told.to_string().ends_with("nothing of it is kept") && !path.exists(), "{told}");
+        let error = (0..2000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
+        assert!(error.to_string().ends_with("nothing of it is kept") && !path.exists(), "{error}");
     }
 }

@@ -1,19 +1,19 @@
 //! Tags in images, found in a thread of its own.
 
 use crate::{Error, Image};
-use apriltag::families::Family as Code;
+use apriltag::families::Family as ApriltagFamily;
 use apriltag::{Detector, Image as Gray};
 use kinematics::Stamp;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
 /// Wrong cells that are mended. With two or more, noise is taken for a tag now and then (Olson 2011, section V.B).
-const MENDED_CELLS: usize = 1;
+const CORRECTED_BITS: usize = 1;
 /// Mean difference in grey between the cells of a tag and the threshold of its code below which it is none. AprilTag's authors call
 /// less than 10 noise; a tag that is hardly seen is not worth its corners.
 const MIN_MARGIN: f32 = 20.0;
 /// From this many pixels on, squares are looked for at half the resolution; corners are refined at the whole.
-const MANY_PX: usize = 1_000_000;
+const DECIMATE_ABOVE_PX: usize = 1_000_000;
 
 /// The detector reads beyond images smaller than a few of its tiles of 4 pixels; none has room for a tag.
 const MIN_SIDE_PX: usize = 16;
@@ -48,7 +48,7 @@ impl Family {
 
 /// A tag in an image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Spotted {
+pub struct TagDetection {
     /// Its number in the family.
     pub id: u32,
     /// Where its corners are seen, pixels: lower left, lower right, upper right, upper left of the tag as it is printed.
@@ -57,97 +57,97 @@ pub struct Spotted {
 
 /// The tags of an image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Sighting {
+pub struct TagDetections {
     /// The camera.
     pub camera: Arc<str>,
     /// The device's stamp of the image.
     pub stamp: Stamp,
     /// What is in it, in no order; numbers may come twice where somebody printed a tag twice.
-    pub tags: Vec<Spotted>,
+    pub tags: Vec<TagDetection>,
 }
 
 /// Looks for tags, one image at a time.
 #[derive(Debug)]
-pub struct Spotter {
+pub struct TagDetector {
     images: SyncSender<Image>,
-    sightings: Receiver<Result<Sighting, Error>>,
-    n_at_work: usize,
+    detections: Receiver<Result<TagDetections, Error>>,
+    n_pending: usize,
 }
 
-impl Spotter {
+impl TagDetector {
     /// Starts the thread, which ends with this.
     ///
     /// Fails where the system gives no thread.
     pub fn start(family: Family) -> Result<Self, Error> {
         // No image waits in the channel: a thread that is busy takes none.
-        let (images, to_look_at) = sync_channel(0);
+        let (images, incoming) = sync_channel(0);
         // The thread goes on looking while the last sighting waits to be taken.
-        let (tell, sightings) = sync_channel(1);
-        let look_at_all = move || {
+        let (sender, detections) = sync_channel(1);
+        let detect_all = move || {
             // It cannot go from thread to thread.
             let mut detector = detector(family);
-            while let Ok(image) = to_look_at.recv() {
-                if tell.send(look(&mut detector, &image)).is_err() {
+            while let Ok(image) = incoming.recv() {
+                if sender.send(detect(&mut detector, &image)).is_err() {
                     return;
                 }
             }
         };
-        let thread = std::thread::Builder::new().name("tags".to_owned()).spawn(look_at_all);
+        let thread = std::thread::Builder::new().name("tags".to_owned()).spawn(detect_all);
         thread.map_err(|source| Error::Thread { device: "tags".to_owned(), source })?;
-        Ok(Self { images, sightings, n_at_work: 0 })
+        Ok(Self { images, detections, n_pending: 0 })
     }
 
     /// Has a colour image looked at; false where the thread is busy with another one.
-    pub fn look(&mut self, image: Image) -> bool {
-        let is_taken = self.images.try_send(image).is_ok();
-        self.n_at_work += usize::from(is_taken);
-        is_taken
+    pub fn detect(&mut self, image: Image) -> bool {
+        let is_accepted = self.images.try_send(image).is_ok();
+        self.n_pending += usize::from(is_accepted);
+        is_accepted
     }
 
     /// Looks at a colour image, whatever time that takes, and at those before it.
-    pub fn look_now(&mut self, image: Image) -> Vec<Result<Sighting, Error>> {
+    pub fn detect_blocking(&mut self, image: Image) -> Vec<Result<TagDetections, Error>> {
         // The thread ends after this only.
-        let is_taken = self.images.send(image).is_ok();
-        self.n_at_work += usize::from(is_taken);
+        let is_accepted = self.images.send(image).is_ok();
+        self.n_pending += usize::from(is_accepted);
         self.finish()
     }
 
     /// What was found since the last call; an image that cannot be read is an error.
-    pub fn found(&mut self) -> Vec<Result<Sighting, Error>> {
-        let found: Vec<_> = self.sightings.try_iter().collect();
-        self.n_at_work -= found.len();
-        found
+    pub fn new_detections(&mut self) -> Vec<Result<TagDetections, Error>> {
+        let new_detections: Vec<_> = self.detections.try_iter().collect();
+        self.n_pending -= new_detections.len();
+        new_detections
     }
 
     /// The same, once everything was looked at.
-    pub fn finish(&mut self) -> Vec<Result<Sighting, Error>> {
-        let found: Vec<_> = self.sightings.iter().take(self.n_at_work).collect();
-        self.n_at_work = 0;
-        found
+    pub fn finish(&mut self) -> Vec<Result<TagDetections, Error>> {
+        let new_detections: Vec<_> = self.detections.iter().take(self.n_pending).collect();
+        self.n_pending = 0;
+        new_detections
     }
 }
 
 fn detector(family: Family) -> Detector {
     let code = match family {
-        Family::Tag36h11 => Code::tag_36h11(),
-        Family::Tag25h9 => Code::tag_25h9(),
-        Family::Tag16h5 => Code::tag_16h5(),
-        Family::Standard41h12 => Code::tag_standard_41h12(),
-        Family::Standard52h13 => Code::tag_standard_52h13(),
+        Family::Tag36h11 => ApriltagFamily::tag_36h11(),
+        Family::Tag25h9 => ApriltagFamily::tag_25h9(),
+        Family::Tag16h5 => ApriltagFamily::tag_16h5(),
+        Family::Standard41h12 => ApriltagFamily::tag_standard_41h12(),
+        Family::Standard52h13 => ApriltagFamily::tag_standard_52h13(),
     };
-    let detector = Detector::builder().add_family_bits(code, MENDED_CELLS).build();
+    let detector = Detector::builder().add_family_bits(code, CORRECTED_BITS).build();
     let mut detector = detector.expect("it has a family");
     detector.set_thread_number(1);
     detector
 }
 
 /// All tags in an image.
-fn look(detector: &mut Detector, image: &Image) -> Result<Sighting, Error> {
+fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error> {
     let rgb = image.decode_rgb()?;
     let [width, height] = image.size_px.map(|side| side as usize);
-    let sighting = |tags| Sighting { camera: Arc::clone(&image.camera), stamp: image.stamp, tags };
+    let tag_detections = |tags| TagDetections { camera: Arc::clone(&image.camera), stamp: image.stamp, tags };
     if width.min(height) < MIN_SIDE_PX {
-        return Ok(sighting(Vec::new()));
+        return Ok(tag_detections(Vec::new()));
     }
     let mut gray = Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
     for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
@@ -155,13 +155,13 @@ fn look(detector: &mut Detector, image: &Image) -> Result<Sighting, Error> {
         let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
         *gray = parts.to_le_bytes()[1];
     }
-    detector.set_decimation(if width * height < MANY_PX { 1.0 } else { 2.0 });
-    let found = detector.detect(&gray);
+    detector.set_decimation(if width * height < DECIMATE_ABOVE_PX { 1.0 } else { 2.0 });
+    let new_detections = detector.detect(&gray);
     let is_clear = |tag: &&apriltag::Detection| tag.decision_margin() >= MIN_MARGIN;
-    let spotted =
-        |tag: &apriltag::Detection| Some(Spotted { id: tag.id().try_into().ok()?, corners_px: tag.corners() });
-    let tags = found.iter().filter(is_clear).filter_map(spotted);
-    Ok(sighting(tags.collect()))
+    let detection =
+        |tag: &apriltag::Detection| Some(TagDetection { id: tag.id().try_into().ok()?, corners_px: tag.corners() });
+    let tags = new_detections.iter().filter(is_clear).filter_map(detection);
+    Ok(tag_detections(tags.collect()))
 }
 
 #[cfg(test)]
@@ -176,7 +176,7 @@ mod tests {
     }
 
     /// The corners of four numbers each in brackets, line by line.
-    fn truth(text: &str) -> Vec<[[f64; 2]; 4]> {
+    fn parse_annotations(text: &str) -> Vec<[[f64; 2]; 4]> {
         let corner = |text: &str| {
             let (x, y) = text.split_once(')')?.0.split_once(' ')?;
             Some([x.parse().ok()?, y.parse().ok()?])
@@ -186,31 +186,32 @@ mod tests {
     }
 
     #[test]
-    fn tags_of_a_photo_are_where_they_were_marked() {
+    fn tags_in_photo_match_annotations() {
         /// The marks are the detector's own of an earlier version, with other settings.
         const NEAR_PX: f64 = 1.5;
         let Some(folder) = test_data::folder("apriltag") else { return };
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();
         let photo = image([799, 533], PixelFormat::Jpeg, read("33369213973_9d9bb4cc96_c.jpg"));
-        let marked = truth(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());
-        assert_eq!(marked.len(), 12);
-        let mut spotter = Spotter::start(Family::Tag36h11).unwrap();
-        let sightings = spotter.look_now(photo);
-        let sighting = sightings[0].as_ref().unwrap();
-        assert_eq!((&*sighting.camera, sighting.stamp), ("wrist", Stamp(5)));
+        let annotated = parse_annotations(&String::from_utf8(read("33369213973_9d9bb4cc96_c.txt")).unwrap());
+        assert_eq!(annotated.len(), 12);
+        let mut spotter = TagDetector::start(Family::Tag36h11).unwrap();
+        let detections = spotter.detect_blocking(photo);
+        let tag_detections = detections[0].as_ref().unwrap();
+        assert_eq!((&*tag_detections.camera, tag_detections.stamp), ("wrist", Stamp(5)));
         let is_near = |a: [f64; 2], b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]) < NEAR_PX;
-        let is_found = |marked: &&[[f64; 2]; 4]| {
-            let is_it =
-                |tag: &&Spotted| tag.corners_px.iter().all(|seen| marked.iter().any(|mark| is_near(*seen, mark)));
-            sighting.tags.iter().find(is_it).is_some_and(|tag| tag.id == 0)
+        let is_found = |annotated: &&[[f64; 2]; 4]| {
+            let matches_annotation = |tag: &&TagDetection| {
+                tag.corners_px.iter().all(|detected| annotated.iter().any(|corner| is_near(*detected, corner)))
+            };
+            tag_detections.tags.iter().find(matches_annotation).is_some_and(|tag| tag.id == 0)
         };
-        let n_found = marked.iter().filter(is_found).count();
-        assert!(n_found >= 10, "{n_found} of 12: {:?}", sighting.tags);
+        let n_found = annotated.iter().filter(is_found).count();
+        assert!(n_found >= 10, "{n_found} of 12: {:?}", tag_detections.tags);
     }
 
     #[test]
-    fn no_tag_is_seen_where_none_is_and_a_broken_image_is_an_error() {
-        let mut spotter = Spotter::start(Family::Tag36h11).unwrap();
+    fn noise_yields_no_tags_and_broken_image_is_error() {
+        let mut spotter = TagDetector::start(Family::Tag36h11).unwrap();
         let mut random = 3_u32;
         let mut noise = |n: usize| -> Vec<u8> {
             let next = |_| {
@@ -222,10 +223,10 @@ mod tests {
         let odd = (1..40_u32).flat_map(|side| [[side, 41 - side], [side, 2000], [999, side]]);
         for size_px in odd.chain([[320, 240], [1201, 901]]) {
             let pixels = noise((size_px[0] * size_px[1]) as usize);
-            let sightings = spotter.look_now(image(size_px, PixelFormat::Gray8, pixels));
-            assert_eq!(sightings[0].as_ref().unwrap().tags, [], "{size_px:?}");
+            let detections = spotter.detect_blocking(image(size_px, PixelFormat::Gray8, pixels));
+            assert_eq!(detections[0].as_ref().unwrap().tags, [], "{size_px:?}");
         }
-        assert!(spotter.look_now(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0].is_err());
-        assert!(spotter.found().is_empty() && spotter.finish().is_empty());
+        assert!(spotter.detect_blocking(image([320, 240], PixelFormat::Jpeg, vec![1, 2, 3]))[0].is_err());
+        assert!(spotter.new_detections().is_empty() && spotter.finish().is_empty());
     }
 }

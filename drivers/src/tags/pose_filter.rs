@@ -5,19 +5,19 @@ use nalgebra::{Matrix6, Vector6};
 
 /// A pose this far from the average, by the square of standard deviations, tells that it moved: once in 10 000 where it did not
 /// (chi-squared, 6 degrees of freedom).
-const MOVED: f64 = 27.86;
+const MAX_CHI_SQUARED: f64 = 27.86;
 /// What an average knows grows old at this rate a pose: errors of lenses and of what was measured by hand do not average out, so some
 /// 30 poses are enough.
-const AGEING: f64 = 0.97;
+const FORGETTING_FACTOR: f64 = 0.97;
 
 /// The average so far.
 #[derive(Clone, Debug, Default)]
-pub struct Steady {
+pub struct StationaryPoseFilter {
     /// The pose, and its covariance in its own axes: metres first, then radians.
     average: Option<(Transform, Matrix6<f64>)>,
 }
 
-impl Steady {
+impl StationaryPoseFilter {
     /// Takes the next pose with its covariance, which is of a small motion in the axes of what is there (metres first, then radians);
     /// comes back with the average since it last moved.
     pub fn push(&mut self, pose: &Transform, covariance: &Matrix6<f64>) -> Transform {
@@ -28,18 +28,18 @@ impl Steady {
 
     /// The average with another pose; `None` where that is of another place.
     fn merged(&self, pose: &Transform, covariance: &Matrix6<f64>) -> Option<(Transform, Matrix6<f64>)> {
-        let (average, known) = self.average.as_ref()?;
-        let known = known / AGEING;
-        let off = transform::log(&(average.inverse() * pose), 1.0);
-        let off = Vector6::from_iterator(off.linear_m_s.iter().chain(&off.angular_rad_s).copied());
-        let both = (known + covariance).try_inverse()?;
-        if (off.transpose() * both * off).x > MOVED {
+        let (average, average_covariance) = self.average.as_ref()?;
+        let average_covariance = average_covariance / FORGETTING_FACTOR;
+        let residual = transform::log(&(average.inverse() * pose), 1.0);
+        let residual = Vector6::from_iterator(residual.linear_m_s.iter().chain(&residual.angular_rad_s).copied());
+        let innovation_inverse = (average_covariance + covariance).try_inverse()?;
+        if (residual.transpose() * innovation_inverse * residual).x > MAX_CHI_SQUARED {
             return None;
         }
-        let gain = known * both;
-        let step = gain * off;
+        let gain = average_covariance * innovation_inverse;
+        let step = gain * residual;
         let twist = Twist { linear_m_s: step.fixed_rows::<3>(0).into(), angular_rad_s: step.fixed_rows::<3>(3).into() };
-        Some((average * transform::exp(&twist, 1.0), known - gain * known))
+        Some((average * transform::exp(&twist, 1.0), average_covariance - gain * average_covariance))
     }
 }
 
@@ -54,36 +54,36 @@ mod tests {
     }
 
     /// There and back by a millimetre and a milliradian.
-    fn noisy(place: &Transform, ix: usize) -> Transform {
+    fn with_noise(true_pose: &Transform, ix: usize) -> Transform {
         let by = if ix.is_multiple_of(2) { 1e-3 } else { -1e-3 };
-        place * Transform::new(Vector3::new(by, -by, by), Vector3::new(by, by, -by))
+        true_pose * Transform::new(Vector3::new(by, -by, by), Vector3::new(by, by, -by))
     }
 
     #[test]
-    fn noise_averages_out_and_a_motion_is_followed_at_once() {
-        let place = Transform::new(Vector3::new(1.0, -2.0, 0.1), Vector3::new(0.1, 0.2, -0.7));
-        let (mut steady, covariance) = (Steady::default(), covariance(1e-3, 1e-3));
-        let mut off = [0.0; 60];
-        for (ix, off) in off.iter_mut().enumerate() {
-            let average = steady.push(&noisy(&place, ix), &covariance);
-            *off = (average.inverse() * place).translation.vector.norm();
+    fn noise_averages_out_and_motion_is_followed() {
+        let true_pose = Transform::new(Vector3::new(1.0, -2.0, 0.1), Vector3::new(0.1, 0.2, -0.7));
+        let (mut steady, covariance) = (StationaryPoseFilter::default(), covariance(1e-3, 1e-3));
+        let mut residual = [0.0; 60];
+        for (ix, residual) in residual.iter_mut().enumerate() {
+            let average = steady.push(&with_noise(&true_pose, ix), &covariance);
+            *residual = (average.inverse() * true_pose).translation.vector.norm();
         }
-        assert!(off[0] > 1.7e-3 && off[59] < 1e-4, "{off:?}");
-        let elsewhere = place * Transform::translation(0.02, 0.0, 0.0);
-        assert_eq!(steady.push(&elsewhere, &covariance), elsewhere);
-        let slowly = |ix: usize| elsewhere * Transform::translation(0.0, 1e-4 * ix as f64, 0.0);
+        assert!(residual[0] > 1.7e-3 && residual[59] < 1e-4, "{residual:?}");
+        let moved_pose = true_pose * Transform::translation(0.02, 0.0, 0.0);
+        assert_eq!(steady.push(&moved_pose, &covariance), moved_pose);
+        let drifting = |ix: usize| moved_pose * Transform::translation(0.0, 1e-4 * ix as f64, 0.0);
         for ix in 0..100 {
-            let average = steady.push(&slowly(ix), &covariance);
-            let behind = (average.inverse() * slowly(ix)).translation.vector.norm();
-            assert!(behind < 3.5e-3, "{behind} m behind what creeps");
+            let average = steady.push(&drifting(ix), &covariance);
+            let lag_m = (average.inverse() * drifting(ix)).translation.vector.norm();
+            assert!(lag_m < 3.5e-3, "{lag_m} m behind what creeps");
         }
     }
 
     #[test]
-    fn what_is_known_better_counts_more() {
-        let (mut steady, there) = (Steady::default(), Transform::translation(2e-3, 0.0, 0.0));
+    fn lower_covariance_weighs_more() {
+        let (mut steady, second_pose) = (StationaryPoseFilter::default(), Transform::translation(2e-3, 0.0, 0.0));
         steady.push(&Transform::identity(), &covariance(1e-3, 1e-3));
-        let average = steady.push(&there, &covariance(3e-3, 1e-3));
-        assert!((average.translation.x - 2e-3 * 1.0 / (1.0 + 9.0 * AGEING)).abs() < 1e-5, "{average}");
+        let average = steady.push(&second_pose, &covariance(3e-3, 1e-3));
+        assert!((average.translation.x - 2e-3 * 1.0 / (1.0 + 9.0 * FORGETTING_FACTOR)).abs() < 1e-5, "{average}");
     }
 }

@@ -1,7 +1,7 @@
 //! An arm whose joint states come over UDP, for instance from the program that moves it.
 
-use super::counts::Counts;
-use super::whole::WholeReadings;
+use super::counts::DatagramCounts;
+use super::reader::DatagramReader;
 use crate::wire::datagram::decode_joints;
 use crate::{Arm, Error};
 use kinematics::JointState;
@@ -12,13 +12,13 @@ use std::time::Duration;
 #[derive(Debug)]
 pub struct UdpArm {
     names: Vec<String>,
-    states: WholeReadings,
+    states: DatagramReader,
 }
 
 impl UdpArm {
     /// Listens for states of these joints; port 0 takes a free one.
     pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
-        Ok(Self { names: joint_names.to_vec(), states: WholeReadings::open("arm", "joint states", address)? })
+        Ok(Self { names: joint_names.to_vec(), states: DatagramReader::open("arm", "joint states", address)? })
     }
 
     /// Where it listens.
@@ -27,7 +27,7 @@ impl UdpArm {
     }
 
     /// What became of the datagrams so far.
-    pub fn counts(&self) -> Counts {
+    pub fn counts(&self) -> DatagramCounts {
         self.states.counts()
     }
 }
@@ -39,8 +39,9 @@ impl Arm for UdpArm {
 
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let Self { names, states } = self;
-        let read = states.next(timeout, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)))?;
-        let (stamp, told) = read.ok_or(Error::NoJoints { waited: timeout })?;
-        Ok(JointState { stamp, position: told.position, velocity: told.velocity, effort: told.effort })
+        let read =
+            states.next(timeout, |bytes| decode_joints(bytes, names).map(|reported| (reported.header, reported)))?;
+        let (stamp, reported) = read.ok_or(Error::NoJoints { waited: timeout })?;
+        Ok(JointState { stamp, position: reported.position, velocity: reported.velocity, effort: reported.effort })
     }
 }

@@ -1,24 +1,24 @@
 //! Datagrams from anyone, to an arm, a base and a range scanner.
 
-use super::order::Order;
-use super::receiver::Arrived;
+use super::reader::DatagramReader;
+use super::receiver::ReceivedDatagram;
 use super::scanner::UdpScanner;
-use super::whole::WholeReadings;
+use super::sequence::SequenceTracker;
 use crate::wire::datagram::{PoseDatagram, decode_joints, decode_pose};
 use kinematics::Stamp;
 use std::cell::RefCell;
 use std::time::Duration;
 
 /// When the first datagram arrives: seeds have stamps near it.
-pub(crate) const BEGAN: Stamp = Stamp(1_000_000_000_000);
+pub(crate) const START_TIME: Stamp = Stamp(1_000_000_000_000);
 /// Nothing that is told lies further off, metres, radians or what a joint's unit is; of echoes each coordinate.
-const FAR: f64 = 1e4;
+const MAX_ABS_VALUE: f64 = 1e4;
 
 /// An arm of three joints, a base, and a scanner named `lidar`, without the threads' bytes.
 struct Readers {
     names: Vec<String>,
-    arm: WholeReadings,
-    base: WholeReadings,
+    arm: DatagramReader,
+    base: DatagramReader,
     scanner: UdpScanner,
 }
 
@@ -30,7 +30,7 @@ thread_local! {
 impl Readers {
     fn new() -> Self {
         let any = "127.0.0.1:0".parse().expect("an address");
-        let open = |device, plural| WholeReadings::open(device, plural, any).expect("a free port");
+        let open = |device, plural| DatagramReader::open(device, plural, any).expect("a free port");
         Self {
             names: ["a", "b", "c"].map(str::to_owned).to_vec(),
             arm: open("arm", "joint states"),
@@ -51,45 +51,47 @@ pub fn datagrams(bytes: &[u8]) {
 pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
     READERS.with_borrow_mut(|readers| {
         let Readers { names, arm, base, scanner } = readers;
-        arm.order = Order::default();
-        base.order = Order::default();
-        scanner.forget();
-        let mut at = BEGAN;
+        arm.sequence = SequenceTracker::default();
+        base.sequence = SequenceTracker::default();
+        scanner.reset();
+        let mut at = START_TIME;
         let mut newest = [None; 3];
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for line in bytes.split(|byte| *byte == b'\n') {
             let millis = str::from_utf8(line).ok().and_then(|line| line.parse::<u32>().ok());
             at += Duration::from_millis(millis.unwrap_or(1).into());
-            let arrived = Arrived { at, from: ([127, 0, 0, 1], 7).into(), bytes: line.to_vec(), n_dropped: 0 };
-            let read = arm.take(&arrived, |bytes| decode_joints(bytes, names).map(|told| (told.head, told)));
+            let datagram =
+                ReceivedDatagram { at, from: ([127, 0, 0, 1], 7).into(), bytes: line.to_vec(), n_dropped: 0 };
+            let read =
+                arm.take(&datagram, |bytes| decode_joints(bytes, names).map(|reported| (reported.header, reported)));
             if let Some((stamp, state)) = read {
-                assert_grows(&mut newest[0], stamp, at);
+                assert_monotonic(&mut newest[0], stamp, at);
                 assert_eq!(state.position.len(), names.len());
                 let numbers = state.position.iter().chain(&state.velocity).chain(&state.effort);
-                assert!(numbers.into_iter().all(|number| number.abs() <= FAR), "{state:?}");
-                told.push(state.position);
+                assert!(numbers.into_iter().all(|number| number.abs() <= MAX_ABS_VALUE), "{state:?}");
+                reported.push(state.position);
             }
             let decode = |bytes: &[u8]| {
-                decode_pose(bytes).map(|PoseDatagram { head, world_from_base, .. }| (head, world_from_base))
+                decode_pose(bytes).map(|PoseDatagram { header, world_from_base, .. }| (header, world_from_base))
             };
-            if let Some((stamp, pose)) = base.take(&arrived, decode) {
-                assert_grows(&mut newest[1], stamp, at);
-                assert!(pose.translation.vector.amax() <= FAR, "{pose:?}");
+            if let Some((stamp, pose)) = base.take(&datagram, decode) {
+                assert_monotonic(&mut newest[1], stamp, at);
+                assert!(pose.translation.vector.amax() <= MAX_ABS_VALUE, "{pose:?}");
                 assert!((pose.rotation.quaternion().norm() - 1.0).abs() < 1e-9, "{pose:?}");
             }
-            scanner.take(&arrived);
-            while let Some(scan) = scanner.done.pop_front() {
-                assert_grows(&mut newest[2], scan.stamp, at);
+            scanner.take(&datagram);
+            while let Some(scan) = scanner.completed.pop_front() {
+                assert_monotonic(&mut newest[2], scan.stamp, at);
                 let coordinates = scan.points.iter().flat_map(|point| point.position_m);
-                assert!(coordinates.into_iter().all(|along| f64::from(along.abs()) <= FAR), "{scan:?}");
+                assert!(coordinates.into_iter().all(|along| f64::from(along.abs()) <= MAX_ABS_VALUE), "{scan:?}");
             }
         }
-        told
+        reported
     })
 }
 
 /// A stamp comes after the one before, and not after its arrival, but for what rounding does.
-fn assert_grows(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
+fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
     assert!(newest.is_none_or(|newest| stamp > newest), "{newest:?}, then {stamp:?}");
     assert!(stamp.secs_since(arrival) <= 1e-3, "{stamp:?} arrived at {arrival:?}");
     *newest = Some(stamp);
@@ -99,39 +101,43 @@ fn assert_grows(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
 pub(crate) mod tests {
     use super::*;
     use crate::RangePoint;
-    use crate::hostile::Random;
-    use crate::wire::datagram::{Clock, Head, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan};
+    use crate::fuzz::Random;
+    use crate::wire::datagram::{
+        Clock, DatagramHeader, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+    };
     use kinematics::Transform;
 
     /// What an arm, a base and a scanner send in 30 ms, one datagram a line.
-    pub(crate) fn talk() -> Vec<Vec<u8>> {
+    pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
         let names = ["a", "b", "c"].map(str::to_owned);
         let mut lines = Vec::new();
         for seq in 0..10_u32 {
-            let stamp_nanos = BEGAN.0 + i64::from(seq) * 3_000_000;
-            let head = Head { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
+            let stamp_nanos = START_TIME.0 + i64::from(seq) * 3_000_000;
+            let header = DatagramHeader { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
             let position = [0.0, 1.0, 2.0].map(|zero| zero + 0.01 * f64::from(seq)).to_vec();
-            let joints = JointsDatagram { head, position, velocity: vec![0.5; 3], effort: Vec::new() };
+            let joints = JointsDatagram { header, position, velocity: vec![0.5; 3], effort: Vec::new() };
             lines.push(encode_joints(&joints, &names));
-            let head = Head { clock: Clock::Device, ..head };
+            let header = DatagramHeader { clock: Clock::Device, ..header };
             let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
-            lines.push(encode_pose(&PoseDatagram { head, world_from_base, covariance: None }));
+            lines.push(encode_pose(&PoseDatagram { header, world_from_base, covariance: None }));
             let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
-            let head = Head { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..head };
-            let part = ScanPart { head, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
+            let header =
+                DatagramHeader { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..header };
+            let part =
+                ScanPart { header, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
             lines.push(encode_scan(&part));
         }
         lines
     }
 
     #[test]
-    fn datagrams_cut_doubled_or_out_of_order_move_no_joint() {
-        let lines = talk();
-        let told = joint_states(&lines.join(&b'\n'));
-        assert_eq!(told.len(), 10);
+    fn corrupted_datagrams_move_no_joint() {
+        let lines = example_traffic();
+        let reported = joint_states(&lines.join(&b'\n'));
+        assert_eq!(reported.len(), 10);
         let read = |lines: &[Vec<u8>]| {
             let read = joint_states(&lines.join(&b'\n'));
-            assert!(read.iter().all(|positions| told.contains(positions)), "{read:?}");
+            assert!(read.iter().all(|positions| reported.contains(positions)), "{read:?}");
             read.len()
         };
         let doubled: Vec<_> = lines.iter().flat_map(|line| [line.clone(), line.clone()]).collect();
@@ -146,7 +152,7 @@ pub(crate) mod tests {
             let cut: Vec<_> = lines.iter().map(|line| line[..line.len().min(n_bytes)].to_vec()).collect();
             assert_eq!(read(&cut), 0, "{n_bytes} bytes");
         }
-        let one_in_one: Vec<_> = lines.iter().map(|line| line.repeat(2)).collect();
-        assert_eq!(read(&one_in_one), 0, "two in one datagram are none");
+        let doubled_payload: Vec<_> = lines.iter().map(|line| line.repeat(2)).collect();
+        assert_eq!(read(&doubled_payload), 0, "two in one datagram are none");
     }
 }

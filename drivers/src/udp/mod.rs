@@ -4,15 +4,15 @@ mod arm;
 mod base;
 mod counts;
 #[cfg(any(test, fuzzing))]
-pub(crate) mod hostile;
-pub(crate) mod order;
+pub(crate) mod fuzz;
+mod reader;
 mod receiver;
 mod scanner;
+pub(crate) mod sequence;
 #[cfg(test)]
 mod tests;
-mod whole;
 
 pub use arm::UdpArm;
 pub use base::UdpBase;
-pub use counts::Counts;
+pub use counts::DatagramCounts;
 pub use scanner::UdpScanner;

@@ -16,12 +16,12 @@ const OVERHEAD_BYTES: usize = 128;
 /// No datagram is longer.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
 /// What came so long before it is asked for the first time is not wanted: other devices were still being opened.
-const MAX_EARLY: Duration = Duration::from_millis(200);
+const MAX_BUFFERED_AGE: Duration = Duration::from_millis(200);
 /// How soon the thread notices that it is to stop.
 const POLL: Duration = Duration::from_millis(100);
 
 /// One datagram.
-pub(super) struct Arrived {
+pub(super) struct ReceivedDatagram {
     pub(super) at: Stamp,
     pub(super) from: SocketAddr,
     pub(super) bytes: Vec<u8>,
@@ -51,7 +51,7 @@ struct State {
     n_dropped: u64,
     error: Option<std::io::Error>,
     /// Somebody has asked for datagrams.
-    is_read: bool,
+    has_reader: bool,
     stop: bool,
 }
 
@@ -89,24 +89,24 @@ impl Receiver {
     }
 
     /// The oldest datagram that waits; `None` when none came until then.
-    pub(super) fn next(&self, until: Instant) -> Result<Option<Arrived>, Error> {
+    pub(super) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.lock();
-        if !std::mem::replace(&mut state.is_read, true) {
-            state.forget_before(clock::now() - MAX_EARLY);
+        if !std::mem::replace(&mut state.has_reader, true) {
+            state.discard_before(clock::now() - MAX_BUFFERED_AGE);
         }
         loop {
             if let Some((at, from, bytes)) = state.queue.pop_front() {
                 state.n_bytes -= bytes.len() + OVERHEAD_BYTES;
-                return Ok(Some(Arrived { at, from, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
+                return Ok(Some(ReceivedDatagram { at, from, bytes, n_dropped: std::mem::take(&mut state.n_dropped) }));
             }
             if let Some(source) = state.error.take() {
                 return Err(Error::Network { device: self.device.clone(), source });
             }
-            let left = until.saturating_duration_since(Instant::now());
-            if left.is_zero() {
+            let remaining = until.saturating_duration_since(Instant::now());
+            if remaining.is_zero() {
                 return Ok(None);
             }
-            state = self.shared.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }
@@ -145,11 +145,11 @@ impl Shared {
 }
 
 impl State {
-    fn forget_before(&mut self, begin: Stamp) {
+    fn discard_before(&mut self, begin: Stamp) {
         while self.queue.front().is_some_and(|(at, ..)| *at < begin)
-            && let Some((.., early)) = self.queue.pop_front()
+            && let Some((.., discarded)) = self.queue.pop_front()
         {
-            self.n_bytes -= early.len() + OVERHEAD_BYTES;
+            self.n_bytes -= discarded.len() + OVERHEAD_BYTES;
         }
         self.n_dropped = 0;
     }
@@ -184,17 +184,17 @@ mod tests {
     const SENDER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), 7);
 
     #[test]
-    fn what_came_before_anybody_asked_is_forgotten_but_for_the_newest() {
+    fn datagrams_before_first_read_are_discarded_by_age() {
         let mut state = State { n_dropped: 3, ..State::default() };
         (0..10).for_each(|ix| state.put(Stamp(ix), SENDER, vec![0; 5]));
-        state.forget_before(Stamp(7));
+        state.discard_before(Stamp(7));
         assert_eq!((state.queue.len(), state.n_bytes, state.n_dropped), (3, 3 * (5 + OVERHEAD_BYTES), 0));
-        state.forget_before(Stamp(100));
+        state.discard_before(Stamp(100));
         assert_eq!((state.queue.len(), state.n_bytes), (0, 0));
     }
 
     #[test]
-    fn a_slow_caller_loses_the_oldest_and_memory_is_bounded() {
+    fn slow_caller_drops_oldest_and_memory_is_bounded() {
         let mut state = State::default();
         for ix in 0..1000 {
             state.put(Stamp(ix), SENDER, vec![0; 60_000]);

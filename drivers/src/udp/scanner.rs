@@ -1,9 +1,9 @@
 //! A range scanner whose turns come over UDP, each in one datagram or cut into parts.
 
-use super::counts::{CLOCK_RESTARTED, Counts, Senders, tell};
-use super::order::{self, Order, Place};
-use super::receiver::{Arrived, Receiver};
-use crate::wire::datagram::{Head, ScanPart, decode_scan};
+use super::counts::{CLOCK_RESTARTED, DatagramCounts, Senders, count_and_warn};
+use super::receiver::{ReceivedDatagram, Receiver};
+use super::sequence::{self, SequencePosition, SequenceTracker};
+use crate::wire::datagram::{DatagramHeader, ScanPart, decode_scan};
 use crate::{Error, RangePoint, RangeScan, RangeScanner};
 use kinematics::Stamp;
 use std::collections::VecDeque;
@@ -18,17 +18,17 @@ use std::time::{Duration, Instant};
 pub struct UdpScanner {
     name: Arc<str>,
     receiver: Receiver,
-    order: Order,
-    counts: Counts,
+    sequence: SequenceTracker,
+    counts: DatagramCounts,
     senders: Senders,
     /// The turn whose parts are coming.
-    turn: Option<Turn>,
-    pub(super) done: VecDeque<RangeScan>,
+    partial_scan: Option<PartialScan>,
+    pub(super) completed: VecDeque<RangeScan>,
 }
 
 #[derive(Debug)]
-struct Turn {
-    head: Head,
+struct PartialScan {
+    header: DatagramHeader,
     stamp: Stamp,
     parts: Vec<Option<Vec<RangePoint>>>,
 }
@@ -40,11 +40,11 @@ impl UdpScanner {
         Ok(Self {
             name: name.into(),
             receiver,
-            order: Order::default(),
-            counts: Counts::default(),
+            sequence: SequenceTracker::default(),
+            counts: DatagramCounts::default(),
             senders: Senders::default(),
-            turn: None,
-            done: VecDeque::new(),
+            partial_scan: None,
+            completed: VecDeque::new(),
         })
     }
 
@@ -54,87 +54,94 @@ impl UdpScanner {
     }
 
     /// What became of the datagrams so far.
-    pub fn counts(&self) -> Counts {
+    pub fn counts(&self) -> DatagramCounts {
         self.counts
     }
 
     /// As if nothing had come yet.
     #[cfg(any(test, fuzzing))]
-    pub(super) fn forget(&mut self) {
-        (self.order, self.turn) = (Order::default(), None);
-        self.done.clear();
+    pub(super) fn reset(&mut self) {
+        (self.sequence, self.partial_scan) = (SequenceTracker::default(), None);
+        self.completed.clear();
     }
 
-    pub(super) fn take(&mut self, arrived: &Arrived) {
+    pub(super) fn take(&mut self, datagram: &ReceivedDatagram) {
         self.counts.n_received += 1;
         let device = self.receiver.device();
-        tell(device, &mut self.counts.n_dropped, arrived.n_dropped, "datagrams gave way to newer ones");
-        let part = match decode_scan(&arrived.bytes) {
+        count_and_warn(device, &mut self.counts.n_dropped, datagram.n_dropped, "datagrams gave way to newer ones");
+        let part = match decode_scan(&datagram.bytes) {
             Ok(part) => part,
-            Err(error) => return self.refuse(format_args!("{error}")),
+            Err(error) => return self.reject(format_args!("{error}")),
         };
         if *part.frame != *self.name {
-            return self.refuse(format_args!("it is of another frame"));
+            return self.reject(format_args!("it is of another frame"));
         }
-        self.senders.note(device, arrived.from);
-        match self.order.place(part.head.seq, arrived.at) {
-            Place::New { n_lost } => {
-                tell(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not come");
-                self.begin(part, arrived.at);
+        self.senders.note(device, datagram.from);
+        match self.sequence.position(part.header.seq, datagram.at) {
+            SequencePosition::New { n_lost } => {
+                count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not come");
+                self.begin(part, datagram.at);
             }
-            Place::Restart => {
-                tell(self.receiver.device(), &mut self.counts.n_restarts, 1, "the sender counts anew");
-                self.begin(part, arrived.at);
+            SequencePosition::Restart => {
+                count_and_warn(self.receiver.device(), &mut self.counts.n_restarts, 1, "the sender counts anew");
+                self.begin(part, datagram.at);
             }
-            Place::Newest => self.add(part),
-            Place::Late => tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came late"),
+            SequencePosition::Current => self.add(part),
+            SequencePosition::Late => {
+                count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came late")
+            }
         }
     }
 
     /// A new turn; what has come of the one before is all there will be.
     fn begin(&mut self, part: ScanPart, arrival: Stamp) {
-        self.end_turn();
-        let n_before = self.order.n_clock_restarts();
-        let stamp = self.order.stamp(&part.head, arrival);
-        let n_more = self.order.n_clock_restarts() - n_before;
-        tell(self.receiver.device(), &mut self.counts.n_clock_restarts, n_more, CLOCK_RESTARTED);
+        self.finish_scan();
+        let n_before = self.sequence.n_clock_restarts();
+        let stamp = self.sequence.stamp(&part.header, arrival);
+        let n_new_restarts = self.sequence.n_clock_restarts() - n_before;
+        count_and_warn(self.receiver.device(), &mut self.counts.n_clock_restarts, n_new_restarts, CLOCK_RESTARTED);
         let Some(stamp) = stamp else {
-            let (says, hint) = (part.head.stamp_nanos, order::hint(&part.head, arrival));
-            return self.refuse(format_args!("the stamp {says} is not after the last, or not of now{hint}"));
+            let (stamp_nanos, hint) = (part.header.stamp_nanos, sequence::hint(&part.header, arrival));
+            return self.reject(format_args!("the stamp {stamp_nanos} is not after the last, or not of now{hint}"));
         };
         let parts = vec![None; part.n_parts as usize];
-        self.turn = Some(Turn { head: part.head, stamp, parts });
+        self.partial_scan = Some(PartialScan { header: part.header, stamp, parts });
         self.add(part);
     }
 
     fn add(&mut self, part: ScanPart) {
-        let Some(turn) = &mut self.turn else {
+        let Some(partial_scan) = &mut self.partial_scan else {
             // Of a turn that is complete, or was refused.
-            return tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice or late");
+            return count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice or late");
         };
-        if turn.head != part.head || turn.parts.len() != part.n_parts as usize {
-            return self.refuse(format_args!("it contradicts another part of the same scan"));
+        if partial_scan.header != part.header || partial_scan.parts.len() != part.n_parts as usize {
+            return self.reject(format_args!("it contradicts another part of the same scan"));
         }
-        let place = &mut turn.parts[part.part as usize];
-        if place.is_some() {
-            return tell(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice");
+        let position = &mut partial_scan.parts[part.part as usize];
+        if position.is_some() {
+            return count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice");
         }
-        *place = Some(part.points);
-        if turn.parts.iter().all(Option::is_some) {
-            self.end_turn();
+        *position = Some(part.points);
+        if partial_scan.parts.iter().all(Option::is_some) {
+            self.finish_scan();
         }
     }
 
-    fn end_turn(&mut self) {
-        let Some(Turn { stamp, parts, .. }) = self.turn.take() else { return };
+    fn finish_scan(&mut self) {
+        let Some(PartialScan { stamp, parts, .. }) = self.partial_scan.take() else { return };
         let n_missing = parts.iter().filter(|part| part.is_none()).count() as u64;
-        tell(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not come");
+        count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not come");
         let points: Arc<[RangePoint]> = parts.into_iter().flatten().flatten().collect();
-        self.done.push_back(RangeScan { scanner: Arc::clone(&self.name), stamp, points });
+        self.completed.push_back(RangeScan { scanner: Arc::clone(&self.name), stamp, points });
     }
 
-    fn refuse(&mut self, why: std::fmt::Arguments<'_>) {
-        tell(self.receiver.device(), &mut self.counts.n_refused, 1, format_args!("a datagram is refused: {why}"));
+    fn reject(&mut self, reason: std::fmt::Arguments<'_>) {
+        count_and_warn(
+            self.receiver.device(),
+            &mut self.counts.n_rejected,
+            1,
+            format_args!("a datagram is refused: {reason}"),
+        );
     }
 }
 
@@ -146,12 +153,12 @@ impl RangeScanner for UdpScanner {
     fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, Error> {
         let until = Instant::now() + timeout;
         loop {
-            if let Some(scan) = self.done.pop_front() {
+            if let Some(scan) = self.completed.pop_front() {
                 return Ok(scan);
             }
-            let Some(arrived) = self.receiver.next(until)? else { break };
-            self.take(&arrived);
-            if self.done.is_empty() && Instant::now() >= until {
+            let Some(datagram) = self.receiver.next(until)? else { break };
+            self.take(&datagram);
+            if self.completed.is_empty() && Instant::now() >= until {
                 break; // However many useless ones there are.
             }
         }

@@ -1,8 +1,8 @@
 //! Over a real socket of the loopback interface.
 
-use super::{Counts, UdpArm, UdpBase, UdpScanner};
+use super::{DatagramCounts, UdpArm, UdpBase, UdpScanner};
 use crate::wire::datagram::{
-    Clock, Head, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
 };
 use crate::{Arm, Base, Devices, Error, Live, RangePoint, RangeScanner, Sample, Source, clock};
 use kinematics::Transform;
@@ -10,9 +10,9 @@ use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
 
 /// Long, as a busy machine may be slow; nothing waits so long where all is well.
-const PATIENCE: Duration = Duration::from_secs(20);
+const LONG_TIMEOUT: Duration = Duration::from_secs(20);
 /// For what does not come.
-const SHORT: Duration = Duration::from_millis(150);
+const SHORT_TIMEOUT: Duration = Duration::from_millis(150);
 /// Of poses that are taken, metres and radians.
 const MAX_SIGMA: [f64; 2] = [0.05, 0.03];
 const FREE_PORT: &str = "127.0.0.1:0";
@@ -28,49 +28,49 @@ fn scanner() -> (UdpScanner, impl Fn(&[u8])) {
     (scanner, send)
 }
 
-fn now(seq: u64) -> Head {
-    Head { seq, clock: Clock::Monotonic, stamp_nanos: clock::now().0 }
+fn now(seq: u64) -> DatagramHeader {
+    DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: clock::now().0 }
 }
 
 /// The part of a scan whose one echo is so far away.
-fn part(head: Head, part: u32, n_parts: u32, range_m: f32) -> Vec<u8> {
+fn part(header: DatagramHeader, part: u32, n_parts: u32, range_m: f32) -> Vec<u8> {
     let point = RangePoint { position_m: [range_m, 0.0, 0.0], ring: 2, offset_micros: 5 };
-    encode_scan(&ScanPart { head, frame: "lidar".into(), part, n_parts, points: vec![point] })
+    encode_scan(&ScanPart { header, frame: "lidar".into(), part, n_parts, points: vec![point] })
 }
 
 fn ranges(scanner: &mut UdpScanner) -> Vec<f32> {
-    scanner.next_scan(PATIENCE).unwrap().points.iter().map(|point| point.position_m[0]).collect()
+    scanner.next_scan(LONG_TIMEOUT).unwrap().points.iter().map(|point| point.position_m[0]).collect()
 }
 
-fn pose(head: Head, x_m: f64) -> Vec<u8> {
-    encode_pose(&PoseDatagram { head, world_from_base: Transform::translation(x_m, 0.0, 0.0), covariance: None })
+fn pose(header: DatagramHeader, x_m: f64) -> Vec<u8> {
+    encode_pose(&PoseDatagram { header, world_from_base: Transform::translation(x_m, 0.0, 0.0), covariance: None })
 }
 
 #[test]
-fn scans_come_whole_and_with_their_stamps() {
+fn scans_are_assembled_with_stamps() {
     let (mut scanner, send) = scanner();
-    let head = now(0);
-    send(&part(head, 0, 1, 1.5));
-    let scan = scanner.next_scan(PATIENCE).unwrap();
-    assert_eq!((&*scan.scanner, scan.stamp.0), ("lidar", head.stamp_nanos));
+    let header = now(0);
+    send(&part(header, 0, 1, 1.5));
+    let scan = scanner.next_scan(LONG_TIMEOUT).unwrap();
+    assert_eq!((&*scan.scanner, scan.stamp.0), ("lidar", header.stamp_nanos));
     let expected = RangePoint { position_m: [1.5, 0.0, 0.0], ring: 2, offset_micros: 5 };
     assert_eq!(*scan.points, [expected]);
     // In parts that come in any order.
-    let head = now(1);
+    let header = now(1);
     for (ix, range_m) in [(2, 3.0), (0, 1.0), (1, 2.0)] {
-        send(&part(head, ix, 3, range_m));
+        send(&part(header, ix, 3, range_m));
     }
     assert_eq!(ranges(&mut scanner), [1.0, 2.0, 3.0]);
     // A clock of its own: the stamp is the arrival's, at first.
     let before = clock::now();
-    send(&part(Head { seq: 2, clock: Clock::Device, stamp_nanos: -77 }, 0, 1, 1.0));
-    let scan = scanner.next_scan(PATIENCE).unwrap();
+    send(&part(DatagramHeader { seq: 2, clock: Clock::Device, stamp_nanos: -77 }, 0, 1, 1.0));
+    let scan = scanner.next_scan(LONG_TIMEOUT).unwrap();
     assert!(scan.stamp > before && scan.stamp <= clock::now());
-    assert_eq!(scanner.counts(), Counts { n_received: 5, ..Counts::default() });
+    assert_eq!(scanner.counts(), DatagramCounts { n_received: 5, ..DatagramCounts::default() });
 }
 
 #[test]
-fn what_is_lost_doubled_or_late_is_counted() {
+fn lost_duplicate_and_late_scans_are_counted() {
     let (mut scanner, send) = scanner();
     let (first, second, fifth, sixth) = (now(1), now(2), now(5), now(6));
     send(&part(first, 0, 1, 1.0));
@@ -86,12 +86,12 @@ fn what_is_lost_doubled_or_late_is_counted() {
     assert_eq!(ranges(&mut scanner), [2.0]);
     assert_eq!(ranges(&mut scanner), [4.5, 5.0]);
     assert_eq!(ranges(&mut scanner), [6.0]);
-    let expected = Counts { n_received: 9, n_refused: 1, n_lost: 3, n_late: 3, ..Counts::default() };
+    let expected = DatagramCounts { n_received: 9, n_rejected: 1, n_lost: 3, n_late: 3, ..DatagramCounts::default() };
     assert_eq!(scanner.counts(), expected);
 }
 
 #[test]
-fn nonsense_is_refused_and_stops_nothing() {
+fn malformed_datagrams_are_rejected() {
     let (mut scanner, send) = scanner();
     let good = part(now(0), 0, 1, 1.0);
     let mut n_sent = 0;
@@ -107,40 +107,40 @@ fn nonsense_is_refused_and_stops_nothing() {
         junk(&good[..end]);
     }
     junk(&pose(now(0), 1.0));
-    junk(&part(Head { stamp_nanos: i64::MAX, ..now(3) }, 0, 1, 1.0));
-    junk(&part(Head { stamp_nanos: i64::MIN, ..now(4) }, 0, 1, 1.0));
+    junk(&part(DatagramHeader { stamp_nanos: i64::MAX, ..now(3) }, 0, 1, 1.0));
+    junk(&part(DatagramHeader { stamp_nanos: i64::MIN, ..now(4) }, 0, 1, 1.0));
     junk(String::from_utf8(part(now(5), 0, 1, 1.0)).unwrap().replace("lidar", "radar").as_bytes());
-    junk(&part(Head { seq: u64::MAX, clock: Clock::Monotonic, stamp_nanos: 0 }, 0, 1, 1.0));
+    junk(&part(DatagramHeader { seq: u64::MAX, clock: Clock::Monotonic, stamp_nanos: 0 }, 0, 1, 1.0));
     let n_junk = n_sent;
     send(&part(now(0), 0, 1, 7.0));
     assert_eq!(ranges(&mut scanner), [7.0]);
     let counts = scanner.counts();
-    assert_eq!((counts.n_received, counts.n_refused), (n_junk + 1, n_junk));
+    assert_eq!((counts.n_received, counts.n_rejected), (n_junk + 1, n_junk));
     // Nothing but nonsense: the wait ends all the same.
     for _ in 0..1000 {
         send(b"?");
     }
-    let begun = Instant::now();
-    let silent = scanner.next_scan(SHORT).unwrap_err();
-    assert!(matches!(silent, Error::NoScan { .. }), "{silent}");
-    assert!(begun.elapsed() < PATIENCE);
+    let started = Instant::now();
+    let timeout_error = scanner.next_scan(SHORT_TIMEOUT).unwrap_err();
+    assert!(matches!(timeout_error, Error::NoScan { .. }), "{timeout_error}");
+    assert!(started.elapsed() < LONG_TIMEOUT);
 }
 
 #[test]
-fn base_poses_come_in_order_and_the_port_is_free_again() {
+fn base_poses_are_ordered_and_drop_frees_port() {
     let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let (address, send) = (base.address(), sender(base.address()));
-    assert!(matches!(base.next_pose(SHORT), Err(Error::NoBasePose { .. })));
-    let heads: Vec<Head> = (0..4).map(now).collect();
+    assert!(matches!(base.next_pose(SHORT_TIMEOUT), Err(Error::NoBasePose { .. })));
+    let heads: Vec<DatagramHeader> = (0..4).map(now).collect();
     for ix in [0, 1, 1, 3, 2] {
         send(&pose(heads[ix], ix as f64));
     }
     for ix in [0, 1, 3] {
-        let told = base.next_pose(PATIENCE).unwrap();
-        assert_eq!((told.stamp.0, told.world_from_base.translation.x), (heads[ix].stamp_nanos, ix as f64));
+        let reported = base.next_pose(LONG_TIMEOUT).unwrap();
+        assert_eq!((reported.stamp.0, reported.world_from_base.translation.x), (heads[ix].stamp_nanos, ix as f64));
     }
-    assert!(base.next_pose(SHORT).is_err());
-    let expected = Counts { n_received: 5, n_lost: 1, n_late: 2, ..Counts::default() };
+    assert!(base.next_pose(SHORT_TIMEOUT).is_err());
+    let expected = DatagramCounts { n_received: 5, n_lost: 1, n_late: 2, ..DatagramCounts::default() };
     assert_eq!(base.counts(), expected);
     let taken = UdpBase::open(address, MAX_SIGMA).unwrap_err();
     assert!(taken.to_string().contains(&address.to_string()), "{taken}");
@@ -149,55 +149,59 @@ fn base_poses_come_in_order_and_the_port_is_free_again() {
 }
 
 #[test]
-fn poses_that_their_sender_is_not_sure_of_are_passed_over_and_counted() {
+fn uncertain_poses_are_skipped_and_counted() {
     let mut base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let send = sender(base.address());
-    let head: Vec<Head> = (0..5).map(now).collect();
-    let told = |ix: usize, sigma_m: f64, sigma_rad: f64| {
+    let header: Vec<DatagramHeader> = (0..5).map(now).collect();
+    let reported = |ix: usize, sigma_m: f64, sigma_rad: f64| {
         let mut covariance = Box::new([0.0; 36]);
         (covariance[0], covariance[28]) = (sigma_m * sigma_m, sigma_rad * sigma_rad);
         let world_from_base = Transform::translation(ix as f64, 0.0, 0.0);
-        encode_pose(&PoseDatagram { head: head[ix], world_from_base, covariance: Some(covariance) })
+        encode_pose(&PoseDatagram { header: header[ix], world_from_base, covariance: Some(covariance) })
     };
     let [max_m, max_rad] = MAX_SIGMA;
-    send(&told(0, 0.9 * max_m, 0.9 * max_rad));
-    send(&told(1, 1.1 * max_m, 0.0));
-    send(&told(2, 0.0, 1.1 * max_rad));
-    send(&pose(head[3], 3.0));
+    send(&reported(0, 0.9 * max_m, 0.9 * max_rad));
+    send(&reported(1, 1.1 * max_m, 0.0));
+    send(&reported(2, 0.0, 1.1 * max_rad));
+    send(&pose(header[3], 3.0));
     for ix in [0, 3] {
-        assert_eq!(base.next_pose(PATIENCE).unwrap().world_from_base.translation.x, f64::from(ix));
+        assert_eq!(base.next_pose(LONG_TIMEOUT).unwrap().world_from_base.translation.x, f64::from(ix));
     }
-    send(&told(4, 1.0, 0.0));
-    assert!(base.next_pose(SHORT).is_err());
-    assert_eq!(base.counts(), Counts { n_received: 5, n_unsure: 3, ..Counts::default() });
+    send(&reported(4, 1.0, 0.0));
+    assert!(base.next_pose(SHORT_TIMEOUT).is_err());
+    assert_eq!(base.counts(), DatagramCounts { n_received: 5, n_uncertain: 3, ..DatagramCounts::default() });
 }
 
 #[test]
-fn joint_states_come_in_order_and_those_of_other_joints_are_refused() {
+fn joint_states_are_ordered_and_other_joints_rejected() {
     let names = ["shoulder", "elbow"].map(str::to_owned);
     let mut arm = UdpArm::open(&names, FREE_PORT.parse().unwrap()).unwrap();
     let send = sender(arm.address());
     assert_eq!(arm.joint_names(), names);
-    let state = |head, at: f64| JointsDatagram { head, position: vec![at, -at], velocity: vec![], effort: vec![at; 2] };
-    let turned = [names[1].clone(), names[0].clone()];
-    let heads: Vec<Head> = (0..4).map(now).collect();
+    let state =
+        |header, at: f64| JointsDatagram { header, position: vec![at, -at], velocity: vec![], effort: vec![at; 2] };
+    let reversed_names = [names[1].clone(), names[0].clone()];
+    let heads: Vec<DatagramHeader> = (0..4).map(now).collect();
     for ix in [0, 2, 1, 3] {
-        send(&encode_joints(&state(heads[ix], ix as f64), &turned));
+        send(&encode_joints(&state(heads[ix], ix as f64), &reversed_names));
         send(&encode_joints(&state(heads[ix], ix as f64), &names));
     }
     for ix in [0, 2, 3] {
-        let told = arm.read(PATIENCE).unwrap();
+        let reported = arm.read(LONG_TIMEOUT).unwrap();
         let at = ix as f64;
-        assert_eq!((told.stamp.0, told.position, told.effort), (heads[ix].stamp_nanos, vec![at, -at], vec![at; 2]));
-        assert!(told.velocity.is_empty());
+        assert_eq!(
+            (reported.stamp.0, reported.position, reported.effort),
+            (heads[ix].stamp_nanos, vec![at, -at], vec![at; 2])
+        );
+        assert!(reported.velocity.is_empty());
     }
-    assert!(matches!(arm.read(SHORT), Err(Error::NoJoints { .. })));
-    let expected = Counts { n_received: 8, n_refused: 4, n_lost: 1, n_late: 1, ..Counts::default() };
+    assert!(matches!(arm.read(SHORT_TIMEOUT), Err(Error::NoJoints { .. })));
+    let expected = DatagramCounts { n_received: 8, n_rejected: 4, n_lost: 1, n_late: 1, ..DatagramCounts::default() };
     assert_eq!(arm.counts(), expected);
 }
 
 #[test]
-fn live_merges_both_and_names_the_one_that_falls_silent() {
+fn live_merges_devices_and_names_silent_one() {
     let (scanner, send_scan) = scanner();
     let base = UdpBase::open(FREE_PORT.parse().unwrap(), MAX_SIGMA).unwrap();
     let send_pose = sender(base.address());
@@ -215,6 +219,6 @@ fn live_merges_both_and_names_the_one_that_falls_silent() {
             other => panic!("{other:?}"),
         }
     }
-    let silent = live.next_sample().unwrap_err();
-    assert!(matches!(silent, Error::NoScan { .. } | Error::NoBasePose { .. }), "{silent}");
+    let timeout_error = live.next_sample().unwrap_err();
+    assert!(matches!(timeout_error, Error::NoScan { .. } | Error::NoBasePose { .. }), "{timeout_error}");
 }

@@ -232,7 +232,7 @@ impl Plain for u32 {}
 /// A request code for the structure that it carries; only this file makes them, from the kernel's own list.
 pub(super) struct Request<T> {
     code: Opcode,
-    carries: std::marker::PhantomData<T>,
+    payload: std::marker::PhantomData<T>,
 }
 
 impl<T> Request<T> {
@@ -241,37 +241,37 @@ impl<T> Request<T> {
     }
 }
 
-const fn reads_and_writes<T>(number: u8) -> Request<T> {
-    Request { code: opcode::read_write::<T>(b'V', number), carries: std::marker::PhantomData }
+const fn read_write_request<T>(number: u8) -> Request<T> {
+    Request { code: opcode::read_write::<T>(b'V', number), payload: std::marker::PhantomData }
 }
 
-const fn reads<T>(number: u8) -> Request<T> {
-    Request { code: opcode::read::<T>(b'V', number), carries: std::marker::PhantomData }
+const fn read_request<T>(number: u8) -> Request<T> {
+    Request { code: opcode::read::<T>(b'V', number), payload: std::marker::PhantomData }
 }
 
-const fn writes<T>(number: u8) -> Request<T> {
-    Request { code: opcode::write::<T>(b'V', number), carries: std::marker::PhantomData }
+const fn write_request<T>(number: u8) -> Request<T> {
+    Request { code: opcode::write::<T>(b'V', number), payload: std::marker::PhantomData }
 }
 
-pub(super) const QUERYCAP: Request<Capability> = reads(0);
-pub(super) const ENUM_FMT: Request<FormatDescription> = reads_and_writes(2);
-pub(super) const S_FMT: Request<Format> = reads_and_writes(5);
-pub(super) const REQBUFS: Request<RequestBuffers> = reads_and_writes(8);
-pub(super) const QUERYBUF: Request<Buffer> = reads_and_writes(9);
-pub(super) const QBUF: Request<Buffer> = reads_and_writes(15);
-pub(super) const DQBUF: Request<Buffer> = reads_and_writes(17);
-pub(super) const STREAMON: Request<u32> = writes(18);
-pub(super) const STREAMOFF: Request<u32> = writes(19);
-pub(super) const G_PARM: Request<StreamParm> = reads_and_writes(21);
-pub(super) const S_PARM: Request<StreamParm> = reads_and_writes(22);
-pub(super) const ENUMINPUT: Request<Input> = reads_and_writes(26);
-pub(super) const G_CTRL: Request<Control> = reads_and_writes(27);
-pub(super) const S_CTRL: Request<Control> = reads_and_writes(28);
-pub(super) const QUERYCTRL: Request<QueryControl> = reads_and_writes(36);
-pub(super) const QUERYMENU: Request<QueryMenu> = reads_and_writes(37);
-pub(super) const G_INPUT: Request<u32> = reads(38);
-pub(super) const ENUM_FRAMESIZES: Request<FrameSize> = reads_and_writes(74);
-pub(super) const ENUM_FRAMEINTERVALS: Request<FrameInterval> = reads_and_writes(75);
+pub(super) const QUERYCAP: Request<Capability> = read_request(0);
+pub(super) const ENUM_FMT: Request<FormatDescription> = read_write_request(2);
+pub(super) const S_FMT: Request<Format> = read_write_request(5);
+pub(super) const REQBUFS: Request<RequestBuffers> = read_write_request(8);
+pub(super) const QUERYBUF: Request<Buffer> = read_write_request(9);
+pub(super) const QBUF: Request<Buffer> = read_write_request(15);
+pub(super) const DQBUF: Request<Buffer> = read_write_request(17);
+pub(super) const STREAMON: Request<u32> = write_request(18);
+pub(super) const STREAMOFF: Request<u32> = write_request(19);
+pub(super) const G_PARM: Request<StreamParm> = read_write_request(21);
+pub(super) const S_PARM: Request<StreamParm> = read_write_request(22);
+pub(super) const ENUMINPUT: Request<Input> = read_write_request(26);
+pub(super) const G_CTRL: Request<Control> = read_write_request(27);
+pub(super) const S_CTRL: Request<Control> = read_write_request(28);
+pub(super) const QUERYCTRL: Request<QueryControl> = read_write_request(36);
+pub(super) const QUERYMENU: Request<QueryMenu> = read_write_request(37);
+pub(super) const G_INPUT: Request<u32> = read_request(38);
+pub(super) const ENUM_FRAMESIZES: Request<FrameSize> = read_write_request(74);
+pub(super) const ENUM_FRAMEINTERVALS: Request<FrameInterval> = read_write_request(75);
 
 // The kernel finds the structure's size in the request code: one that is off would be refused as an unknown request.
 const _: () = {
@@ -301,17 +301,17 @@ mod tests {
 
     /// Compiles a C program against the kernel's own header where there is a compiler, and compares request codes and places.
     #[test]
-    fn structures_and_requests_are_those_of_the_kernels_header() {
+    fn abi_matches_kernel_header() {
         let header = std::path::Path::new("/usr/include/linux/videodev2.h");
         if !header.exists() {
             eprintln!("skipped: {header:?} is not there");
             return;
         }
         macro_rules! rows {
-            ($($name:ident),*; $($ours:ident . $field:ident = $theirs:literal),*) => {
+            ($($name:ident),*; $($ours:ident . $field:ident = $kernel_value:literal),*) => {
                 (
                     vec![$((concat!("VIDIOC_", stringify!($name)).to_owned(), u64::from($name.code()))),*],
-                    vec![$((format!("offsetof(struct {})", $theirs), std::mem::offset_of!($ours, $field) as u64)),*],
+                    vec![$((format!("offsetof(struct {})", $kernel_value), std::mem::offset_of!($ours, $field) as u64)),*],
                 )
             };
         }
@@ -337,11 +337,11 @@ mod tests {
             Input.status = "v4l2_input, status",
             Input.capabilities = "v4l2_input, capabilities"
         );
-        let wanted: Vec<(String, u64)> = codes.into_iter().chain(places).collect();
-        let print = |(what, _): &(String, u64)| format!("printf(\"%llu\\n\", (unsigned long long){what});\n");
+        let expected: Vec<(String, u64)> = codes.into_iter().chain(places).collect();
+        let c_print = |(what, _): &(String, u64)| format!("printf(\"%llu\\n\", (unsigned long long){what});\n");
         let program = format!(
             "#include <stddef.h>\n#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) {{\n{}return 0; }}\n",
-            wanted.iter().map(print).collect::<String>()
+            expected.iter().map(c_print).collect::<String>()
         );
         let folder = tempfile::tempdir().expect("a folder");
         let (source, built) = (folder.path().join("abi.c"), folder.path().join("abi"));
@@ -349,15 +349,16 @@ mod tests {
         let compiler = std::process::Command::new("cc").arg(&source).arg("-o").arg(&built).status();
         assert!(compiler.expect("a compiler, which Rust needs too").success());
         let output = std::process::Command::new(&built).output().expect("it runs");
-        let told: Vec<u64> =
+        let reported: Vec<u64> =
             String::from_utf8_lossy(&output.stdout).lines().map(|line| line.parse().expect("a number")).collect();
-        assert_eq!(told.len(), wanted.len());
-        let wrong: Vec<_> = wanted.iter().zip(&told).filter(|((_, ours), theirs)| ours != *theirs).collect();
+        assert_eq!(reported.len(), expected.len());
+        let wrong: Vec<_> =
+            expected.iter().zip(&reported).filter(|((_, ours), kernel_value)| ours != *kernel_value).collect();
         assert!(wrong.is_empty(), "{wrong:?}");
     }
 
     #[test]
-    fn texts_end_at_the_zero() {
+    fn text_ends_at_nul() {
         assert_eq!(text(b"vivid\0\0garbage"), "vivid");
         assert_eq!(text(b"full"), "full");
     }

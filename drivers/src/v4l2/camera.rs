@@ -1,6 +1,6 @@
 //! A V4L2 camera as the rest of the program sees it: images while it is plugged in, waiting while it is not.
 
-use super::running::Running;
+use super::stream::V4l2Stream;
 use super::{Config, Problem};
 use crate::outage::{Outage, n_between};
 use crate::{Camera, Error, Image};
@@ -21,14 +21,14 @@ const MAX_SILENT_IMAGES: f64 = 5.0;
 #[derive(Debug)]
 pub struct V4l2Camera {
     config: Config,
-    link: Link,
+    connection: Connection,
     counts: Counts,
     /// Stamp of the last image, across reconnections.
     last: Option<Stamp>,
     /// Set from a loss to the next image.
     outage: Option<Outage>,
     /// Whether an image was asked for yet.
-    is_asked: bool,
+    was_read: bool,
 }
 
 /// What became of the camera since it was opened.
@@ -45,9 +45,9 @@ pub struct Counts {
 }
 
 #[derive(Debug)]
-enum Link {
-    Up(Box<Running>),
-    Down,
+enum Connection {
+    Connected(Box<V4l2Stream>),
+    Disconnected,
 }
 
 impl V4l2Camera {
@@ -59,15 +59,15 @@ impl V4l2Camera {
                 "camera {name:?}: {device} may be another camera tomorrow; `fieldrig devices` prints a name that stays"
             );
         }
-        let running = Running::start(&config)?;
-        log::info!("camera {:?}: {}", config.name, running.describe());
+        let stream = V4l2Stream::start(&config)?;
+        log::info!("camera {:?}: {}", config.name, stream.describe());
         Ok(Self {
             config,
-            link: Link::Up(Box::new(running)),
+            connection: Connection::Connected(Box::new(stream)),
             counts: Counts::default(),
             last: None,
             outage: None,
-            is_asked: false,
+            was_read: false,
         })
     }
 
@@ -78,38 +78,38 @@ impl V4l2Camera {
 
     /// What the camera told when its settings were read back, names and counts; empty while it is gone.
     pub fn read_back(&self) -> &[(&'static str, i32)] {
-        match &self.link {
-            Link::Up(running) => running.read_back(),
-            Link::Down => &[],
+        match &self.connection {
+            Connection::Connected(stream) => stream.read_back(),
+            Connection::Disconnected => &[],
         }
     }
 
     /// One step of waiting for an image of a camera that is there.
-    fn wait_for_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
-        let Link::Up(running) = &mut self.link else { return Ok(None) };
-        if !std::mem::replace(&mut self.is_asked, true)
-            && let Err(problem) = running.forget_waiting()
+    fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
+        let Connection::Connected(stream) = &mut self.connection else { return Ok(None) };
+        if !std::mem::replace(&mut self.was_read, true)
+            && let Err(problem) = stream.discard_queued()
         {
-            return self.lose(problem).map(|()| None);
+            return self.handle_disconnect(problem).map(|()| None);
         }
-        let (n_damaged, image) = (running.n_damaged(), running.next_image(&self.config, deadline));
-        self.counts.n_damaged += running.n_damaged() - n_damaged;
+        let (n_damaged, image) = (stream.n_damaged(), stream.next_image(&self.config, deadline));
+        self.counts.n_damaged += stream.n_damaged() - n_damaged;
         let image = match image {
             Ok(image) => image,
-            Err(problem) => return self.lose(problem).map(|()| None),
+            Err(problem) => return self.handle_disconnect(problem).map(|()| None),
         };
-        let waited = running.silent_for();
+        let waited = stream.time_since_image();
         if image.is_none() && waited > MAX_SILENCE.max(Duration::from_secs_f64(MAX_SILENT_IMAGES / self.config.rate_hz))
         {
-            self.lose(Problem::Silent { waited })?;
+            self.handle_disconnect(Problem::Silent { waited })?;
         }
         Ok(image.map(|image| self.count(image)))
     }
 
     fn count(&mut self, mut image: Image) -> Image {
-        if self.is_first_again() {
-            let by_time = self.last.map_or(0, |last| n_between(last, image.stamp, self.config.rate_hz));
-            image.n_skipped = image.n_skipped.max(by_time);
+        if self.is_first_since_open() {
+            let n_missed_by_time = self.last.map_or(0, |last| n_between(last, image.stamp, self.config.rate_hz));
+            image.n_skipped = image.n_skipped.max(n_missed_by_time);
         }
         self.last = Some(image.stamp);
         self.outage = None;
@@ -119,53 +119,53 @@ impl V4l2Camera {
     }
 
     /// Whether the image in hand is the first since the camera was opened, for the first time or again.
-    fn is_first_again(&self) -> bool {
-        matches!(&self.link, Link::Up(running) if running.n_images() == 1)
+    fn is_first_since_open(&self) -> bool {
+        matches!(&self.connection, Connection::Connected(stream) if stream.n_images() == 1)
     }
 
     /// Closes the device before it is looked for: a node in use keeps its number. Fails when it has been lost for too long: a camera
     /// that can be opened and sends nothing is lost, too.
-    fn lose(&mut self, why: Problem) -> Result<(), Error> {
+    fn handle_disconnect(&mut self, cause: Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
-        self.link = Link::Down;
+        self.connection = Connection::Disconnected;
         if outage.n_tries > 0 {
-            return self.give_up_if_late(outage, why);
+            return self.fail_if_overdue(outage, cause);
         }
-        log::warn!("camera {:?}: {why}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        log::warn!("camera {:?}: {cause}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
         Ok(())
     }
 
     /// The error of a camera that was lost for longer than the rig file allows.
-    fn give_up_if_late(&self, Outage { since, n_tries, .. }: Outage, why: Problem) -> Result<(), Error> {
+    fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, cause: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
-            log::debug!("camera {camera:?}: {why}");
+            log::debug!("camera {camera:?}: {cause}");
             return Ok(());
         }
-        Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: Box::new(why) }) })
+        Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: Box::new(cause) }) })
     }
 
     /// One try to open a lost camera again, not before the pause since the last one is over.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
-        let (Link::Down, Some(outage)) = (&self.link, &mut self.outage) else { return Ok(()) };
+        let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
         let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
-        if !outage.try_again(pause, deadline) {
+        if !outage.wait_for_retry(pause, deadline) {
             return Err(Error::Reconnecting { camera: self.config.name.clone(), waited: outage.since.elapsed() });
         }
         let outage = *outage;
-        match Running::start(&self.config) {
-            Ok(running) => {
+        match V4l2Stream::start(&self.config) {
+            Ok(stream) => {
                 let Outage { since, n_tries, .. } = outage;
                 let (camera, waited) = (&self.config.name, since.elapsed());
                 log::info!(
                     "camera {camera:?}: there again after {waited:?} and {n_tries} tries: {}",
-                    running.describe()
+                    stream.describe()
                 );
                 self.counts.n_reconnections += 1;
-                self.link = Link::Up(Box::new(running));
+                self.connection = Connection::Connected(Box::new(stream));
                 Ok(())
             }
-            Err(Error::V4l2 { problem, .. }) => self.give_up_if_late(outage, *problem),
+            Err(Error::V4l2 { problem, .. }) => self.fail_if_overdue(outage, *problem),
             Err(other) => Err(other),
         }
     }
@@ -183,13 +183,13 @@ impl Camera for V4l2Camera {
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error> {
         let deadline = Instant::now() + timeout;
         loop {
-            match &self.link {
-                Link::Down => self.reconnect(deadline)?,
-                Link::Up(_) => {
-                    if let Some(image) = self.wait_for_image(deadline)? {
+            match &self.connection {
+                Connection::Disconnected => self.reconnect(deadline)?,
+                Connection::Connected(_) => {
+                    if let Some(image) = self.poll_image(deadline)? {
                         return Ok(image);
                     }
-                    if matches!(self.link, Link::Up(_)) {
+                    if matches!(self.connection, Connection::Connected(_)) {
                         return Err(Error::NoImage { camera: self.config.name.clone(), waited: timeout });
                     }
                 }
@@ -203,7 +203,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_camera_that_is_not_plugged_in_is_an_error_that_names_it() {
+    fn missing_camera_error_names_it() {
         let config = Config {
             name: "wrist".into(),
             device: "no such serial".into(),
@@ -216,7 +216,7 @@ mod tests {
                 rectified: true,
             },
             rate_hz: 30.0,
-            metres_per_count: None,
+            meters_per_count: None,
             settings: super::super::Settings::default(),
             delivery: super::super::Delivery::Every,
             reconnect_for: Duration::from_secs(1),

@@ -13,14 +13,14 @@ pub struct Config {
     /// A path (best a link under `/dev/v4l`, whose name stays), a serial number on USB, or where it is plugged in as the
     /// kernel tells (`usb-0000:00:14.0-2`).
     pub device: String,
-    /// Pixel format; `None` takes the first that is offered at this size and rate, see [`V4l2Format::OF_COLOR`].
+    /// Pixel format; `None` takes the first that is offered at this size and rate, see [`V4l2Format::COLOR_FORMATS`].
     pub format: Option<V4l2Format>,
     /// Lens and size of the images.
     pub intrinsics: Intrinsics,
     /// Images a second.
     pub rate_hz: f64,
     /// Metres per count of depth; needed for [`V4l2Format::Z16`].
-    pub metres_per_count: Option<f64>,
+    pub meters_per_count: Option<f64>,
     /// Exposure, gain, white balance, brightness.
     pub settings: Settings,
     /// Which image a slow caller gets.

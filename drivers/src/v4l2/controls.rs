@@ -11,7 +11,7 @@ use std::io;
 /// Exposure counts of 100 us.
 const MICROS_PER_COUNT: f64 = 100.0;
 /// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
-const EXPOSURE_OFF_FRAC: f64 = 0.1;
+const EXPOSURE_TOLERANCE_FRAC: f64 = 0.1;
 
 /// A control by the kernel's number.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,18 +55,18 @@ struct Step {
     id: Id,
     value: i32,
     /// How far off it may read back.
-    slack: i32,
+    tolerance: i32,
     /// Asked for by the rig file; else a camera that refuses is told of and left as it is.
-    is_asked_for: bool,
+    is_required: bool,
 }
 
 /// What the camera is set to, as it told itself.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Applied {
+pub(super) struct AppliedSettings {
     /// Exposure time where it is fixed and told, seconds.
     pub(super) exposure_secs: Option<f64>,
     /// Whether the exposure is automatic and can be asked for.
-    pub(super) tells_exposure: bool,
+    pub(super) reports_exposure: bool,
     /// Names and values, for people.
     pub(super) read_back: Vec<(&'static str, i32)>,
 }
@@ -102,11 +102,11 @@ impl Controls for Device {
 }
 
 /// Sets a camera, reads everything back, and compares.
-pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
     let steps = plan(settings, camera)?;
     for step in &steps {
         match camera.set(step.id, step.value) {
-            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) if step.is_required || error == Errno::NODEV => return Err(refused(step.control, error)),
             Err(error) => log::debug!("{}: {error}", step.control),
             Ok(()) => {}
         }
@@ -115,7 +115,7 @@ pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Appli
 }
 
 /// Compares again once images come, for some cameras forget their settings when a stream begins; sets them once more if so.
-pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<Applied, Problem> {
+pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
     match check(settings, camera, &plan(settings, camera)?) {
         Err(Problem::ReadBack { .. }) => apply(settings, camera),
         other => other,
@@ -123,16 +123,16 @@ pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<App
 }
 
 /// Reads back what was set, and compares.
-fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<Applied, Problem> {
-    let mut applied = Applied::default();
+fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<AppliedSettings, Problem> {
+    let mut applied = AppliedSettings::default();
     for step in steps {
         let got = match camera.get(step.id) {
             Ok(got) => got,
-            Err(error) if step.is_asked_for || error == Errno::NODEV => return Err(refused(step.control, error)),
+            Err(error) if step.is_required || error == Errno::NODEV => return Err(refused(step.control, error)),
             Err(_) => continue,
         };
-        if step.is_asked_for && got.abs_diff(step.value) > step.slack.unsigned_abs() {
-            return Err(Problem::ReadBack { control: step.control, wanted: step.value, got });
+        if step.is_required && got.abs_diff(step.value) > step.tolerance.unsigned_abs() {
+            return Err(Problem::ReadBack { control: step.control, requested: step.value, got });
         }
         if step.id == Id::ExposureAbsolute {
             applied.exposure_secs = Some(secs_of_counts(got));
@@ -141,7 +141,7 @@ fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<
         applied.read_back.push((step.control, got));
     }
     if settings.exposure_micros.is_none() {
-        applied.tells_exposure = exposure_secs(camera).is_some();
+        applied.reports_exposure = exposure_secs(camera).is_some();
     } else if applied.exposure_secs.is_none() {
         // It cannot be set: then the rig file knows it.
         applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
@@ -171,9 +171,10 @@ fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Proble
     let mut steps = Vec::new();
     exposure(settings.exposure_micros, camera, &mut steps)?;
     let gain_id = [Id::Gain, Id::AnalogueGain].into_iter().find(|id| camera.find(*id).is_some());
-    let gain = Lock { auto: ("automatic gain", Id::AutoGain), fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)) };
+    let gain =
+        AutoControl { auto: ("automatic gain", Id::AutoGain), fixed: ("v4l2.gain", gain_id.unwrap_or(Id::Gain)) };
     gain.plan(settings.gain, camera, &mut steps)?;
-    let balance = Lock {
+    let balance = AutoControl {
         auto: ("automatic white balance", Id::AutoWhiteBalance),
         fixed: ("v4l2.white_balance_kelvin", Id::WhiteBalanceTemperature),
     };
@@ -185,17 +186,17 @@ fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Proble
 }
 
 /// A value that a camera may choose itself.
-struct Lock {
+struct AutoControl {
     auto: (&'static str, Id),
     fixed: (&'static str, Id),
 }
 
-impl Lock {
+impl AutoControl {
     fn plan(&self, value: Option<i32>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
         let (control, id) = self.auto;
         if camera.find(id).is_some() {
-            let is_asked_for = value.is_some();
-            steps.push(Step { control, id, value: i32::from(!is_asked_for), slack: 0, is_asked_for });
+            let is_required = value.is_some();
+            steps.push(Step { control, id, value: i32::from(!is_required), tolerance: 0, is_required });
         }
         if let Some(value) = value {
             steps.push(fixed(self.fixed.0, self.fixed.1, value, camera)?);
@@ -213,13 +214,13 @@ fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> R
     if !is_known {
         return Err(Problem::ControlRange {
             control,
-            wanted: value.into(),
-            least: known.minimum.into(),
-            most: known.maximum.into(),
+            requested: value.into(),
+            min: known.minimum.into(),
+            max: known.maximum.into(),
             step: step.into(),
         });
     }
-    Ok(Step { control, id, value, slack: 0, is_asked_for: true })
+    Ok(Step { control, id, value, tolerance: 0, is_required: true })
 }
 
 /// Exposure: the mode, that automation keeps the rate, and the time where it is fixed.
@@ -231,12 +232,12 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
         Some(_) => [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY],
     };
     if let Some(value) = candidates.into_iter().find(|entry| entries.contains(entry)) {
-        let is_asked_for = micros.is_some();
-        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, slack: 0, is_asked_for });
+        let is_required = micros.is_some();
+        steps.push(Step { control: "exposure mode", id: Id::ExposureAuto, value, tolerance: 0, is_required });
     }
     if camera.find(Id::ExposureAutoPriority).is_some() {
         let control = "exposure_dynamic_framerate";
-        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, slack: 0, is_asked_for: false });
+        steps.push(Step { control, id: Id::ExposureAutoPriority, value: 0, tolerance: 0, is_required: false });
     }
     let Some(micros) = micros else { return Ok(()) };
     let Some(known) = camera.find(Id::ExposureAbsolute) else { return Ok(()) };
@@ -248,15 +249,15 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
     #[expect(clippy::cast_possible_truncation, reason = "within the range of the control, which is 32 bits wide")]
     let value = counts.map(|counts| counts as i32).ok_or(Problem::ControlRange {
         control: "exposure_micros",
-        wanted: micros,
-        least: f64::from(known.minimum) * MICROS_PER_COUNT,
-        most: f64::from(known.maximum) * MICROS_PER_COUNT,
+        requested: micros,
+        min: f64::from(known.minimum) * MICROS_PER_COUNT,
+        max: f64::from(known.maximum) * MICROS_PER_COUNT,
         step: step * MICROS_PER_COUNT,
     })?;
     #[expect(clippy::cast_possible_truncation, reason = "a tenth of 32 bits")]
-    let slack = (f64::from(value) * EXPOSURE_OFF_FRAC) as i32;
-    let slack = slack.max(known.step);
-    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, slack, is_asked_for: true });
+    let tolerance = (f64::from(value) * EXPOSURE_TOLERANCE_FRAC) as i32;
+    let tolerance = tolerance.max(known.step);
+    steps.push(Step { control: "exposure_micros", id: Id::ExposureAbsolute, value, tolerance, is_required: true });
     Ok(())
 }
 
@@ -267,29 +268,29 @@ mod tests {
     use std::collections::BTreeMap;
 
     /// A camera by a table of its controls: number, least, most, step.
-    struct Table {
+    struct FakeControls {
         controls: &'static [(Id, i32, i32, i32)],
         exposure_modes: &'static [i32],
     }
 
     /// Such a camera with the values it has now, by the kernel's numbers; it refuses to be set where it says so.
-    struct Switched {
-        table: Table,
+    struct FakeCamera {
+        controls_table: FakeControls,
         values: RefCell<BTreeMap<u32, i32>>,
-        refuses: &'static [Id],
+        rejects: &'static [Id],
     }
 
-    impl Controls for Switched {
+    impl Controls for FakeCamera {
         fn find(&self, id: Id) -> Option<QueryControl> {
-            self.table.find(id)
+            self.controls_table.find(id)
         }
 
         fn menu(&self, id: Id) -> Vec<i32> {
-            self.table.menu(id)
+            self.controls_table.menu(id)
         }
 
         fn set(&self, id: Id, value: i32) -> Result<(), Errno> {
-            if self.refuses.contains(&id) {
+            if self.rejects.contains(&id) {
                 return Err(Errno::IO);
             }
             // Sensors expose whole rows: what is near is what they take.
@@ -304,11 +305,11 @@ mod tests {
         }
     }
 
-    fn switched(table: Table, refuses: &'static [Id]) -> Switched {
-        Switched { table, values: RefCell::default(), refuses }
+    fn fake_camera(controls_table: FakeControls, rejects: &'static [Id]) -> FakeCamera {
+        FakeCamera { controls_table, values: RefCell::default(), rejects }
     }
 
-    impl Controls for Table {
+    impl Controls for FakeControls {
         fn find(&self, id: Id) -> Option<QueryControl> {
             let (_, minimum, maximum, step) = *self.controls.iter().find(|control| control.0 == id)?;
             Some(QueryControl { id: id as u32, minimum, maximum, step, ..Default::default() })
@@ -328,7 +329,7 @@ mod tests {
     }
 
     /// Logitech C920 as `v4l2-ctl -L` prints it (kernel 5.15, firmware 0.0.15).
-    const C920: Table = Table {
+    const C920: FakeControls = FakeControls {
         controls: &[
             (Id::Brightness, 0, 255, 1),
             (Id::AutoWhiteBalance, 0, 1, 1),
@@ -342,32 +343,32 @@ mod tests {
     };
 
     /// The test driver vivid.
-    const VIVID: Table = Table {
+    const VIVID: FakeControls = FakeControls {
         controls: &[(Id::Brightness, 0, 255, 1), (Id::AutoGain, 0, 1, 1), (Id::Gain, 0, 255, 1)],
         exposure_modes: &[],
     };
 
-    fn planned(settings: &Settings, camera: &Table) -> Vec<(Id, i32)> {
+    fn planned(settings: &Settings, camera: &FakeControls) -> Vec<(Id, i32)> {
         plan(settings, camera).expect("it can").iter().map(|step| (step.id, step.value)).collect()
     }
 
     #[test]
-    fn what_the_rig_file_leaves_open_is_automatic_and_keeps_the_rate() {
+    fn unset_settings_are_automatic_and_keep_rate() {
         let automatic = planned(&Settings::default(), &C920);
-        let wanted = [(Id::ExposureAuto, 3), (Id::ExposureAutoPriority, 0), (Id::AutoWhiteBalance, 1)];
-        assert_eq!(automatic, wanted);
+        let requested = [(Id::ExposureAuto, 3), (Id::ExposureAutoPriority, 0), (Id::AutoWhiteBalance, 1)];
+        assert_eq!(automatic, requested);
         assert_eq!(planned(&Settings::default(), &VIVID), [(Id::AutoGain, 1)]);
     }
 
     #[test]
-    fn what_it_fixes_is_set_after_its_automation_is_off() {
+    fn fixed_settings_follow_disabling_automation() {
         let settings = Settings {
             exposure_micros: Some(4040.0),
             gain: Some(12),
             white_balance_kelvin: Some(4600),
             brightness: Some(100),
         };
-        let wanted = [
+        let requested = [
             (Id::ExposureAuto, 1),
             (Id::ExposureAutoPriority, 0),
             (Id::ExposureAbsolute, 40),
@@ -376,39 +377,46 @@ mod tests {
             (Id::WhiteBalanceTemperature, 4600),
             (Id::Brightness, 100),
         ];
-        assert_eq!(planned(&settings, &C920), wanted);
+        assert_eq!(planned(&settings, &C920), requested);
         let gain = Settings { gain: Some(12), ..Settings::default() };
         assert_eq!(planned(&gain, &VIVID), [(Id::AutoGain, 0), (Id::Gain, 12)]);
     }
 
     #[test]
-    fn what_a_camera_cannot_do_is_told_with_what_it_can() {
-        let refuse = |settings: &Settings, camera: &Table| plan(settings, camera).expect_err("it cannot").to_string();
-        let dark = Settings { exposure_micros: Some(100.0), ..Settings::default() };
-        assert_eq!(refuse(&dark, &C920), "exposure_micros is 100, it takes 300 to 204700 in steps of 100");
-        let loud = Settings { gain: Some(256), ..Settings::default() };
-        assert_eq!(refuse(&loud, &C920), "v4l2.gain is 256, it takes 0 to 255 in steps of 1");
-        let warm = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
-        assert_eq!(refuse(&warm, &VIVID), "it has no control for v4l2.white_balance_kelvin: leave the key out");
-        const COARSE: Table = Table { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
-        let off = Settings { gain: Some(15), ..Settings::default() };
-        assert!(refuse(&off, &COARSE).ends_with("it takes 0 to 100 in steps of 10"));
+    fn unsupported_settings_report_supported_range() {
+        let plan_error =
+            |settings: &Settings, camera: &FakeControls| plan(settings, camera).expect_err("it cannot").to_string();
+        let too_short_exposure = Settings { exposure_micros: Some(100.0), ..Settings::default() };
+        assert_eq!(
+            plan_error(&too_short_exposure, &C920),
+            "exposure_micros is 100, it takes 300 to 204700 in steps of 100"
+        );
+        let too_high_gain = Settings { gain: Some(256), ..Settings::default() };
+        assert_eq!(plan_error(&too_high_gain, &C920), "v4l2.gain is 256, it takes 0 to 255 in steps of 1");
+        let unsupported_white_balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
+        assert_eq!(
+            plan_error(&unsupported_white_balance, &VIVID),
+            "it has no control for v4l2.white_balance_kelvin: leave the key out"
+        );
+        const COARSE: FakeControls = FakeControls { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
+        let misaligned_gain = Settings { gain: Some(15), ..Settings::default() };
+        assert!(plan_error(&misaligned_gain, &COARSE).ends_with("it takes 0 to 100 in steps of 10"));
     }
 
     #[test]
-    fn a_camera_without_exposure_control_is_not_refused() {
+    fn camera_without_exposure_control_is_accepted() {
         // The key then states what is known about it, as docs/reference/rig.md describes.
         let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
         assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
     }
 
     #[test]
-    fn what_was_set_is_read_back_and_set_again_where_a_stream_changed_it() {
+    fn settings_are_read_back_and_reapplied() {
         let settings = Settings { exposure_micros: Some(4000.0), gain: Some(12), ..Settings::default() };
-        let camera = switched(C920, &[]);
+        let camera = fake_camera(C920, &[]);
         let applied = apply(&settings, &camera).expect("it takes all");
         assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "what the camera made of it");
-        assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.tells_exposure);
+        assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.reports_exposure);
         camera.values.borrow_mut().insert(Id::Gain as u32, 64);
         assert!(confirm(&settings, &camera).expect("set again").read_back.contains(&("v4l2.gain", 12)));
         assert_eq!(camera.get(Id::Gain), Ok(12));
@@ -416,13 +424,13 @@ mod tests {
         // With automatic exposure it is asked for with each image.
         camera.values.borrow_mut().insert(Id::ExposureAbsolute as u32, 156);
         let automatic = apply(&Settings::default(), &camera).expect("it takes all");
-        assert!(automatic.tells_exposure && automatic.exposure_secs.is_none());
+        assert!(automatic.reports_exposure && automatic.exposure_secs.is_none());
         assert_eq!(exposure_secs(&camera), Some(secs_of_counts(156)));
     }
 
     #[test]
-    fn only_what_the_rig_file_asks_for_has_to_be_taken() {
-        let camera = switched(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
+    fn only_requested_settings_are_required() {
+        let camera = fake_camera(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
         assert!(apply(&Settings::default(), &camera).is_ok(), "nothing was asked for");
         let gain = Settings { gain: Some(12), ..Settings::default() };
         let message = apply(&gain, &camera).expect_err("it refuses").to_string();

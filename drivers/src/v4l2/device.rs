@@ -30,7 +30,7 @@ pub(super) struct Identity {
 
 /// An image that the device has filled.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Filled {
+pub(super) struct FilledBuffer {
     index: u32,
     n_bytes: usize,
     /// Images since the stream began, lost ones counted.
@@ -77,7 +77,7 @@ impl Device {
     }
 
     /// One request; repeated when a signal cuts it short.
-    fn ask<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
+    fn ioctl<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
         rustix::io::retry_on_intr(|| {
             // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the call; none of the structures
             // holds a pointer for the kernel to follow.
@@ -89,31 +89,35 @@ impl Device {
     }
 
     /// Asks with rising indices until the device has no more; a device without this request has none at all.
-    fn list<T: Plain>(&self, request: &Request<T>, mut of_index: impl FnMut(u32) -> T) -> Vec<T> {
-        const MOST: u32 = 1000; // A driver that never ends its list must not hold us.
+    fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
+        const MAX_ENTRIES: u32 = 1000; // A driver that never ends its list must not hold us.
         let entry = |index| {
-            let mut entry = of_index(index);
-            self.ask(request, &mut entry).is_ok().then_some(entry)
+            let mut entry = request_at(index);
+            self.ioctl(request, &mut entry).is_ok().then_some(entry)
         };
-        (0..MOST).map_while(entry).collect()
+        (0..MAX_ENTRIES).map_while(entry).collect()
     }
 
     pub(super) fn identity(&self) -> rustix::io::Result<Identity> {
-        let mut told = abi::Capability::default();
-        self.ask(&abi::QUERYCAP, &mut told)?;
-        let of_node = if told.capabilities & abi::CAP_DEVICE_CAPS == 0 { told.capabilities } else { told.device_caps };
-        let needed = abi::CAP_VIDEO_CAPTURE | abi::CAP_STREAMING;
+        let mut reported = abi::Capability::default();
+        self.ioctl(&abi::QUERYCAP, &mut reported)?;
+        let of_node = if reported.capabilities & abi::CAP_DEVICE_CAPS == 0 {
+            reported.capabilities
+        } else {
+            reported.device_caps
+        };
+        let required = abi::CAP_VIDEO_CAPTURE | abi::CAP_STREAMING;
         Ok(Identity {
-            card: abi::text(&told.card),
-            bus: abi::text(&told.bus_info),
-            streams_images: of_node & needed == needed,
+            card: abi::text(&reported.card),
+            bus: abi::text(&reported.bus_info),
+            streams_images: of_node & required == required,
         })
     }
 
     /// Codes of the pixel formats on offer, in the device's order.
     pub(super) fn fourccs(&self) -> Vec<u32> {
-        let of_index = |index| abi::FormatDescription { index, kind: abi::VIDEO_CAPTURE, ..Default::default() };
-        self.list(&abi::ENUM_FMT, of_index).iter().map(|format| format.fourcc).collect()
+        let request_at = |index| abi::FormatDescription { index, kind: abi::VIDEO_CAPTURE, ..Default::default() };
+        self.list(&abi::ENUM_FMT, request_at).iter().map(|format| format.fourcc).collect()
     }
 
     /// Sizes on offer in a format.
@@ -123,43 +127,43 @@ impl Device {
 
     /// Times between images on offer in a format at a size.
     pub(super) fn intervals(&self, fourcc: u32, [width, height]: [u32; 2]) -> Vec<abi::FrameInterval> {
-        let of_index = |index| abi::FrameInterval { index, fourcc, width, height, ..Default::default() };
-        self.list(&abi::ENUM_FRAMEINTERVALS, of_index)
+        let request_at = |index| abi::FrameInterval { index, fourcc, width, height, ..Default::default() };
+        self.list(&abi::ENUM_FRAMEINTERVALS, request_at)
     }
 
     /// Asks for a format and tells what the device made of it.
     pub(super) fn set_format(&self, fourcc: u32, [width, height]: [u32; 2]) -> rustix::io::Result<abi::PixFormat> {
         let pix = abi::PixFormat { width, height, fourcc, field: abi::FIELD_NONE, ..Default::default() };
         let mut format = abi::Format { kind: abi::VIDEO_CAPTURE, padding: 0, pix, rest: [0; 19] };
-        self.ask(&abi::S_FMT, &mut format)?;
+        self.ioctl(&abi::S_FMT, &mut format)?;
         Ok(format.pix)
     }
 
     /// Asks for a rate, images a second, and tells what the device made of it; `None` where it has a rate of its own.
     pub(super) fn set_rate_hz(&self, rate_hz: f64) -> rustix::io::Result<Option<f64>> {
         let mut parm = abi::StreamParm { kind: abi::VIDEO_CAPTURE, capture: Default::default(), rest: [0; 40] };
-        if self.ask(&abi::G_PARM, &mut parm).is_err() || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0 {
+        if self.ioctl(&abi::G_PARM, &mut parm).is_err() || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0 {
             return Ok(None);
         }
         parm.capture.time_per_frame = super::format::interval_of(rate_hz);
-        self.ask(&abi::S_PARM, &mut parm)?;
+        self.ioctl(&abi::S_PARM, &mut parm)?;
         Ok(Some(super::format::rate_of(parm.capture.time_per_frame)))
     }
 
     /// Whether what it receives are high-definition television signals, as of an HDMI grabber.
     pub(super) fn is_hdtv(&self) -> bool {
         let mut index = 0;
-        if self.ask(&abi::G_INPUT, &mut index).is_err() {
+        if self.ioctl(&abi::G_INPUT, &mut index).is_err() {
             return false;
         }
         let mut input = abi::Input { index, ..Default::default() };
-        self.ask(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
+        self.ioctl(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
     /// What a control is; `None` where the device has none of this number that can be set.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
         let mut control = abi::QueryControl { id, ..Default::default() };
-        self.ask(&abi::QUERYCTRL, &mut control).ok()?;
+        self.ioctl(&abi::QUERYCTRL, &mut control).ok()?;
         (control.flags & (abi::CONTROL_DISABLED | abi::CONTROL_READ_ONLY) == 0).then_some(control)
     }
 
@@ -167,7 +171,7 @@ impl Device {
     pub(super) fn menu(&self, id: u32, range: std::ops::RangeInclusive<i32>) -> Vec<i32> {
         let has = |entry: &i32| {
             u32::try_from(*entry).is_ok_and(|index| {
-                self.ask(&abi::QUERYMENU, &mut abi::QueryMenu { id, index, ..Default::default() }).is_ok()
+                self.ioctl(&abi::QUERYMENU, &mut abi::QueryMenu { id, index, ..Default::default() }).is_ok()
             })
         };
         range.filter(has).collect()
@@ -175,31 +179,31 @@ impl Device {
 
     pub(super) fn control_value(&self, id: u32) -> rustix::io::Result<i32> {
         let mut control = abi::Control { id, value: 0 };
-        self.ask(&abi::G_CTRL, &mut control)?;
+        self.ioctl(&abi::G_CTRL, &mut control)?;
         Ok(control.value)
     }
 
     pub(super) fn set_control(&self, id: u32, value: i32) -> rustix::io::Result<()> {
-        self.ask(&abi::S_CTRL, &mut abi::Control { id, value })
+        self.ioctl(&abi::S_CTRL, &mut abi::Control { id, value })
     }
 
     /// Gives the device `n_buffers` to fill (it may take more or fewer) and lets it begin.
     pub(super) fn stream(self, n_buffers: u32) -> Result<Stream, Refused> {
-        let mut wanted = abi::RequestBuffers {
+        let mut requested = abi::RequestBuffers {
             count: n_buffers,
             kind: abi::VIDEO_CAPTURE,
             memory: abi::MEMORY_MMAP,
             ..Default::default()
         };
-        self.ask(&abi::REQBUFS, &mut wanted).map_err(Refused::Buffers)?;
+        self.ioctl(&abi::REQBUFS, &mut requested).map_err(Refused::Buffers)?;
         let mut buffers = Vec::new();
-        for index in 0..wanted.count {
+        for index in 0..requested.count {
             let mut buffer = buffer_of(index);
-            self.ask(&abi::QUERYBUF, &mut buffer).map_err(Refused::Buffers)?;
+            self.ioctl(&abi::QUERYBUF, &mut buffer).map_err(Refused::Buffers)?;
             buffers.push(Mapped::new(&self.fd, &buffer).map_err(Refused::Buffers)?);
-            self.ask(&abi::QBUF, &mut buffer_of(index)).map_err(Refused::Buffers)?;
+            self.ioctl(&abi::QBUF, &mut buffer_of(index)).map_err(Refused::Buffers)?;
         }
-        self.ask(&abi::STREAMON, &mut abi::VIDEO_CAPTURE.clone()).map_err(Refused::Begin)?;
+        self.ioctl(&abi::STREAMON, &mut abi::VIDEO_CAPTURE.clone()).map_err(Refused::Begin)?;
         Ok(Stream { device: self, buffers })
     }
 }
@@ -227,27 +231,27 @@ impl Stream {
 
     /// Waits until an image is there (`true`) or the time is over; fails when the device is gone.
     pub(super) fn wait(&self, timeout: Duration) -> rustix::io::Result<bool> {
-        let mut waited = [PollFd::new(&self.device.fd, PollFlags::IN)];
+        let mut poll_fds = [PollFd::new(&self.device.fd, PollFlags::IN)];
         let timeout = Timespec {
             tv_sec: i64::try_from(timeout.as_secs()).unwrap_or(i64::MAX),
             tv_nsec: timeout.subsec_nanos().into(),
         };
-        match poll(&mut waited, Some(&timeout)) {
+        match poll(&mut poll_fds, Some(&timeout)) {
             Err(Errno::INTR) => Ok(false),
             Err(error) => Err(error),
-            Ok(_) => Ok(!waited[0].revents().is_empty()), // Errors too: taking the image tells which.
+            Ok(_) => Ok(!poll_fds[0].revents().is_empty()), // Errors too: taking the image tells which.
         }
     }
 
     /// Takes the oldest filled image out of the queue; `None` when none is filled. It has to be given [back](Self::give_back).
-    pub(super) fn take(&mut self) -> rustix::io::Result<Option<Filled>> {
+    pub(super) fn take(&mut self) -> rustix::io::Result<Option<FilledBuffer>> {
         let mut buffer = buffer_of(0);
-        match self.device.ask(&abi::DQBUF, &mut buffer) {
+        match self.device.ioctl(&abi::DQBUF, &mut buffer) {
             Ok(()) => {}
             Err(Errno::AGAIN) => return Ok(None),
             Err(error) => return Err(error),
         }
-        Ok(Some(Filled {
+        Ok(Some(FilledBuffer {
             index: buffer.index,
             n_bytes: buffer.bytes_used as usize,
             sequence: buffer.sequence,
@@ -258,22 +262,22 @@ impl Stream {
     }
 
     /// The bytes of an image that was taken; fewer than it says where it says more than there is room for.
-    pub(super) fn bytes(&self, filled: &Filled) -> &[u8] {
-        let Some(mapped) = self.buffers.get(filled.index as usize) else { return &[] };
-        let whole = mapped.bytes();
-        &whole[..filled.n_bytes.min(whole.len())]
+    pub(super) fn bytes(&self, filled: &FilledBuffer) -> &[u8] {
+        let Some(mapping) = self.buffers.get(filled.index as usize) else { return &[] };
+        let buffer_bytes = mapping.bytes();
+        &buffer_bytes[..filled.n_bytes.min(buffer_bytes.len())]
     }
 
     /// Lets the device fill it again.
-    pub(super) fn give_back(&mut self, filled: Filled) -> rustix::io::Result<()> {
-        self.device.ask(&abi::QBUF, &mut buffer_of(filled.index))
+    pub(super) fn requeue(&mut self, filled: FilledBuffer) -> rustix::io::Result<()> {
+        self.device.ioctl(&abi::QBUF, &mut buffer_of(filled.index))
     }
 }
 
 impl Drop for Stream {
     fn drop(&mut self) {
         // A device that is gone has stopped already.
-        let _ = self.device.ask(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
+        let _ = self.device.ioctl(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
     }
 }
 
@@ -312,7 +316,7 @@ impl Mapped {
 
     fn bytes(&self) -> &[u8] {
         // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes only between `QBUF` and
-        // `DQBUF`, and `give_back` needs the stream for itself, so no slice is left then. A device that breaks this would show torn
+        // `DQBUF`, and `requeue` needs the stream for itself, so no slice is left then. A device that breaks this would show torn
         // pixels: bytes have no invalid values, and nothing here decides twice on the same byte.
         #[expect(unsafe_code, reason = "memory that the kernel shares")]
         unsafe {

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// One node of a V4L2 device that gives images.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Found {
+pub struct FoundCamera {
     /// The node, whose number may change: `/dev/video0`.
     pub node: PathBuf,
     /// What it calls itself.
@@ -25,7 +25,7 @@ pub struct Found {
     pub modes: Vec<Mode>,
 }
 
-impl Found {
+impl FoundCamera {
     /// What to write into a rig file: a link of udev, else its serial number, else where it is plugged in.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
@@ -38,8 +38,8 @@ impl Found {
     }
 
     /// What it offers that its USB cannot carry, for people.
-    pub fn beyond_usb(&self) -> Vec<String> {
-        self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::beyond(&self.modes, bytes_per_sec))
+    pub fn modes_exceeding_usb(&self) -> Vec<String> {
+        self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::modes_exceeding(&self.modes, bytes_per_sec))
     }
 }
 
@@ -54,20 +54,20 @@ struct Node {
 }
 
 /// All that give images, and why the others cannot be opened; nodes of metadata are left out.
-pub fn cameras() -> Vec<Result<Found, Problem>> {
+pub fn cameras() -> Vec<Result<FoundCamera, Problem>> {
     let root = Path::new("/");
     nodes(root).into_iter().filter_map(|node| describe(root, node).transpose()).collect()
 }
 
-fn describe(root: &Path, node: Node) -> Result<Option<Found>, Problem> {
+fn describe(root: &Path, node: Node) -> Result<Option<FoundCamera>, Problem> {
     let device =
         Device::open(&node.path).map_err(|error| Problem::Open { path: node.path.clone(), source: error.into() })?;
     let Some(identity) = device.identity().ok().filter(|identity| identity.streams_images) else { return Ok(None) };
-    Ok(Some(Found {
+    Ok(Some(FoundCamera {
         name: identity.card,
         bus: identity.bus,
         serial: node.serial,
-        links: links_to(root, &node.path),
+        links: stable_links(root, &node.path),
         usb_mbits: node.usb_mbits,
         modes: modes(&device),
         node: node.path,
@@ -81,7 +81,7 @@ pub(super) fn modes(device: &Device) -> Vec<Mode> {
         let Some(format) = V4l2Format::from_fourcc(fourcc) else { continue };
         for size in device.sizes(fourcc) {
             let sizes = Sizes::from_kernel(&size);
-            let rates = Rates::from_kernel(&device.intervals(fourcc, sizes.most()));
+            let rates = Rates::from_kernel(&device.intervals(fourcc, sizes.max()));
             modes.push(Mode { fourcc, format, sizes, rates });
         }
     }
@@ -93,16 +93,16 @@ pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);
     }
-    let sits_there = |node: &Node| {
+    let has_bus_address = |node: &Node| {
         Device::open(&node.path).and_then(|open| open.identity()).is_ok_and(|identity| identity.bus == device)
     };
-    let is_meant = |node: &Node| node.serial.as_deref() == Some(device) || sits_there(node);
-    let found = nodes(Path::new("/")).into_iter().filter(is_meant).collect();
-    one_camera(device, found)
+    let is_match = |node: &Node| node.serial.as_deref() == Some(device) || has_bus_address(node);
+    let found = nodes(Path::new("/")).into_iter().filter(is_match).collect();
+    paths_of_one_camera(device, found)
 }
 
 /// Looks whether something that is plugged in goes by this name of a rig file, without opening it more than to ask.
-pub fn look_for(device: &str) -> Result<(), Problem> {
+pub fn check_connected(device: &str) -> Result<(), Problem> {
     match candidates(device)?.iter().any(|path| path.exists()) {
         true => Ok(()),
         false => Err(Problem::NoDevice { device: device.to_owned() }),
@@ -110,7 +110,7 @@ pub fn look_for(device: &str) -> Result<(), Problem> {
 }
 
 /// The paths of nodes once they are known to be of one camera: makers give serial numbers twice.
-fn one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
+fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();
     let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
     let paths: Vec<_> = found.into_iter().map(|node| node.path).collect();
@@ -157,7 +157,7 @@ fn usb_folder(device: &Path) -> Option<PathBuf> {
 }
 
 /// The links of udev that lead to a node: those by device before those by port.
-fn links_to(root: &Path, node: &Path) -> Vec<PathBuf> {
+fn stable_links(root: &Path, node: &Path) -> Vec<PathBuf> {
     let Ok(node) = node.canonicalize() else { return Vec::new() };
     let links_in = |folder: &str| {
         let mut links: Vec<PathBuf> = std::fs::read_dir(root.join("dev/v4l").join(folder))
@@ -178,7 +178,7 @@ mod tests {
     use std::os::unix::fs::symlink;
 
     #[test]
-    fn stable_names_are_found_where_the_kernel_and_udev_put_them() {
+    fn stable_names_are_read_from_sysfs_and_udev() {
         let root = tempfile::tempdir().expect("a folder");
         let root = root.path();
         let usb = root.join("sys/devices/pci0/usb1/1-2");
@@ -202,7 +202,7 @@ mod tests {
         symlink("../../video10", root.join("dev/v4l/by-id/usb-A1B2")).expect("link");
         symlink("../../video9", root.join("dev/v4l/by-path/platform")).expect("link");
         let found = nodes(root);
-        let wanted = [
+        let expected = [
             Node { path: root.join("dev/video9"), usb: None, serial: None, usb_mbits: None },
             Node {
                 path: node.clone(),
@@ -211,9 +211,12 @@ mod tests {
                 usb_mbits: Some(480.0),
             },
         ];
-        assert_eq!(found, wanted);
-        assert_eq!(links_to(root, &node), [root.join("dev/v4l/by-id/usb-A1B2"), root.join("dev/v4l/by-path/pci-2")]);
-        let mut camera = Found {
+        assert_eq!(found, expected);
+        assert_eq!(
+            stable_links(root, &node),
+            [root.join("dev/v4l/by-id/usb-A1B2"), root.join("dev/v4l/by-path/pci-2")]
+        );
+        let mut camera = FoundCamera {
             node,
             name: "C920".into(),
             bus: "usb-1-2".into(),
@@ -230,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_plugged_in_is_nothing_found() {
+    fn no_device_found_when_none_connected() {
         let root = tempfile::tempdir().expect("a folder");
         assert_eq!(nodes(root.path()), []);
         let message = candidates("no such serial").expect_err("nothing of that name").to_string();

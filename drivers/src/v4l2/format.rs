@@ -30,8 +30,8 @@ impl V4l2Format {
 
     /// The usual code of a format.
     fn fourcc(self) -> u32 {
-        let usual = Self::CODES.iter().find(|(_, format)| *format == self);
-        usual.map_or(0, |(code, _)| u32::from_le_bytes(**code))
+        let default_code = Self::CODES.iter().find(|(_, format)| *format == self);
+        default_code.map_or(0, |(code, _)| u32::from_le_bytes(**code))
     }
 
     /// Bytes a second of images of a size at a rate; `None` where compression decides.
@@ -46,8 +46,8 @@ impl V4l2Format {
         Some(bytes_per_pixel * f64::from(width) * f64::from(height) * rate_hz)
     }
 
-    /// How its bytes are read; `metres_per_count` counts for depth only.
-    pub(super) fn pixels(self, colors: V4l2Colors, metres_per_count: f64) -> Result<PixelFormat, Error> {
+    /// How its bytes are read; `meters_per_count` counts for depth only.
+    pub(super) fn pixels(self, colors: V4l2Colors, meters_per_count: f64) -> Result<PixelFormat, Error> {
         let yuv = |layout| Ok(PixelFormat::Yuv { layout, colors: YuvColors::from_v4l2(colors)? });
         match self {
             Self::Yuyv => yuv(YuvLayout::Yuyv),
@@ -57,7 +57,7 @@ impl V4l2Format {
             Self::Bgr => Ok(PixelFormat::Bgr8),
             Self::Mjpeg => Ok(PixelFormat::Jpeg),
             Self::Grey => Ok(PixelFormat::Gray8),
-            Self::Z16 => Ok(PixelFormat::DepthU16 { metres_per_count }),
+            Self::Z16 => Ok(PixelFormat::DepthU16 { meters_per_count }),
         }
     }
 }
@@ -83,9 +83,9 @@ pub enum Sizes {
     /// Any from the least to the most, in steps, by width and height.
     Range {
         /// Least.
-        least: [u32; 2],
+        min: [u32; 2],
         /// Most.
-        most: [u32; 2],
+        max: [u32; 2],
         /// Steps.
         step: [u32; 2],
     },
@@ -95,15 +95,15 @@ pub enum Sizes {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Rates {
     /// The device does not tell.
-    Untold,
+    Unknown,
     /// One of these.
     List(Vec<f64>),
     /// Any in this range.
     Range {
         /// Slowest.
-        least_hz: f64,
+        min_hz: f64,
         /// Fastest.
-        most_hz: f64,
+        max_hz: f64,
     },
 }
 
@@ -115,69 +115,69 @@ impl Mode {
 }
 
 impl Sizes {
-    pub(super) fn from_kernel(told: &FrameSize) -> Self {
-        let [a, b, c, d, e, f] = told.numbers;
-        match told.kind {
+    pub(super) fn from_kernel(reported: &FrameSize) -> Self {
+        let [a, b, c, d, e, f] = reported.numbers;
+        match reported.kind {
             DISCRETE => Self::One([a, b]),
-            _ => Self::Range { least: [a, d], most: [b, e], step: [c, f] },
+            _ => Self::Range { min: [a, d], max: [b, e], step: [c, f] },
         }
     }
 
     /// The largest.
-    pub(super) fn most(&self) -> [u32; 2] {
+    pub(super) fn max(&self) -> [u32; 2] {
         match self {
             Self::One(size) => *size,
-            Self::Range { most, .. } => *most,
+            Self::Range { max, .. } => *max,
         }
     }
 
-    fn has(&self, wanted: [u32; 2]) -> bool {
+    fn has(&self, requested: [u32; 2]) -> bool {
         match self {
-            Self::One(size) => *size == wanted,
-            Self::Range { least, most, step } => (0..2).all(|side| {
-                let (wanted, least, most) = (wanted[side], least[side], most[side]);
-                (least..=most).contains(&wanted) && (wanted - least).is_multiple_of(step[side].max(1))
+            Self::One(size) => *size == requested,
+            Self::Range { min, max, step } => (0..2).all(|side| {
+                let (requested, min, max) = (requested[side], min[side], max[side]);
+                (min..=max).contains(&requested) && (requested - min).is_multiple_of(step[side].max(1))
             }),
         }
     }
 }
 
 impl Rates {
-    pub(super) fn from_kernel(told: &[FrameInterval]) -> Self {
-        match told.first() {
-            None => Self::Untold,
+    pub(super) fn from_kernel(reported: &[FrameInterval]) -> Self {
+        match reported.first() {
+            None => Self::Unknown,
             Some(first) if first.kind == DISCRETE => {
-                Self::List(told.iter().map(|interval| rate_of(interval.fractions[0])).collect())
+                Self::List(reported.iter().map(|interval| rate_of(interval.fractions[0])).collect())
             }
             // The longest interval is the lowest rate.
-            Some(range) => Self::Range { least_hz: rate_of(range.fractions[1]), most_hz: rate_of(range.fractions[0]) },
+            Some(range) => Self::Range { min_hz: rate_of(range.fractions[1]), max_hz: rate_of(range.fractions[0]) },
         }
     }
 
-    fn has(&self, wanted_hz: f64) -> bool {
+    fn has(&self, requested_hz: f64) -> bool {
         match self {
-            Self::Untold => true,
-            Self::List(rates) => rates.iter().any(|rate_hz| is_same_rate(*rate_hz, wanted_hz)),
-            Self::Range { least_hz, most_hz } => {
-                (least_hz * (1.0 - SAME_RATE_FRAC)..=most_hz * (1.0 + SAME_RATE_FRAC)).contains(&wanted_hz)
+            Self::Unknown => true,
+            Self::List(rates) => rates.iter().any(|rate_hz| is_same_rate(*rate_hz, requested_hz)),
+            Self::Range { min_hz, max_hz } => {
+                (min_hz * (1.0 - SAME_RATE_FRAC)..=max_hz * (1.0 + SAME_RATE_FRAC)).contains(&requested_hz)
             }
         }
     }
 }
 
-/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::OF_COLOR`].
+/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::COLOR_FORMATS`].
 pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
     let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
     let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
     match format {
         Some(format) => of(format),
-        None => V4l2Format::OF_COLOR.iter().find_map(|(_, each)| of(*each)),
+        None => V4l2Format::COLOR_FORMATS.iter().find_map(|(_, each)| of(*each)),
     }
 }
 
 /// Place of a format in the order in which they are preferred; depth, which is asked for by name, comes last.
 pub(super) fn rank(format: V4l2Format) -> usize {
-    V4l2Format::OF_COLOR.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::OF_COLOR.len())
+    V4l2Format::COLOR_FORMATS.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::COLOR_FORMATS.len())
 }
 
 /// Bytes a second that USB carries to one camera, by the speed that sysfs tells: the largest isochronous transfer of an endpoint.
@@ -194,20 +194,25 @@ pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
 }
 
 /// What of some modes takes more than so many bytes a second: the slowest rate of each that does, for people.
-pub(super) fn beyond(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
-    let too_fast = |mode: &Mode| {
-        let [width, height] = mode.sizes.most();
-        let needs = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
+pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
+    let exceeds = |mode: &Mode| {
+        let [width, height] = mode.sizes.max();
+        let required_bytes_per_sec = |rate_hz: f64| mode.format.bytes_per_sec([width, height], rate_hz);
         let rates: &[f64] = match &mode.rates {
-            Rates::Untold => &[],
+            Rates::Unknown => &[],
             Rates::List(rates) => rates,
-            Rates::Range { most_hz, .. } => std::slice::from_ref(most_hz),
+            Rates::Range { max_hz, .. } => std::slice::from_ref(max_hz),
         };
-        let slowest = rates.iter().copied().filter(|hz| needs(*hz) > Some(bytes_per_sec)).fold(f64::INFINITY, f64::min);
-        let megabytes = needs(slowest).filter(|needs| needs.is_finite())? * 1e-6;
+        let slowest = rates
+            .iter()
+            .copied()
+            .filter(|hz| required_bytes_per_sec(*hz) > Some(bytes_per_sec))
+            .fold(f64::INFINITY, f64::min);
+        let megabytes =
+            required_bytes_per_sec(slowest).filter(|required_bytes_per_sec| required_bytes_per_sec.is_finite())? * 1e-6;
         Some(format!("{} {width}x{height} at {slowest:.0} Hz ({megabytes:.0} MB/s)", mode.format.name()))
     };
-    modes.iter().filter_map(too_fast).collect()
+    modes.iter().filter_map(exceeds).collect()
 }
 
 /// Whether two rates, images a second, are one rate told in two ways.
@@ -236,20 +241,20 @@ pub fn summary(modes: &[Mode]) -> String {
     let size = |mode: &Mode| {
         let sizes = match &mode.sizes {
             Sizes::One([width, height]) => format!("{width}x{height}"),
-            Sizes::Range { least: [w0, h0], most: [w1, h1], .. } => format!("{w0}x{h0} to {w1}x{h1}"),
+            Sizes::Range { min: [w0, h0], max: [w1, h1], .. } => format!("{w0}x{h0} to {w1}x{h1}"),
         };
-        let most_hz = match &mode.rates {
-            Rates::Untold => return sizes,
+        let max_hz = match &mode.rates {
+            Rates::Unknown => return sizes,
             Rates::List(rates) => rates.iter().copied().fold(0.0, f64::max),
-            Rates::Range { most_hz, .. } => *most_hz,
+            Rates::Range { max_hz, .. } => *max_hz,
         };
-        format!("{sizes} up to {} Hz", (most_hz * 100.0).round() / 100.0)
+        format!("{sizes} up to {} Hz", (max_hz * 100.0).round() / 100.0)
     };
     let of_format = |format: V4l2Format| {
         let sizes: Vec<_> = modes.iter().filter(|mode| mode.format == format).map(size).collect();
         (!sizes.is_empty()).then(|| format!("{}: {}", format.name(), sizes.join(", ")))
     };
-    let formats = V4l2Format::OF_COLOR.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
+    let formats = V4l2Format::COLOR_FORMATS.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
     let all: Vec<_> = formats.filter_map(of_format).collect();
     if all.is_empty() { "no format that is read here".to_owned() } else { all.join("; ") }
 }
@@ -259,7 +264,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_compressed_is_taken_where_it_is_fast_enough() {
+    fn uncompressed_format_is_preferred_at_sufficient_rate() {
         use V4l2Format::{Grey, Mjpeg, Yuyv, Z16};
         // As a USB 2 webcam offers them.
         let modes = [
@@ -269,20 +274,20 @@ mod tests {
             Mode::new(Z16, [848, 480], &[30.0]),
             Mode::new(Grey, [848, 480], &[30.0]),
         ];
-        let taken = |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
-        assert_eq!(taken(None, [640, 480], 30.0), Some(Yuyv));
-        assert_eq!(taken(None, [1280, 720], 30.0), Some(Mjpeg));
-        assert_eq!(taken(None, [1280, 720], 10.0), Some(Yuyv));
-        assert_eq!(taken(None, [640, 480], 29.97), Some(Yuyv));
-        assert_eq!(taken(None, [640, 480], 25.0), None);
-        assert_eq!(taken(Some(Yuyv), [1280, 720], 30.0), None);
-        assert_eq!(taken(Some(Z16), [848, 480], 30.0), Some(Z16));
-        assert_eq!(taken(None, [848, 480], 30.0), Some(Grey), "depth is never taken for color");
+        let chosen = |format, size, rate_hz| choose(&modes, format, size, rate_hz).map(|mode| mode.format);
+        assert_eq!(chosen(None, [640, 480], 30.0), Some(Yuyv));
+        assert_eq!(chosen(None, [1280, 720], 30.0), Some(Mjpeg));
+        assert_eq!(chosen(None, [1280, 720], 10.0), Some(Yuyv));
+        assert_eq!(chosen(None, [640, 480], 29.97), Some(Yuyv));
+        assert_eq!(chosen(None, [640, 480], 25.0), None);
+        assert_eq!(chosen(Some(Yuyv), [1280, 720], 30.0), None);
+        assert_eq!(chosen(Some(Z16), [848, 480], 30.0), Some(Z16));
+        assert_eq!(chosen(None, [848, 480], 30.0), Some(Grey), "depth is never taken for color");
     }
 
     #[test]
-    fn ranges_hold_their_steps() {
-        let sizes = Sizes::Range { least: [16, 16], most: [1920, 1080], step: [8, 2] };
+    fn size_ranges_respect_steps() {
+        let sizes = Sizes::Range { min: [16, 16], max: [1920, 1080], step: [8, 2] };
         assert!(sizes.has([640, 480]) && sizes.has([16, 16]) && sizes.has([1920, 1080]));
         assert!(!sizes.has([644, 480]) && !sizes.has([640, 481]) && !sizes.has([8, 16]) && !sizes.has([1928, 1080]));
         let range = FrameInterval {
@@ -295,13 +300,13 @@ mod tests {
             ..Default::default()
         };
         let rates = Rates::from_kernel(&[range]);
-        assert_eq!(rates, Rates::Range { least_hz: 5.0, most_hz: 60.0 });
+        assert_eq!(rates, Rates::Range { min_hz: 5.0, max_hz: 60.0 });
         assert!(rates.has(30.0) && rates.has(60.0) && !rates.has(61.0) && !rates.has(4.9));
-        assert_eq!(Rates::from_kernel(&[]), Rates::Untold);
+        assert_eq!(Rates::from_kernel(&[]), Rates::Unknown);
     }
 
     #[test]
-    fn rates_survive_the_kernels_fractions() {
+    fn rates_round_trip_through_fractions() {
         for rate_hz in [0.01, 0.5, 7.5, 14.985, 29.97, 30.0, 60.0, 90.0, 1000.0] {
             let back_hz = rate_of(interval_of(rate_hz));
             assert!((back_hz - rate_hz).abs() <= 1e-6 * rate_hz.max(1.0), "{rate_hz}: {back_hz}");
@@ -311,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn bandwidth_of_the_issue() {
+    fn modes_exceeding_usb_bandwidth_are_listed() {
         let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("not compressed");
         assert_eq!((bytes / 1e6).round(), 221.0);
         assert_eq!(V4l2Format::Mjpeg.bytes_per_sec([2560, 1440], 30.0), None);
@@ -320,31 +325,31 @@ mod tests {
             Mode::new(V4l2Format::Yuyv, [2560, 1440], &[5.0, 30.0, 15.0]),
             Mode::new(V4l2Format::Mjpeg, [2560, 1440], &[30.0]),
         ];
-        assert_eq!(beyond(&modes, usb_bytes_per_sec(480.0)), ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]);
-        assert_eq!(beyond(&modes, usb_bytes_per_sec(5000.0)), Vec::<String>::new());
-        assert_eq!(beyond(&modes, 200e6), ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]);
+        assert_eq!(modes_exceeding(&modes, usb_bytes_per_sec(480.0)), ["yuyv 2560x1440 at 5 Hz (37 MB/s)"]);
+        assert_eq!(modes_exceeding(&modes, usb_bytes_per_sec(5000.0)), Vec::<String>::new());
+        assert_eq!(modes_exceeding(&modes, 200e6), ["yuyv 2560x1440 at 30 Hz (221 MB/s)"]);
     }
 
     #[test]
-    fn codes_are_the_kernels() {
+    fn fourccs_match_kernel() {
         // v4l2_fourcc(a, b, c, d) is a | b << 8 | c << 16 | d << 24.
         assert_eq!(V4l2Format::from_fourcc(0x5659_5559), Some(V4l2Format::Yuyv));
         assert_eq!(V4l2Format::from_fourcc(0x2036_315a), Some(V4l2Format::Z16));
         assert_eq!(V4l2Format::from_fourcc(0), None);
-        for (_, format) in V4l2Format::OF_COLOR {
+        for (_, format) in V4l2Format::COLOR_FORMATS {
             assert_eq!(V4l2Format::from_fourcc(format.fourcc()), Some(format));
         }
     }
 
     #[test]
-    fn offers_are_told_by_format() {
+    fn summary_groups_modes_by_format() {
         let modes = [
             Mode::new(V4l2Format::Mjpeg, [1280, 720], &[30.0, 15.0]),
             Mode::new(V4l2Format::Yuyv, [640, 480], &[14.985, 29.97]),
             Mode::new(V4l2Format::Yuyv, [1280, 720], &[10.0]),
         ];
-        let told = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
-        assert_eq!(summary(&modes), told);
+        let reported = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
+        assert_eq!(summary(&modes), reported);
         assert_eq!(summary(&[]), "no format that is read here");
     }
 }

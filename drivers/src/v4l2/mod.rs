@@ -1,7 +1,7 @@
 //! Cameras of the kernel's `Video4Linux2`: webcams, capture cards, and depth cameras without their makers' software.
 //!
 //! `abi.rs` is the kernel's interface, `device.rs` the only place that crosses into it; `format.rs` and `controls.rs` are tables
-//! of what cameras offer and how they are set; `running.rs` moves bytes, `camera.rs` survives an unplugged cable. Elsewhere than on
+//! of what cameras offer and how they are set; `stream.rs` moves bytes, `camera.rs` survives an unplugged cable. Elsewhere than on
 //! Linux only the names are there, which rig files have everywhere.
 
 #[cfg(target_os = "linux")]
@@ -22,9 +22,9 @@ mod pixel_format;
 #[cfg(target_os = "linux")]
 mod problem;
 #[cfg(target_os = "linux")]
-mod running;
-#[cfg(target_os = "linux")]
 mod sequence;
+#[cfg(target_os = "linux")]
+mod stream;
 
 #[cfg(target_os = "linux")]
 pub use camera::{Counts, V4l2Camera};
@@ -33,7 +33,7 @@ pub use config::{Config, control, set_control};
 #[cfg(target_os = "linux")]
 pub use controls::Settings;
 #[cfg(target_os = "linux")]
-pub use find::{Found, cameras, look_for};
+pub use find::{FoundCamera, cameras, check_connected};
 #[cfg(target_os = "linux")]
 pub use format::{Mode, Rates, Sizes, summary};
 pub use pixel_format::V4l2Format;

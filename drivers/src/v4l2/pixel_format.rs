@@ -24,7 +24,7 @@ pub enum V4l2Format {
 impl V4l2Format {
     /// Those of color with their names in rig files, in the order in which they are preferred: what is not compressed before
     /// what is, colors before grey.
-    pub const OF_COLOR: [(&str, Self); 7] = [
+    pub const COLOR_FORMATS: [(&str, Self); 7] = [
         ("yuyv", Self::Yuyv),
         ("uyvy", Self::Uyvy),
         ("nv12", Self::Nv12),
@@ -36,6 +36,6 @@ impl V4l2Format {
 
     /// Its name in rig files.
     pub fn name(self) -> &'static str {
-        Self::OF_COLOR.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
+        Self::COLOR_FORMATS.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
     }
 }

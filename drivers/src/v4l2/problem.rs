@@ -42,23 +42,23 @@ pub enum Problem {
         path: PathBuf,
     },
     /// It does not offer what is asked for.
-    #[error("it does not offer {wanted}; it offers {offered}")]
+    #[error("it does not offer {requested}; it offers {offered}")]
     NoMode {
         /// Format, size and rate of the rig file.
-        wanted: String,
+        requested: String,
         /// All that it has.
         offered: String,
     },
     /// It offers something, but does otherwise.
-    #[error("asked for {wanted}, it gives {got}")]
+    #[error("asked for {requested}, it gives {got}")]
     OtherMode {
         /// Asked for.
-        wanted: String,
+        requested: String,
         /// Told back.
         got: String,
     },
     /// Depth without a scale.
-    #[error("its depth counts need camera.NAME.depth.metres_per_count in the rig file (0.001 for a RealSense D4xx)")]
+    #[error("its depth counts need camera.NAME.depth.meters_per_count in the rig file (0.001 for a RealSense D4xx)")]
     NoDepthScale,
     /// Another program holds it.
     #[error("another program uses it: `fuser -v {}` names it", path.display())]
@@ -92,26 +92,26 @@ pub enum Problem {
         control: &'static str,
     },
     /// The rig file sets something to a value that the camera does not know.
-    #[error("{control} is {wanted}, it takes {least} to {most} in steps of {step}")]
+    #[error("{control} is {requested}, it takes {min} to {max} in steps of {step}")]
     ControlRange {
         /// Name of the key.
         control: &'static str,
         /// Asked for, in the units of the key.
-        wanted: f64,
+        requested: f64,
         /// Least.
-        least: f64,
+        min: f64,
         /// Most.
-        most: f64,
+        max: f64,
         /// Step.
         step: f64,
     },
     /// It took a setting and tells another one.
-    #[error("{control} was set to {wanted} and reads {got}")]
+    #[error("{control} was set to {requested} and reads {got}")]
     ReadBack {
         /// Name of the control.
         control: &'static str,
         /// What was set, counts of the device.
-        wanted: i32,
+        requested: i32,
         /// What it tells, counts of the device.
         got: i32,
     },

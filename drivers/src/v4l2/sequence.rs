@@ -21,10 +21,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gaps_are_counted_also_where_numbers_wrap() {
-        let told = [5, 6, 9, 10, u32::MAX - 1, 1, 1, 1, 2, 0, 1, 4];
+    fn gaps_are_counted_across_wraparound() {
+        let reported = [5, 6, 9, 10, u32::MAX - 1, 1, 1, 1, 2, 0, 1, 4];
         let mut sequence = Sequence::default();
-        let skipped: Vec<u64> = told.map(|number| sequence.n_skipped_before(number)).into();
+        let skipped: Vec<u64> = reported.map(|number| sequence.n_skipped_before(number)).into();
         // From 10 to almost the end of the numbers is further than half way round: the device began anew.
         assert_eq!(skipped, [0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 2]);
     }

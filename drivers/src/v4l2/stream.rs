@@ -1,8 +1,8 @@
 //! A V4L2 device that streams: from the node to stamped images.
 
 use super::abi::{FIELD_ANY, FIELD_NONE, PixFormat};
-use super::controls::{self, Applied};
-use super::device::{Device, Filled, Refused, Stream};
+use super::controls::{self, AppliedSettings};
+use super::device::{Device, FilledBuffer, Refused, Stream};
 use super::format::{self, Mode};
 use super::sequence::Sequence;
 use super::{Config, Delivery, Problem, V4l2Format, find};
@@ -16,31 +16,31 @@ use std::time::{Duration, Instant};
 /// Images that the device may fill while we copy one: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
 /// A stamp so long before the stream began, or after now, is of another clock, whatever its flag says.
-const MAX_STAMP_OFF_SECS: f64 = 1.0;
+const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Asking for the exposure of each image may take this share of the time between two.
-const MAX_ASKING_FRAC: f64 = 0.25;
+const MAX_EXPOSURE_QUERY_FRAC: f64 = 0.25;
 
 /// A device that streams.
 #[derive(Debug)]
-pub(super) struct Running {
+pub(super) struct V4l2Stream {
     stream: Stream,
     camera: Arc<str>,
     path: PathBuf,
     mode: String,
     format: PixelFormat,
     bytes_per_line: usize,
-    applied: Applied,
+    applied: AppliedSettings,
     sequence: Sequence,
-    began: Stamp,
+    started_at: Stamp,
     /// Lost and not told yet.
-    n_untold: u64,
+    n_unreported: u64,
     n_images: u64,
     n_damaged: u64,
-    last_whole: Instant,
-    clock_warned: bool,
+    last_image_at: Instant,
+    has_warned_of_clock: bool,
 }
 
-impl Running {
+impl V4l2Stream {
     /// Finds the device of a config and starts it.
     pub(super) fn start(config: &Config) -> Result<Self, Error> {
         let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
@@ -67,33 +67,33 @@ impl Running {
             quantization: pix.quantization,
             is_hdtv: device.is_hdtv(),
         };
-        if mode.format == V4l2Format::Z16 && config.metres_per_count.is_none() {
+        if mode.format == V4l2Format::Z16 && config.meters_per_count.is_none() {
             return Err(named(Problem::NoDepthScale));
         }
-        let format = mode.format.pixels(colors, config.metres_per_count.unwrap_or(0.0))?;
+        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0))?;
         controls::apply(&config.settings, &device).map_err(named)?;
-        let wanted = wanted(config, Some(mode.format));
-        let began = clock::now();
+        let requested = requested(config, Some(mode.format));
+        let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
             let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
-            named(problem_of(refused, path, wanted.clone(), bytes_per_sec))
+            named(stream_problem(refused, path, requested.clone(), bytes_per_sec))
         })?;
         let applied = controls::confirm(&config.settings, stream.device()).map_err(named)?;
         Ok(Self {
             stream,
             camera: config.name.as_str().into(),
             path: path.to_owned(),
-            mode: wanted,
+            mode: requested,
             format,
             bytes_per_line: pix.bytes_per_line as usize,
             applied,
             sequence: Sequence::default(),
-            began,
-            n_untold: 0,
+            started_at,
+            n_unreported: 0,
             n_images: 0,
             n_damaged: 0,
-            last_whole: Instant::now(),
-            clock_warned: false,
+            last_image_at: Instant::now(),
+            has_warned_of_clock: false,
         })
     }
 
@@ -118,15 +118,15 @@ impl Running {
     }
 
     /// Since when no whole image came.
-    pub(super) fn silent_for(&self) -> Duration {
-        self.last_whole.elapsed()
+    pub(super) fn time_since_image(&self) -> Duration {
+        self.last_image_at.elapsed()
     }
 
     /// Drops what came before anybody asked: it counts as lost no more than what came before the stream began.
-    pub(super) fn forget_waiting(&mut self) -> Result<(), Problem> {
+    pub(super) fn discard_queued(&mut self) -> Result<(), Problem> {
         for _ in 0..N_BUFFERS {
             let Some(filled) = self.stream.take().map_err(lost)? else { break };
-            self.stream.give_back(filled).map_err(lost)?;
+            self.stream.requeue(filled).map_err(lost)?;
         }
         self.sequence = Sequence::default();
         Ok(())
@@ -136,22 +136,22 @@ impl Running {
     pub(super) fn next_image(&mut self, config: &Config, deadline: Instant) -> Result<Option<Image>, Problem> {
         loop {
             let Some(filled) = self.next_filled(config.delivery, deadline)? else { return Ok(None) };
-            self.n_untold += self.sequence.n_skipped_before(filled.sequence);
+            self.n_unreported += self.sequence.n_skipped_before(filled.sequence);
             let image = (!filled.is_damaged).then(|| self.image_of(&filled, config.intrinsics.size_px));
-            self.stream.give_back(filled).map_err(lost)?;
+            self.stream.requeue(filled).map_err(lost)?;
             match image {
                 Some(Ok(mut image)) => {
                     image.exposure_secs = self.exposure_secs(config.rate_hz);
-                    image.n_skipped = std::mem::take(&mut self.n_untold);
+                    image.n_skipped = std::mem::take(&mut self.n_unreported);
                     self.n_images += 1;
-                    self.last_whole = Instant::now();
+                    self.last_image_at = Instant::now();
                     return Ok(Some(image));
                 }
-                damaged => {
-                    if let Some(Err(error)) = damaged {
+                other => {
+                    if let Some(Err(error)) = other {
                         log::debug!("{error}");
                     }
-                    self.n_untold += 1;
+                    self.n_unreported += 1;
                     self.n_damaged += 1;
                     if Instant::now() >= deadline {
                         return Ok(None);
@@ -162,14 +162,14 @@ impl Running {
     }
 
     /// The image to hand out: the oldest that waits, or the newest, which gives the older ones back.
-    fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<Filled>, Problem> {
-        let mut taken: Option<Filled> = None;
+    fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<FilledBuffer>, Problem> {
+        let mut taken: Option<FilledBuffer> = None;
         loop {
             match self.stream.take().map_err(lost)? {
                 Some(newer) => {
                     if let Some(older) = taken.replace(newer) {
-                        self.n_untold += self.sequence.n_skipped_before(older.sequence) + 1;
-                        self.stream.give_back(older).map_err(lost)?;
+                        self.n_unreported += self.sequence.n_skipped_before(older.sequence) + 1;
+                        self.stream.requeue(older).map_err(lost)?;
                     }
                     if delivery == Delivery::Every {
                         return Ok(taken);
@@ -187,7 +187,7 @@ impl Running {
     }
 
     /// Copies an image out of the shared memory, without the padding of its rows.
-    fn image_of(&mut self, filled: &Filled, size_px: [u32; 2]) -> Result<Image, Error> {
+    fn image_of(&mut self, filled: &FilledBuffer, size_px: [u32; 2]) -> Result<Image, Error> {
         let stamp = self.stamp_of(filled);
         Image {
             camera: Arc::clone(&self.camera),
@@ -202,14 +202,14 @@ impl Running {
     }
 
     /// The device's stamp where it is of our clock, else now. `stamp_to_mid_exposure_millis` of the rig file says what it means.
-    fn stamp_of(&mut self, filled: &Filled) -> Stamp {
+    fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
-        let ours = self.began.plus_secs(-MAX_STAMP_OFF_SECS)..now.plus_secs(MAX_STAMP_OFF_SECS);
-        if filled.is_monotonic && ours.contains(&stamp) {
+        let valid_range = self.started_at.plus_secs(-MAX_STAMP_ERROR_SECS)..now.plus_secs(MAX_STAMP_ERROR_SECS);
+        if filled.is_monotonic && valid_range.contains(&stamp) {
             return stamp;
         }
-        if !std::mem::replace(&mut self.clock_warned, true) {
+        if !std::mem::replace(&mut self.has_warned_of_clock, true) {
             log::warn!(
                 "camera {:?}: its stamps are not of the monotonic clock; images are stamped as they arrive",
                 self.camera
@@ -220,22 +220,22 @@ impl Running {
 
     /// Fixed, or what the camera tells now; not asked for again once asking fails or takes too long.
     fn exposure_secs(&mut self, rate_hz: f64) -> Option<f64> {
-        if !self.applied.tells_exposure {
+        if !self.applied.reports_exposure {
             return self.applied.exposure_secs;
         }
-        let began = Instant::now();
+        let started_at = Instant::now();
         let exposure_secs = controls::exposure_secs(self.stream.device());
-        let took = began.elapsed();
-        if exposure_secs.is_none() || took.as_secs_f64() * rate_hz > MAX_ASKING_FRAC {
-            log::warn!("camera {:?}: asking for its exposure took {took:?}; it is not told any more", self.camera);
-            self.applied.tells_exposure = false;
+        let elapsed = started_at.elapsed();
+        if exposure_secs.is_none() || elapsed.as_secs_f64() * rate_hz > MAX_EXPOSURE_QUERY_FRAC {
+            log::warn!("camera {:?}: asking for its exposure took {elapsed:?}; it is not told any more", self.camera);
+            self.applied.reports_exposure = false;
         }
         exposure_secs
     }
 }
 
 /// Why a stream did not begin; `ENOSPC` is how the kernel says that USB has no bandwidth left (`usb_submit_urb`).
-fn problem_of(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
+fn stream_problem(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
     match refused {
         Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode, bytes_per_sec },
         Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
@@ -265,8 +265,10 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
 fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
     let modes = find::modes(device);
     let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
-    let mode = format::choose(&modes, config.format, size_px, rate_hz)
-        .ok_or_else(|| Problem::NoMode { wanted: wanted(config, config.format), offered: format::summary(&modes) })?;
+    let mode = format::choose(&modes, config.format, size_px, rate_hz).ok_or_else(|| Problem::NoMode {
+        requested: requested(config, config.format),
+        offered: format::summary(&modes),
+    })?;
     let refused = |error| match error {
         Errno::BUSY => Problem::Busy { path: path.to_owned() },
         error => Problem::Refused { what: "take the format", source: std::io::Error::from(error) },
@@ -278,7 +280,7 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
         let format = V4l2Format::from_fourcc(pix.fourcc).map_or("another format", V4l2Format::name);
         let rate = got_hz.map_or(String::new(), |got_hz| format!(" at {got_hz:.2} Hz"));
         let got = format!("{format} {}x{}{rate}", pix.width, pix.height);
-        return Err(Problem::OtherMode { wanted: wanted(config, Some(mode.format)), got });
+        return Err(Problem::OtherMode { requested: requested(config, Some(mode.format)), got });
     }
     if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
         log::warn!("camera {:?}: it sends every other row at another time (interlaced)", config.name);
@@ -289,7 +291,7 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
     Ok((mode.clone(), pix))
 }
 
-fn wanted(config: &Config, format: Option<V4l2Format>) -> String {
+fn requested(config: &Config, format: Option<V4l2Format>) -> String {
     let [width, height] = config.intrinsics.size_px;
     format!("{} {width}x{height} at {} Hz", format.map_or("color", V4l2Format::name), config.rate_hz)
 }
@@ -299,15 +301,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_stream_without_bandwidth_is_told_with_what_to_do() {
-        let told =
-            |refused, mode: &str, bytes| problem_of(refused, Path::new("/dev/video0"), mode.into(), bytes).to_string();
-        let full = told(Refused::Begin(Errno::NOSPC), "yuyv 2560x1440 at 30 Hz", Some(221.2e6));
-        assert!(full.starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "), "{full}");
-        assert!(full.contains("mjpeg") && full.contains("another USB controller"), "{full}");
-        let compressed = told(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
+    fn bandwidth_error_suggests_fixes() {
+        let reported = |refused, mode: &str, bytes| {
+            stream_problem(refused, Path::new("/dev/video0"), mode.into(), bytes).to_string()
+        };
+        let bandwidth_error = reported(Refused::Begin(Errno::NOSPC), "yuyv 2560x1440 at 30 Hz", Some(221.2e6));
+        assert!(
+            bandwidth_error.starts_with("USB has no bandwidth left for yuyv 2560x1440 at 30 Hz (221 MB/s): "),
+            "{bandwidth_error}"
+        );
+        assert!(
+            bandwidth_error.contains("mjpeg") && bandwidth_error.contains("another USB controller"),
+            "{bandwidth_error}"
+        );
+        let compressed = reported(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
         assert!(compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "), "{compressed}");
-        assert!(told(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
-        assert!(told(Refused::Begin(Errno::IO), "", None).starts_with("it refuses to begin its stream: "));
+        assert!(reported(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
+        assert!(reported(Refused::Begin(Errno::IO), "", None).starts_with("it refuses to begin its stream: "));
     }
 }

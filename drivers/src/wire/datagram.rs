@@ -11,15 +11,15 @@ pub const VERSION: u32 = 1;
 /// Most datagrams that one scan may be cut into.
 pub const MAX_PARTS: u32 = 64;
 /// Coordinates, ranges and what joints do beyond this are slips, metres or whatever their unit is.
-const FAR_M: f64 = 1e4;
+const MAX_ABS_VALUE: f64 = 1e4;
 /// Angles beyond this are slips, rad.
-const MOST_RAD: f64 = 100.0;
+const MAX_ANGLE_RAD: f64 = 100.0;
 /// Most characters of a parser's message that are told.
-const MAX_TOLD: usize = 200;
+const MAX_ERROR_CHARS: usize = 200;
 /// How far the halves of a covariance may be from each other, as a share of what they may be at most; single precision does less.
-const SAME_WITHIN: f64 = 1e-4;
+const SYMMETRY_TOLERANCE: f64 = 1e-4;
 /// How far from one the length of a quaternion may be.
-const UNIT_WITHIN: f64 = 1e-3;
+const UNIT_NORM_TOLERANCE: f64 = 1e-3;
 
 /// Which clock a stamp is on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,7 +33,7 @@ pub enum Clock {
 
 /// What every datagram says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Head {
+pub struct DatagramHeader {
     /// One more with every scan, pose or joint state.
     pub seq: u64,
     /// Which clock the stamp is on.
@@ -46,7 +46,7 @@ pub struct Head {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScanPart {
     /// The same in all parts of a scan.
-    pub head: Head,
+    pub header: DatagramHeader,
     /// Name of the scanner in the rig file.
     pub frame: String,
     /// Which part this is, from 0.
@@ -61,7 +61,7 @@ pub struct ScanPart {
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseDatagram {
     /// When.
-    pub head: Head,
+    pub header: DatagramHeader,
     /// Pose of the base.
     pub world_from_base: Transform,
     /// Covariance of the pose where the sender tells it, row by row: position along the world's axes, then small turns about them
@@ -82,7 +82,7 @@ impl PoseDatagram {
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointsDatagram {
     /// When.
-    pub head: Head,
+    pub header: DatagramHeader,
     /// Radians or metres.
     pub position: Vec<f64>,
     /// Radians or metres per second; empty where the sender does not tell.
@@ -108,7 +108,7 @@ struct WireScan {
     frame: String,
     #[serde(default)]
     part: u32,
-    #[serde(default = "one")]
+    #[serde(default = "default_parts")]
     parts: u32,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     points_m: Option<Vec<f32>>,
@@ -164,19 +164,19 @@ const SCAN: &str = "range";
 const POSE: &str = "base";
 const JOINTS: &str = "joints";
 
-fn one() -> u32 {
+fn default_parts() -> u32 {
     1
 }
 
 /// A part of a scan as a datagram; every bit of it comes back from [`decode_scan`].
 pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
-    let ScanPart { head, frame, part, n_parts, points } = part;
+    let ScanPart { header, frame, part, n_parts, points } = part;
     let wire = WireScan {
         kind: SCAN.to_owned(),
         version: VERSION,
-        seq: head.seq,
-        clock: head.clock,
-        stamp_nanos: head.stamp_nanos,
+        seq: header.seq,
+        clock: header.clock,
+        stamp_nanos: header.stamp_nanos,
         frame: frame.clone(),
         part: *part,
         parts: *n_parts,
@@ -193,13 +193,13 @@ pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
 
 /// A base's pose as a datagram; every bit of it comes back from [`decode_pose`].
 pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
-    let PoseDatagram { head, world_from_base, covariance } = pose;
+    let PoseDatagram { header, world_from_base, covariance } = pose;
     let wire = WirePose {
         kind: POSE.to_owned(),
         version: VERSION,
-        seq: head.seq,
-        clock: head.clock,
-        stamp_nanos: head.stamp_nanos,
+        seq: header.seq,
+        clock: header.clock,
+        stamp_nanos: header.stamp_nanos,
         world_from_base: Pose {
             xyz_m: world_from_base.translation.vector.into(),
             quat_xyzw: world_from_base.rotation.coords.into(),
@@ -211,13 +211,13 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
 
 /// The state of joints of these names as a datagram; every bit of it comes back from [`decode_joints`].
 pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
-    let JointsDatagram { head, position, velocity, effort } = joints;
+    let JointsDatagram { header, position, velocity, effort } = joints;
     let wire = WireJoints {
         kind: JOINTS.to_owned(),
         version: VERSION,
-        seq: head.seq,
-        clock: head.clock,
-        stamp_nanos: head.stamp_nanos,
+        seq: header.seq,
+        clock: header.clock,
+        stamp_nanos: header.stamp_nanos,
         names: Some(names.to_vec()),
         position: position.clone(),
         velocity: velocity.clone(),
@@ -229,31 +229,31 @@ pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
 /// Reads a part of a scan.
 pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
     check_kind(bytes, SCAN)?;
-    let wire: WireScan = parsed(bytes)?;
+    let wire: WireScan = parse_json(bytes)?;
     if wire.parts == 0 || wire.parts > MAX_PARTS || wire.part >= wire.parts {
-        return Err(amiss(format!(
+        return Err(invalid(format!(
             "part is {} of {}, must be below parts, and parts 1 to {MAX_PARTS}",
             wire.part, wire.parts
         )));
     }
-    let places = places(&wire)?;
-    let n = places.len();
-    let fits = |name, len: Option<usize>| match len {
-        Some(len) if len != n => Err(amiss(format!("{name} has {len} entries for {n} echoes"))),
+    let echo_positions = echo_positions(&wire)?;
+    let n = echo_positions.len();
+    let check_length = |name, len: Option<usize>| match len {
+        Some(len) if len != n => Err(invalid(format!("{name} has {len} entries for {n} echoes"))),
         _ => Ok(()),
     };
-    fits("rings", wire.rings.as_ref().map(Vec::len))?;
-    fits("offsets_micros", wire.offsets_micros.as_ref().map(Vec::len))?;
-    let point = |(ix, place): (usize, Option<[f32; 3]>)| {
+    check_length("rings", wire.rings.as_ref().map(Vec::len))?;
+    check_length("offsets_micros", wire.offsets_micros.as_ref().map(Vec::len))?;
+    let point = |(ix, echo_position): (usize, Option<[f32; 3]>)| {
         Some(RangePoint {
-            position_m: place?,
+            position_m: echo_position?,
             ring: wire.rings.as_ref().map_or(0, |rings| rings[ix]),
             offset_micros: wire.offsets_micros.as_ref().map_or(0, |offsets| offsets[ix]),
         })
     };
     Ok(ScanPart {
-        head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
-        points: places.into_iter().enumerate().filter_map(point).collect(),
+        header: DatagramHeader { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
+        points: echo_positions.into_iter().enumerate().filter_map(point).collect(),
         frame: wire.frame,
         part: wire.part,
         n_parts: wire.parts,
@@ -263,23 +263,23 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
 /// Reads a base's pose.
 pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     check_kind(bytes, POSE)?;
-    let wire: WirePose = parsed(bytes)?;
+    let wire: WirePose = parse_json(bytes)?;
     let Pose { xyz_m: [x, y, z], quat_xyzw: [i, j, k, w] } = wire.world_from_base;
-    if ![x, y, z].iter().all(|along| along.abs() <= FAR_M) {
-        return Err(amiss(format!("xyz_m has a number beyond {FAR_M} m")));
+    if ![x, y, z].iter().all(|coordinate| coordinate.abs() <= MAX_ABS_VALUE) {
+        return Err(invalid(format!("xyz_m has a number beyond {MAX_ABS_VALUE} m")));
     }
     let quaternion = Quaternion::new(w, i, j, k);
     // Written so that no number is no length.
-    let is_unit = (quaternion.norm() - 1.0).abs() <= UNIT_WITHIN;
+    let is_unit = (quaternion.norm() - 1.0).abs() <= UNIT_NORM_TOLERANCE;
     if !is_unit {
-        return Err(amiss("quat_xyzw has not the length 1".to_owned()));
+        return Err(invalid("quat_xyzw has not the length 1".to_owned()));
     }
     let rotation = match (quaternion.norm() - 1.0).abs() < 1e-12 {
         true => UnitQuaternion::new_unchecked(quaternion),
         false => UnitQuaternion::new_normalize(quaternion),
     };
     Ok(PoseDatagram {
-        head: Head { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
+        header: DatagramHeader { seq: wire.seq, clock: wire.clock, stamp_nanos: wire.stamp_nanos },
         world_from_base: Transform::from_parts(Translation3::new(x, y, z), rotation),
         covariance: wire.covariance.map(covariance).transpose()?,
     })
@@ -288,15 +288,17 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
 fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     let n = numbers.len();
     let covariance: Box<[f64; 36]> =
-        numbers.try_into().map_err(|_| amiss(format!("covariance has {n} numbers, not 36")))?;
-    if !(0..6).all(|ix| (0.0..=FAR_M).contains(&covariance[7 * ix])) {
-        return Err(amiss(format!("covariance has a variance outside 0 to {FAR_M}")));
+        numbers.try_into().map_err(|_| invalid(format!("covariance has {n} numbers, not 36")))?;
+    if !(0..6).all(|ix| (0.0..=MAX_ABS_VALUE).contains(&covariance[7 * ix])) {
+        return Err(invalid(format!("covariance has a variance outside 0 to {MAX_ABS_VALUE}")));
     }
     for (row, column) in (0..6).flat_map(|row| (0..row).map(move |column| (row, column))) {
-        let [below, above] = [covariance[6 * row + column], covariance[6 * column + row]];
-        let most = (covariance[7 * row] * covariance[7 * column]).sqrt();
-        if (below - above).abs() > SAME_WITHIN * most || below.abs() > (1.0 + SAME_WITHIN) * most {
-            return Err(amiss(format!(
+        let [lower, upper] = [covariance[6 * row + column], covariance[6 * column + row]];
+        let max_covariance = (covariance[7 * row] * covariance[7 * column]).sqrt();
+        if (lower - upper).abs() > SYMMETRY_TOLERANCE * max_covariance
+            || lower.abs() > (1.0 + SYMMETRY_TOLERANCE) * max_covariance
+        {
+            return Err(invalid(format!(
                 "covariance: row {row}, column {column} (from 0) is not as its mirror image, or larger than the variances allow"
             )));
         }
@@ -307,87 +309,87 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
 /// Reads the state of joints of these names; a sender that names them must name the same in the same order.
 pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, Malformed> {
     check_kind(bytes, JOINTS)?;
-    let WireJoints { seq, clock, stamp_nanos, names: told, position, velocity, effort, .. } = parsed(bytes)?;
-    if told.is_some_and(|told| told != names) {
-        return Err(amiss("names are not those of arm.joints, in that order".to_owned()));
+    let WireJoints { seq, clock, stamp_nanos, names: reported, position, velocity, effort, .. } = parse_json(bytes)?;
+    if reported.is_some_and(|reported| reported != names) {
+        return Err(invalid("names are not those of arm.joints, in that order".to_owned()));
     }
     let n = names.len();
-    let fits = |name, numbers: &[f64], may_be_empty: bool| match numbers.len() {
+    let check_length = |name, numbers: &[f64], may_be_empty: bool| match numbers.len() {
         0 if may_be_empty => Ok(()),
-        len if len != n => Err(amiss(format!("{name} has {len} numbers for {n} joints"))),
-        _ if numbers.iter().any(|number| number.abs() > FAR_M) => {
-            Err(amiss(format!("{name} has a number beyond {FAR_M}")))
+        len if len != n => Err(invalid(format!("{name} has {len} numbers for {n} joints"))),
+        _ if numbers.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
+            Err(invalid(format!("{name} has a number beyond {MAX_ABS_VALUE}")))
         }
         _ => Ok(()),
     };
-    fits("position", &position, false)?;
-    fits("velocity", &velocity, true)?;
-    fits("effort", &effort, true)?;
-    Ok(JointsDatagram { head: Head { seq, clock, stamp_nanos }, position, velocity, effort })
+    check_length("position", &position, false)?;
+    check_length("velocity", &velocity, true)?;
+    check_length("effort", &effort, true)?;
+    Ok(JointsDatagram { header: DatagramHeader { seq, clock, stamp_nanos }, position, velocity, effort })
 }
 
 /// A place for each direction of a part, `None` without an echo.
-fn places(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
+fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
     match (&wire.points_m, &wire.ranges_m) {
         (Some(numbers), None) => {
             let (points, rest) = numbers.as_chunks::<3>();
             if !rest.is_empty() {
-                return Err(amiss(format!("points_m has {} numbers, not three a point", numbers.len())));
+                return Err(invalid(format!("points_m has {} numbers, not three a point", numbers.len())));
             }
-            match points.iter().flatten().all(|along| f64::from(along.abs()) <= FAR_M) {
+            match points.iter().flatten().all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE) {
                 true => Ok(points.iter().map(|point| Some(*point)).collect()),
-                false => Err(amiss(format!("points_m has a number beyond {FAR_M} m"))),
+                false => Err(invalid(format!("points_m has a number beyond {MAX_ABS_VALUE} m"))),
             }
         }
         (None, Some(ranges)) => {
             let angle = |name, angle: Option<f64>| match angle {
-                Some(angle) if angle.abs() <= MOST_RAD => Ok(angle),
-                _ => Err(amiss(format!("ranges_m needs {name} between -{MOST_RAD} and {MOST_RAD} rad"))),
+                Some(angle) if angle.abs() <= MAX_ANGLE_RAD => Ok(angle),
+                _ => Err(invalid(format!("ranges_m needs {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"))),
             };
             let (first, step) = (angle("first_rad", wire.first_rad)?, angle("step_rad", wire.step_rad)?);
             let elevation = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
-            let place = |(ix, range): (usize, &Option<f32>)| {
+            let echo_position = |(ix, range): (usize, &Option<f32>)| {
                 let Some(range_m) = range.map(f64::from) else { return Ok(None) };
-                match (0.0..=FAR_M).contains(&range_m) {
-                    true => Ok(Some(place_of(range_m, first + ix as f64 * step, elevation))),
-                    false => Err(amiss(format!("ranges_m has a number outside 0 to {FAR_M} m"))),
+                match (0.0..=MAX_ABS_VALUE).contains(&range_m) {
+                    true => Ok(Some(position_from_polar(range_m, first + ix as f64 * step, elevation))),
+                    false => Err(invalid(format!("ranges_m has a number outside 0 to {MAX_ABS_VALUE} m"))),
                 }
             };
-            ranges.iter().enumerate().map(place).collect()
+            ranges.iter().enumerate().map(echo_position).collect()
         }
-        _ => Err(amiss("either points_m or ranges_m is needed, and not both".to_owned())),
+        _ => Err(invalid("either points_m or ranges_m is needed, and not both".to_owned())),
     }
 }
 
 /// Where an echo is whose azimuth counts from x towards y, and whose elevation from that plane towards z.
 #[expect(clippy::cast_possible_truncation, reason = "metres within 10 km")]
-fn place_of(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f32; 3] {
-    let across_m = range_m * elevation_rad.cos();
-    [across_m * azimuth_rad.cos(), across_m * azimuth_rad.sin(), range_m * elevation_rad.sin()]
-        .map(|along| along as f32)
+fn position_from_polar(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f32; 3] {
+    let horizontal_m = range_m * elevation_rad.cos();
+    [horizontal_m * azimuth_rad.cos(), horizontal_m * azimuth_rad.sin(), range_m * elevation_rad.sin()]
+        .map(|coordinate| coordinate as f32)
 }
 
-fn check_kind(bytes: &[u8], wanted: &'static str) -> Result<(), Malformed> {
-    let Kind { kind, version } = parsed(bytes)?;
-    if kind != wanted {
+fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
+    let Kind { kind, version } = parse_json(bytes)?;
+    if kind != expected {
         // Not the sender's own text, which may be of any length.
-        return Err(amiss(format!("the kind is not {wanted:?}")));
+        return Err(invalid(format!("the kind is not {expected:?}")));
     }
     match version == VERSION {
         true => Ok(()),
-        false => Err(amiss(format!("version {version}, this program speaks {VERSION}"))),
+        false => Err(invalid(format!("version {version}, this program speaks {VERSION}"))),
     }
 }
 
-fn parsed<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
+fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
     // The parser may repeat the sender's text, which may be long and hold anything: it goes into logs.
-    let told = |error: serde_json::Error| {
-        error.to_string().chars().take(MAX_TOLD).map(|c| if c.is_control() { '?' } else { c }).collect()
+    let reported = |error: serde_json::Error| {
+        error.to_string().chars().take(MAX_ERROR_CHARS).map(|c| if c.is_control() { '?' } else { c }).collect()
     };
-    serde_json::from_slice(bytes).map_err(|error| amiss(told(error)))
+    serde_json::from_slice(bytes).map_err(|error| invalid(reported(error)))
 }
 
-fn amiss(reason: String) -> Malformed {
+fn invalid(reason: String) -> Malformed {
     Malformed::Json { reason }
 }
 
@@ -395,7 +397,7 @@ fn amiss(reason: String) -> Malformed {
 mod tests {
     use super::*;
 
-    const HEAD: Head = Head { seq: 7, clock: Clock::Monotonic, stamp_nanos: 1_234_567_890_123 };
+    const HEADER: DatagramHeader = DatagramHeader { seq: 7, clock: Clock::Monotonic, stamp_nanos: 1_234_567_890_123 };
 
     fn part() -> ScanPart {
         let point = |ix: u16| RangePoint {
@@ -403,7 +405,7 @@ mod tests {
             ring: ix,
             offset_micros: 100 * u32::from(ix),
         };
-        ScanPart { head: HEAD, frame: "lidar".into(), part: 1, n_parts: 3, points: (0..5).map(point).collect() }
+        ScanPart { header: HEADER, frame: "lidar".into(), part: 1, n_parts: 3, points: (0..5).map(point).collect() }
     }
 
     fn pose() -> PoseDatagram {
@@ -411,7 +413,7 @@ mod tests {
         let world_from_base = Transform::from_parts(Translation3::new(0.1, -1.0 / 3.0, 1e3), rotation);
         let covariance =
             Some(Box::new(std::array::from_fn(|ix| if ix % 7 == 0 { 1e-4 } else { 1e-6 * (ix / 6 + ix % 6) as f64 })));
-        PoseDatagram { head: Head { clock: Clock::Device, ..HEAD }, world_from_base, covariance }
+        PoseDatagram { header: DatagramHeader { clock: Clock::Device, ..HEADER }, world_from_base, covariance }
     }
 
     fn names() -> Vec<String> {
@@ -420,14 +422,14 @@ mod tests {
 
     fn joints() -> JointsDatagram {
         JointsDatagram {
-            head: HEAD,
+            header: HEADER,
             position: vec![0.1, -1.0 / 3.0, 3.0],
             velocity: vec![1e-7, 0.0, -2.0],
             effort: Vec::new(),
         }
     }
 
-    fn refused_scan(fields: &str) -> String {
+    fn scan_error(fields: &str) -> String {
         let text = format!(
             r#"{{"kind":"range","version":1,"seq":1,"clock":"device","stamp_nanos":5,"frame":"lidar",{fields}}}"#
         );
@@ -435,14 +437,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_sent_comes_back_bit_for_bit() {
+    fn datagrams_round_trip_exactly() {
         assert_eq!(decode_scan(&encode_scan(&part())).expect("own bytes"), part());
         assert_eq!(decode_pose(&encode_pose(&pose())).expect("own bytes"), pose());
         assert_eq!(decode_joints(&encode_joints(&joints(), &names()), &names()).expect("own bytes"), joints());
     }
 
     #[test]
-    fn the_datagrams_of_the_documentation_are_read() {
+    fn documented_datagrams_are_decoded() {
         let page = include_str!("../../../docs/reference/udp.md");
         let examples: Vec<&str> = page.lines().filter(|line| line.starts_with(r#"{"kind""#)).collect();
         let scans: Vec<ScanPart> = examples.iter().filter_map(|text| decode_scan(text.as_bytes()).ok()).collect();
@@ -458,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_amiss_is_named() {
+    fn invalid_fields_are_named() {
         for (fields, named) in [
             (r#""points_m":[1,2,3,4]"#, "three a point"),
             (r#""points_m":[1,2,1e5]"#, "beyond"),
@@ -477,8 +479,8 @@ mod tests {
             (r#""points_m":[],"part":2,"parts":2"#, "part is 2"),
             (r#""points_m":[],"seq":2"#, "duplicate"),
         ] {
-            let told = refused_scan(fields);
-            assert!(told.contains(named), "{fields}: {told}");
+            let reported = scan_error(fields);
+            assert!(reported.contains(named), "{fields}: {reported}");
         }
         let other = String::from_utf8(encode_pose(&pose())).expect("text");
         for (from, to, named) in [
@@ -495,13 +497,13 @@ mod tests {
             (r#""covariance":[0.0001"#, r#""covariance":[0.0"#, "row 1, column 0"),
         ] {
             assert!(other.contains(from), "{from}");
-            let told = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();
-            assert!(told.contains(named), "{to}: {told}");
+            let reported = decode_pose(other.replace(from, to).as_bytes()).expect_err(to).to_string();
+            assert!(reported.contains(named), "{to}: {reported}");
         }
     }
 
     #[test]
-    fn joints_that_are_amiss_are_named() {
+    fn invalid_joints_are_named() {
         let good = String::from_utf8(encode_joints(&joints(), &names())).expect("text");
         for (from, to, named) in [
             (r#"["a","b","c"]"#, r#"["b","a","c"]"#, "arm.joints"),
@@ -513,30 +515,30 @@ mod tests {
             (r#""version":1"#, r#""version":1,"effort":[1,2]"#, "effort has 2"),
         ] {
             assert!(good.contains(from), "{from}");
-            let told = decode_joints(good.replace(from, to).as_bytes(), &names()).expect_err(to).to_string();
-            assert!(told.contains(named), "{to}: {told}");
+            let reported = decode_joints(good.replace(from, to).as_bytes(), &names()).expect_err(to).to_string();
+            assert!(reported.contains(named), "{to}: {reported}");
         }
     }
 
     #[test]
-    fn a_senders_text_does_not_flood_the_log() {
+    fn sender_text_in_errors_is_truncated() {
         let long = format!(r#""a\n{}""#, "b".repeat(50_000));
         let text = String::from_utf8(encode_pose(&pose())).expect("text").replace(r#""device""#, &long);
-        let told = decode_pose(text.as_bytes()).expect_err("no such clock").to_string();
-        assert!(told.contains("unknown variant `a?b") && told.len() <= MAX_TOLD, "{told}");
+        let reported = decode_pose(text.as_bytes()).expect_err("no such clock").to_string();
+        assert!(reported.contains("unknown variant `a?b") && reported.len() <= MAX_ERROR_CHARS, "{reported}");
     }
 
     #[test]
-    fn cut_bent_and_random_bytes_never_panic() {
-        for whole in [encode_scan(&part()), encode_pose(&pose()), encode_joints(&joints(), &names())] {
-            for end in 0..whole.len() {
-                assert!(decode_scan(&whole[..end]).is_err() && decode_pose(&whole[..end]).is_err(), "{end}");
-                assert!(decode_joints(&whole[..end], &names()).is_err(), "{end}");
+    fn corrupted_bytes_never_panic() {
+        for complete in [encode_scan(&part()), encode_pose(&pose()), encode_joints(&joints(), &names())] {
+            for end in 0..complete.len() {
+                assert!(decode_scan(&complete[..end]).is_err() && decode_pose(&complete[..end]).is_err(), "{end}");
+                assert!(decode_joints(&complete[..end], &names()).is_err(), "{end}");
             }
-            for ix in 0..8 * whole.len() {
-                let mut bent = whole.clone();
-                bent[ix / 8] ^= 1 << (ix % 8);
-                let _ = (decode_scan(&bent), decode_pose(&bent), decode_joints(&bent, &names()));
+            for ix in 0..8 * complete.len() {
+                let mut corrupted = complete.clone();
+                corrupted[ix / 8] ^= 1 << (ix % 8);
+                let _ = (decode_scan(&corrupted), decode_pose(&corrupted), decode_joints(&corrupted, &names()));
             }
         }
         let mut state = 1_u64;

@@ -11,7 +11,7 @@ pub struct Schema {
     /// Package and name, `foxglove.RawImage`.
     pub name: &'static str,
     fields: &'static [FieldSpec],
-    needs: &'static [&'static Self],
+    dependencies: &'static [&'static Self],
     enums: &'static [EnumSpec],
 }
 
@@ -51,14 +51,14 @@ const fn field(name: &'static str, number: u32, kind: Kind) -> FieldSpec {
 const TIMESTAMP: Schema = Schema {
     name: "google.protobuf.Timestamp",
     fields: &[field("seconds", 1, Kind::Int64), field("nanos", 2, Kind::Int32)],
-    needs: &[],
+    dependencies: &[],
     enums: &[],
 };
 
 const VECTOR3: Schema = Schema {
     name: "foxglove.Vector3",
     fields: &[field("x", 1, Kind::Double), field("y", 2, Kind::Double), field("z", 3, Kind::Double)],
-    needs: &[],
+    dependencies: &[],
     enums: &[],
 };
 
@@ -70,7 +70,7 @@ const QUATERNION: Schema = Schema {
         field("z", 3, Kind::Double),
         field("w", 4, Kind::Double),
     ],
-    needs: &[],
+    dependencies: &[],
     enums: &[],
 };
 
@@ -87,7 +87,7 @@ pub const COMPRESSED_IMAGE: Schema = Schema {
         field("width_px", 1003, Kind::Fixed32),
         field("height_px", 1004, Kind::Fixed32),
     ],
-    needs: &[&TIMESTAMP],
+    dependencies: &[&TIMESTAMP],
     enums: &[],
 };
 
@@ -104,10 +104,10 @@ pub const RAW_IMAGE: Schema = Schema {
         field("frame_id", 7, Kind::Text),
         field("exposure_secs", 1001, Kind::Double),
         field("n_skipped", 1002, Kind::Uint64),
-        field("metres_per_count", 1005, Kind::Double),
+        field("meters_per_count", 1005, Kind::Double),
         field("yuv_colors", 1007, Kind::Text),
     ],
-    needs: &[&TIMESTAMP],
+    dependencies: &[&TIMESTAMP],
     enums: &[],
 };
 
@@ -125,7 +125,7 @@ pub const CAMERA_CALIBRATION: Schema = Schema {
         field("P", 8, Kind::Doubles),
         field("frame_id", 9, Kind::Text),
     ],
-    needs: &[&TIMESTAMP],
+    dependencies: &[&TIMESTAMP],
     enums: &[],
 };
 
@@ -140,7 +140,7 @@ pub const FRAME_TRANSFORM: Schema = Schema {
         field("rotation", 5, Kind::Message(".foxglove.Quaternion")),
         field("psnr_ceiling", 1006, Kind::Double),
     ],
-    needs: &[&TIMESTAMP, &VECTOR3, &QUATERNION],
+    dependencies: &[&TIMESTAMP, &VECTOR3, &QUATERNION],
     enums: &[],
 };
 
@@ -150,7 +150,7 @@ const POSE: Schema = Schema {
         field("position", 1, Kind::Message(".foxglove.Vector3")),
         field("orientation", 2, Kind::Message(".foxglove.Quaternion")),
     ],
-    needs: &[&VECTOR3, &QUATERNION],
+    dependencies: &[&VECTOR3, &QUATERNION],
     enums: &[],
 };
 
@@ -161,7 +161,7 @@ const PACKED_ELEMENT_FIELD: Schema = Schema {
         field("offset", 2, Kind::Fixed32),
         field("type", 3, Kind::Enum(".foxglove.PackedElementField.NumericType")),
     ],
-    needs: &[],
+    dependencies: &[],
     enums: &[EnumSpec {
         name: "NumericType",
         values: &["UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"],
@@ -179,7 +179,7 @@ pub const POINT_CLOUD: Schema = Schema {
         field("fields", 5, Kind::Messages(".foxglove.PackedElementField")),
         field("data", 6, Kind::Bytes),
     ],
-    needs: &[&TIMESTAMP, &VECTOR3, &QUATERNION, &POSE, &PACKED_ELEMENT_FIELD],
+    dependencies: &[&TIMESTAMP, &VECTOR3, &QUATERNION, &POSE, &PACKED_ELEMENT_FIELD],
     enums: &[],
 };
 
@@ -187,8 +187,8 @@ impl Schema {
     /// The encoded `FileDescriptorSet`: this message's file after the files it needs.
     pub fn file_descriptor_set(&self) -> Vec<u8> {
         let mut set = Message::default();
-        for needed in self.needs {
-            set.message(1, &needed.file());
+        for dependency in self.dependencies {
+            set.message(1, &dependency.file());
         }
         set.message(1, &self.file());
         set.into_bytes()
@@ -202,13 +202,13 @@ impl Schema {
         for field in self.fields {
             message.message(2, &field.encode());
         }
-        for listed in self.enums {
-            message.message(4, &listed.encode());
+        for enum_spec in self.enums {
+            message.message(4, &enum_spec.encode());
         }
         let mut file = Message::default();
         file.bytes(1, self.path().as_bytes()).bytes(2, package.as_bytes());
-        for needed in self.needs {
-            file.bytes(3, needed.path().as_bytes());
+        for dependency in self.dependencies {
+            file.bytes(3, dependency.path().as_bytes());
         }
         file.message(4, &message).bytes(12, b"proto3");
         file
@@ -275,7 +275,7 @@ mod tests {
     use crate::wire::protobuf::fields;
 
     #[test]
-    fn a_set_lists_every_file_before_the_one_that_needs_it() {
+    fn dependencies_precede_their_users() {
         let set = FRAME_TRANSFORM.file_descriptor_set();
         let paths: Vec<String> = fields(&set)
             .map(|file| {

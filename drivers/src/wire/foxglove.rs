@@ -14,7 +14,7 @@ const EXPOSURE_SECS: u32 = 1001;
 const N_SKIPPED: u32 = 1002;
 const WIDTH_PX: u32 = 1003;
 const HEIGHT_PX: u32 = 1004;
-const METRES_PER_COUNT: u32 = 1005;
+const METERS_PER_COUNT: u32 = 1005;
 const PSNR_CEILING: u32 = 1006;
 const YUV_COLORS: u32 = 1007;
 /// Values of that field.
@@ -63,9 +63,9 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
             raw_image(&mut message, image, name_of(&YUV_LAYOUTS, layout));
             message.bytes(YUV_COLORS, name_of(&YUV_COLORS_NAMES, colors).as_bytes());
         }
-        PixelFormat::DepthU16 { metres_per_count } => {
+        PixelFormat::DepthU16 { meters_per_count } => {
             raw_image(&mut message, image, "16UC1");
-            message.double(METRES_PER_COUNT, metres_per_count);
+            message.double(METERS_PER_COUNT, meters_per_count);
         }
     }
     if let Some(exposure_secs) = image.exposure_secs {
@@ -77,10 +77,10 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
 
 /// The first name of a value in a table that has them all.
 fn name_of<T: PartialEq>(names: &[(&'static str, T)], value: T) -> &'static str {
-    names.iter().find(|(_, named)| *named == value).expect("the table names every value").0
+    names.iter().find(|(_, lookup)| *lookup == value).expect("the table names every value").0
 }
 
-fn named<T: Copy>(names: &[(&str, T)], name: &str) -> Option<T> {
+fn lookup<T: Copy>(names: &[(&str, T)], name: &str) -> Option<T> {
     names.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
 }
 
@@ -99,7 +99,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     let mut stamp = None;
     let mut size_px = [0; 2];
     let mut format = "";
-    let mut metres_per_count = None;
+    let mut meters_per_count = None;
     let mut colors = None;
     let mut image = Image {
         camera: Arc::from(""),
@@ -122,7 +122,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (EXPOSURE_SECS, _) => image.exposure_secs = Some(field.double()?),
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
             (YUV_COLORS, false) => colors = Some(field.text()?),
-            (METRES_PER_COUNT, false) => metres_per_count = Some(field.double()?),
+            (METERS_PER_COUNT, false) => meters_per_count = Some(field.double()?),
             _ => {} // A newer writer may know more.
         }
     }
@@ -135,9 +135,9 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
         ("bgr8", false) => PixelFormat::Bgr8,
         ("mono8", false) => PixelFormat::Gray8,
         ("16UC1", false) => PixelFormat::DepthU16 {
-            metres_per_count: metres_per_count.ok_or(Malformed::Missing { name: "metres_per_count" })?,
+            meters_per_count: meters_per_count.ok_or(Malformed::Missing { name: "meters_per_count" })?,
         },
-        (name, compressed) => match named(&YUV_LAYOUTS, name) {
+        (name, compressed) => match lookup(&YUV_LAYOUTS, name) {
             Some(layout) if !compressed => PixelFormat::Yuv { layout, colors: yuv_colors(colors)? },
             _ => return Err(Malformed::PixelFormat { name: name.to_owned() }),
         },
@@ -147,7 +147,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
 
 fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
     let name = name.ok_or(Malformed::Missing { name: "yuv_colors" })?;
-    named(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat { name: name.to_owned() })
+    lookup(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat { name: name.to_owned() })
 }
 
 /// Depth in metres as a `RawImage` of 32-bit floats.
@@ -164,8 +164,8 @@ pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
     for field in fields(bytes) {
         let field = field?;
         if field.number == 6 {
-            let metres = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
-            return Ok(field.bytes()?.chunks_exact(4).map(metres).collect());
+            let meters = |bytes: &[u8]| f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+            return Ok(field.bytes()?.chunks_exact(4).map(meters).collect());
         }
     }
     Err(Malformed::Missing { name: "data" })
@@ -308,8 +308,8 @@ mod tests {
     }
 
     #[test]
-    fn images_come_back_bit_for_bit_in_every_format() {
-        let depth = PixelFormat::DepthU16 { metres_per_count: 0.1 + 0.2 };
+    fn images_round_trip_exactly_in_every_format() {
+        let depth = PixelFormat::DepthU16 { meters_per_count: 0.1 + 0.2 };
         let plain = [PixelFormat::Rgb8, PixelFormat::Bgr8, PixelFormat::Gray8, PixelFormat::Jpeg, PixelFormat::Png];
         let yuv = [YuvLayout::Yuyv, YuvLayout::Uyvy, YuvLayout::Nv12]
             .into_iter()
@@ -325,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn poses_come_back_bit_for_bit() {
+    fn poses_round_trip_exactly() {
         let pose = Transform::from_parts(
             Translation3::new(0.1, -0.0, 1e-300),
             UnitQuaternion::from_euler_angles(0.3, -0.7, 2.9),
@@ -340,19 +340,19 @@ mod tests {
     }
 
     #[test]
-    fn metres_come_back_bit_for_bit() {
+    fn depth_round_trips_exactly() {
         let depth_m = [0.0, 1.25, f32::NAN, f32::MIN_POSITIVE];
         let read = decode_depth_m(&encode_depth_m("wrist", Stamp(1), [2, 2], &depth_m)).expect("own bytes");
         assert!(read.iter().zip(depth_m).all(|(read, sent)| read.to_bits() == sent.to_bits()) && read.len() == 4);
     }
 
     #[test]
-    fn what_is_missing_or_unknown_is_named() {
+    fn missing_and_unknown_fields_are_named() {
         assert_eq!(decode_image("foxglove.RawImage", &[]), Err(Malformed::Missing { name: "timestamp" }));
         let jpeg_as_raw = decode_image("foxglove.RawImage", &encode_image(&image(PixelFormat::Jpeg)));
         assert!(jpeg_as_raw.is_err(), "{jpeg_as_raw:?}");
-        let cut = &encode_image(&image(PixelFormat::Rgb8))[..30];
-        assert_eq!(decode_image("foxglove.RawImage", cut), Err(Malformed::CutOff));
+        let truncated = &encode_image(&image(PixelFormat::Rgb8))[..30];
+        assert_eq!(decode_image("foxglove.RawImage", truncated), Err(Malformed::Truncated));
         assert!(decode_transform(&[]).is_err());
     }
 }

@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn readings_come_back_bit_for_bit() {
+    fn joint_states_round_trip_exactly() {
         let mut number = 0.1_f64;
         for stamp in [0, -1, 1_700_000_000_123_456_789, i64::MAX] {
             let position: Vec<f64> = (0..7)
@@ -93,14 +93,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_stays_no_number() {
+    fn nan_round_trips() {
         let sent = JointState { stamp: Stamp(1), position: vec![f64::NAN, 1.0], velocity: vec![], effort: vec![] };
         let read = decode(&encode(&sent)).expect("own bytes");
         assert!(read.position[0].is_nan() && read.position[1] == 1.0);
     }
 
     #[test]
-    fn broken_json_is_told_and_the_schema_is_json() {
+    fn broken_json_is_error_and_schema_is_valid() {
         assert!(decode(b"{\"timestamp\":").is_err());
         assert!(decode(b"{}").expect_err("empty").to_string().contains("timestamp"));
         serde_json::from_str::<serde_json::Value>(SCHEMA).expect("valid JSON");

@@ -14,7 +14,7 @@ pub mod protobuf;
 pub enum Malformed {
     /// The bytes end inside a field.
     #[error("the message ends inside a field")]
-    CutOff,
+    Truncated,
     /// A field has a type that protobuf does not know or that this field cannot have.
     #[error("field {field} has wire type {wire_type}, which it cannot have")]
     WireType {

@@ -18,7 +18,7 @@ const FIELDS: [(&str, u32, u64); 5] =
 pub fn encode(scan: &RangeScan) -> Vec<u8> {
     let mut data = Vec::with_capacity(scan.points.len() * STRIDE as usize);
     for point in scan.points.iter() {
-        data.extend(point.position_m.iter().flat_map(|metres| metres.to_le_bytes()));
+        data.extend(point.position_m.iter().flat_map(|meters| meters.to_le_bytes()));
         data.extend(point.ring.to_le_bytes());
         data.extend([0; 2]);
         data.extend(point.offset_micros.to_le_bytes());
@@ -66,11 +66,11 @@ pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
 }
 
 fn point(bytes: &[u8; STRIDE as usize]) -> RangePoint {
-    let four = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
+    let four_bytes_at = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
     RangePoint {
-        position_m: [0, 4, 8].map(|at| f32::from_le_bytes(four(at))),
+        position_m: [0, 4, 8].map(|at| f32::from_le_bytes(four_bytes_at(at))),
         ring: u16::from_le_bytes([bytes[12], bytes[13]]),
-        offset_micros: u32::from_le_bytes(four(16)),
+        offset_micros: u32::from_le_bytes(four_bytes_at(16)),
     }
 }
 
@@ -80,7 +80,7 @@ mod tests {
     use kinematics::Stamp;
 
     #[test]
-    fn scans_come_back_bit_for_bit_and_other_layouts_are_refused() {
+    fn scans_round_trip_exactly_and_other_layouts_are_rejected() {
         let point =
             |x: f32, ring| RangePoint { position_m: [x, -0.0, 1e-30], ring, offset_micros: 7 + u32::from(ring) };
         let points: Arc<[RangePoint]> = [point(1.5, 0), point(-3.25, u16::MAX)].into();

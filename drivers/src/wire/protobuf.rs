@@ -201,19 +201,19 @@ impl<'a> Fields<'a> {
                 return Ok(value);
             }
         }
-        Err(Malformed::CutOff)
+        Err(Malformed::Truncated)
     }
 
     fn take(&mut self, n_bytes: usize) -> Result<&'a [u8], Malformed> {
-        let (taken, rest) = self.0.split_at_checked(n_bytes).ok_or(Malformed::CutOff)?;
+        let (chunk, rest) = self.0.split_at_checked(n_bytes).ok_or(Malformed::Truncated)?;
         self.0 = rest;
-        Ok(taken)
+        Ok(chunk)
     }
 
     fn array<const N: usize>(&mut self) -> Result<[u8; N], Malformed> {
-        let (taken, rest) = self.0.split_first_chunk().ok_or(Malformed::CutOff)?;
+        let (chunk, rest) = self.0.split_first_chunk().ok_or(Malformed::Truncated)?;
         self.0 = rest;
-        Ok(*taken)
+        Ok(*chunk)
     }
 }
 
@@ -222,7 +222,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_documented_examples_encode_to_their_bytes() {
+    fn documented_examples_match_published_bytes() {
         // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 holds the first message.
         let mut inner = Message::default();
         inner.varint(1, 150);
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_come_back_as_they_went_in() {
+    fn fields_round_trip() {
         let mut message = Message::default();
         message.varint(1, u64::MAX).fixed32(2, 7).double(16, -0.0).doubles(1005, &[1.5, f64::MIN_POSITIVE]);
         let bytes = message.into_bytes();
@@ -247,14 +247,14 @@ mod tests {
     }
 
     #[test]
-    fn every_cut_is_noticed() {
+    fn truncation_is_detected() {
         let mut message = Message::default();
         message.bytes(2, b"testing").double(3, 1.0).varint(4, 1 << 40);
         let bytes = message.into_bytes();
-        let whole = [9, 18, bytes.len()]; // Ends of the three fields: a cut there leaves a valid shorter message.
+        let field_ends = [9, 18, bytes.len()]; // Ends of the three fields: a cut there leaves a valid shorter message.
         for n_bytes in 1..bytes.len() {
-            let cut = fields(&bytes[..n_bytes]).any(|field| field.is_err());
-            assert_eq!(cut, !whole.contains(&n_bytes), "cut after {n_bytes} bytes");
+            let is_truncated = fields(&bytes[..n_bytes]).any(|field| field.is_err());
+            assert_eq!(is_truncated, !field_ends.contains(&n_bytes), "cut after {n_bytes} bytes");
         }
         assert!(fields(&[0xff; 11]).all(|field| field.is_err()));
         assert!(fields(&[0x0b]).all(|field| field == Err(Malformed::WireType { field: 1, wire_type: 3 })));

@@ -1,8 +1,8 @@
 //! Motors on CAN buses whose shafts follow a script until a client switches one on: a thread a bus.
 
 use super::JointTrack;
-use drivers::can::played::{Played, State};
-use drivers::can::{ArmConfig, Arrived, Bus, MotorConfig};
+use drivers::can::emulated::{EmulatedMotor, State};
+use drivers::can::{ArmConfig, Bus, BusEvent, MotorConfig};
 use drivers::wire::can::mit::{Limits, Motion};
 use drivers::{Error, clock};
 use kinematics::JointState;
@@ -14,40 +14,40 @@ use std::time::Duration;
 /// What the counts of Damiao motors cover: rad, rad/s and Nm, as a DM4310's do.
 const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 /// How long a bus is listened to before motors that report by themselves are looked after.
-const TICK: Duration = Duration::from_millis(1);
+const RECEIVE_TIMEOUT: Duration = Duration::from_millis(1);
 
 /// Motors that answer until they are dropped.
 #[derive(Debug)]
-pub struct PlayedMotors {
-    signs: Arc<Signs>,
+pub struct EmulatedMotors {
+    flags: Arc<SharedFlags>,
     threads: Vec<JoinHandle<()>>,
 }
 
 /// What the threads of an arm tell each other.
 #[derive(Debug, Default)]
-struct Signs {
+struct SharedFlags {
     stop: AtomicBool,
     /// A client has switched a motor on.
-    is_moved: AtomicBool,
+    is_client_controlled: AtomicBool,
 }
 
-impl PlayedMotors {
+impl EmulatedMotors {
     /// Opens the buses, which must be up, and plays every motor of the arm; the track's joints are in the order of the motors.
     /// Once a client has switched one on, all of them stay with what clients want.
     pub fn start(track: &JointTrack, arm: &ArmConfig) -> Result<Self, Error> {
-        let mut motors = Self { signs: Arc::default(), threads: Vec::new() };
+        let mut motors = Self { flags: Arc::default(), threads: Vec::new() };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
-            let own = arm.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
-            let own = own.map(|(joint_ix, motor)| Shaft {
+            let joints_of_bus = arm.motors.iter().enumerate().filter(|(_, motor)| motor.bus_ix == bus_ix);
+            let joints_of_bus = joints_of_bus.map(|(joint_ix, motor)| EmulatedJoint {
                 joint_ix,
                 config: motor.clone(),
-                motor: Played::new(motor.family, DAMIAO_LIMITS),
+                motor: EmulatedMotor::new(motor.family, DAMIAO_LIMITS),
             });
-            let (bus, own, track) = (Bus::open(bus)?, own.collect(), track.clone());
-            let signs = Arc::clone(&motors.signs);
+            let (bus, joints_of_bus, track) = (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
+            let flags = Arc::clone(&motors.flags);
             let device = format!("played motors on {}", bus.config().interface);
             let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
-                if let Err(error) = play(&bus, own, &track, &signs) {
+                if let Err(error) = run_bus(&bus, joints_of_bus, &track, &flags) {
                     log::error!("{error}");
                 }
             });
@@ -57,9 +57,9 @@ impl PlayedMotors {
     }
 }
 
-impl Drop for PlayedMotors {
+impl Drop for EmulatedMotors {
     fn drop(&mut self) {
-        self.signs.stop.store(true, Ordering::Relaxed);
+        self.flags.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
             // A thread that panicked has said so.
             let _ = thread.join();
@@ -68,46 +68,52 @@ impl Drop for PlayedMotors {
 }
 
 /// A motor and the joint it moves.
-struct Shaft {
+struct EmulatedJoint {
     joint_ix: usize,
     config: MotorConfig,
-    motor: Played,
+    motor: EmulatedMotor,
 }
 
-impl Shaft {
+impl EmulatedJoint {
     /// Turns it to where its joint is.
     fn follow(&mut self, joints: &JointState) {
         let MotorConfig { gear_ratio, is_reversed, offset_rad, .. } = self.config;
-        let per_turn = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
+        let motor_per_joint = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
         let of = |numbers: &[f64]| numbers.get(self.joint_ix).copied().unwrap_or(0.0);
         self.motor.set_motion(Motion {
-            position_rad: (of(&joints.position) - offset_rad) * per_turn,
-            velocity_rad_s: of(&joints.velocity) * per_turn,
-            torque_nm: of(&joints.effort) / per_turn,
+            position_rad: (of(&joints.position) - offset_rad) * motor_per_joint,
+            velocity_rad_s: of(&joints.velocity) * motor_per_joint,
+            torque_nm: of(&joints.effort) / motor_per_joint,
         });
     }
 }
 
-fn play(bus: &Bus, mut shafts: Vec<Shaft>, track: &JointTrack, signs: &Signs) -> Result<(), Error> {
-    while !signs.stop.load(Ordering::Relaxed) {
-        let arrived = bus.receive(TICK)?;
+fn run_bus(
+    bus: &Bus,
+    mut joints_on_bus: Vec<EmulatedJoint>,
+    track: &JointTrack,
+    flags: &SharedFlags,
+) -> Result<(), Error> {
+    while !flags.stop.load(Ordering::Relaxed) {
+        let arrived = bus.receive(RECEIVE_TIMEOUT)?;
         let now = clock::now();
-        let joints = (!signs.is_moved.load(Ordering::Relaxed)).then(|| track.at(now));
-        for shaft in &mut shafts {
+        let joints = (!flags.is_client_controlled.load(Ordering::Relaxed)).then(|| track.at(now));
+        for emulated_joint in &mut joints_on_bus {
             if let Some(joints) = &joints {
-                shaft.follow(joints);
+                emulated_joint.follow(joints);
             }
             let answers = match &arrived {
-                Some((_, Arrived::Frame(frame))) => shaft.motor.take(frame),
+                Some((_, BusEvent::Frame(frame))) => emulated_joint.motor.take(frame),
                 _ => Ok(Vec::new()),
             };
-            for frames in [answers, shaft.motor.report(now)] {
+            for frames in [answers, emulated_joint.motor.report(now)] {
                 match frames {
                     Ok(frames) => frames.iter().try_for_each(|frame| bus.send(frame).map(drop))?,
-                    Err(error) => log::debug!("joint {:?}: {error}", shaft.config.joint),
+                    Err(error) => log::debug!("joint {:?}: {error}", emulated_joint.config.joint),
                 }
             }
-            if shaft.motor.state() != State::Free && !signs.is_moved.swap(true, Ordering::Relaxed) {
+            if emulated_joint.motor.state() != State::Free && !flags.is_client_controlled.swap(true, Ordering::Relaxed)
+            {
                 log::info!("a client moves the arm: from now on it stays where clients want it");
             }
         }

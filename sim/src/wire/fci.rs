@@ -2,27 +2,27 @@
 
 use super::JointTrack;
 use drivers::Error;
-use drivers::franka::played::{Joints, PlayedRobot, RobotConfig};
+use drivers::franka::emulated::{EmulatedRobot, Joints, RobotConfig};
 
 /// Takes clients until it is dropped. Once a client has moved the arm it stays with what clients want.
-pub fn play_fci(track: JointTrack, config: RobotConfig) -> Result<PlayedRobot, Error> {
-    let mut is_moved = false;
-    let owner = move |now, wanted: &drivers::franka::played::Wanted| {
-        if wanted.is_moving && !std::mem::replace(&mut is_moved, true) {
+pub fn emulate_fci(track: JointTrack, config: RobotConfig) -> Result<EmulatedRobot, Error> {
+    let mut is_client_controlled = false;
+    let joint_simulator = move |now, client_target: &drivers::franka::emulated::CommandedJoints| {
+        if client_target.is_moving && !std::mem::replace(&mut is_client_controlled, true) {
             log::info!("a client moves the arm: from now on it stays where clients want it");
         }
-        if is_moved {
-            let (position_rad, velocity_rad_s) = (wanted.position_rad, wanted.velocity_rad_s);
+        if is_client_controlled {
+            let (position_rad, velocity_rad_s) = (client_target.position_rad, client_target.velocity_rad_s);
             return Joints { position_rad, velocity_rad_s, ..Joints::default() };
         }
         let state = track.at(now);
-        let seven = |numbers: Vec<f64>| std::array::from_fn(|ix| numbers.get(ix).copied().unwrap_or(0.0));
+        let to_joint_array = |numbers: Vec<f64>| std::array::from_fn(|ix| numbers.get(ix).copied().unwrap_or(0.0));
         Joints {
-            position_rad: seven(state.position),
-            velocity_rad_s: seven(state.velocity),
-            torque_nm: seven(state.effort),
+            position_rad: to_joint_array(state.position),
+            velocity_rad_s: to_joint_array(state.velocity),
+            torque_nm: to_joint_array(state.effort),
             ..Joints::default()
         }
     };
-    PlayedRobot::start(config, Box::new(owner))
+    EmulatedRobot::start(config, Box::new(joint_simulator))
 }

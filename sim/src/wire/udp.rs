@@ -1,9 +1,9 @@
 //! Joint states, base poses and range scans as datagrams, each when it was said.
 
-use super::{Clockwork, Script};
+use super::{DeviceScript, PlaybackClock};
 use drivers::clock;
 use drivers::wire::datagram::{
-    Clock, Head, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
 };
 use drivers::{Error, RangeScan};
 use kinematics::{JointState, Stamp};
@@ -16,13 +16,13 @@ use std::time::Duration;
 /// Echoes in one datagram: as JSON they take about 60 bytes each, and 65 507 fit.
 const MAX_POINTS: usize = 1000;
 /// How often it is told that nothing moves.
-const STILL: Duration = Duration::from_millis(20);
+const RESEND_PERIOD: Duration = Duration::from_millis(20);
 /// How soon the thread notices that it is to stop.
-const POLL: Duration = Duration::from_millis(50);
+const STOP_CHECK_PERIOD: Duration = Duration::from_millis(50);
 
 /// Who listens to what.
 #[derive(Clone, Debug, Default)]
-pub struct Listeners {
+pub struct DatagramTargets {
     /// To the joints of these names.
     pub joints: Option<(SocketAddr, Vec<String>)>,
     /// To the base's poses.
@@ -33,14 +33,18 @@ pub struct Listeners {
 
 /// A thread that sends until it is dropped.
 #[derive(Debug)]
-pub struct PlayedSenders {
+pub struct EmulatedSenders {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl PlayedSenders {
+impl EmulatedSenders {
     /// Begins to send: the script when it is played, and before and after it that joints and base stand still at its ends.
-    pub fn start(script: &Script, clockwork: Clockwork, listeners: Listeners) -> Result<Self, Error> {
+    pub fn start(
+        script: &DeviceScript,
+        playback_clock: PlaybackClock,
+        datagram_targets: DatagramTargets,
+    ) -> Result<Self, Error> {
         let device = "played datagrams".to_owned();
         let any = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
         let socket = UdpSocket::bind(any);
@@ -48,9 +52,9 @@ impl PlayedSenders {
         let stop = Arc::new(AtomicBool::new(false));
         let sender = Sender {
             script: script.clone(),
-            clockwork,
-            n_sent: vec![0; listeners.scanners.len()],
-            listeners,
+            playback_clock,
+            n_sent: vec![0; datagram_targets.scanners.len()],
+            datagram_targets,
             socket,
             n_joints_sent: 0,
             n_poses_sent: 0,
@@ -62,7 +66,7 @@ impl PlayedSenders {
     }
 }
 
-impl Drop for PlayedSenders {
+impl Drop for EmulatedSenders {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
@@ -74,7 +78,7 @@ impl Drop for PlayedSenders {
 
 /// One sample of the script, by its place.
 #[derive(Clone, Copy)]
-enum Line {
+enum ScriptEntry {
     Joints(usize),
     Pose(usize),
     /// And which scanner's it is.
@@ -82,9 +86,9 @@ enum Line {
 }
 
 struct Sender {
-    script: Script,
-    clockwork: Clockwork,
-    listeners: Listeners,
+    script: DeviceScript,
+    playback_clock: PlaybackClock,
+    datagram_targets: DatagramTargets,
     socket: UdpSocket,
     n_joints_sent: u64,
     n_poses_sent: u64,
@@ -95,58 +99,59 @@ struct Sender {
 
 impl Sender {
     fn run(mut self) {
-        let lines = self.lines();
-        if let Some((first, _)) = lines.first() {
-            self.stand_still(0, *first);
+        let script_entries = self.script_entries();
+        if let Some((first, _)) = script_entries.first() {
+            self.resend_end_state(0, *first);
         }
-        for (due, line) in lines {
-            if !self.wait(due) {
+        for (due_stamp, script_entry) in script_entries {
+            if !self.wait(due_stamp) {
                 return;
             }
-            match line {
-                Line::Joints(ix) => self.send_joints(ix, due, false),
-                Line::Pose(ix) => self.send_pose(ix, due),
-                Line::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
+            match script_entry {
+                ScriptEntry::Joints(ix) => self.send_joints(ix, due_stamp, false),
+                ScriptEntry::Pose(ix) => self.send_pose(ix, due_stamp),
+                ScriptEntry::Scan(scanner_ix, ix) => self.send_scan(scanner_ix, ix),
             }
         }
-        self.stand_still(usize::MAX, Stamp(i64::MAX));
+        self.resend_end_state(usize::MAX, Stamp(i64::MAX));
     }
 
     /// The script in the order in which it is sent: scans once they are whole.
-    fn lines(&self) -> Vec<(Stamp, Line)> {
-        let Script { joints, poses, scans } = &self.script;
-        let at = |stamp: Stamp| self.clockwork.played_at(stamp);
-        let mut lines = Vec::new();
-        if self.listeners.joints.is_some() {
-            lines.extend(joints.iter().enumerate().map(|(ix, state)| (at(state.stamp), Line::Joints(ix))));
+    fn script_entries(&self) -> Vec<(Stamp, ScriptEntry)> {
+        let DeviceScript { joints, poses, scans } = &self.script;
+        let at = |stamp: Stamp| self.playback_clock.playback_stamp_of(stamp);
+        let mut script_entries = Vec::new();
+        if self.datagram_targets.joints.is_some() {
+            script_entries
+                .extend(joints.iter().enumerate().map(|(ix, state)| (at(state.stamp), ScriptEntry::Joints(ix))));
         }
-        if self.listeners.base.is_some() {
-            lines.extend(poses.iter().enumerate().map(|(ix, pose)| (at(pose.stamp), Line::Pose(ix))));
+        if self.datagram_targets.base.is_some() {
+            script_entries.extend(poses.iter().enumerate().map(|(ix, pose)| (at(pose.stamp), ScriptEntry::Pose(ix))));
         }
-        for (scanner_ix, (name, _)) in self.listeners.scanners.iter().enumerate() {
-            let turns = scans.iter().enumerate().filter(|(_, scan)| *scan.scanner == **name);
-            lines.extend(turns.map(|(ix, RangeScan { stamp, points, .. })| {
+        for (scanner_ix, (name, _)) in self.datagram_targets.scanners.iter().enumerate() {
+            let revolutions = scans.iter().enumerate().filter(|(_, scan)| *scan.scanner == **name);
+            script_entries.extend(revolutions.map(|(ix, RangeScan { stamp, points, .. })| {
                 let last_micros = points.iter().map(|point| point.offset_micros).max().unwrap_or(0);
-                (at(stamp.plus_secs(f64::from(last_micros) * 1e-6)), Line::Scan(scanner_ix, ix))
+                (at(stamp.plus_secs(f64::from(last_micros) * 1e-6)), ScriptEntry::Scan(scanner_ix, ix))
             }));
         }
-        lines.sort_by_key(|(due, _)| *due);
-        lines
+        script_entries.sort_by_key(|(due_stamp, _)| *due_stamp);
+        script_entries
     }
 
     /// Tells again and again, until shortly before a time, that joints and base are where one end of the script has them.
-    fn stand_still(&mut self, end: usize, until: Stamp) {
+    fn resend_end_state(&mut self, end: usize, until: Stamp) {
         let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
         let (joints_ix, pose_ix) = (last(self.script.joints.len()), last(self.script.poses.len()));
         let mut now = clock::now();
-        while now.plus_secs(STILL.as_secs_f64()) < until {
+        while now.plus_secs(RESEND_PERIOD.as_secs_f64()) < until {
             if let Some(ix) = joints_ix {
                 self.send_joints(ix, now, true);
             }
             if let Some(ix) = pose_ix {
                 self.send_pose(ix, now);
             }
-            if !self.wait(now.plus_secs(STILL.as_secs_f64())) {
+            if !self.wait(now.plus_secs(RESEND_PERIOD.as_secs_f64())) {
                 return;
             }
             now = clock::now();
@@ -154,48 +159,48 @@ impl Sender {
     }
 
     /// Waits for a time; false where it is to stop.
-    fn wait(&self, due: Stamp) -> bool {
+    fn wait(&self, due_stamp: Stamp) -> bool {
         loop {
             if self.stop.load(Ordering::Relaxed) {
                 return false;
             }
-            let left = due.duration_since(clock::now());
+            let left = due_stamp.duration_since(clock::now());
             if left.is_zero() {
                 return true;
             }
-            std::thread::sleep(left.min(POLL));
+            std::thread::sleep(left.min(STOP_CHECK_PERIOD));
         }
     }
 
-    fn send_joints(&mut self, ix: usize, stamp: Stamp, is_still: bool) {
-        let Some((to, names)) = &self.listeners.joints else { return };
+    fn send_joints(&mut self, ix: usize, stamp: Stamp, is_at_rest: bool) {
+        let Some((to, names)) = &self.datagram_targets.joints else { return };
         let JointState { position, mut velocity, effort, .. } = self.script.joints[ix].clone();
-        if is_still {
+        if is_at_rest {
             velocity.fill(0.0);
         }
-        let joints = JointsDatagram { head: head(self.n_joints_sent, stamp), position, velocity, effort };
+        let joints = JointsDatagram { header: header(self.n_joints_sent, stamp), position, velocity, effort };
         self.send(&encode_joints(&joints, names), *to);
         self.n_joints_sent += 1;
     }
 
     fn send_pose(&mut self, ix: usize, stamp: Stamp) {
-        let Some(to) = self.listeners.base else { return };
+        let Some(to) = self.datagram_targets.base else { return };
         let world_from_base = self.script.poses[ix].world_from_base;
         self.send(
-            &encode_pose(&PoseDatagram { head: head(self.n_poses_sent, stamp), world_from_base, covariance: None }),
+            &encode_pose(&PoseDatagram { header: header(self.n_poses_sent, stamp), world_from_base, covariance: None }),
             to,
         );
         self.n_poses_sent += 1;
     }
 
     fn send_scan(&mut self, scanner_ix: usize, ix: usize) {
-        let (name, to) = self.listeners.scanners[scanner_ix].clone();
+        let (name, to) = self.datagram_targets.scanners[scanner_ix].clone();
         let RangeScan { stamp, points, .. } = &self.script.scans[ix];
-        let head = head(self.n_sent[scanner_ix], self.clockwork.played_at(*stamp));
+        let header = header(self.n_sent[scanner_ix], self.playback_clock.playback_stamp_of(*stamp));
         let chunks: Vec<_> = if points.is_empty() { vec![&points[..]] } else { points.chunks(MAX_POINTS).collect() };
         let n_parts = u32::try_from(chunks.len()).unwrap_or(u32::MAX);
         for (part, points) in (0..).zip(chunks) {
-            let scan = ScanPart { head, frame: name.clone(), part, n_parts, points: points.to_vec() };
+            let scan = ScanPart { header, frame: name.clone(), part, n_parts, points: points.to_vec() };
             self.send(&encode_scan(&scan), to);
         }
         self.n_sent[scanner_ix] += 1;
@@ -207,8 +212,8 @@ impl Sender {
     }
 }
 
-fn head(seq: u64, stamp: Stamp) -> Head {
-    Head { seq, clock: Clock::Monotonic, stamp_nanos: stamp.0 }
+fn header(seq: u64, stamp: Stamp) -> DatagramHeader {
+    DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: stamp.0 }
 }
 
 #[cfg(test)]
@@ -219,10 +224,10 @@ mod tests {
     use kinematics::Transform;
 
     #[test]
-    fn what_is_played_is_what_the_drivers_hear_stamped_when_it_was_so() {
+    fn drivers_receive_the_emulated_samples_with_stamps() {
         const MILLI: i64 = 1_000_000;
         let point = |ix: u16| RangePoint { position_m: [f32::from(ix), 1.0, 0.5], ring: 2, offset_micros: ix.into() };
-        let script = Script {
+        let script = DeviceScript {
             joints: vec![JointState {
                 stamp: Stamp(5 * MILLI),
                 position: vec![0.25, -1.5],
@@ -242,28 +247,37 @@ mod tests {
         let mut base = UdpBase::open(free, [1.0; 2]).expect("a free port");
         let mut scanner = UdpScanner::open("lidar", free).expect("a free port");
         let played = clock::now().plus_secs(0.2);
-        let listeners = Listeners {
+        let datagram_targets = DatagramTargets {
             joints: Some((arm.address(), names)),
             base: Some(base.address()),
             scanners: vec![("lidar".into(), scanner.address())],
         };
-        let clockwork = Clockwork { scripted: Stamp(0), played };
-        let _senders = PlayedSenders::start(&script, clockwork, listeners).expect("a socket");
+        let playback_clock = PlaybackClock { scripted: Stamp(0), played };
+        let _senders = EmulatedSenders::start(&script, playback_clock, datagram_targets).expect("a socket");
         let wait = Duration::from_secs(5);
-        let still = arm.read(wait).expect("joints");
-        assert_eq!(still.position, script.joints[0].position);
-        assert!(still.stamp < clockwork.played_at(Stamp(0)), "told before it is played");
-        let mut joints = still;
-        while joints.stamp < clockwork.played_at(Stamp(0)) {
+        let at_rest_state = arm.read(wait).expect("joints");
+        assert_eq!(at_rest_state.position, script.joints[0].position);
+        assert!(at_rest_state.stamp < playback_clock.playback_stamp_of(Stamp(0)), "told before it is played");
+        let mut joints = at_rest_state;
+        while joints.stamp < playback_clock.playback_stamp_of(Stamp(0)) {
             joints = arm.read(wait).expect("joints");
         }
-        assert_eq!(joints, JointState { stamp: clockwork.played_at(Stamp(5 * MILLI)), ..script.joints[0].clone() });
+        assert_eq!(
+            joints,
+            JointState { stamp: playback_clock.playback_stamp_of(Stamp(5 * MILLI)), ..script.joints[0].clone() }
+        );
         let mut pose = base.next_pose(wait).expect("a pose");
-        while pose.stamp < clockwork.played_at(Stamp(0)) {
+        while pose.stamp < playback_clock.playback_stamp_of(Stamp(0)) {
             pose = base.next_pose(wait).expect("a pose");
         }
-        assert_eq!((pose.stamp, pose.world_from_base.translation.z), (clockwork.played_at(Stamp(6 * MILLI)), 3.0));
+        assert_eq!(
+            (pose.stamp, pose.world_from_base.translation.z),
+            (playback_clock.playback_stamp_of(Stamp(6 * MILLI)), 3.0)
+        );
         let scan = scanner.next_scan(wait).expect("a scan");
-        assert_eq!((scan.stamp, &scan.points), (clockwork.played_at(Stamp(7 * MILLI)), &script.scans[0].points));
+        assert_eq!(
+            (scan.stamp, &scan.points),
+            (playback_clock.playback_stamp_of(Stamp(7 * MILLI)), &script.scans[0].points)
+        );
     }
 }

@@ -12,12 +12,12 @@ pub(crate) struct Run {
     pub(crate) depth: Vec<Image>,
     pub(crate) truth: Vec<TruthImage>,
     pub(crate) joints: Vec<JointState>,
-    pub(crate) told: Vec<BasePose>,
+    pub(crate) reported_base: Vec<BasePose>,
     pub(crate) true_base: Vec<BasePose>,
     pub(crate) scans: Vec<RangeScan>,
 }
 
-pub(crate) fn play(config: &Config) -> Run {
+pub(crate) fn run_rig(config: &Config) -> Run {
     let mut rig = sim::open(config).expect("the rig opens").into_lockstep();
     let mut run = Run {
         info: rig.info().clone(),
@@ -25,7 +25,7 @@ pub(crate) fn play(config: &Config) -> Run {
         depth: vec![],
         truth: vec![],
         joints: vec![],
-        told: vec![],
+        reported_base: vec![],
         true_base: vec![],
         scans: vec![],
     };
@@ -35,7 +35,7 @@ pub(crate) fn play(config: &Config) -> Run {
             Sample::Image(image) => run.depth.push(image),
             Sample::Truth(truth) => run.truth.push(truth),
             Sample::Joints(state) => run.joints.push(state),
-            Sample::Base(pose) => run.told.push(pose),
+            Sample::Base(pose) => run.reported_base.push(pose),
             Sample::BaseTruth(pose) => run.true_base.push(pose),
             Sample::Range(scan) => run.scans.push(scan),
         }

@@ -5,22 +5,22 @@ use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{median, sample_std};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{Kind, Recipe};
+use crate::method::{ModelKind, ModelSpec};
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::splat::{CountChoice, SplatOptions};
+use trainer::splat::{CountPolicy, SplatOptions};
 
 /// Length of a run where no flag says.
-const USUAL_SECONDS: f64 = 16.0;
+const DEFAULT_SECONDS: f64 = 16.0;
 /// Marks that the table tells, seconds.
-const TOLD_SECS: [f64; 2] = [1.0, 4.0];
+const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
 /// What all are compared with.
-const WHOLE: Variant = Variant { name: "as it is", change: |options| options };
+const BASELINE: Variant = Variant { name: "as it is", change: |options| options };
 
-const CHANGES: &[Variant] = &[
+const VARIANTS: &[Variant] = &[
     Variant { name: "cloud for seeds", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
     Variant { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
     Variant { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
@@ -28,12 +28,12 @@ const CHANGES: &[Variant] = &[
         name: "full size from the start",
         change: |options| SplatOptions { coarse_steps: Some([0; 2]), ..options },
     },
-    Variant { name: "black background", change: |options| SplatOptions { varied_background: 0.0, ..options } },
+    Variant { name: "black background", change: |options| SplatOptions { random_background: 0.0, ..options } },
     Variant { name: "opacity and size for free", change: |options| SplatOptions { cost_images: 0.0, ..options } },
     Variant { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
     Variant { name: "no wandering", change: |options| SplatOptions { noise: 0.0, ..options } },
     Variant { name: "one color a splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
-    Variant { name: "filled up to the cap", change: |options| SplatOptions { count: CountChoice::ToCap, ..options } },
+    Variant { name: "filled up to the cap", change: |options| SplatOptions { count: CountPolicy::ToCap, ..options } },
     CAMERAS_AS_GIVEN,
 ];
 
@@ -60,7 +60,7 @@ pub(crate) struct Args {
 
 /// The runs of one change.
 #[derive(Debug, Serialize)]
-struct Changed {
+struct VariantResult {
     name: &'static str,
     /// Medians, dB.
     psnr: f64,
@@ -69,37 +69,42 @@ struct Changed {
     depth_rmse_m: Option<f64>,
     primitives: f64,
     /// Median of the gains of whole over changed, seed by seed, dB.
-    bought_db: f64,
+    gain_db: f64,
     /// Standard deviation of them; `None` of a single seed.
-    bought_std_db: Option<f64>,
+    gain_std_db: Option<f64>,
     runs: Vec<Run>,
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
+    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
-    let usual = data.splats()?;
-    let asked = |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
-    let changes: Vec<&Variant> = CHANGES.iter().filter(|change| is_change(change, usual)).filter(asked).collect();
+    let base_options = data.splats()?;
+    let is_selected =
+        |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
+    let changes: Vec<&Variant> =
+        VARIANTS.iter().filter(|change| is_change(change, base_options)).filter(is_selected).collect();
     if changes.is_empty() {
-        let names: Vec<&str> = CHANGES.iter().map(|change| change.name).collect();
+        let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
         return Err(BadArgument(format!("--only: none of the rows is named so: {}", names.join(", "))).into());
     }
     if args.bench.training.count.is_some() {
         return Err(BadArgument("--count: this bench sets it itself".into()).into());
     }
     runs.expect((changes.len() + 1) * usize::try_from(args.seeds)?);
-    let mut whole: Vec<Run> = Vec::new();
-    let mut rows: Vec<Changed> = Vec::new();
+    let mut baseline: Vec<Run> = Vec::new();
+    let mut rows: Vec<VariantResult> = Vec::new();
     let mut page = None;
-    for change in std::iter::once(&WHOLE).chain(changes) {
+    for change in std::iter::once(&BASELINE).chain(changes) {
         let mut finished = Vec::new();
-        for seed in usual.seed..usual.seed.saturating_add(args.seeds) {
+        for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
             finished.push(runs.run(Job {
                 name: format!("ablation {} {} seed {seed}", data.name, change.name),
                 data: &data,
-                recipe: Recipe { kind: Kind::Splat, options: change.options(&SplatOptions { seed, ..usual.clone() }) },
+                model_spec: ModelSpec {
+                    kind: ModelKind::Splat,
+                    options: change.options(&SplatOptions { seed, ..base_options.clone() }),
+                },
                 limits,
                 disturbed: None,
                 variant: Some(change.name.to_owned()),
@@ -107,16 +112,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                 is_thorough: false,
             })?);
         }
-        if whole.is_empty() {
-            whole = finished.clone();
+        if baseline.is_empty() {
+            baseline = finished.clone();
         }
-        rows.extend(Changed::of(change.name, &whole, finished));
+        rows.extend(VariantResult::of(change.name, &baseline, finished));
         page = Some(findings(args, &runs, &data, &rows)?);
     }
     if let Some((findings, page)) = page {
-        findings.tell(&page, args.bench.json)?;
+        findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::after(&data.data.losses))
+    Ok(exit::from_losses(&data.data.dropped_messages))
 }
 
 /// Whether it changes anything about how these data are learned.
@@ -124,19 +129,20 @@ fn is_change(change: &Variant, options: &SplatOptions) -> bool {
     change.options(options) != *options
 }
 
-impl Changed {
-    fn of(name: &'static str, whole: &[Run], runs: Vec<Run>) -> Option<Self> {
-        let middle = |of: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(of).collect::<Vec<_>>());
-        let bought: Vec<f64> = whole.iter().zip(&runs).map(|(whole, changed)| whole.psnr() - changed.psnr()).collect();
+impl VariantResult {
+    fn of(name: &'static str, baseline: &[Run], runs: Vec<Run>) -> Option<Self> {
+        let median_of = |of: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(of).collect::<Vec<_>>());
+        let gain: Vec<f64> =
+            baseline.iter().zip(&runs).map(|(baseline, changed)| baseline.psnr() - changed.psnr()).collect();
         Some(Self {
             name,
-            psnr: middle(&|run| Some(run.psnr()))?,
-            ssim: middle(&|run| run.end.ssim),
-            lpips: middle(&|run| run.end.lpips),
-            depth_rmse_m: middle(&|run| run.end.depth_rmse_m),
-            primitives: middle(&|run| Some(run.end.primitives as f64))?,
-            bought_db: median(&bought)?,
-            bought_std_db: sample_std(&bought),
+            psnr: median_of(&|run| Some(run.psnr()))?,
+            ssim: median_of(&|run| run.end.ssim),
+            lpips: median_of(&|run| run.end.lpips),
+            depth_rmse_m: median_of(&|run| run.end.depth_rmse_m),
+            primitives: median_of(&|run| Some(run.end.primitives as f64))?,
+            gain_db: median(&gain)?,
+            gain_std_db: sample_std(&gain),
             runs,
         })
     }
@@ -147,24 +153,24 @@ impl Changed {
         };
         let at = |secs: f64| {
             let of_run = |run: &Run| {
-                run.curve().into_iter().find(|(mark, _)| (mark / secs - 1.0).abs() < 0.1).map(|(_, psnr)| psnr)
+                run.curve().into_iter().find(|(time, _)| (time / secs - 1.0).abs() < 0.1).map(|(_, psnr)| psnr)
             };
             number(median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()), 2)
         };
-        let bought = if self.name == WHOLE.name {
+        let gain = if self.name == BASELINE.name {
             "-".to_owned()
         } else {
-            let spread = self.bought_std_db.map_or_else(String::new, |std| format!(" (std {std:.2})"));
-            format!("{:+.2}{spread}", self.bought_db)
+            let spread = self.gain_std_db.map_or_else(String::new, |std| format!(" (std {std:.2})"));
+            format!("{:+.2}{spread}", self.gain_db)
         };
         let mut row = vec![self.name.to_owned()];
-        row.extend(TOLD_SECS.map(at));
+        row.extend(TABLE_SECS.map(at));
         row.extend([
             format!("{:.2}", self.psnr),
-            bought,
+            gain,
             number(self.ssim, 4),
             number(self.lpips, 4),
-            number(self.depth_rmse_m.map(|metres| 1e3 * metres), 1),
+            number(self.depth_rmse_m.map(|meters| 1e3 * meters), 1),
             format!("{:.0}", self.primitives),
         ]);
         row
@@ -172,10 +178,15 @@ impl Changed {
 }
 
 /// Everything known so far, written.
-fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, rows: &[Changed]) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, USUAL_SECONDS)?.in_words();
+fn findings(
+    args: &Args,
+    runs: &Runs<'_>,
+    data: &NamedData,
+    rows: &[VariantResult],
+) -> anyhow::Result<(Findings, PathBuf)> {
+    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["trained".to_owned()];
-    head.extend(TOLD_SECS.map(|secs| format!("at {secs} s, dB")));
+    head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
     head.extend(["at the end, dB", "bought, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
     let findings = Findings {
         name: "ablation",
@@ -189,11 +200,15 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, rows: &[Changed]) ->
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],
         charts: Vec::new(),
-        tables: vec![Table { title: format!("After {length}"), head, rows: rows.iter().map(Changed::row).collect() }],
+        tables: vec![Table {
+            title: format!("After {length}"),
+            head,
+            rows: rows.iter().map(VariantResult::row).collect(),
+        }],
         numbers: serde_json::json!({
             "bench": "ablation",
             "data": data.path,
-            "method": Kind::Splat.name(),
+            "method": ModelKind::Splat.name(),
             "adapter": runs.adapter(),
             "changes": rows,
         }),
@@ -208,19 +223,19 @@ mod tests {
     use crate::bench::runs::tests::run;
 
     #[test]
-    fn gains_are_told_seed_by_seed() {
-        let whole = [run("a", &[(1.0, 24.0), (4.0, 26.0)], 900), run("b", &[(1.0, 23.0), (4.0, 27.0)], 900)];
+    fn gains_are_computed_per_seed() {
+        let baseline = [run("a", &[(1.0, 24.0), (4.0, 26.0)], 900), run("b", &[(1.0, 23.0), (4.0, 27.0)], 900)];
         let changed = vec![run("a", &[(1.0, 20.0), (4.0, 25.0)], 800), run("b", &[(1.0, 21.0), (4.0, 25.0)], 1000)];
-        let changed = Changed::of("less", &whole, changed).expect("two runs");
-        assert_eq!((changed.psnr, changed.bought_db, changed.primitives), (25.0, 1.5, 900.0));
+        let changed = VariantResult::of("less", &baseline, changed).expect("two runs");
+        assert_eq!((changed.psnr, changed.gain_db, changed.primitives), (25.0, 1.5, 900.0));
         assert_eq!(changed.row()[..5], ["less", "20.50", "25.00", "25.00", "+1.50 (std 0.71)"]);
     }
 
     #[test]
-    fn what_is_off_already_is_not_tried() {
+    fn variants_without_effect_are_skipped() {
         let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() };
         let tried: Vec<&str> =
-            CHANGES.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
+            VARIANTS.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
         assert!(!tried.contains(&"no depth loss") && tried.contains(&"no growth"), "{tried:?}");
     }
 }

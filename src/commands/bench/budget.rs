@@ -3,21 +3,21 @@
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{db_per_doubling, extent, median};
-use crate::chart::{Axis, Chart, Line, Point, Rule, Scale};
+use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{Kind, Recipe};
+use crate::method::{ModelKind, ModelSpec};
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::splat::{CountChoice, SplatOptions};
+use trainer::splat::{CountPolicy, SplatOptions};
 
 /// Length of a run where no flag says.
-const USUAL_SECONDS: f64 = 60.0;
+const DEFAULT_SECONDS: f64 = 60.0;
 /// More splats than any rig file may ask for.
-const MOST_SPLATS: i64 = 100_000_000;
+const MAX_CAP: i64 = 100_000_000;
 /// A doubling that gains less than this does not pay, dB.
-const PAYS_DB: f64 = 0.1;
+const MIN_GAIN_DB: f64 = 0.1;
 
 /// Flags of `bench budget`.
 #[derive(Debug, clap::Args)]
@@ -30,7 +30,7 @@ pub(crate) struct Args {
         value_name = "N,...",
         value_delimiter = ',',
         default_value = "2000,4000,8000,16000,32000,64000,128000,256000,512000,1000000",
-        value_parser = clap::value_parser!(u32).range(1..=MOST_SPLATS)
+        value_parser = clap::value_parser!(u32).range(1..=MAX_CAP)
     )]
     splats: Vec<u32>,
     /// Length of a run in seconds of training; loading and scoring do not count [default: 60, unless --steps is given]
@@ -69,7 +69,7 @@ struct Gain {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, USUAL_SECONDS)?;
+    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
         return Err(
             BadArgument("--max-splats, --count: this bench sets them itself, name caps with --splats".into()).into()
@@ -83,23 +83,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     runs.expect(caps.len() * usize::try_from(args.seeds)?);
     let data = runs.load(&args.data, &mut HashSet::new())?;
-    let usual = data.splats()?;
+    let base_options = data.splats()?;
     let mut capped = Vec::new();
     let mut page = None;
     for cap in caps {
         let mut finished = Vec::new();
         let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
-        for seed in usual.seed..usual.seed.saturating_add(args.seeds) {
+        for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
             let (max_splats, count) = match cap {
-                Some(cap) => (cap, CountChoice::ToCap),
-                None => (usual.max_splats, CountChoice::Tested),
+                Some(cap) => (cap, CountPolicy::ToCap),
+                None => (base_options.max_splats, CountPolicy::Tested),
             };
             finished.push(runs.run(Job {
                 name: format!("budget {} {cap_name} seed {seed}", data.name),
                 data: &data,
-                recipe: Recipe {
-                    kind: Kind::Splat,
-                    options: SplatOptions { seed, max_splats, count, ..usual.clone() },
+                model_spec: ModelSpec {
+                    kind: ModelKind::Splat,
+                    options: SplatOptions { seed, max_splats, count, ..base_options.clone() },
                 },
                 limits,
                 disturbed: None,
@@ -112,9 +112,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         page = Some(findings(args, &runs, &data, &capped)?);
     }
     if let Some((findings, page)) = page {
-        findings.tell(&page, args.bench.json)?;
+        findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::after(&data.data.losses))
+    Ok(exit::from_losses(&data.data.dropped_messages))
 }
 
 impl Capped {
@@ -129,7 +129,7 @@ impl Capped {
         Point { x: self.primitives.max(1.0), y: self.psnr, low, high }
     }
 
-    fn cap_in_words(&self) -> String {
+    fn cap_label(&self) -> String {
         self.cap.map_or_else(|| "none".to_owned(), |cap| cap.to_string())
     }
 }
@@ -148,9 +148,9 @@ fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
 /// Everything known so far, written.
 fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -> anyhow::Result<(Findings, PathBuf)> {
     let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
-    let own = capped.iter().find(|capped| capped.cap.is_none());
+    let chosen = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
-    let length = training::limits(args.seconds, args.steps, USUAL_SECONDS)?.in_words();
+    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds, band: lowest to highest", args.seeds)
     } else {
@@ -158,11 +158,11 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     };
     let subtitle = format!("{}, splat, {length}; {spread}", data.name);
     let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
-    let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_foreign: false };
-    let own_point = own.map(Capped::point);
-    let own_rule = own.map(|own| Rule {
-        x: own.primitives.max(1.0),
-        label: format!("the trainer's own choice: {} splats, {:.2} dB", own.primitives, own.psnr),
+    let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_peer: false };
+    let own_curve_point = chosen.map(Capped::point);
+    let own_marker = chosen.map(|chosen| Marker {
+        x: chosen.primitives.max(1.0),
+        label: format!("the trainer's own choice: {} splats, {:.2} dB", chosen.primitives, chosen.psnr),
         line_ix: 1,
     });
     let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
@@ -172,27 +172,27 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         subtitle: subtitle.clone(),
         x: x("splats at the end (log)"),
         y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("with a cap", points), line("no cap given", own_point.into_iter().collect())],
-        floors: Vec::new(),
-        rules: own_rule.into_iter().collect(),
+        lines: vec![line("with a cap", points), line("no cap given", own_curve_point.into_iter().collect())],
+        thresholds: Vec::new(),
+        markers: own_marker.into_iter().collect(),
     };
     let gain_point = |gain: &Gain| {
         let x = (gain.from_primitives * gain.to_primitives).sqrt();
         Point { x, y: gain.db_per_doubling, low: gain.db_per_doubling, high: gain.db_per_doubling }
     };
-    let worth = Chart {
+    let gain_chart = Chart {
         title: "What doubling the splats gains".into(),
         subtitle: format!("{subtitle}; each point between two neighboring caps"),
         x: x("splats (log)"),
         y: Axis { label: "gain, dB a doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
         lines: vec![line("gain of a doubling", gains.iter().map(gain_point).collect())],
-        floors: vec![(PAYS_DB, format!("{PAYS_DB} dB: less does not pay"))],
-        rules: Vec::new(),
+        thresholds: vec![(MIN_GAIN_DB, format!("{MIN_GAIN_DB} dB: less does not pay"))],
+        markers: Vec::new(),
     };
     let row = |capped: &Capped| {
         let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
         vec![
-            capped.cap_in_words(),
+            capped.cap_label(),
             format!("{:.0}", capped.primitives),
             format!("{:.2}", capped.psnr),
             gain.map_or_else(|| "-".to_owned(), |gain| format!("{:+.2}", gain.db_per_doubling)),
@@ -206,20 +206,20 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
             format!(
                 "Each point is a model trained for {length} under a cap on its splats and scored on held-out images; \
                  the run without a cap shows what the trainer takes by itself (at most {}): halved as long as \
-                 that costs less than {PAYS_DB} dB on images held back for it.",
+                 that costs less than {MIN_GAIN_DB} dB on images held back for it.",
                 data.splats()?.max_splats
             ),
-            format!("A doubling of the splats that gains less than {PAYS_DB} dB does not pay."),
+            format!("A doubling of the splats that gains less than {MIN_GAIN_DB} dB does not pay."),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],
-        charts: vec![("", accuracy), ("-gain", worth)],
+        charts: vec![("", accuracy), ("-gain", gain_chart)],
         tables: vec![Table { title: format!("After {length}"), head, rows: capped.iter().map(row).collect() }],
         numbers: serde_json::json!({
             "bench": "budget",
             "data": data.path,
-            "method": Kind::Splat.name(),
+            "method": ModelKind::Splat.name(),
             "adapter": runs.adapter(),
-            "own_choice": own,
+            "automatic": chosen,
             "caps": by_cap,
             "gains": gains,
         }),
@@ -234,7 +234,7 @@ mod tests {
     use crate::bench::runs::tests::run;
 
     #[test]
-    fn gains_stand_between_caps_that_filled() {
+    fn gains_are_between_caps_that_were_reached() {
         let capped = |cap: u32, n_splats: u64, psnr: f64| {
             Capped::of(Some(cap), vec![run("a", &[(1.0, psnr)], n_splats)]).expect("a run")
         };

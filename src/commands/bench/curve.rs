@@ -4,19 +4,19 @@ use crate::bench::page::{Findings, Table};
 use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{extent, median, sample_std, secs_to};
-use crate::chart::{Axis, Chart, Line, Point, Scale, short};
+use crate::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{Kind, Recipe};
-use crate::{marks, training};
+use crate::method::{ModelKind, ModelSpec};
+use crate::{evaluation_schedule, training};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::splat::SplatOptions;
 
 /// Qualities whose time is told, dB.
-const WANTED_DB: [f64; 3] = [25.0, 28.0, 30.0];
+const TARGET_DB: [f64; 3] = [25.0, 28.0, 30.0];
 /// Length of a run where no flag says.
-const USUAL_SECONDS: f64 = 60.0;
+const DEFAULT_SECONDS: f64 = 60.0;
 
 /// Flags of `bench curve`.
 #[derive(Debug, clap::Args)]
@@ -25,7 +25,7 @@ pub(crate) struct Args {
     #[arg(required = true)]
     data: Vec<PathBuf>,
     /// Length of a run in seconds of training; loading and scoring do not count
-    #[arg(long, value_name = "S", default_value_t = USUAL_SECONDS)]
+    #[arg(long, value_name = "S", default_value_t = DEFAULT_SECONDS)]
     seconds: f64,
     /// Runs of each line, 1 to 1000, with seeds counted up from --seed
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
@@ -39,26 +39,26 @@ pub(crate) struct Args {
 
 /// One method on one data set, or one peer.
 #[derive(Debug, Serialize)]
-struct Measured {
+struct CurveResult {
     label: String,
     /// Of ours.
     method: Option<&'static str>,
     is_peer: bool,
     /// PSNR at the marks.
-    points: Vec<Mark>,
+    points: Vec<CurvePoint>,
     summary: Summary,
     runs: Vec<Run>,
 }
 
 /// The runs at one mark.
 #[derive(Debug, PartialEq, Serialize)]
-struct Mark {
+struct CurvePoint {
     /// Median.
     seconds: f64,
     /// Median.
     psnr: f64,
-    lowest_psnr: f64,
-    highest_psnr: f64,
+    min_psnr: f64,
+    max_psnr: f64,
     n_runs: usize,
 }
 
@@ -77,12 +77,12 @@ struct Summary {
     primitives_spread: Option<f64>,
     /// Median at the end.
     bytes: Option<f64>,
-    seconds_to: Vec<Reached>,
+    seconds_to: Vec<TimeToQuality>,
 }
 
 /// What the runs of a line came to.
 #[derive(Debug, Default)]
-struct Ends {
+struct FinalValues {
     psnr: Vec<f64>,
     seconds: Vec<f64>,
     primitives: Vec<f64>,
@@ -91,7 +91,7 @@ struct Ends {
 
 /// When a quality was reached.
 #[derive(Debug, PartialEq, Serialize)]
-struct Reached {
+struct TimeToQuality {
     psnr: f64,
     /// Median over the runs that reached it.
     seconds: Option<f64>,
@@ -99,28 +99,31 @@ struct Reached {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(Some(args.seconds), None, USUAL_SECONDS)?;
+    let limits = training::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
     if args.seconds == 0.0 {
         return Err(BadArgument("--seconds: must be above 0".into()).into());
     }
     let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
-    let mut bench = Bench { args, peers, measured: Vec::new(), notes: Vec::new() };
-    let (mut losses, mut names) = (Vec::new(), HashSet::new());
+    let mut bench = Bench { args, peers, results: Vec::new(), notes: Vec::new() };
+    let (mut dropped_messages, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;
     for (path, n_left) in args.data.iter().zip((1..=args.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
-        losses.extend(data.data.losses.iter().cloned());
-        let recipes = bench.fitting(&data);
-        runs.expect(n_left * recipes.len() * usize::try_from(args.seeds)?);
-        for recipe in recipes {
+        dropped_messages.extend(data.data.dropped_messages.iter().cloned());
+        let model_specs = bench.applicable(&data);
+        runs.expect(n_left * model_specs.len() * usize::try_from(args.seeds)?);
+        for model_spec in model_specs {
             let mut finished = Vec::new();
-            bench.measured.push(Measured::of_runs(&data, recipe.kind, Vec::new()));
-            for seed in recipe.options.seed..recipe.options.seed.saturating_add(args.seeds) {
+            bench.results.push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
+            for seed in model_spec.options.seed..model_spec.options.seed.saturating_add(args.seeds) {
                 finished.push(runs.run(Job {
-                    name: format!("curve {} {} seed {seed}", data.name, recipe.kind.name()),
+                    name: format!("curve {} {} seed {seed}", data.name, model_spec.kind.name()),
                     data: &data,
-                    recipe: Recipe { kind: recipe.kind, options: SplatOptions { seed, ..recipe.options.clone() } },
+                    model_spec: ModelSpec {
+                        kind: model_spec.kind,
+                        options: SplatOptions { seed, ..model_spec.options.clone() },
+                    },
                     limits,
                     disturbed: None,
                     variant: None,
@@ -128,22 +131,22 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                     is_thorough: true,
                 })?);
                 // Written after every run, so that an interrupted bench shows what it has.
-                bench.measured.pop();
-                bench.measured.push(Measured::of_runs(&data, recipe.kind, finished.clone()));
+                bench.results.pop();
+                bench.results.push(CurveResult::of_runs(&data, model_spec.kind, finished.clone()));
                 page = Some(bench.findings(&runs)?);
             }
         }
     }
     if let Some((findings, page)) = page {
-        findings.tell(&page, args.bench.json)?;
+        findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::after(&losses))
+    Ok(exit::from_losses(&dropped_messages))
 }
 
-impl Measured {
-    fn of_runs(data: &NamedData, kind: Kind, runs: Vec<Run>) -> Self {
+impl CurveResult {
+    fn of_runs(data: &NamedData, kind: ModelKind, runs: Vec<Run>) -> Self {
         let curves: Vec<Vec<(f64, f64)>> = runs.iter().map(Run::curve).collect();
-        let ends = Ends {
+        let ends = FinalValues {
             psnr: runs.iter().map(Run::psnr).collect(),
             seconds: runs.iter().map(|run| run.end.seconds).collect(),
             primitives: runs.iter().map(|run| run.end.primitives as f64).collect(),
@@ -153,7 +156,7 @@ impl Measured {
             label: format!("{}, {}", data.name, kind.name()),
             method: Some(kind.name()),
             is_peer: false,
-            points: at_marks(&curves),
+            points: median_curve(&curves),
             summary: Summary::of(&curves, &ends),
             runs,
         }
@@ -162,7 +165,7 @@ impl Measured {
     fn of_peer(peer: &Peer) -> Self {
         let curves = vec![peer.curve()];
         let last = peer.rows.last();
-        let ends = Ends {
+        let ends = FinalValues {
             psnr: last.map(|row| row.psnr).into_iter().collect(),
             seconds: last.map(|row| row.seconds).into_iter().collect(),
             primitives: last.and_then(|row| row.n).map(|n| n as f64).into_iter().collect(),
@@ -172,16 +175,20 @@ impl Measured {
             label: peer.label.clone(),
             method: None,
             is_peer: true,
-            points: at_marks(&curves),
+            points: median_curve(&curves),
             summary: Summary::of(&curves, &ends),
             runs: Vec::new(),
         }
     }
 
     fn line(&self) -> Line {
-        let point =
-            |mark: &Mark| Point { x: mark.seconds, y: mark.psnr, low: mark.lowest_psnr, high: mark.highest_psnr };
-        Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_foreign: self.is_peer }
+        let point = |point_of: &CurvePoint| Point {
+            x: point_of.seconds,
+            y: point_of.psnr,
+            low: point_of.min_psnr,
+            high: point_of.max_psnr,
+        };
+        Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_peer: self.is_peer }
     }
 
     /// Its end over the size of the model; without a point where that is not known.
@@ -189,40 +196,40 @@ impl Measured {
         let Summary { psnr, bytes, .. } = self.summary;
         let megabytes = bytes.map(|bytes| bytes / 1e6).filter(|megabytes| *megabytes > 0.0);
         let point = megabytes.zip(psnr).map(|(x, y)| Point { x, y, low: y, high: y });
-        Line { label: self.label.clone(), points: point.into_iter().collect(), is_foreign: self.is_peer }
+        Line { label: self.label.clone(), points: point.into_iter().collect(), is_peer: self.is_peer }
     }
 }
 
 /// Median and extent at each mark that at least half of the runs met, in the order of time.
-fn at_marks(curves: &[Vec<(f64, f64)>]) -> Vec<Mark> {
+fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
     // Keyed by the mark's bits, which order as the marks do; a last point between two marks stands by itself.
     let mut groups: BTreeMap<(u64, bool), Vec<(f64, f64)>> = BTreeMap::new();
     for curve in curves {
         let mut taken = HashSet::new();
         for &(seconds, psnr) in curve {
-            let mark = marks::latest(seconds).unwrap_or(0.0).to_bits();
-            groups.entry((mark, !taken.insert(mark))).or_default().push((seconds, psnr));
+            let point_of = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
+            groups.entry((point_of, !taken.insert(point_of))).or_default().push((seconds, psnr));
         }
     }
-    let mut marks: Vec<Mark> = groups
+    let mut evaluations: Vec<CurvePoint> = groups
         .into_values()
         .filter(|group| 2 * group.len() >= curves.len())
         .filter_map(|group| {
             let (seconds, psnr): (Vec<f64>, Vec<f64>) = group.into_iter().unzip();
-            let [lowest_psnr, highest_psnr] = extent(&psnr)?;
+            let [min_psnr, max_psnr] = extent(&psnr)?;
             let n_runs = psnr.len();
-            Some(Mark { seconds: median(&seconds)?, psnr: median(&psnr)?, lowest_psnr, highest_psnr, n_runs })
+            Some(CurvePoint { seconds: median(&seconds)?, psnr: median(&psnr)?, min_psnr, max_psnr, n_runs })
         })
         .collect();
-    marks.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
-    marks
+    evaluations.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+    evaluations
 }
 
 impl Summary {
-    fn of(curves: &[Vec<(f64, f64)>], ends: &Ends) -> Self {
-        let reached = |wanted_db: f64| {
-            let seconds: Vec<f64> = curves.iter().filter_map(|curve| secs_to(curve, wanted_db)).collect();
-            Reached { psnr: wanted_db, seconds: median(&seconds), n_runs: seconds.len() }
+    fn of(curves: &[Vec<(f64, f64)>], ends: &FinalValues) -> Self {
+        let reached = |target_db: f64| {
+            let seconds: Vec<f64> = curves.iter().filter_map(|curve| secs_to(curve, target_db)).collect();
+            TimeToQuality { psnr: target_db, seconds: median(&seconds), n_runs: seconds.len() }
         };
         let mean_size = ends.primitives.iter().sum::<f64>() / ends.primitives.len().max(1) as f64;
         Self {
@@ -234,7 +241,7 @@ impl Summary {
             primitives_extent: extent(&ends.primitives),
             primitives_spread: sample_std(&ends.primitives).map(|std| std / mean_size),
             bytes: median(&ends.bytes),
-            seconds_to: WANTED_DB.map(reached).into(),
+            seconds_to: TARGET_DB.map(reached).into(),
         }
     }
 
@@ -261,34 +268,34 @@ impl Summary {
 struct Bench<'a> {
     args: &'a Args,
     peers: Vec<Peer>,
-    measured: Vec<Measured>,
+    results: Vec<CurveResult>,
     /// Sentences for the page.
     notes: Vec<String>,
 }
 
 impl Bench<'_> {
     /// The methods that have something to learn from in these data. Where there is but one, it says itself what it lacks.
-    fn fitting<'a>(&mut self, data: &'a NamedData) -> Vec<&'a Recipe> {
-        let (fitting, lacking): (Vec<_>, Vec<_>) =
-            data.recipes.iter().partition(|recipe| data.data.has_depth() || recipe.kind != Kind::Tsdf);
-        if fitting.is_empty() {
-            return lacking;
+    fn applicable<'a>(&mut self, data: &'a NamedData) -> Vec<&'a ModelSpec> {
+        let (applicable, without_depth): (Vec<_>, Vec<_>) =
+            data.model_specs.iter().partition(|model_spec| data.data.has_depth() || model_spec.kind != ModelKind::Tsdf);
+        if applicable.is_empty() {
+            return without_depth;
         }
-        for recipe in lacking {
+        for model_spec in without_depth {
             let note =
-                format!("{} has no depth, which {} is made of: it has no such line", data.name, recipe.kind.name());
+                format!("{} has no depth, which {} is made of: it has no such line", data.name, model_spec.kind.name());
             log::warn!("{note}");
             self.notes.push(note + ".");
         }
-        fitting
+        applicable
     }
 
     /// Everything known so far, written.
     fn findings(&self, runs: &Runs<'_>) -> anyhow::Result<(Findings, PathBuf)> {
-        let peers: Vec<Measured> = self.peers.iter().map(Measured::of_peer).collect();
-        let all = || self.measured.iter().chain(&peers);
-        let last_secs = all().flat_map(|measured| &measured.points).map(|point| point.seconds).fold(1.0, f64::max);
-        let (n_seeds, seconds) = (self.args.seeds, short(self.args.seconds));
+        let peers: Vec<CurveResult> = self.peers.iter().map(CurveResult::of_peer).collect();
+        let all = || self.results.iter().chain(&peers);
+        let last_secs = all().flat_map(|results| &results.points).map(|point| point.seconds).fold(1.0, f64::max);
+        let (n_seeds, seconds) = (self.args.seeds, compact_number(self.args.seconds));
         let subtitle = if n_seeds > 1 {
             format!("median of {n_seeds} seeds; band: lowest to highest; dashed: peers")
         } else {
@@ -301,29 +308,29 @@ impl Bench<'_> {
             x: Axis {
                 label: "seconds of training (log)".into(),
                 scale: Scale::Log,
-                ticks: marks::up_to(1.1 * last_secs).collect(),
+                ticks: evaluation_schedule::up_to(1.1 * last_secs).collect(),
             },
             y: psnr(),
-            lines: all().map(Measured::line).collect(),
-            floors: Vec::new(),
-            rules: Vec::new(),
+            lines: all().map(CurveResult::line).collect(),
+            thresholds: Vec::new(),
+            markers: Vec::new(),
         };
         let over_size = Chart {
             title: "PSNR of held-out images over the size of the model".into(),
             subtitle: format!("after {seconds} s; median of the runs"),
             x: Axis { label: "GPU memory of the model, MB (log)".into(), scale: Scale::Log, ticks: Vec::new() },
             y: psnr(),
-            lines: all().map(Measured::size_line).collect(),
-            floors: Vec::new(),
-            rules: Vec::new(),
+            lines: all().map(CurveResult::size_line).collect(),
+            thresholds: Vec::new(),
+            markers: Vec::new(),
         };
         let head =
             ["data, method", "runs", "PSNR, dB", "std, dB", "seconds", "primitives", "extent", "spread, %", "MB"];
-        let head = head.map(str::to_owned).into_iter().chain(WANTED_DB.map(|wanted_db| format!("to {wanted_db} dB")));
+        let head = head.map(str::to_owned).into_iter().chain(TARGET_DB.map(|target_db| format!("to {target_db} dB")));
         let table = Table {
             title: format!("After {seconds} s (peers: after their last row)"),
             head: head.collect(),
-            rows: all().map(|measured| measured.summary.row(&measured.label)).collect(),
+            rows: all().map(|results| results.summary.row(&results.label)).collect(),
         };
         let mut sentences = vec![
             format!(
@@ -364,29 +371,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn runs_meet_at_marks() {
+    fn runs_are_grouped_by_evaluation_time() {
         let curves = [
             vec![(0.26, 10.0), (1.01, 20.0), (2.5, 22.0)],
             vec![(0.30, 12.0), (1.10, 21.0), (2.5, 25.0)],
             vec![(0.55, 15.0), (1.02, 25.0), (2.5, 23.0)],
         ];
-        let marks = at_marks(&curves);
-        let told: Vec<(f64, f64, usize)> = marks.iter().map(|mark| (mark.seconds, mark.psnr, mark.n_runs)).collect();
-        assert_eq!(told, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "one run alone at 0.5 s makes no point");
-        assert_eq!((marks[1].lowest_psnr, marks[1].highest_psnr), (20.0, 25.0));
+        let evaluations = median_curve(&curves);
+        let points: Vec<(f64, f64, usize)> =
+            evaluations.iter().map(|point_of| (point_of.seconds, point_of.psnr, point_of.n_runs)).collect();
+        assert_eq!(points, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "one run alone at 0.5 s makes no point");
+        assert_eq!((evaluations[1].min_psnr, evaluations[1].max_psnr), (20.0, 25.0));
     }
 
     #[test]
-    fn an_end_between_marks_is_a_point_of_its_own() {
-        let marks = at_marks(&[vec![(1.0, 20.0), (1.9, 21.0)], vec![(1.0, 22.0), (1.9, 23.0)]]);
-        assert_eq!(marks.iter().map(|mark| mark.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
+    fn end_between_evaluations_is_a_separate_point() {
+        let evaluations = median_curve(&[vec![(1.0, 20.0), (1.9, 21.0)], vec![(1.0, 22.0), (1.9, 23.0)]]);
+        assert_eq!(evaluations.iter().map(|point_of| point_of.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
     }
 
     #[test]
-    fn the_summary_counts_who_reached_a_quality() {
+    fn summary_counts_runs_that_reached_a_quality() {
         let curves = [vec![(1.0, 20.0), (4.0, 30.0)], vec![(1.0, 20.0), (4.0, 26.0)]];
-        let ends =
-            Ends { psnr: vec![30.0, 26.0], primitives: vec![1000.0, 3000.0], bytes: vec![5e6, 7e6], ..Ends::default() };
+        let ends = FinalValues {
+            psnr: vec![30.0, 26.0],
+            primitives: vec![1000.0, 3000.0],
+            bytes: vec![5e6, 7e6],
+            ..FinalValues::default()
+        };
         let summary = Summary::of(&curves, &ends);
         assert_eq!((summary.psnr, summary.primitives), (Some(28.0), Some(2000.0)));
         let [to_25, to_28, _] = &summary.seconds_to[..] else { panic!("three qualities") };

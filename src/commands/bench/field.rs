@@ -6,8 +6,8 @@ use serde::Serialize;
 use trainer::nerf::bench::time_steps;
 
 /// Samples of a step where no flag says: on a GPU, and on the CPU.
-const USUAL: [u32; 2] = [1 << 17, 1 << 18];
-const USUAL_ON_CPU: [u32; 1] = [1 << 14];
+const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
+const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
 
 /// Flags of `bench field`.
 #[derive(Debug, clap::Args)]
@@ -45,12 +45,14 @@ struct Row {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let is_software = crate::commands::open_gpu()?.is_software();
-    let usual: &[u32] = if is_software { &USUAL_ON_CPU } else { &USUAL };
+    let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
     let n_repeats = args.repeats.unwrap_or(if is_software { 3 } else { 100 }) as usize;
-    for (place, n_samples) in (if args.samples.is_empty() { usual } else { &args.samples }).iter().enumerate() {
+    for (row_ix, n_samples) in
+        (if args.samples.is_empty() { default_samples } else { &args.samples }).iter().enumerate()
+    {
         // A fresh device for each row, so that the peak of memory is the row's own.
         let gpu = crate::commands::open_gpu()?;
-        if place == 0 {
+        if row_ix == 0 {
             log::info!("{}", gpu.describe());
         }
         let n_samples = (n_samples / args.rays).max(1) * args.rays;

@@ -11,23 +11,23 @@ use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
 /// More splats than any rig file may ask for.
-const MOST_SPLATS: i64 = 100_000_000;
+const MAX_CLOUD_SPLATS: i64 = 100_000_000;
 
 /// What is measured where no flag says.
-struct Usual {
+struct Defaults {
     size: &'static [Size],
     splats: &'static [u32],
     repeats: u32,
 }
 
 /// On a GPU.
-const USUAL: Usual = Usual {
+const DEFAULTS: Defaults = Defaults {
     size: &[Size([1024, 1024]), Size([1280, 720]), Size([1920, 1080])],
     splats: &[100_000, 300_000, 1_000_000, 3_000_000],
     repeats: 30,
 };
 /// On the CPU, which takes seconds a step for what a GPU does in a millisecond, and binds smaller buffers.
-const USUAL_ON_CPU: Usual = Usual { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
+const DEFAULTS_ON_CPU: Defaults = Defaults { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
 
 /// Flags of `bench kernels`.
 #[derive(Debug, clap::Args)]
@@ -40,7 +40,7 @@ pub(crate) struct Args {
     size: Vec<Size>,
     /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud the file's
     /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
-    #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MOST_SPLATS))]
+    #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
     splats: Vec<u32>,
     /// Pictures and steps timed, 1 to 10000; the median counts [default: 30; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
@@ -94,35 +94,36 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
-    let usual = if crate::commands::open_gpu()?.is_software() { USUAL_ON_CPU } else { USUAL };
-    let sizes = if args.size.is_empty() { usual.size } else { &args.size };
-    let asked = if args.splats.is_empty() { usual.splats } else { &args.splats };
-    let counts = given
-        .as_ref()
-        .map_or_else(|| asked.iter().map(|n_splats| *n_splats as usize).collect(), |cloud| vec![cloud.n_splats()]);
-    let n_repeats = args.repeats.unwrap_or(usual.repeats) as usize;
+    let defaults = if crate::commands::open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
+    let sizes = if args.size.is_empty() { defaults.size } else { &args.size };
+    let splat_counts = if args.splats.is_empty() { defaults.splats } else { &args.splats };
+    let counts = given.as_ref().map_or_else(
+        || splat_counts.iter().map(|n_splats| *n_splats as usize).collect(),
+        |cloud| vec![cloud.n_splats()],
+    );
+    let n_repeats = args.repeats.unwrap_or(defaults.repeats) as usize;
     let eye = if args.inside { Eye::Inside } else { Eye::Outside };
     let mut out = std::io::stdout().lock();
-    for (place, Size(size)) in sizes.iter().enumerate() {
+    for (size_ix, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A fresh device for each row, so that the peak of memory is the row's own.
             let gpu = crate::commands::open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
-            if place == 0 && counts.first() == Some(n_splats) {
+            if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
-            let made;
+            let synthetic;
             let cloud: &SplatArrays = match &given {
                 Some(cloud) => cloud,
                 None => {
-                    made = synthetic_cloud(*n_splats, 0);
-                    &made
+                    synthetic = synthetic_cloud(*n_splats, 0);
+                    &synthetic
                 }
             };
             let repeats = Repeats {
                 n_warm_up: n_repeats.div_ceil(3),
                 warm_up: Duration::from_millis(300),
                 n_timed: n_repeats,
-                n_row: 3 * n_repeats,
+                n_consecutive: 3 * n_repeats,
             };
             let figures = time_kernels(&gpu, cloud, *size, eye, repeats).with_context(|| {
                 format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
@@ -131,11 +132,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 w: size[0],
                 h: size[1],
                 n: *n_splats,
-                isect: figures.n_isect,
+                isect: figures.n_intersections,
                 render_ms: figures.render_millis,
                 step_ms: figures.step_millis,
-                step_touched_ms: figures.step_touched_millis,
-                touched: figures.n_touched,
+                step_touched_ms: figures.step_visible_millis,
+                touched: figures.n_visible,
                 step_unordered_ms: figures.step_unordered_millis,
                 render_wall_ms: figures.render_wall_millis,
                 step_wall_ms: figures.step_wall_millis,

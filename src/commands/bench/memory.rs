@@ -1,13 +1,13 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
-use crate::bench::memory::{Beyond, Growth, Sample, resident_bytes};
+use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
 use crate::bench::page::{Findings, Table};
 use crate::bench::viewer::Viewer;
-use crate::chart::{Axis, Chart, Line, Point, Rule, Scale};
+use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::commands::run::{self, Running};
 use crate::exit::{BadArgument, Exit};
 use crate::print;
-use crate::run_folder::MadeFolders;
+use crate::run_folder::CreatedFolders;
 use anyhow::Context;
 use clap::Parser;
 use std::collections::BTreeMap;
@@ -17,15 +17,15 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Maximum time between two lines on stdout.
-const TELL_EVERY: Duration = Duration::from_secs(60);
+const PRINT_PERIOD: Duration = Duration::from_secs(60);
 /// Charts and numbers are written this often, so that an interrupted bench leaves results.
-const WRITE_EVERY: Duration = Duration::from_secs(60);
+const WRITE_PERIOD: Duration = Duration::from_secs(60);
 /// Points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
 const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
 /// Number of GPU buffers in the table, the largest first.
-const MAX_GPU_PARTS: usize = 12;
+const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
 const SECS_PER_MINUTE: f64 = 60.0;
 
@@ -80,7 +80,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     let mut measured = measured?;
     let findings = findings(args, &measured)?;
-    findings.tell(&findings.write(&args.out)?, args.json)?;
+    findings.print_summary(&findings.write(&args.out)?, args.json)?;
     match measured.input_error.take() {
         Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the end of the run")),
         None => Ok(Exit::Done),
@@ -89,40 +89,40 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 /// The measurements of a run.
 #[derive(Debug, Default)]
-struct Measured {
+struct MemoryRun {
     /// Whether the GPU's memory is the host's.
     is_software: bool,
     samples: Vec<Sample>,
     /// GPU buffers at the last sample, bytes by label.
-    gpu_parts: BTreeMap<Arc<str>, u64>,
+    gpu_buffers: BTreeMap<Arc<str>, u64>,
     /// Why the devices ended early.
     input_error: Option<drivers::Error>,
 }
 
-fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<Measured> {
-    let mut running = run::start(flags, None, &mut MadeFolders::default())?;
+fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<MemoryRun> {
+    let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.server.address();
     let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<anyhow::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
-    let mut measured = Measured { is_software: running.gpu.is_software(), ..Measured::default() };
+    let mut measured = MemoryRun { is_software: running.gpu.is_software(), ..MemoryRun::default() };
     let mut due = Instant::now();
-    let (mut told, mut written) = (None, Instant::now());
-    while running.take_turn()? {
+    let (mut last_printed, mut written) = (None, Instant::now());
+    while running.run_time_slice()? {
         let now = Instant::now();
         if now < due {
             continue;
         }
         due = now + every;
-        measured.gpu_parts = running.gpu.live_bytes_by_label();
-        let sample = sample(&running, &viewers, &measured.gpu_parts)?;
+        measured.gpu_buffers = running.gpu.live_bytes_by_label();
+        let sample = sample(&running, &viewers, &measured.gpu_buffers)?;
         measured.samples.push(sample);
         if args.json {
             print::report_json(&serde_json::json!({ "event": "sample", "sample": sample }))?;
-        } else if told.is_none_or(|told: Instant| told.elapsed() >= TELL_EVERY) {
-            print::report(in_words(&sample));
-            told = Some(now);
+        } else if last_printed.is_none_or(|last_printed: Instant| last_printed.elapsed() >= PRINT_PERIOD) {
+            print::report(describe(&sample));
+            last_printed = Some(now);
         }
-        if written.elapsed() >= WRITE_EVERY {
+        if written.elapsed() >= WRITE_PERIOD {
             findings(args, &measured)?.write(&args.out)?;
             written = Instant::now();
         }
@@ -132,7 +132,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<Measured> {
     Ok(measured)
 }
 
-fn sample(running: &Running, viewers: &[Viewer], gpu_parts: &BTreeMap<Arc<str>, u64>) -> anyhow::Result<Sample> {
+fn sample(running: &Running, viewers: &[Viewer], gpu_buffers: &BTreeMap<Arc<str>, u64>) -> anyhow::Result<Sample> {
     let (live, gpu) = (&running.live, &running.gpu);
     let sessions = live.sessions();
     Ok(Sample {
@@ -141,7 +141,7 @@ fn sample(running: &Running, viewers: &[Viewer], gpu_parts: &BTreeMap<Arc<str>, 
         gpu_bytes: gpu.live_bytes(),
         gpu_reserved_bytes: gpu.reserved_bytes(),
         model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
-        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_parts.get(*label)).sum(),
+        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_buffers.get(*label)).sum(),
         keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
         keyframes: live.keyframes().len(),
         evicted: live.n_evicted(),
@@ -151,7 +151,7 @@ fn sample(running: &Running, viewers: &[Viewer], gpu_parts: &BTreeMap<Arc<str>, 
     })
 }
 
-fn in_words(sample: &Sample) -> String {
+fn describe(sample: &Sample) -> String {
     let mb = |bytes: u64| bytes as f64 / BYTES_PER_MB;
     format!(
         "{:7.1} s  {:8.1} MB resident  {:8.1} MB on the GPU  {:7.1} MB model  {:8.1} MB in {} keyframes, step {}",
@@ -210,24 +210,25 @@ impl Args {
 }
 
 /// One component of memory use.
-struct Part {
+struct MemoryComponent {
     label: &'static str,
     bytes: fn(&Sample) -> Option<u64>,
 }
 
-const PARTS: [Part; 6] = [
-    Part { label: "resident", bytes: |sample| Some(sample.resident_bytes) },
-    Part { label: "GPU buffers", bytes: |sample| Some(sample.gpu_bytes) },
-    Part { label: "keyframes on the host", bytes: |sample| Some(sample.keyframe_bytes) },
-    Part { label: "model", bytes: |sample| Some(sample.model_bytes) },
-    Part { label: "images on the GPU", bytes: |sample| Some(sample.gpu_image_bytes) },
-    Part { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
+const COMPONENTS: [MemoryComponent; 6] = [
+    MemoryComponent { label: "resident", bytes: |sample| Some(sample.resident_bytes) },
+    MemoryComponent { label: "GPU buffers", bytes: |sample| Some(sample.gpu_bytes) },
+    MemoryComponent { label: "keyframes on the host", bytes: |sample| Some(sample.keyframe_bytes) },
+    MemoryComponent { label: "model", bytes: |sample| Some(sample.model_bytes) },
+    MemoryComponent { label: "images on the GPU", bytes: |sample| Some(sample.gpu_image_bytes) },
+    MemoryComponent { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
 ];
 
 /// The median and range of each group of samples.
-fn line(part: &Part, samples: &[Sample]) -> Line {
+fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
-        let mut mb: Vec<f64> = group.iter().filter_map(part.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
+        let mut mb: Vec<f64> =
+            group.iter().filter_map(component.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
         mb.sort_by(f64::total_cmp);
         let (low, high) = (*mb.first()?, *mb.last()?);
         let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
@@ -235,20 +236,22 @@ fn line(part: &Part, samples: &[Sample]) -> Line {
     };
     let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
     Line {
-        label: part.label.to_owned(),
+        label: component.label.to_owned(),
         points: samples.chunks(n_each).filter_map(of_group).collect(),
-        is_foreign: false,
+        is_peer: false,
     }
 }
 
-fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
+fn findings(args: &Args, measured: &MemoryRun) -> anyhow::Result<Findings> {
     let samples = &measured.samples;
     let growths: Vec<(&str, Growth)> = match measured.is_software {
-        true => vec![("without the model", Beyond::Model), ("without model and training buffers", Beyond::Training)],
-        false => vec![("of the host", Beyond::Nothing)],
+        true => {
+            vec![("without the model", Excluded::Model), ("without model and training buffers", Excluded::Training)]
+        }
+        false => vec![("of the host", Excluded::Nothing)],
     }
     .into_iter()
-    .filter_map(|(name, beyond)| Some((name, Growth::of(samples, beyond)?)))
+    .filter_map(|(name, excluded)| Some((name, Growth::of(samples, excluded)?)))
     .collect();
     let rate = growths.first().map_or("too short to measure a growth rate".to_owned(), |(name, growth)| {
         let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
@@ -256,9 +259,9 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
     });
     let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
     let lines: Vec<Line> =
-        PARTS.iter().map(|part| line(part, samples)).filter(|line| !line.points.is_empty()).collect();
+        COMPONENTS.iter().map(|component| line(component, samples)).filter(|line| !line.points.is_empty()).collect();
     let full = samples.iter().find(|sample| sample.evicted > 0);
-    let rules = full.map(|sample| Rule {
+    let markers = full.map(|sample| Marker {
         x: sample.seconds / SECS_PER_MINUTE,
         label: format!("store full: {} keyframes", sample.keyframes),
         line_ix: 2,
@@ -267,9 +270,9 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
     let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
     let mb = |bytes: f64| format!("{:.1} MB", bytes / BYTES_PER_MB);
     if let Some(last) = samples.last() {
-        for part in &PARTS {
-            if let Some(bytes) = (part.bytes)(last) {
-                add(&format!("{} at the end", part.label), mb(bytes as f64));
+        for component in &COMPONENTS {
+            if let Some(bytes) = (component.bytes)(last) {
+                add(&format!("{} at the end", component.label), mb(bytes as f64));
             }
         }
         add("peak of resident memory", mb(resident_bytes()?.1 as f64));
@@ -282,11 +285,11 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
         let of = format!("{} per hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
         add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
     }
-    let mut gpu_parts: Vec<(&Arc<str>, u64)> =
-        measured.gpu_parts.iter().map(|(label, bytes)| (label, *bytes)).collect();
-    gpu_parts.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
+    let mut gpu_buffers: Vec<(&Arc<str>, u64)> =
+        measured.gpu_buffers.iter().map(|(label, bytes)| (label, *bytes)).collect();
+    gpu_buffers.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
     let gpu_rows =
-        gpu_parts.iter().take(MAX_GPU_PARTS).map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
+        gpu_buffers.iter().take(MAX_GPU_BUFFERS).map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
     Ok(Findings {
         name: "memory",
         title: "Memory of a long run".to_owned(),
@@ -305,12 +308,12 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
                 x: Axis { label: "minutes since the first image".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 y: Axis { label: "MB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 lines,
-                floors: Vec::new(),
-                rules: rules.into_iter().collect(),
+                thresholds: Vec::new(),
+                markers: markers.into_iter().collect(),
             },
         )],
         tables: vec![
-            Table { title: "Memory".to_owned(), head: vec!["what".to_owned(), "value".to_owned()], rows },
+            Table { title: "Memory".to_owned(), head: vec!["disturbance".to_owned(), "value".to_owned()], rows },
             Table {
                 title: "Largest GPU buffers at the end".to_owned(),
                 head: vec!["label".to_owned(), "size".to_owned()],
@@ -321,7 +324,7 @@ fn findings(args: &Args, measured: &Measured) -> anyhow::Result<Findings> {
             "input": args.input(),
             "viewers": args.viewers,
             "growth": growths.iter().map(|(name, growth)| (*name, growth)).collect::<BTreeMap<_, _>>(),
-            "gpu_parts": gpu_parts.iter().map(|(label, bytes)| (label.as_ref(), bytes)).collect::<BTreeMap<_, _>>(),
+            "gpu_buffers": gpu_buffers.iter().map(|(label, bytes)| (label.as_ref(), bytes)).collect::<BTreeMap<_, _>>(),
             "peak_resident_bytes": resident_bytes()?.1,
             "samples": samples,
         }),
@@ -343,20 +346,20 @@ mod tests {
     }
 
     #[test]
-    fn flags_of_run_are_passed_on_and_wrong_ones_named() {
+    fn run_flags_are_forwarded_and_invalid_ones_named() {
         let folder = Path::new("some");
         assert!(args(&["--sim", "--", "--method", "tsdf"]).run_flags(folder).is_ok());
-        let refused = args(&["--sim", "--", "--metod", "tsdf"]).run_flags(folder).expect_err("no such flag");
-        assert!(refused.to_string().contains("--metod"), "{refused}");
+        let error_message = args(&["--sim", "--", "--metod", "tsdf"]).run_flags(folder).expect_err("no such flag");
+        assert!(error_message.to_string().contains("--metod"), "{error_message}");
         for flags in [["--seconds", "0"], ["--seconds", "NaN"], ["--every-secs", "-1"]] {
             let flags = [format!("{}={}", flags[0], flags[1])];
-            let refused = args(&[flags[0].as_str()]).check().expect_err("out of range").to_string();
-            assert!(refused.starts_with("--"), "{refused}");
+            let error_message = args(&[flags[0].as_str()]).check().expect_err("out of range").to_string();
+            assert!(error_message.starts_with("--"), "{error_message}");
         }
     }
 
     #[test]
-    fn findings_say_how_fast_memory_grows() {
+    fn findings_report_memory_growth() {
         let sample = |ix: u64| Sample {
             seconds: ix as f64,
             resident_bytes: 1_000_000_000 + 10_000 * ix,
@@ -367,10 +370,10 @@ mod tests {
             ..Sample::default()
         };
         let samples: Vec<Sample> = (0..600).map(sample).collect();
-        let gpu_parts = BTreeMap::from([("small".into(), 1), ("large".into(), 2)]);
-        let mut measured = Measured { is_software: true, samples, gpu_parts, input_error: None };
+        let gpu_buffers = BTreeMap::from([("small".into(), 1), ("large".into(), 2)]);
+        let mut measured = MemoryRun { is_software: true, samples, gpu_buffers, input_error: None };
         let of_host =
-            Measured { is_software: false, ..Measured { samples: measured.samples.clone(), ..Measured::default() } };
+            MemoryRun { is_software: false, ..MemoryRun { samples: measured.samples.clone(), ..MemoryRun::default() } };
         let of_host = findings(&args(&["--sim"]), &of_host).expect("numbers");
         assert!(
             of_host.sentences[0].contains("+3.59") && of_host.sentences[0].contains("host"),
@@ -384,7 +387,7 @@ mod tests {
         let chart = &findings.charts[0].1;
         assert_eq!(chart.lines.len(), 5, "the reserved memory is unknown");
         assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
-        assert_eq!(chart.rules[0].label, "store full: 100 keyframes");
+        assert_eq!(chart.markers[0].label, "store full: 100 keyframes");
         assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));
     }
 }

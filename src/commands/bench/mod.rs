@@ -17,11 +17,11 @@ use trainer::gpu::PassTiming;
 #[derive(Debug, Parser)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: What,
+    command: BenchCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum BenchCommand {
     /// Time of a picture and of a training step on a synthetic cloud of splats, by size and count
     Kernels(kernels::Args),
     /// Time of a training step of a neural field on synthetic rays, by number of samples
@@ -41,19 +41,19 @@ enum What {
 }
 
 /// Names and milliseconds of passes, where they are asked for.
-fn profile(passes: &[PassTiming], is_asked: bool) -> Vec<(&'static str, f64)> {
-    if is_asked { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
+fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
+    if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    match &args.what {
-        What::Kernels(args) => kernels::run(args).map(|()| Exit::Done),
-        What::Field(args) => field::run(args).map(|()| Exit::Done),
-        What::Curve(args) => curve::run(args),
-        What::Budget(args) => budget::run(args),
-        What::Ablation(args) => ablation::run(args),
-        What::Stability(args) => stability::run(args),
-        What::Stamps(args) => stamps::run(args),
-        What::Memory(args) => memory::run(args),
+    match &args.command {
+        BenchCommand::Kernels(args) => kernels::run(args).map(|()| Exit::Done),
+        BenchCommand::Field(args) => field::run(args).map(|()| Exit::Done),
+        BenchCommand::Curve(args) => curve::run(args),
+        BenchCommand::Budget(args) => budget::run(args),
+        BenchCommand::Ablation(args) => ablation::run(args),
+        BenchCommand::Stability(args) => stability::run(args),
+        BenchCommand::Stamps(args) => stamps::run(args),
+        BenchCommand::Memory(args) => memory::run(args),
     }
 }

@@ -12,13 +12,13 @@ use std::time::Duration;
 /// Width of a bar, milliseconds.
 const BIN_MILLIS: f64 = 0.1;
 /// Bars reach so far to either side, milliseconds; what lies beyond counts in the last ones.
-const REACH_MILLIS: f64 = 8.0;
+const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
 /// Joint readings a second.
 const JOINT_RATE_HZ: u32 = 1000;
 /// The joint turns so fast, rad/s: its angle tells the time.
 const SPEED_RAD_S: f64 = 1.0;
 /// What is counted as found.
-const CLOSE_MILLIS: f64 = 1.0;
+const MAX_ERROR_MILLIS: f64 = 1.0;
 
 /// Flags of `bench stamps`.
 #[derive(Debug, clap::Args)]
@@ -53,7 +53,7 @@ pub(crate) struct Args {
 
 /// How far from the shutter the pose was taken, milliseconds, for one rate.
 #[derive(Debug, Serialize)]
-struct Found {
+struct StampErrors {
     rate_hz: f64,
     /// Whether the fixed part of the latency is in the rig file.
     is_calibrated: bool,
@@ -61,27 +61,27 @@ struct Found {
     within_1_ms_frac: f64,
     median_millis: f64,
     p99_abs_millis: f64,
-    worst_abs_millis: f64,
+    max_abs_millis: f64,
     /// Share of the images in each bar, from -8 ms on in steps of 0.1 ms.
     bars: Vec<f64>,
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check(args)?;
-    let mut found = Vec::new();
+    let mut results = Vec::new();
     for rate_hz in &args.rates {
         let errors: Vec<f64> = (1..=args.seeds).flat_map(|seed| errors_millis(args, *rate_hz, seed)).collect();
         for is_calibrated in [true, false] {
             // What the rig file says is taken off every stamp alike.
-            let known = if is_calibrated { args.fixed_millis } else { 0.0 };
-            let errors: Vec<f64> = errors.iter().map(|error| error - known).collect();
-            found.push(Found::of(*rate_hz, is_calibrated, &errors));
+            let fixed_latency = if is_calibrated { args.fixed_millis } else { 0.0 };
+            let errors: Vec<f64> = errors.iter().map(|error| error - fixed_latency).collect();
+            results.push(StampErrors::of(*rate_hz, is_calibrated, &errors));
         }
     }
     std::fs::create_dir_all(&args.out)
         .map_err(|error| anyhow::Error::new(error).context(format!("cannot make {}", args.out.display())))?;
-    let findings = findings(args, &found)?;
-    findings.tell(&findings.write(&args.out)?, args.json)?;
+    let findings = findings(args, &results)?;
+    findings.print_summary(&findings.write(&args.out)?, args.json)?;
     Ok(Exit::Done)
 }
 
@@ -122,8 +122,8 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     for ix in 0..(args.seconds * rate_hz) as i64 {
         let shutter_secs = ix as f64 / rate_hz;
         let device_nanos = (shutter_secs / (1.0 + args.drift_ppm * 1e-6) * 1e9) as i64;
-        let late_millis = args.fixed_millis + args.jitter_millis * uniform(&mut random);
-        let arrival = Stamp(((shutter_secs + late_millis * 1e-3) * 1e9) as i64);
+        let latency_millis = args.fixed_millis + args.jitter_millis * uniform(&mut random);
+        let arrival = Stamp(((shutter_secs + latency_millis * 1e-3) * 1e9) as i64);
         let stamp = clock.stamp(device_nanos, arrival);
         if shutter_secs < args.settle_seconds {
             continue;
@@ -144,14 +144,14 @@ fn uniform(state: &mut u64) -> f64 {
     ((mixed ^ (mixed >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
 }
 
-impl Found {
+impl StampErrors {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped into the bars")]
     fn of(rate_hz: f64, is_calibrated: bool, errors: &[f64]) -> Self {
-        let n_bars = (2.0 * REACH_MILLIS / BIN_MILLIS).round() as usize;
+        let n_bars = (2.0 * HISTOGRAM_RANGE_MILLIS / BIN_MILLIS).round() as usize;
         let mut bars = vec![0.0; n_bars];
         let n = errors.len();
         for error in errors {
-            let bar = ((error + REACH_MILLIS) / BIN_MILLIS).floor().max(0.0) as usize;
+            let bar = ((error + HISTOGRAM_RANGE_MILLIS) / BIN_MILLIS).floor().max(0.0) as usize;
             bars[bar.min(n_bars - 1)] += 1.0 / n as f64;
         }
         let median_millis = median(errors).unwrap_or(f64::NAN);
@@ -161,48 +161,49 @@ impl Found {
             rate_hz,
             is_calibrated,
             images: n,
-            within_1_ms_frac: sizes.partition_point(|size| *size <= CLOSE_MILLIS) as f64 / n as f64,
+            within_1_ms_frac: sizes.partition_point(|size| *size <= MAX_ERROR_MILLIS) as f64 / n as f64,
             median_millis,
             p99_abs_millis: quantile(&sizes, 0.99).unwrap_or(f64::NAN),
-            worst_abs_millis: quantile(&sizes, 1.0).unwrap_or(f64::NAN),
+            max_abs_millis: quantile(&sizes, 1.0).unwrap_or(f64::NAN),
             bars,
         }
     }
 
     fn label(&self) -> String {
-        let told = if self.is_calibrated { "" } else { ", fixed part unknown" };
-        format!("{} Hz{told}", self.rate_hz)
+        let suffix = if self.is_calibrated { "" } else { ", fixed part unknown" };
+        format!("{} Hz{suffix}", self.rate_hz)
     }
 }
 
-fn findings(args: &Args, found: &[Found]) -> anyhow::Result<Findings> {
-    let point = |(ix, share): (usize, &f64)| {
-        let y = 100.0 * share;
-        Point { x: (ix as f64 + 0.5) * BIN_MILLIS - REACH_MILLIS, y, low: y, high: y }
+fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
+    let point = |(ix, fraction): (usize, &f64)| {
+        let y = 100.0 * fraction;
+        Point { x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS, y, low: y, high: y }
     };
-    let line = |found: &Found| {
+    let line = |results: &StampErrors| {
         // From the bar before the first that has any to the one behind the last.
-        let first = found.bars.iter().position(|share| *share > 0.0).unwrap_or(0).saturating_sub(1);
-        let n_behind = found.bars.iter().rev().position(|share| *share > 0.0).unwrap_or(0).saturating_sub(1);
-        let n_drawn = found.bars.len() - n_behind - first;
+        let first = results.bars.iter().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
+        let n_empty_after =
+            results.bars.iter().rev().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
+        let n_drawn = results.bars.len() - n_empty_after - first;
         Line {
-            label: found.label(),
-            points: found.bars.iter().enumerate().skip(first).take(n_drawn).map(point).collect(),
-            is_foreign: !found.is_calibrated,
+            label: results.label(),
+            points: results.bars.iter().enumerate().skip(first).take(n_drawn).map(point).collect(),
+            is_peer: !results.is_calibrated,
         }
     };
     let conditions = format!(
         "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, the first {} s left out",
         args.fixed_millis, args.jitter_millis, args.drift_ppm, args.seeds, args.seconds, args.settle_seconds
     );
-    let row = |found: &Found| {
+    let row = |results: &StampErrors| {
         vec![
-            found.label(),
-            format!("{}", found.images),
-            format!("{:.2}", 100.0 * found.within_1_ms_frac),
-            format!("{:+.3}", found.median_millis),
-            format!("{:.3}", found.p99_abs_millis),
-            format!("{:.3}", found.worst_abs_millis),
+            results.label(),
+            format!("{}", results.images),
+            format!("{:.2}", 100.0 * results.within_1_ms_frac),
+            format!("{:+.3}", results.median_millis),
+            format!("{:.3}", results.p99_abs_millis),
+            format!("{:.3}", results.max_abs_millis),
         ]
     };
     let head = ["camera", "images", "within 1 ms, %", "median, ms", "99 % within, ms", "worst, ms"];
@@ -222,17 +223,17 @@ fn findings(args: &Args, found: &[Found]) -> anyhow::Result<Findings> {
                 subtitle: conditions,
                 x: Axis { label: "ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 y: Axis { label: "share of images, % in 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                lines: found.iter().map(line).collect(),
-                floors: Vec::new(),
-                rules: Vec::new(),
+                lines: results.iter().map(line).collect(),
+                thresholds: Vec::new(),
+                markers: Vec::new(),
             },
         )],
         tables: vec![Table {
             title: "Stamps".to_owned(),
             head: head.map(str::to_owned).to_vec(),
-            rows: found.iter().map(row).collect(),
+            rows: results.iter().map(row).collect(),
         }],
-        numbers: serde_json::to_value(found)?,
+        numbers: serde_json::to_value(results)?,
     })
 }
 
@@ -248,18 +249,18 @@ mod tests {
     }
 
     #[test]
-    fn shutters_are_found_to_a_millisecond_once_the_fixed_part_is_known() {
+    fn calibrated_stamps_are_within_one_millisecond() {
         let args = Flags::parse_from(["stamps", "--rates", "30", "--seeds", "3"]).args;
         let errors: Vec<f64> = (1..=3).flat_map(|seed| errors_millis(&args, 30.0, seed)).collect();
-        let known = Found::of(30.0, true, &errors.iter().map(|error| error - 5.0).collect::<Vec<_>>());
-        assert_eq!(known.within_1_ms_frac, 1.0, "{known:?}");
-        assert!((known.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
-        let unknown = Found::of(30.0, false, &errors);
+        let fixed_latency = StampErrors::of(30.0, true, &errors.iter().map(|error| error - 5.0).collect::<Vec<_>>());
+        assert_eq!(fixed_latency.within_1_ms_frac, 1.0, "{fixed_latency:?}");
+        assert!((fixed_latency.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
+        let unknown = StampErrors::of(30.0, false, &errors);
         assert!((unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0, "{unknown:?}");
     }
 
     #[test]
-    fn numbers_that_make_no_sense_are_refused() {
+    fn out_of_range_arguments_are_rejected() {
         for flags in [["--seconds", "0"], ["--rates", "0,30"], ["--drift-ppm", "-900"], ["--settle-seconds", "500"]] {
             let args = Flags::parse_from(["stamps"].into_iter().chain(flags)).args;
             assert!(check(&args).is_err_and(|error| error.to_string().contains(flags[0])), "{flags:?}");

@@ -10,9 +10,9 @@ use std::process::Command;
 use std::time::Duration;
 
 /// Franka asks for less between a state and the answer to it.
-const MOST_MILLIS: f64 = 1.0;
+const MAX_PING_MILLIS: f64 = 1.0;
 /// A controller in the same network answers at once.
-const LONGEST_CONNECTING: Duration = Duration::from_secs(1);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Pings, five a second.
 const N_PINGS: &str = "10";
 
@@ -22,42 +22,45 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     let os_release = std::fs::read_to_string("/etc/os-release").unwrap_or_default();
     let mut findings = vec![kernel(Path::new("/sys"), &os_release), locked_memory(Path::new("/proc"))];
     if arm.address.is_empty() {
-        let mend = "arm.address = \"172.16.0.2\" in the rig file, or what Desk shows under Settings, Network";
-        findings.push(Finding::fail("robot", "arm.address is missing", mend));
+        let remedy = "arm.address = \"172.16.0.2\" in the rig file, or what Desk shows under Settings, Network";
+        findings.push(Finding::fail("robot", "arm.address is missing", remedy));
         return findings;
     }
     let host = host_of(&arm.address);
-    let ran = |program: &str, arguments: &[&str]| {
+    let output_of = |program: &str, arguments: &[&str]| {
         let output = Command::new(program).args(arguments).output().ok()?;
         Some(String::from_utf8_lossy(&output.stdout).into_owned())
     };
-    findings.extend(ran("ip", &["-o", "route", "get", host]).map(|told| route(Path::new("/sys"), host, &told)));
-    let pinged = match ran("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
-        Some(told) => pings(host, &told),
+    findings.extend(
+        output_of("ip", &["-o", "route", "get", host])
+            .map(|command_output| route(Path::new("/sys"), host, &command_output)),
+    );
+    let pinged = match output_of("ping", &["-n", "-q", "-i", "0.2", "-W", "1", "-c", N_PINGS, host]) {
+        Some(command_output) => pings(host, &command_output),
         None => {
-            let mend = "sudo apt-get install -y iputils-ping";
-            Finding::warn("robot", format!("whether {host} answers is not known without ping"), mend)
+            let remedy = "sudo apt-get install -y iputils-ping";
+            Finding::warn("robot", format!("whether {host} answers is not known without ping"), remedy)
         }
     };
-    let is_there = pinged.verdict != Verdict::Fail;
+    let is_reachable = pinged.verdict != Verdict::Fail;
     findings.push(pinged);
-    findings.extend(is_there.then(|| port(&arm.address)));
+    findings.extend(is_reachable.then(|| port(&arm.address)));
     findings
 }
 
 /// Whether the controller takes clients: a connection is opened, and closed without a word, by which it gives away no place.
 fn port(address: &str) -> Finding {
-    let is_bare = host_of(address) == address;
-    let found = if is_bare { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
+    let has_no_port = host_of(address) == address;
+    let found = if has_no_port { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
     let connected = found.and_then(|mut all| {
         let address = all.next().ok_or(ErrorKind::AddrNotAvailable)?;
-        TcpStream::connect_timeout(&address, LONGEST_CONNECTING)
+        TcpStream::connect_timeout(&address, CONNECT_TIMEOUT)
     });
     match connected {
         Ok(_) => Finding::ok("FCI", format!("{address} takes clients")),
         Err(error) => {
-            let mend = "activate FCI in Desk; unlock the joints; FCI is a feature that the robot has to have";
-            Finding::fail("FCI", format!("{address} takes no client: {error}"), mend)
+            let remedy = "activate FCI in Desk; unlock the joints; FCI is a feature that the robot has to have";
+            Finding::fail("FCI", format!("{address} takes no client: {error}"), remedy)
         }
     }
 }
@@ -76,11 +79,11 @@ fn kernel(sys: &Path, os_release: &str) -> Finding {
     if is_realtime {
         return Finding::ok("kernel", "PREEMPT_RT");
     }
-    let mend = match os_release.lines().any(|line| line == "ID=ubuntu") {
+    let remedy = match os_release.lines().any(|line| line == "ID=ubuntu") {
         true => "sudo pro enable realtime-kernel, then boot into it",
         false => "sudo apt-get install -y linux-image-rt-amd64, then boot into it",
     };
-    Finding::warn("kernel", "without PREEMPT_RT: an arm's states at 1 kHz are read, now and then some ms late", mend)
+    Finding::warn("kernel", "without PREEMPT_RT: an arm's states at 1 kHz are read, now and then some ms late", remedy)
 }
 
 /// How much memory this user may keep from being swapped out.
@@ -89,55 +92,58 @@ fn locked_memory(proc: &Path) -> Finding {
         None => Finding::ok("memory lock", "the kernel does not tell"),
         Some("unlimited") => Finding::ok("memory lock", "unlimited"),
         Some(bytes) => {
-            let says = format!("at most {bytes} bytes may be locked: an arm's thread may wait for the disk");
-            let mend = r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
-            Finding::warn("memory lock", says, mend)
+            let message = format!("at most {bytes} bytes may be locked: an arm's thread may wait for the disk");
+            let remedy =
+                r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
+            Finding::warn("memory lock", message, remedy)
         }
     }
 }
 
 /// The way to the robot, as `ip -o route get` tells it.
-fn route(sys: &Path, host: &str, told: &str) -> Finding {
+fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
     let after = |word: &str| {
-        let mut words = told.split_whitespace().skip_while(|found| *found != word);
+        let mut words = command_output.split_whitespace().skip_while(|found| *found != word);
         words.nth(1)
     };
     let Some(interface) = after("dev") else {
-        let mend = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the one that the robot's cable is in, another host of its network)";
-        return Finding::fail("route", format!("no way leads to {host}"), mend);
+        let remedy = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the one that the robot's cable is in, another host of its network)";
+        return Finding::fail("route", format!("no way leads to {host}"), remedy);
     };
     if sys.join("class/net").join(interface).join("wireless").exists() {
-        let says = format!("{host} is behind {interface}, a wireless network: states come late and get lost");
-        return Finding::warn("route", says, "put the robot's cable into this computer");
+        let message = format!("{host} is behind {interface}, a wireless network: states come late and get lost");
+        return Finding::warn("route", message, "put the robot's cable into this computer");
     }
     match after("via") {
         Some(router) => {
-            let says = format!("{host} is behind the router {router} ({interface})");
-            Finding::warn("route", says, "put the robot's cable into this computer, in a network of their own")
+            let message = format!("{host} is behind the router {router} ({interface})");
+            Finding::warn("route", message, "put the robot's cable into this computer, in a network of their own")
         }
         None => Finding::ok("route", format!("{host} is on {interface}")),
     }
 }
 
 /// Whether the robot answers, and how soon, as `ping -q` tells it.
-fn pings(host: &str, told: &str) -> Finding {
-    let loss_percent: Option<f64> =
-        told.split_once("% packet loss").and_then(|(before, _)| before.split_whitespace().last()?.parse().ok());
-    let times = told.split_once("mdev = ").and_then(|(_, times)| times.split_whitespace().next());
+fn pings(host: &str, command_output: &str) -> Finding {
+    let loss_percent: Option<f64> = command_output
+        .split_once("% packet loss")
+        .and_then(|(before, _)| before.split_whitespace().last()?.parse().ok());
+    let times = command_output.split_once("mdev = ").and_then(|(_, times)| times.split_whitespace().next());
     let times: Option<Vec<f64>> = times.and_then(|times| times.split('/').map(|time| time.parse().ok()).collect());
-    let slow = "a cable without a switch; sudo ethtool -C INTERFACE rx-usecs 0; the governor performance";
+    let latency_remedy = "a cable without a switch; sudo ethtool -C INTERFACE rx-usecs 0; the governor performance";
     match (loss_percent, times.as_deref()) {
-        (Some(loss_percent), Some([_, average, longest, ..])) => {
-            let says =
-                format!("{host} answers after {average} ms, at most {longest} ms; {loss_percent} % of pings are lost");
-            if loss_percent > 0.0 || *longest > MOST_MILLIS {
-                return Finding::warn("robot", says, slow);
+        (Some(loss_percent), Some([_, average, max_millis, ..])) => {
+            let message = format!(
+                "{host} answers after {average} ms, at most {max_millis} ms; {loss_percent} % of pings are lost"
+            );
+            if loss_percent > 0.0 || *max_millis > MAX_PING_MILLIS {
+                return Finding::warn("robot", message, latency_remedy);
             }
-            Finding::ok("robot", says)
+            Finding::ok("robot", message)
         }
         _ => {
-            let mend = "look at the cable and the robot's lights; Desk shows its address under Settings, Network";
-            Finding::fail("robot", format!("{host} does not answer"), mend)
+            let remedy = "look at the cable and the robot's lights; Desk shows its address under Settings, Network";
+            Finding::fail("robot", format!("{host} does not answer"), remedy)
         }
     }
 }
@@ -147,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hosts_are_told_from_ports() {
+    fn host_and_port_are_separated() {
         for (address, host) in [
             ("172.16.0.2", "172.16.0.2"),
             ("172.16.0.2:1338", "172.16.0.2"),
@@ -160,17 +166,17 @@ mod tests {
     }
 
     #[test]
-    fn whether_a_controller_takes_clients_is_told() {
+    fn controller_connection_is_checked() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("bound").to_string();
         assert_eq!(port(&address).verdict, Verdict::Ok);
         drop(listener);
         let finding = port(&address);
-        assert!(finding.says.contains(&address) && finding.mend.is_some_and(|mend| mend.contains("Desk")));
+        assert!(finding.message.contains(&address) && finding.remedy.is_some_and(|remedy| remedy.contains("Desk")));
     }
 
     #[test]
-    fn kernels_and_limits_are_told_with_their_remedy() {
+    fn kernel_and_limits_are_reported_with_remedies() {
         let folder = tempfile::tempdir().expect("a folder");
         for (name, text) in
             [("kernel/realtime", "1\n"), ("self/limits", "Max locked memory  8388608  8388608  bytes\n")]
@@ -183,40 +189,40 @@ mod tests {
         for (os_release, remedy) in [("ID=ubuntu\n", "pro enable"), ("ID=debian\n", "linux-image-rt")] {
             let finding = kernel(Path::new("/nowhere"), os_release);
             assert_eq!(finding.verdict, Verdict::Warn);
-            assert!(finding.mend.expect("a remedy").contains(remedy));
+            assert!(finding.remedy.expect("a remedy").contains(remedy));
         }
         let finding = locked_memory(folder.path());
-        assert!(finding.says.contains("8388608") && finding.mend.expect("a remedy").contains("memlock"));
+        assert!(finding.message.contains("8388608") && finding.remedy.expect("a remedy").contains("memlock"));
         std::fs::write(folder.path().join("self/limits"), "Max locked memory  unlimited  unlimited  bytes\n")
             .expect("ours");
         assert_eq!(locked_memory(folder.path()).verdict, Verdict::Ok);
     }
 
     #[test]
-    fn the_way_to_the_robot_is_judged() {
+    fn route_to_the_robot_is_checked() {
         let sys = tempfile::tempdir().expect("a folder");
         std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless")).expect("room on the disk");
-        let judged = |told: &str| route(sys.path(), "172.16.0.2", told);
-        let direct = judged("172.16.0.2 dev eth0 src 172.16.0.1 uid 0 \\    cache ");
-        assert_eq!((direct.verdict, direct.says.contains("eth0")), (Verdict::Ok, true));
-        let routed = judged("172.16.0.2 via 10.0.0.1 dev eth0 src 10.0.0.7 uid 0 \\    cache ");
-        assert_eq!((routed.verdict, routed.says.contains("10.0.0.1")), (Verdict::Warn, true));
-        assert!(judged("172.16.0.2 dev wlan0 src 172.16.0.1").says.contains("wireless"));
-        assert_eq!(judged("").verdict, Verdict::Fail);
+        let route_finding = |command_output: &str| route(sys.path(), "172.16.0.2", command_output);
+        let direct = route_finding("172.16.0.2 dev eth0 src 172.16.0.1 uid 0 \\    cache ");
+        assert_eq!((direct.verdict, direct.message.contains("eth0")), (Verdict::Ok, true));
+        let routed = route_finding("172.16.0.2 via 10.0.0.1 dev eth0 src 10.0.0.7 uid 0 \\    cache ");
+        assert_eq!((routed.verdict, routed.message.contains("10.0.0.1")), (Verdict::Warn, true));
+        assert!(route_finding("172.16.0.2 dev wlan0 src 172.16.0.1").message.contains("wireless"));
+        assert_eq!(route_finding("").verdict, Verdict::Fail);
     }
 
     #[test]
-    fn pings_are_judged_by_loss_and_by_the_longest() {
-        let told = |loss: &str, longest: &str| {
+    fn ping_check_uses_loss_and_max_latency() {
+        let command_output = |loss: &str, max_millis: &str| {
             format!(
                 "PING 172.16.0.2 (172.16.0.2) 56(84) bytes of data.\n\n--- 172.16.0.2 ping statistics ---\n10 packets transmitted, \
-                 10 received, {loss}% packet loss, time 1835ms\nrtt min/avg/max/mdev = 0.101/0.150/{longest}/0.020 ms\n"
+                 10 received, {loss}% packet loss, time 1835ms\nrtt min/avg/max/mdev = 0.101/0.150/{max_millis}/0.020 ms\n"
             )
         };
-        let verdict = |told: &str| pings("172.16.0.2", told).verdict;
-        assert_eq!(verdict(&told("0", "0.300")), Verdict::Ok);
-        assert_eq!(verdict(&told("0", "1.300")), Verdict::Warn);
-        assert_eq!(verdict(&told("10", "0.300")), Verdict::Warn);
+        let verdict = |command_output: &str| pings("172.16.0.2", command_output).verdict;
+        assert_eq!(verdict(&command_output("0", "0.300")), Verdict::Ok);
+        assert_eq!(verdict(&command_output("0", "1.300")), Verdict::Warn);
+        assert_eq!(verdict(&command_output("10", "0.300")), Verdict::Warn);
         assert_eq!(verdict("10 packets transmitted, 0 received, 100% packet loss, time 9000ms\n"), Verdict::Fail);
         assert_eq!(verdict(""), Verdict::Fail);
     }

@@ -3,63 +3,63 @@
 use crate::config::{Camera, CameraDriver, Rig};
 use anyhow::Context;
 use drivers::realsense::Pace;
-use drivers::realsense::played::{BagWriter, PlayedCamera, PlayedDepth};
+use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::{Image, PixelFormat};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// The files of a rig's cameras, while they are written.
-pub(super) struct Films {
-    films: Vec<Film>,
+pub(super) struct CameraFiles {
+    camera_files: Vec<CameraFile>,
 }
 
 /// A camera of the rig, and its file once its first images told what they are.
-struct Film {
+struct CameraFile {
     camera: Camera,
     path: PathBuf,
     /// Colour and depth that came before the other was seen.
-    waiting: Vec<Image>,
+    pending: Vec<Image>,
     writer: Option<BagWriter>,
 }
 
-impl Films {
+impl CameraFiles {
     /// One for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
         let folder = std::path::absolute(folder).context("the folder of the cameras' files")?;
-        let film = |camera: &Camera| Film {
+        let camera_file = |camera: &Camera| CameraFile {
             camera: camera.clone(),
             path: folder.join(format!("{}.bag", camera.name)),
-            waiting: Vec::new(),
+            pending: Vec::new(),
             writer: None,
         };
-        let is_its = |camera: &&Camera| camera.driver == CameraDriver::Realsense;
-        Ok(Self { films: rig.cameras.iter().filter(is_its).map(film).collect() })
+        let is_realsense = |camera: &&Camera| camera.driver == CameraDriver::Realsense;
+        Ok(Self { camera_files: rig.cameras.iter().filter(is_realsense).map(camera_file).collect() })
     }
 
     /// Takes an image; those of other cameras are not played.
     pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
-        match self.films.iter_mut().find(|film| film.camera.name == image.camera) {
-            Some(film) => film.take(image),
+        match self.camera_files.iter_mut().find(|camera_file| camera_file.camera.name == image.camera) {
+            Some(camera_file) => camera_file.take(image),
             None => Ok(()),
         }
     }
 
     /// Ends the files and has the rig play them, by the clock; a sentence for each comes back.
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
-        let mut told = Vec::new();
-        for film in self.films {
-            let (name, path) = (Arc::clone(&film.camera.name), film.path.clone());
-            film.finish()?;
-            told.push(format!("camera {name:?}: {}", path.display()));
+        let mut descriptions = Vec::new();
+        for camera_file in self.camera_files {
+            let (name, path) = (Arc::clone(&camera_file.camera.name), camera_file.path.clone());
+            camera_file.finish()?;
+            descriptions.push(format!("camera {name:?}: {}", path.display()));
             for camera in rig.cameras.iter_mut().filter(|camera| camera.name == name) {
                 (camera.realsense.file, camera.realsense.pace) = (path.clone(), Pace::Clock);
             }
         }
-        Ok(told)
+        Ok(descriptions)
     }
 }
 
-impl Film {
+impl CameraFile {
     fn take(&mut self, image: Image) -> anyhow::Result<()> {
         let image = if image.is_depth() {
             image
@@ -70,26 +70,26 @@ impl Film {
         match &mut self.writer {
             Some(writer) => writer.write(&image)?,
             None => {
-                self.waiting.push(image);
-                self.begin()?;
+                self.pending.push(image);
+                self.create_writer()?;
             }
         }
         Ok(())
     }
 
     /// Begins the file as soon as an image of each kind has come.
-    fn begin(&mut self) -> anyhow::Result<()> {
+    fn create_writer(&mut self) -> anyhow::Result<()> {
         let Camera { name, rate_hz, intrinsics, depth, .. } = &self.camera;
-        let counts = self.waiting.iter().find_map(|image| match image.format {
-            PixelFormat::DepthU16 { metres_per_count } => Some(metres_per_count),
+        let meters_per_depth_count = self.pending.iter().find_map(|image| match image.format {
+            PixelFormat::DepthU16 { meters_per_count } => Some(meters_per_count),
             _ => None,
         });
-        let has_color = self.waiting.iter().any(|image| !image.is_depth());
-        let depth = match (depth, counts) {
-            (Some(depth), Some(metres_per_count)) => Some(PlayedDepth {
+        let has_color = self.pending.iter().any(|image| !image.is_depth());
+        let depth = match (depth, meters_per_depth_count) {
+            (Some(depth), Some(meters_per_count)) => Some(EmulatedDepth {
                 intrinsics: depth.intrinsics.clone(),
                 camera_from_depth: depth.camera_from_depth,
-                metres_per_count,
+                meters_per_count,
             }),
             (Some(_), None) => return Ok(()),
             (None, _) => None,
@@ -99,7 +99,7 @@ impl Film {
         }
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rates are small numbers above 0")]
         let rate_hz = rate_hz.round().max(1.0) as u16;
-        let played = PlayedCamera {
+        let emulated = EmulatedCamera {
             name: "fieldrig simulated camera".to_owned(),
             serial: format!("sim-{name}"),
             rate_hz,
@@ -107,8 +107,8 @@ impl Film {
             format: PixelFormat::Rgb8,
             depth,
         };
-        let mut writer = BagWriter::create(&self.path, &played)?;
-        self.waiting.drain(..).try_for_each(|image| writer.write(&image))?;
+        let mut writer = BagWriter::create(&self.path, &emulated)?;
+        self.pending.drain(..).try_for_each(|image| writer.write(&image))?;
         self.writer = Some(writer);
         Ok(())
     }

@@ -1,7 +1,7 @@
 //! From a rig file to its devices on the wire.
 
 use super::Args;
-use super::bag::Films;
+use super::bag::CameraFiles;
 use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
 use crate::open::{self, Devices, FCI_PORT, Opened};
@@ -9,17 +9,19 @@ use crate::print;
 use crate::stop::Stop;
 use anyhow::{Context, bail};
 use drivers::franka::FciVersion;
-use drivers::franka::played::{Limits, PlayedRobot, RobotConfig};
+use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
-use sim::wire::{Clockwork, JointTrack, Listeners, PlayedMotors, PlayedSenders, Script, play_fci};
+use sim::wire::{
+    DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock, emulate_fci,
+};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// What is simulated, beside the rig file.
-const SCRIPT_FILE: &str = "script.mcap";
+const SIMULATION_FILE: &str = "script.mcap";
 /// How soon Ctrl-C is noticed.
 const POLL: Duration = Duration::from_millis(50);
 
@@ -35,19 +37,19 @@ const SCENES: [(&str, &str, &str); 2] = [
 
 /// What is told once all is ready.
 #[derive(Debug, Serialize)]
-struct Ready<'a> {
+struct ReadyEvent<'a> {
     event: &'static str,
     /// The rig file to run against.
     rig: &'a Path,
     /// Until playing begins, and how long it goes on.
     starts_in_secs: f64,
     seconds: f64,
-    playing: &'a [String],
+    devices: &'a [String],
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
-    let (name, mut rig) = load(&args.what)?;
+    let (name, mut rig) = load(&args.rig_or_scene)?;
     check(&rig)?;
     if rig.arm.driver == ArmDriver::Franka {
         // Not after a minute of simulating.
@@ -63,23 +65,29 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             None => return Ok(Exit::Done),
         },
     };
-    let mut films = Films::new(&rig, &folder)?;
-    let Some(script) = read(&recording, args, &mut films, &stop)? else { return Ok(Exit::Done) };
-    let mut told = films.finish(&mut rig)?;
+    let mut camera_files = CameraFiles::new(&rig, &folder)?;
+    let Some(script) = read(&recording, args, &mut camera_files, &stop)? else { return Ok(Exit::Done) };
+    let mut descriptions = camera_files.finish(&mut rig)?;
     let first = script.joints.first().map(|state| state.stamp);
     let first = first.or(script.poses.first().map(|pose| pose.stamp)).unwrap_or_default();
-    let clockwork = Clockwork { scripted: first, played: clock::now().plus_secs(args.start_in) };
+    let playback_clock = PlaybackClock { scripted: first, emulated: clock::now().plus_secs(args.start_in) };
     for camera in &mut rig.cameras {
-        camera.realsense.clock_offset_nanos = clockwork.played.0.saturating_sub(clockwork.scripted.0);
+        camera.realsense.clock_offset_nanos = playback_clock.emulated.0.saturating_sub(playback_clock.scripted.0);
     }
     let rig_file = write_rig(&folder, &rig)?;
-    let played = Played::start(&rig, &script, clockwork, args)?;
-    told.extend(played.told.iter().cloned());
+    let emulated = EmulatedDevices::start(&rig, &script, playback_clock, args)?;
+    descriptions.extend(emulated.descriptions.iter().cloned());
     if args.json {
         let (starts_in_secs, seconds) = (args.start_in, args.seconds);
-        print::report_json(&Ready { event: "ready", rig: &rig_file, starts_in_secs, seconds, playing: &told })?;
+        print::report_json(&ReadyEvent {
+            event: "ready",
+            rig: &rig_file,
+            starts_in_secs,
+            seconds,
+            devices: &descriptions,
+        })?;
     } else {
-        for device in &told {
+        for device in &descriptions {
             print::report(device);
         }
         print::report(format_args!(
@@ -89,19 +97,19 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             rig_file.display()
         ));
     }
-    wait(&stop, clockwork.played, args)?;
+    wait(&stop, playback_clock.emulated, args)?;
     Ok(Exit::Done)
 }
 
 /// The rig and what it is called.
-fn load(what: &str) -> anyhow::Result<(String, Rig)> {
-    if let Some((name, text, urdf)) = SCENES.iter().find(|(name, ..)| *name == what) {
+fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
+    if let Some((name, text, urdf)) = SCENES.iter().find(|(name, ..)| *name == rig_or_scene) {
         return Ok(((*name).to_owned(), Rig::parse(name, text, urdf, &[])?));
     }
-    let path = Path::new(what);
+    let path = Path::new(rig_or_scene);
     if !path.exists() {
         let scenes: Vec<_> = SCENES.iter().map(|(name, ..)| *name).collect();
-        return Err(BadArgument(format!("there is no rig file {what:?}; scenes: {}", scenes.join(", "))).into());
+        return Err(BadArgument(format!("there is no rig file {rig_or_scene:?}; scenes: {}", scenes.join(", "))).into());
     }
     let name = path.file_stem().map_or_else(|| "rig".to_owned(), |stem| stem.to_string_lossy().into_owned());
     Ok((name, Rig::load(path, &[])?))
@@ -123,7 +131,7 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     let mut simulated = rig.clone();
     simulated.sim.lockstep = true;
     let Opened { rig, mut source, .. } = open::rig(simulated, Devices::Sim)?;
-    let path = folder.join(SCRIPT_FILE);
+    let path = folder.join(SIMULATION_FILE);
     // Of an earlier time, or of one that was interrupted.
     match std::fs::remove_file(&path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
@@ -139,7 +147,7 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
         if secs > args.seconds {
             break;
         }
-        if stop.asked() {
+        if stop.requested() {
             return Ok(None);
         }
         bar.set_message(format!("{secs:.1} of {:.1} s simulated", args.seconds));
@@ -151,22 +159,27 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
 }
 
 /// What the devices of a recording say in its first seconds; images go to the cameras' files. `None` where that was interrupted.
-fn read(recording: &Path, args: &Args, films: &mut Films, stop: &Stop) -> anyhow::Result<Option<Script>> {
+fn read(
+    recording: &Path,
+    args: &Args,
+    camera_files: &mut CameraFiles,
+    stop: &Stop,
+) -> anyhow::Result<Option<DeviceScript>> {
     let Opened { mut source, damage, .. } = open::recording(recording, None, &[])?;
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
-    let mut script = Script::default();
+    let mut script = DeviceScript::default();
     let mut first: Option<Stamp> = None;
     while let Some(sample) = source.next_sample()? {
         let secs = sample.stamp().secs_since(*first.get_or_insert(sample.stamp()));
         if secs > args.seconds {
             break;
         }
-        if stop.asked() {
+        if stop.requested() {
             return Ok(None);
         }
         bar.set_message(format!("{secs:.1} of {:.1} s made ready", args.seconds));
         match sample {
-            Sample::Image(image) => films.take(image)?,
+            Sample::Image(image) => camera_files.take(image)?,
             other => script.take(other),
         }
     }
@@ -188,24 +201,24 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
 }
 
 /// Devices that answer until they are dropped.
-struct Played {
-    _robot: Option<PlayedRobot>,
-    _motors: Option<PlayedMotors>,
-    _senders: PlayedSenders,
+struct EmulatedDevices {
+    _robot: Option<EmulatedRobot>,
+    _motors: Option<EmulatedMotors>,
+    _senders: EmulatedSenders,
     /// What they are, a sentence each.
-    told: Vec<String>,
+    descriptions: Vec<String>,
 }
 
-impl Played {
-    fn start(rig: &Rig, script: &Script, clockwork: Clockwork, args: &Args) -> anyhow::Result<Self> {
-        let track = || JointTrack::new(&script.joints, clockwork).context("the joints' readings");
+impl EmulatedDevices {
+    fn start(rig: &Rig, script: &DeviceScript, playback_clock: PlaybackClock, args: &Args) -> anyhow::Result<Self> {
+        let track = || JointTrack::new(&script.joints, playback_clock).context("the joints' readings");
         let (mut robot, mut motors) = (None, None);
-        let mut listeners = Listeners::default();
-        let mut told = Vec::new();
+        let mut datagram_targets = DatagramTargets::default();
+        let mut descriptions = Vec::new();
         match rig.arm.driver {
             ArmDriver::Franka => {
-                let open = play_fci(track()?, robot_config(rig, &args.fci)?)?;
-                told.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
+                let open = emulate_fci(track()?, robot_config(rig, &args.fci)?)?;
+                descriptions.push(format!("arm: a Franka controller at {}, FCI {}", open.address(), args.fci));
                 robot = Some(open);
             }
             ArmDriver::Can => {
@@ -214,27 +227,27 @@ impl Played {
                     motors: rig.arm.motors.clone(),
                     rate_hz: rig.arm.rate_hz,
                 };
-                motors = Some(PlayedMotors::start(&track()?, &config)?);
+                motors = Some(EmulatedMotors::start(&track()?, &config)?);
                 let buses: Vec<_> = rig.arm.buses.iter().map(|bus| &*bus.interface).collect();
-                told.push(format!("arm: {} motors on {}", rig.arm.motors.len(), buses.join(", ")));
+                descriptions.push(format!("arm: {} motors on {}", rig.arm.motors.len(), buses.join(", ")));
             }
             ArmDriver::Udp => {
                 let address = open::udp_arm_address(rig)?;
-                told.push(format!("arm: datagrams to {address}"));
-                listeners.joints = Some((address, rig.arm.joints.clone()));
+                descriptions.push(format!("arm: datagrams to {address}"));
+                datagram_targets.joints = Some((address, rig.arm.joints.clone()));
             }
             ArmDriver::None | ArmDriver::Sim => {}
         }
         if rig.base.driver == BaseDriver::Udp {
-            told.push(format!("base: datagrams to {}", rig.base.address));
-            listeners.base = Some(rig.base.address);
+            descriptions.push(format!("base: datagrams to {}", rig.base.address));
+            datagram_targets.base = Some(rig.base.address);
         }
         for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
-            told.push(format!("range scanner {:?}: datagrams to {}", scanner.name, scanner.address));
-            listeners.scanners.push((scanner.name.to_string(), scanner.address));
+            descriptions.push(format!("range scanner {:?}: datagrams to {}", scanner.name, scanner.address));
+            datagram_targets.scanners.push((scanner.name.to_string(), scanner.address));
         }
-        let senders = PlayedSenders::start(script, clockwork, listeners)?;
-        Ok(Self { _robot: robot, _motors: motors, _senders: senders, told })
+        let senders = EmulatedSenders::start(script, playback_clock, datagram_targets)?;
+        Ok(Self { _robot: robot, _motors: motors, _senders: senders, descriptions })
     }
 }
 
@@ -262,11 +275,11 @@ fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
 }
 
 /// Waits for Ctrl-C; the devices stand still once all was played.
-fn wait(stop: &Stop, begins: Stamp, args: &Args) -> anyhow::Result<()> {
+fn wait(stop: &Stop, starts_at: Stamp, args: &Args) -> anyhow::Result<()> {
     let bar = print::bar(None, "{spinner} {msg}", args.json);
     let mut is_over = false;
-    while !stop.asked() {
-        let secs = clock::now().secs_since(begins);
+    while !stop.requested() {
+        let secs = clock::now().secs_since(starts_at);
         bar.set_message(match secs {
             ..0.0 => format!("begins in {:.1} s", -secs),
             _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played", args.seconds),
@@ -289,7 +302,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scenes_on_the_wire_are_those_that_are_simulated() {
+    fn wire_scenes_match_the_simulated_scenes() {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
         for (name, ..) in SCENES {
             let (_, wire) = load(name).expect("it comes along");
@@ -308,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn rigs_that_cannot_be_played_are_refused_before_anything_is_simulated() {
+    fn unsupported_rigs_are_rejected_before_simulating() {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
         let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("it comes along");
         assert!(check(&plain).is_err_and(|error| error.to_string().contains("arm.driver is sim")));

@@ -1,49 +1,49 @@
 //! Alignment beside training: begun with the first step on a thread of its own, taken at a fixed step.
 
 use super::{Alignment, align};
-use crate::splat::{CameraChoice, CameraFix, PosedLens};
+use crate::splat::{CalibratedCamera, CameraCorrection, CameraRefinement};
 use crate::{Error, Keyframe};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
 /// The step at which the result is taken, waiting for it where needed: on a processor steps are as dear as alignment.
-const TAKEN_AT: u64 = 400;
-const TAKEN_AT_ON_SOFTWARE: u64 = 50;
+const ALIGNMENT_STEP: u64 = 400;
+const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
 /// The step at which the result is taken.
-pub(crate) fn taken_at(is_software: bool, n_planned_steps: u64) -> u64 {
-    let usual = if is_software { TAKEN_AT_ON_SOFTWARE } else { TAKEN_AT };
-    usual.min(n_planned_steps / 4).max(1)
+pub(crate) fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
+    let default_step = if is_software { SOFTWARE_ALIGNMENT_STEP } else { ALIGNMENT_STEP };
+    default_step.min(n_planned_steps / 4).max(1)
 }
 
 /// Where alignment stands.
 #[derive(Debug)]
-pub(crate) enum Aligning {
+pub(crate) enum AlignmentTask {
     /// It begins with the next step.
-    Asked,
+    Requested,
     Running(JoinHandle<Option<Alignment>>),
     /// With what came of it, where it could be done.
     Done(Option<Alignment>),
 }
 
-impl Aligning {
-    pub(crate) fn new(choice: &CameraChoice) -> Self {
-        let is_asked = match choice {
-            CameraChoice::Given(terms) => terms.any(),
-            CameraChoice::Try(candidates) => !candidates.is_empty(),
+impl AlignmentTask {
+    pub(crate) fn new(choice: &CameraRefinement) -> Self {
+        let is_requested = match choice {
+            CameraRefinement::Always(params) => params.any(),
+            CameraRefinement::Try(candidates) => !candidates.is_empty(),
         };
-        if is_asked { Self::Asked } else { Self::Done(None) }
+        if is_requested { Self::Requested } else { Self::Done(None) }
     }
 
     pub(crate) fn result(&self) -> Option<&Alignment> {
         match self {
             Self::Done(result) => result.as_ref(),
-            Self::Asked | Self::Running(_) => None,
+            Self::Requested | Self::Running(_) => None,
         }
     }
 
-    pub(crate) fn is_asked(&self) -> bool {
-        matches!(self, Self::Asked)
+    pub(crate) fn is_requested(&self) -> bool {
+        matches!(self, Self::Requested)
     }
 
     pub(crate) fn is_done(&self) -> bool {
@@ -51,9 +51,9 @@ impl Aligning {
     }
 
     /// Begins, on a thread of its own.
-    pub(crate) fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraChoice) {
+    pub(crate) fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
         let choice = choice.clone();
-        *self = Self::Running(std::thread::spawn(move || beside_training(|| align(&keyframes, &choice))));
+        *self = Self::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
 
     /// Waits for what was begun, and says whether keyframes are to be corrected.
@@ -63,30 +63,36 @@ impl Aligning {
         for line in result.iter().flat_map(Alignment::lines) {
             log::info!("{line}");
         }
-        let is_any = result.as_ref().is_some_and(Alignment::is_any);
+        let has_corrections = result.as_ref().is_some_and(Alignment::has_corrections);
         *self = Self::Done(result);
-        Ok(is_any)
+        Ok(has_corrections)
     }
 
-    fn fix(&self, camera: &str) -> Option<&CameraFix> {
-        self.result()?.fixes.get(camera)
+    fn correction(&self, camera: &str) -> Option<&CameraCorrection> {
+        self.result()?.corrections.get(camera)
     }
 
     /// The keyframe with what alignment found; the same where that is nothing.
     pub(crate) fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
-        match self.fix(&keyframe.camera) {
-            Some(fix) => Arc::new(fix.corrected(keyframe)),
+        match self.correction(&keyframe.camera) {
+            Some(correction) => Arc::new(correction.corrected(keyframe)),
             None => keyframe.clone(),
         }
     }
 
     /// The camera of a keyframe with what alignment found and then what was learned with the splats.
-    pub(crate) fn posed_lens(&self, keyframe: &Keyframe, learned: Option<&CameraFix>) -> PosedLens {
-        let posed = |keyframe: &Keyframe| learned.map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe));
-        match self.fix(&keyframe.camera) {
-            Some(fix) => PosedLens {
-                color_from_depth: keyframe.depth.as_ref().map(|depth| fix.color_from_depth(keyframe, depth)),
-                ..posed(&fix.corrected(&Keyframe { depth: None, ..keyframe.clone() }))
+    pub(crate) fn calibrated_camera(
+        &self,
+        keyframe: &Keyframe,
+        learned: Option<&CameraCorrection>,
+    ) -> CalibratedCamera {
+        let posed = |keyframe: &Keyframe| {
+            learned.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
+        };
+        match self.correction(&keyframe.camera) {
+            Some(correction) => CalibratedCamera {
+                color_from_depth: keyframe.depth.as_ref().map(|depth| correction.color_from_depth(keyframe, depth)),
+                ..posed(&correction.corrected(&Keyframe { depth: None, ..keyframe.clone() }))
             },
             None => posed(keyframe),
         }
@@ -94,7 +100,7 @@ impl Aligning {
 }
 
 /// Works on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
-pub fn beside_training<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {
         Ok(pool) => pool.install(work),

@@ -1,9 +1,9 @@
 //! What was found so far, and how a step changes it.
 
-use super::frame::Frame;
-use super::layout::{Layout, Term};
-use super::view::View;
-use crate::splat::{CameraFix, moved};
+use super::layout::{CalibrationParam, Layout};
+use super::prepared_image::PreparedImage;
+use super::view::CorrectedView;
+use crate::splat::{CameraCorrection, rigid_transform};
 use kinematics::{Transform, Twist, transform};
 use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;
@@ -11,68 +11,74 @@ use rayon::prelude::*;
 /// One fix a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Corrections {
-    pub(super) fixes: Vec<CameraFix>,
+    pub(super) by_camera: Vec<CameraCorrection>,
 }
 
 impl Corrections {
     pub(super) fn none(n_cameras: usize) -> Self {
-        Self { fixes: vec![CameraFix::default(); n_cameras] }
+        Self { by_camera: vec![CameraCorrection::default(); n_cameras] }
     }
 
     /// The frames' cameras; every frame has depth.
-    pub(super) fn views(&self, frames: &[Frame], layout: &Layout) -> Vec<View> {
-        let view = |frame: &Frame| {
-            View::new(frame, &self.fixes[frame.camera], layout).expect("a frame is made of a keyframe with depth")
+    pub(super) fn views(&self, images: &[PreparedImage], layout: &Layout) -> Vec<CorrectedView> {
+        let view = |image: &PreparedImage| {
+            CorrectedView::new(image, &self.by_camera[image.camera], layout)
+                .expect("a frame is made of a keyframe with depth")
         };
-        frames.par_iter().map(view).collect()
+        images.par_iter().map(view).collect()
     }
 
     /// The value of a term; the mount's as a motion of the camera, which is exact for small ones.
-    pub(super) fn value(&self, term: Term) -> f64 {
-        match term {
-            Term::Mount(camera, part) if part < 3 => -self.fixes[camera].shift_m[part],
-            Term::Mount(camera, part) => -self.fixes[camera].turn_rad[part - 3],
-            Term::Delay(camera) => self.fixes[camera].delay_secs,
-            Term::Joint(joint) => {
-                self.fixes.iter().find_map(|fix| fix.joint_offsets.get(joint)).copied().unwrap_or(0.0)
+    pub(super) fn value(&self, param: CalibrationParam) -> f64 {
+        match param {
+            CalibrationParam::Extrinsics(camera, part) if part < 3 => -self.by_camera[camera].translation_m[part],
+            CalibrationParam::Extrinsics(camera, part) => -self.by_camera[camera].rotation_rad[part - 3],
+            CalibrationParam::TimeOffset(camera) => self.by_camera[camera].time_offset_secs,
+            CalibrationParam::Joint(joint) => {
+                self.by_camera.iter().find_map(|correction| correction.joint_offsets.get(joint)).copied().unwrap_or(0.0)
             }
-            Term::DepthPose(camera, part) if part < 3 => self.fixes[camera].depth_shift_m[part],
-            Term::DepthPose(camera, part) => self.fixes[camera].depth_turn_rad[part - 3],
-            Term::Lens(camera, part) if part < 2 => self.fixes[camera].log_focal[part],
-            Term::Lens(camera, part) => self.fixes[camera].principal_focals[part - 2],
-            Term::DepthScale(camera) => self.fixes[camera].log_depth_scale,
-            Term::Readout(camera) => self.fixes[camera].readout_secs,
+            CalibrationParam::DepthPose(camera, part) if part < 3 => self.by_camera[camera].depth_translation_m[part],
+            CalibrationParam::DepthPose(camera, part) => self.by_camera[camera].depth_rotation_rad[part - 3],
+            CalibrationParam::Lens(camera, part) if part < 2 => self.by_camera[camera].log_focal[part],
+            CalibrationParam::Lens(camera, part) => self.by_camera[camera].principal_offset_focals[part - 2],
+            CalibrationParam::DepthScale(camera) => self.by_camera[camera].log_depth_scale,
+            CalibrationParam::Readout(camera) => self.by_camera[camera].readout_secs,
         }
     }
 
     /// Takes a step along the terms of a layout, in their units.
-    pub(super) fn take(&mut self, layout: &Layout, step: &DVector<f64>) {
-        for (ix, term) in layout.terms.iter().enumerate() {
-            let change = step[ix];
-            match *term {
-                Term::Mount(camera, 0) => {
-                    let fix = &mut self.fixes[camera];
-                    let mount = transform::exp(&twist(step, ix), -1.0) * moved(fix.turn_rad.into(), fix.shift_m.into());
-                    (fix.turn_rad, fix.shift_m) = parts(&mount);
+    pub(super) fn apply_step(&mut self, layout: &Layout, step: &DVector<f64>) {
+        for (ix, param) in layout.params.iter().enumerate() {
+            let delta = step[ix];
+            match *param {
+                CalibrationParam::Extrinsics(camera, 0) => {
+                    let correction = &mut self.by_camera[camera];
+                    let extrinsics = transform::exp(&twist(step, ix), -1.0)
+                        * rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+                    (correction.rotation_rad, correction.translation_m) = rotation_and_translation(&extrinsics);
                 }
-                Term::DepthPose(camera, 0) => {
-                    let fix = &mut self.fixes[camera];
-                    let before = moved(fix.depth_turn_rad.into(), fix.depth_shift_m.into());
-                    (fix.depth_turn_rad, fix.depth_shift_m) = parts(&(transform::exp(&twist(step, ix), 1.0) * before));
+                CalibrationParam::DepthPose(camera, 0) => {
+                    let correction = &mut self.by_camera[camera];
+                    let before =
+                        rigid_transform(correction.depth_rotation_rad.into(), correction.depth_translation_m.into());
+                    (correction.depth_rotation_rad, correction.depth_translation_m) =
+                        rotation_and_translation(&(transform::exp(&twist(step, ix), 1.0) * before));
                 }
-                Term::Mount(..) | Term::DepthPose(..) => {}
-                Term::Delay(camera) => self.fixes[camera].delay_secs += change,
-                Term::Joint(joint) => {
-                    for fix in &mut self.fixes {
-                        let n = fix.joint_offsets.len().max(joint + 1);
-                        fix.joint_offsets.resize(n, 0.0);
-                        fix.joint_offsets[joint] += change;
+                CalibrationParam::Extrinsics(..) | CalibrationParam::DepthPose(..) => {}
+                CalibrationParam::TimeOffset(camera) => self.by_camera[camera].time_offset_secs += delta,
+                CalibrationParam::Joint(joint) => {
+                    for correction in &mut self.by_camera {
+                        let n = correction.joint_offsets.len().max(joint + 1);
+                        correction.joint_offsets.resize(n, 0.0);
+                        correction.joint_offsets[joint] += delta;
                     }
                 }
-                Term::Lens(camera, part) if part < 2 => self.fixes[camera].log_focal[part] += change,
-                Term::Lens(camera, part) => self.fixes[camera].principal_focals[part - 2] += change,
-                Term::DepthScale(camera) => self.fixes[camera].log_depth_scale += change,
-                Term::Readout(camera) => self.fixes[camera].readout_secs += change,
+                CalibrationParam::Lens(camera, part) if part < 2 => self.by_camera[camera].log_focal[part] += delta,
+                CalibrationParam::Lens(camera, part) => {
+                    self.by_camera[camera].principal_offset_focals[part - 2] += delta
+                }
+                CalibrationParam::DepthScale(camera) => self.by_camera[camera].log_depth_scale += delta,
+                CalibrationParam::Readout(camera) => self.by_camera[camera].readout_secs += delta,
             }
         }
     }
@@ -85,6 +91,6 @@ pub(super) fn twist(step: &DVector<f64>, begin: usize) -> Twist {
 }
 
 /// Rotation vector and translation.
-pub(super) fn parts(motion: &Transform) -> ([f64; 3], [f64; 3]) {
+pub(super) fn rotation_and_translation(motion: &Transform) -> ([f64; 3], [f64; 3]) {
     (motion.rotation.scaled_axis().into(), motion.translation.vector.into())
 }

@@ -1,14 +1,14 @@
 //! Which numbers are sought, in which order, and how large each may be.
 
-use super::frame::Frame;
-use crate::splat::TermSet;
+use super::prepared_image::PreparedImage;
+use crate::splat::ParamSet;
 
 /// How large an error may be before one would call it a mistake: what the solver damps towards, and the scale on which a
 /// direction counts as seen or not.
 mod prior {
-    pub(super) const TURN_RAD: f64 = 0.0175; // 1 degree.
-    pub(super) const SHIFT_M: f64 = 0.005;
-    pub(super) const DELAY_SECS: f64 = 0.02;
+    pub(super) const ROTATION_RAD: f64 = 0.0175; // 1 degree.
+    pub(super) const TRANSLATION_M: f64 = 0.005;
+    pub(super) const TIME_OFFSET_SECS: f64 = 0.02;
     pub(super) const JOINT: f64 = 0.01; // Of a radian or metre.
     pub(super) const LENS: f64 = 0.01; // Of the focal length.
     pub(super) const DEPTH_SCALE: f64 = 0.01;
@@ -17,11 +17,11 @@ mod prior {
 
 /// One number that is sought.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Term {
+pub(super) enum CalibrationParam {
     /// Motion of a camera on what carries it, in its own axes: 0 to 2 metres, 3 to 5 radians.
-    Mount(usize, usize),
+    Extrinsics(usize, usize),
     /// Seconds.
-    Delay(usize),
+    TimeOffset(usize),
     /// Of all cameras the arm carries: radians or metres.
     Joint(usize),
     /// Motion of the depth frame in the axes of its camera, as for the mount.
@@ -34,13 +34,13 @@ pub(super) enum Term {
     Readout(usize),
 }
 
-impl Term {
+impl CalibrationParam {
     /// How large it may be, in its own unit.
     pub(super) fn scale(self) -> f64 {
         match self {
-            Self::Mount(_, part) | Self::DepthPose(_, part) if part < 3 => prior::SHIFT_M,
-            Self::Mount(..) | Self::DepthPose(..) => prior::TURN_RAD,
-            Self::Delay(_) => prior::DELAY_SECS,
+            Self::Extrinsics(_, part) | Self::DepthPose(_, part) if part < 3 => prior::TRANSLATION_M,
+            Self::Extrinsics(..) | Self::DepthPose(..) => prior::ROTATION_RAD,
+            Self::TimeOffset(_) => prior::TIME_OFFSET_SECS,
             Self::Joint(_) => prior::JOINT,
             Self::Lens(..) => prior::LENS,
             Self::DepthScale(_) => prior::DEPTH_SCALE,
@@ -52,16 +52,16 @@ impl Term {
 /// The numbers that are sought, in order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Layout {
-    pub(super) terms: Vec<Term>,
-    by_camera: Vec<CameraTerms>,
+    pub(super) params: Vec<CalibrationParam>,
+    by_camera: Vec<CameraParamOffsets>,
     joints: Option<usize>,
 }
 
 /// Where the terms of a camera begin.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(super) struct CameraTerms {
-    pub(super) mount: Option<usize>,
-    pub(super) delay: Option<usize>,
+pub(super) struct CameraParamOffsets {
+    pub(super) extrinsics: Option<usize>,
+    pub(super) time_offset: Option<usize>,
     pub(super) depth_pose: Option<usize>,
     pub(super) lens: Option<usize>,
     pub(super) depth_scale: Option<usize>,
@@ -70,43 +70,43 @@ pub(super) struct CameraTerms {
 
 impl Layout {
     /// The terms of a set that the frames have: a camera that never moves has no delay, one without joints no offsets.
-    pub(super) fn new(set: TermSet, frames: &[Frame], n_cameras: usize) -> Self {
+    pub(super) fn new(set: ParamSet, images: &[PreparedImage], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {
-            let of = || frames.iter().filter(move |frame| frame.camera == camera).map(|frame| &frame.keyframe);
-            let moves = of().any(|keyframe| {
+            let keyframes = || images.iter().filter(move |image| image.camera == camera).map(|image| &image.keyframe);
+            let moves = keyframes().any(|keyframe| {
                 keyframe.twist.is_some_and(|twist| twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 0.0)
             });
-            let rolls = moves && of().any(|keyframe| keyframe.readout_secs > 0.0);
-            let mut begin = |on: bool, n: usize, term: &dyn Fn(usize) -> Term| {
-                let at = layout.terms.len();
+            let has_rolling_shutter = moves && keyframes().any(|keyframe| keyframe.readout_secs > 0.0);
+            let mut allocate = |on: bool, n: usize, param: &dyn Fn(usize) -> CalibrationParam| {
+                let at = layout.params.len();
                 on.then(|| {
-                    layout.terms.extend((0..n).map(term));
+                    layout.params.extend((0..n).map(param));
                     at
                 })
             };
-            layout.by_camera.push(CameraTerms {
-                mount: begin(set.mount, 6, &|part| Term::Mount(camera, part)),
-                delay: begin(set.delay && moves, 1, &|_| Term::Delay(camera)),
-                depth_pose: begin(set.depth_pose, 6, &|part| Term::DepthPose(camera, part)),
-                lens: begin(set.lens, 4, &|part| Term::Lens(camera, part)),
-                depth_scale: begin(set.depth_scale, 1, &|_| Term::DepthScale(camera)),
-                readout: begin(set.readout && rolls, 1, &|_| Term::Readout(camera)),
+            layout.by_camera.push(CameraParamOffsets {
+                extrinsics: allocate(set.extrinsics, 6, &|part| CalibrationParam::Extrinsics(camera, part)),
+                time_offset: allocate(set.time_offset && moves, 1, &|_| CalibrationParam::TimeOffset(camera)),
+                depth_pose: allocate(set.depth_pose, 6, &|part| CalibrationParam::DepthPose(camera, part)),
+                lens: allocate(set.lens, 4, &|part| CalibrationParam::Lens(camera, part)),
+                depth_scale: allocate(set.depth_scale, 1, &|_| CalibrationParam::DepthScale(camera)),
+                readout: allocate(set.readout && has_rolling_shutter, 1, &|_| CalibrationParam::Readout(camera)),
             });
         }
-        let n_joints = frames.iter().map(|frame| frame.keyframe.joint_twists.len()).max().unwrap_or(0);
+        let n_joints = images.iter().map(|image| image.keyframe.joint_twists.len()).max().unwrap_or(0);
         if set.joints && n_joints > 0 {
-            layout.joints = Some(layout.terms.len());
-            layout.terms.extend((0..n_joints).map(Term::Joint));
+            layout.joints = Some(layout.params.len());
+            layout.params.extend((0..n_joints).map(CalibrationParam::Joint));
         }
         layout
     }
 
     pub(super) fn n(&self) -> usize {
-        self.terms.len()
+        self.params.len()
     }
 
-    pub(super) fn of_camera(&self, camera: usize) -> CameraTerms {
+    pub(super) fn of_camera(&self, camera: usize) -> CameraParamOffsets {
         self.by_camera.get(camera).copied().unwrap_or_default()
     }
 

@@ -1,10 +1,10 @@
 //! What alignment found, in words and numbers a person can use.
 
 use super::fit::Fit;
-use super::layout::Term;
-use super::solve::Solved;
-use super::{LEAST_JUDGES, Model, Scene};
-use crate::splat::{CameraFix, Candidate, Trial};
+use super::layout::CalibrationParam;
+use super::solve::Solution;
+use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
+use crate::splat::{CameraCorrection, Candidate, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -13,11 +13,11 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Alignment {
     /// By camera; empty where nothing was kept.
-    pub fixes: BTreeMap<String, CameraFix>,
+    pub corrections: BTreeMap<String, CameraCorrection>,
     /// What was kept, with its uncertainty.
-    pub found: Vec<Found>,
+    pub estimates: Vec<Estimate>,
     /// What the motion does not show of what was kept; it stays at zero.
-    pub unseen: Vec<Unseen>,
+    pub unobservable: Vec<Unobservable>,
     /// What was tried, and how much better it predicts the selection images.
     pub trials: Vec<Trial>,
     /// Pairs of images that were compared.
@@ -26,18 +26,18 @@ pub struct Alignment {
 
 /// A correction. Deviations are standard ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "what", rename_all = "kebab-case")]
-pub enum Found {
+#[serde(tag = "parameter", rename_all = "kebab-case")]
+pub enum Estimate {
     /// The camera sits elsewhere on what carries it: a turn about an axis and a way, both in its own axes as the input has them.
-    HandEye(Moved),
+    HandEye(PoseEstimate),
     /// The depth frame sits elsewhere in the color frame, in whose axes this is told.
-    DepthPose(Moved),
+    DepthPose(PoseEstimate),
     /// Images were taken later than their stamps say.
-    Delay(Number),
+    TimeOffset(ScalarEstimate),
     /// Readings of depth want this factor, less 1.
-    DepthScale(Number),
+    DepthScale(ScalarEstimate),
     /// The readout takes longer, seconds.
-    Readout(Number),
+    Readout(ScalarEstimate),
     /// What is to be added to a joint's reading.
     Joint {
         /// In the order of the chain's moving joints.
@@ -47,7 +47,7 @@ pub enum Found {
         /// Radians or metres.
         sigma: f64,
         /// Share of it that only shows together with something else, 0 to 1.
-        unseen_share: f64,
+        unobservable_frac: f64,
     },
     /// The lens.
     Lens {
@@ -58,9 +58,9 @@ pub enum Found {
         /// Their deviations.
         focal_sigma: [f64; 2],
         /// Shift of the principal point, in focal lengths.
-        principal_focals: [f64; 2],
+        principal_offset_focals: [f64; 2],
         /// Their deviations.
-        principal_sigma: [f64; 2],
+        principal_offset_sigma: [f64; 2],
     },
     /// Images that were moved on their own.
     ImagePoses {
@@ -77,26 +77,26 @@ pub enum Found {
 
 /// A rigid motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Moved {
+pub struct PoseEstimate {
     /// Name of the camera.
     pub camera: String,
     /// Radians.
-    pub turn_rad: f64,
+    pub rotation_rad: f64,
     /// Radians.
-    pub turn_sigma_rad: f64,
+    pub rotation_sigma_rad: f64,
     /// Of length one; zero where nothing turned.
-    pub turn_axis: [f64; 3],
+    pub rotation_axis: [f64; 3],
     /// Metres.
-    pub shift_m: f64,
+    pub translation_m: f64,
     /// Metres.
-    pub shift_sigma_m: f64,
+    pub translation_sigma_m: f64,
     /// Of length one; zero where nothing moved.
-    pub shift_axis: [f64; 3],
+    pub translation_axis: [f64; 3],
 }
 
 /// One number of one camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Number {
+pub struct ScalarEstimate {
     /// Name of the camera.
     pub camera: String,
     /// Seconds, or a share of one.
@@ -107,154 +107,211 @@ pub struct Number {
 
 /// A direction that the motion does not show: a change of all these together leaves every pair as it is.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Unseen {
+pub struct Unobservable {
     /// Words, one part each.
     pub parts: Vec<String>,
 }
 
-pub(super) fn alignment(scene: &Scene, kept: &Model, trials: Vec<Trial>, unseen: Vec<Unseen>) -> Alignment {
-    let mut found = Vec::new();
+pub(super) fn alignment(
+    scene: &AlignmentScene,
+    kept: &CalibrationModel,
+    trials: Vec<Trial>,
+    unobservable: Vec<Unobservable>,
+) -> Alignment {
+    let mut estimates = Vec::new();
     if let Some(fit) = &kept.fit {
-        for (ix, term) in fit.layout.terms.iter().enumerate() {
-            found.extend(self::found(scene, kept, &fit.solved, ix, *term));
+        for (ix, param) in fit.layout.params.iter().enumerate() {
+            estimates.extend(self::estimate(scene, kept, &fit.solution, ix, *param));
         }
     }
     if kept.set.image_poses {
-        found.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
-            let drift = &kept.corrections.fixes[camera].drift;
+        estimates.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
+            let drift = &kept.corrections.by_camera[camera].drift;
             let rms = |parts: std::ops::Range<usize>| {
                 let squares = drift.values().map(|drift| drift[parts.clone()].iter().map(|x| x * x).sum::<f64>());
                 (squares.sum::<f64>() / drift.len().max(1) as f64).sqrt()
             };
-            Found::ImagePoses { camera: name.to_string(), n_images: drift.len(), rms_m: rms(3..6), rms_rad: rms(0..3) }
+            Estimate::ImagePoses {
+                camera: name.to_string(),
+                n_images: drift.len(),
+                rms_m: rms(3..6),
+                rms_rad: rms(0..3),
+            }
         }));
     }
-    let fixes = scene.cameras.iter().zip(&kept.corrections.fixes).map(|(name, fix)| (name.to_string(), fix.clone()));
-    let fixes = if kept.set.any() { fixes.collect() } else { BTreeMap::new() };
-    Alignment { fixes, found, unseen, trials, n_pairs: scene.pairs.len() }
+    let corrections = scene
+        .cameras
+        .iter()
+        .zip(&kept.corrections.by_camera)
+        .map(|(name, correction)| (name.to_string(), correction.clone()));
+    let corrections = if kept.set.any() { corrections.collect() } else { BTreeMap::new() };
+    Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
 }
 
 /// What is said where a term's first number stands.
-fn found(scene: &Scene, kept: &Model, solved: &Solved, ix: usize, term: Term) -> Option<Found> {
-    let fix = |camera: usize| &kept.corrections.fixes[camera];
+fn estimate(
+    scene: &AlignmentScene,
+    kept: &CalibrationModel,
+    solution: &Solution,
+    ix: usize,
+    param: CalibrationParam,
+) -> Option<Estimate> {
+    let correction = |camera: usize| &kept.corrections.by_camera[camera];
     let name = |camera: usize| scene.cameras[camera].to_string();
-    let number = |camera: usize, value: f64| Number { camera: name(camera), value, sigma: solved.sigma(ix) };
-    Some(match term {
-        Term::Mount(camera, 0) => {
-            let was = crate::splat::moved(fix(camera).turn_rad.into(), fix(camera).shift_m.into()).inverse();
-            Found::HandEye(moved(name(camera), was.rotation.scaled_axis(), was.translation.vector, solved, ix))
+    let number = |camera: usize, value: f64| ScalarEstimate { camera: name(camera), value, sigma: solution.sigma(ix) };
+    Some(match param {
+        CalibrationParam::Extrinsics(camera, 0) => {
+            let wrong_extrinsics = crate::splat::rigid_transform(
+                correction(camera).rotation_rad.into(),
+                correction(camera).translation_m.into(),
+            )
+            .inverse();
+            Estimate::HandEye(pose_estimate(
+                name(camera),
+                wrong_extrinsics.rotation.scaled_axis(),
+                wrong_extrinsics.translation.vector,
+                solution,
+                ix,
+            ))
         }
-        Term::DepthPose(camera, 0) => {
-            let (turn, shift) = (fix(camera).depth_turn_rad.into(), fix(camera).depth_shift_m.into());
-            Found::DepthPose(moved(name(camera), turn, shift, solved, ix))
+        CalibrationParam::DepthPose(camera, 0) => {
+            let (rotation, translation) =
+                (correction(camera).depth_rotation_rad.into(), correction(camera).depth_translation_m.into());
+            Estimate::DepthPose(pose_estimate(name(camera), rotation, translation, solution, ix))
         }
-        Term::Delay(camera) => Found::Delay(number(camera, fix(camera).delay_secs)),
-        Term::DepthScale(camera) => Found::DepthScale(number(camera, fix(camera).log_depth_scale.exp_m1())),
-        Term::Readout(camera) => Found::Readout(number(camera, fix(camera).readout_secs)),
-        Term::Joint(joint_ix) => Found::Joint {
+        CalibrationParam::TimeOffset(camera) => {
+            Estimate::TimeOffset(number(camera, correction(camera).time_offset_secs))
+        }
+        CalibrationParam::DepthScale(camera) => {
+            Estimate::DepthScale(number(camera, correction(camera).log_depth_scale.exp_m1()))
+        }
+        CalibrationParam::Readout(camera) => Estimate::Readout(number(camera, correction(camera).readout_secs)),
+        CalibrationParam::Joint(joint_ix) => Estimate::Joint {
             joint_ix,
-            value: kept.corrections.value(term),
-            sigma: solved.sigma(ix),
-            unseen_share: solved.unseen_share(ix),
+            value: kept.corrections.value(param),
+            sigma: solution.sigma(ix),
+            unobservable_frac: solution.unobservable_frac(ix),
         },
-        Term::Lens(camera, 0) => Found::Lens {
+        CalibrationParam::Lens(camera, 0) => Estimate::Lens {
             camera: name(camera),
-            focal_frac: fix(camera).log_focal.map(f64::exp_m1),
-            focal_sigma: [solved.sigma(ix), solved.sigma(ix + 1)],
-            principal_focals: fix(camera).principal_focals,
-            principal_sigma: [solved.sigma(ix + 2), solved.sigma(ix + 3)],
+            focal_frac: correction(camera).log_focal.map(f64::exp_m1),
+            focal_sigma: [solution.sigma(ix), solution.sigma(ix + 1)],
+            principal_offset_focals: correction(camera).principal_offset_focals,
+            principal_offset_sigma: [solution.sigma(ix + 2), solution.sigma(ix + 3)],
         },
-        Term::Mount(..) | Term::DepthPose(..) | Term::Lens(..) => return None,
+        CalibrationParam::Extrinsics(..) | CalibrationParam::DepthPose(..) | CalibrationParam::Lens(..) => return None,
     })
 }
 
-fn moved(camera: String, turn: Vector3<f64>, shift: Vector3<f64>, solved: &Solved, begin: usize) -> Moved {
+fn pose_estimate(
+    camera: String,
+    rotation: Vector3<f64>,
+    translation: Vector3<f64>,
+    solution: &Solution,
+    begin: usize,
+) -> PoseEstimate {
     let part = |vector: Vector3<f64>, begin: usize| {
         let axis = vector.try_normalize(0.0).unwrap_or_else(Vector3::zeros);
-        let mut weights = DVector::zeros(solved.step.len());
+        let mut weights = DVector::zeros(solution.step.len());
         weights.rows_mut(begin, 3).copy_from(&axis);
-        (vector.norm(), solved.variance(&weights).sqrt(), axis.into())
+        (vector.norm(), solution.variance(&weights).sqrt(), axis.into())
     };
-    let (turn_rad, turn_sigma_rad, turn_axis) = part(turn, begin + 3);
-    let (shift_m, shift_sigma_m, shift_axis) = part(shift, begin);
-    Moved { camera, turn_rad, turn_sigma_rad, turn_axis, shift_m, shift_sigma_m, shift_axis }
+    let (rotation_rad, rotation_sigma_rad, rotation_axis) = part(rotation, begin + 3);
+    let (translation_m, translation_sigma_m, translation_axis) = part(translation, begin);
+    PoseEstimate {
+        camera,
+        rotation_rad,
+        rotation_sigma_rad,
+        rotation_axis,
+        translation_m,
+        translation_sigma_m,
+        translation_axis,
+    }
 }
 
 /// Directions that a fit cannot tell.
-pub(super) fn unseen(scene: &Scene, fit: &Fit) -> Vec<Unseen> {
-    let carries_way = |ix: usize| !matches!(fit.layout.terms[ix], Term::Mount(_, 0..3) | Term::DepthPose(_, 0..3));
-    let directions = fit.solved.unseen(carries_way);
-    directions.iter().map(|direction| named(scene, &fit.layout.terms, direction)).collect()
+pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
+    let is_not_translation = |ix: usize| {
+        !matches!(fit.layout.params[ix], CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3))
+    };
+    let directions = fit.solution.unobservable(is_not_translation);
+    directions.iter().map(|direction| describe(scene, &fit.layout.params, direction)).collect()
 }
 
-fn named(scene: &Scene, terms: &[Term], direction: &DVector<f64>) -> Unseen {
+fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVector<f64>) -> Unobservable {
     /// Parts below this share of the largest are left out.
-    const SMALL: f64 = 0.1;
-    let scaled: Vec<f64> = terms.iter().enumerate().map(|(ix, term)| direction[ix] / term.scale()).collect();
+    const MIN_SHARE: f64 = 0.1;
+    let scaled: Vec<f64> = params.iter().enumerate().map(|(ix, param)| direction[ix] / param.scale()).collect();
     let largest = scaled.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
-    let matters = |ix: usize, n: usize| scaled[ix..ix + n].iter().any(|value| value.abs() > SMALL * largest);
+    let is_significant = |ix: usize, n: usize| scaled[ix..ix + n].iter().any(|value| value.abs() > MIN_SHARE * largest);
     let axis = |ix: usize| {
         let along = Vector3::from_fn(|row, _| direction[ix + row]).normalize();
         format!("({:.2} {:.2} {:.2})", along.x, along.y, along.z)
     };
     let mut parts = Vec::new();
-    for (ix, term) in terms.iter().enumerate() {
+    for (ix, param) in params.iter().enumerate() {
         let name = |camera: usize| &scene.cameras[camera];
-        parts.extend(match *term {
-            Term::Mount(camera, 0) if matters(ix, 3) => {
+        parts.extend(match *param {
+            CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => {
                 Some(format!("translation of camera {:?} along {} of its own axes", name(camera), axis(ix)))
             }
-            Term::Mount(camera, 3) if matters(ix, 3) => {
+            CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => {
                 Some(format!("turn of camera {:?} about {} of its own axes", name(camera), axis(ix)))
             }
-            Term::DepthPose(camera, 0) if matters(ix, 3) => {
+            CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => {
                 Some(format!("translation of the depth frame of camera {:?} along {}", name(camera), axis(ix)))
             }
-            Term::DepthPose(camera, 3) if matters(ix, 3) => {
+            CalibrationParam::DepthPose(camera, 3) if is_significant(ix, 3) => {
                 Some(format!("turn of the depth frame of camera {:?} about {}", name(camera), axis(ix)))
             }
-            Term::Joint(joint) if matters(ix, 1) => Some(format!("offset of joint {joint}")),
-            Term::Delay(camera) if matters(ix, 1) => Some(format!("delay of camera {:?}", name(camera))),
-            Term::DepthScale(camera) if matters(ix, 1) => {
+            CalibrationParam::Joint(joint) if is_significant(ix, 1) => Some(format!("offset of joint {joint}")),
+            CalibrationParam::TimeOffset(camera) if is_significant(ix, 1) => {
+                Some(format!("delay of camera {:?}", name(camera)))
+            }
+            CalibrationParam::DepthScale(camera) if is_significant(ix, 1) => {
                 Some(format!("scale of the depth of camera {:?}", name(camera)))
             }
-            Term::Readout(camera) if matters(ix, 1) => Some(format!("readout time of camera {:?}", name(camera))),
-            Term::Lens(camera, part) if matters(ix, 1) => {
-                let what = [
+            CalibrationParam::Readout(camera) if is_significant(ix, 1) => {
+                Some(format!("readout time of camera {:?}", name(camera)))
+            }
+            CalibrationParam::Lens(camera, part) if is_significant(ix, 1) => {
+                let names = [
                     "focal length along x",
                     "focal length along y",
                     "principal point along x",
                     "principal point along y",
                 ];
-                Some(format!("{} of camera {:?}", what[part], name(camera)))
+                Some(format!("{} of camera {:?}", names[part], name(camera)))
             }
             _ => None,
         });
     }
-    Unseen { parts }
+    Unobservable { parts }
 }
 
 impl Alignment {
     /// Whether anything was kept.
-    pub fn is_any(&self) -> bool {
-        !self.fixes.is_empty()
+    pub fn has_corrections(&self) -> bool {
+        !self.corrections.is_empty()
     }
 
     /// Whether there were enough images to tell what pays.
-    pub fn is_judged(&self) -> bool {
-        self.trials.iter().all(|trial| trial.n_images >= LEAST_JUDGES)
+    pub fn has_enough_validation_images(&self) -> bool {
+        self.trials.iter().all(|trial| trial.n_images >= MIN_VALIDATION_IMAGES)
     }
 
     /// Whether images got poses of their own.
     pub fn has_image_poses(&self) -> bool {
-        let of_images = |terms: &Candidate| matches!(terms, Candidate::Cameras(terms) if terms.image_poses);
-        self.trials.iter().any(|trial| trial.kept && of_images(&trial.candidate))
+        let is_image_poses = |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.image_poses);
+        self.trials.iter().any(|trial| trial.kept && is_image_poses(&trial.candidate))
     }
 
     /// One line each: what was found, what cannot be seen, what was tried and not needed.
     pub fn lines(&self) -> Vec<String> {
-        let mut lines: Vec<String> = self.found.iter().map(ToString::to_string).collect();
-        lines.extend(self.unseen.iter().map(|unseen| format!("cannot be seen in this motion: {unseen}")));
+        let mut lines: Vec<String> = self.estimates.iter().map(ToString::to_string).collect();
+        lines.extend(
+            self.unobservable.iter().map(|unobservable| format!("cannot be seen in this motion: {unobservable}")),
+        );
         for trial in &self.trials {
             lines.push(format!(
                 "{}: {:+.2} dB (standard error {:.2}) on {} selection images: {}",
@@ -264,7 +321,7 @@ impl Alignment {
                 trial.n_images,
                 match trial.kept {
                     true => "kept",
-                    false if trial.n_images < LEAST_JUDGES => "too few to judge by",
+                    false if trial.n_images < MIN_VALIDATION_IMAGES => "too few to judge by",
                     false => "not needed",
                 }
             ));
@@ -273,51 +330,51 @@ impl Alignment {
     }
 }
 
-impl std::fmt::Display for Unseen {
+impl std::fmt::Display for Unobservable {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(&self.parts.join(" together with "))
     }
 }
 
-impl std::fmt::Display for Moved {
+impl std::fmt::Display for PoseEstimate {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let [ax, ay, az] = self.turn_axis;
-        let [sx, sy, sz] = self.shift_axis;
+        let [ax, ay, az] = self.rotation_axis;
+        let [sx, sy, sz] = self.translation_axis;
         write!(
             f,
             "turned by {:.3} +- {:.3} degrees about ({ax:.2} {ay:.2} {az:.2}), moved by {:.2} +- {:.2} mm along ({sx:.2} {sy:.2} {sz:.2})",
-            self.turn_rad.to_degrees(),
-            self.turn_sigma_rad.to_degrees(),
-            1e3 * self.shift_m,
-            1e3 * self.shift_sigma_m,
+            self.rotation_rad.to_degrees(),
+            self.rotation_sigma_rad.to_degrees(),
+            1e3 * self.translation_m,
+            1e3 * self.translation_sigma_m,
         )
     }
 }
 
-impl std::fmt::Display for Found {
+impl std::fmt::Display for Estimate {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
-            Self::HandEye(moved) => write!(f, "hand-eye of {}: {moved}", moved.camera),
-            Self::DepthPose(moved) => write!(f, "depth frame of {}: {moved}", moved.camera),
-            Self::Delay(Number { camera, value, sigma }) => {
+            Self::HandEye(pose_estimate) => write!(f, "hand-eye of {}: {pose_estimate}", pose_estimate.camera),
+            Self::DepthPose(pose_estimate) => write!(f, "depth frame of {}: {pose_estimate}", pose_estimate.camera),
+            Self::TimeOffset(ScalarEstimate { camera, value, sigma }) => {
                 write!(f, "delay of {camera}: {:.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
             }
-            Self::DepthScale(Number { camera, value, sigma }) => {
+            Self::DepthScale(ScalarEstimate { camera, value, sigma }) => {
                 write!(f, "depth of {camera}: times {:.4} +- {sigma:.4}", 1.0 + value)
             }
-            Self::Readout(Number { camera, value, sigma }) => {
+            Self::Readout(ScalarEstimate { camera, value, sigma }) => {
                 write!(f, "readout of {camera}: {:+.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
             }
-            Self::Joint { joint_ix, value, sigma, unseen_share } => {
+            Self::Joint { joint_ix, value, sigma, unobservable_frac } => {
                 let (value, sigma) = (value.to_degrees(), sigma.to_degrees());
                 write!(f, "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees")?;
-                if *unseen_share > 0.1 {
+                if *unobservable_frac > 0.1 {
                     f.write_str(", of which a part cannot be told from something else")
                 } else {
                     Ok(())
                 }
             }
-            Self::Lens { camera, focal_frac, focal_sigma, principal_focals, principal_sigma } => {
+            Self::Lens { camera, focal_frac, focal_sigma, principal_offset_focals, principal_offset_sigma } => {
                 let percent = |value: f64| 100.0 * value;
                 write!(
                     f,
@@ -326,10 +383,10 @@ impl std::fmt::Display for Found {
                     percent(focal_sigma[0]),
                     percent(focal_frac[1]),
                     percent(focal_sigma[1]),
-                    percent(principal_focals[0]),
-                    percent(principal_sigma[0]),
-                    percent(principal_focals[1]),
-                    percent(principal_sigma[1]),
+                    percent(principal_offset_focals[0]),
+                    percent(principal_offset_sigma[0]),
+                    percent(principal_offset_focals[1]),
+                    percent(principal_offset_sigma[1]),
                 )
             }
             Self::ImagePoses { camera, n_images, rms_m, rms_rad } => write!(

@@ -1,7 +1,7 @@
 //! A room of textured planes seen by a camera on an arm of four joints, with one thing wrong at a time.
 
 use super::*;
-use crate::splat::CameraFix;
+use crate::splat::CameraCorrection;
 use crate::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -16,19 +16,19 @@ pub(crate) type Joints = [f64; 4];
 
 /// Azimuth, elevation, roll (radians) and reach (metres).
 fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
-    let turn = |axis: Vector3<f64>, angle: f64| {
+    let rotation = |axis: Vector3<f64>, angle: f64| {
         Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_scaled_axis(axis * angle))
     };
-    let shift = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
+    let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
     // At zero the flange looks along x, with x to the right: -y of the base.
-    let looking =
+    let look_at =
         UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
-    turn(Vector3::z(), azimuth)
-        * shift(0.1, 0.0, 0.5)
-        * turn(Vector3::y(), elevation)
-        * shift(reach, 0.05, 0.0)
-        * turn(Vector3::x(), roll)
-        * Isometry3::from_parts(Translation3::identity(), looking)
+    rotation(Vector3::z(), azimuth)
+        * translation(0.1, 0.0, 0.5)
+        * rotation(Vector3::y(), elevation)
+        * translation(reach, 0.05, 0.0)
+        * rotation(Vector3::x(), roll)
+        * Isometry3::from_parts(Translation3::identity(), look_at)
 }
 
 fn flange_from_camera() -> Transform {
@@ -84,10 +84,10 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
 
 /// What is wrong, and how noisy images are.
 #[derive(Clone)]
-pub(crate) struct Wrong {
+pub(crate) struct Miscalibration {
     /// The input has the camera at the true pose times this.
-    pub(crate) mount: Transform,
-    pub(crate) delay_secs: f64,
+    pub(crate) extrinsics: Transform,
+    pub(crate) time_offset_secs: f64,
     pub(crate) joints: Joints,
     /// The input has the depth frame at the true pose times this.
     pub(crate) depth_pose: Transform,
@@ -95,23 +95,23 @@ pub(crate) struct Wrong {
     pub(crate) depth_frac: f64,
     pub(crate) readout_secs: f64,
     pub(crate) azimuth_only: bool,
-    pub(crate) rolls: bool,
+    pub(crate) has_rolling_shutter: bool,
     pub(crate) noise: f64,
     pub(crate) seed: u64,
 }
 
-impl Wrong {
-    pub(crate) fn nothing() -> Self {
+impl Miscalibration {
+    pub(crate) fn none() -> Self {
         Self {
-            mount: Transform::identity(),
-            delay_secs: 0.0,
+            extrinsics: Transform::identity(),
+            time_offset_secs: 0.0,
             joints: [0.0; 4],
             depth_pose: Transform::identity(),
             focal_frac: 0.0,
             depth_frac: 0.0,
             readout_secs: 0.0,
             azimuth_only: false,
-            rolls: false,
+            has_rolling_shutter: false,
             noise: 1.0,
             seed: 1,
         }
@@ -132,26 +132,29 @@ fn noise(key: u64) -> f64 {
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bytes and stamps of a test")]
-pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
+pub(crate) fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
     let image = |ix: usize| {
         let secs = 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin();
-        let joints = |secs: f64| joints_at(secs, wrong.azimuth_only);
+        let joints = |secs: f64| joints_at(secs, miscalibration.azimuth_only);
         let [width, height] = SIZE_PX.map(|side| side as usize);
-        let looked = |pose: &Transform, x: usize, y: usize| {
+        let cast_pixel = |pose: &Transform, x: usize, y: usize| {
             let at = [x as f64 + 0.5, y as f64 + 0.5];
             let ray =
                 Vector3::new((at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0], (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1], 1.0);
             cast(Point3::from(pose.translation.vector), pose.rotation * ray)
         };
-        let key =
-            |pixel: usize, stream: u64| wrong.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream;
+        let key = |pixel: usize, stream: u64| {
+            miscalibration.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream
+        };
         let mut rgba = Vec::new();
         for y in 0..height {
             let share = (y as f64 + 0.5) / height as f64 - 0.5;
-            let pose = camera_at(joints(secs + if wrong.rolls { share * READOUT_SECS } else { 0.0 }));
+            let pose =
+                camera_at(joints(secs + if miscalibration.has_rolling_shutter { share * READOUT_SECS } else { 0.0 }));
             for x in 0..width {
-                let (_, value) = looked(&pose, x, y);
-                let value = (value + wrong.noise * noise(key(y * width + x, 0))).round().clamp(0.0, 255.0) as u8;
+                let (_, value) = cast_pixel(&pose, x, y);
+                let value =
+                    (value + miscalibration.noise * noise(key(y * width + x, 0))).round().clamp(0.0, 255.0) as u8;
                 rgba.extend([value, value, value, 255]);
             }
         }
@@ -159,18 +162,22 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
         let depth_pose = camera_at(joints(secs)) * depth_from_true;
         let depth_m: Vec<f32> = (0..width * height)
             .map(|pixel| {
-                let z = looked(&depth_pose, pixel % width, pixel / width).0;
-                ((z + 0.0007 * wrong.noise * z * z * noise(key(pixel, 1))) * (1.0 - wrong.depth_frac)) as f32
+                let z = cast_pixel(&depth_pose, pixel % width, pixel / width).0;
+                ((z + 0.0007 * miscalibration.noise * z * z * noise(key(pixel, 1))) * (1.0 - miscalibration.depth_frac))
+                    as f32
             })
             .collect();
-        let claimed_joints = {
-            let moved = joints(secs - wrong.delay_secs);
-            std::array::from_fn(|joint| moved[joint] - wrong.joints[joint])
+        let reported_joints = {
+            let moved = joints(secs - miscalibration.time_offset_secs);
+            std::array::from_fn(|joint| moved[joint] - miscalibration.joints[joint])
         };
-        let claimed = camera_at(claimed_joints) * wrong.mount;
-        let attached = |twist: Twist| twist.of_attached(&wrong.mount);
+        let reported = camera_at(reported_joints) * miscalibration.extrinsics;
+        let attached = |twist: Twist| twist.of_attached(&miscalibration.extrinsics);
         let rates = {
-            let (before, after) = (joints(secs - wrong.delay_secs - 1e-4), joints(secs - wrong.delay_secs + 1e-4));
+            let (before, after) = (
+                joints(secs - miscalibration.time_offset_secs - 1e-4),
+                joints(secs - miscalibration.time_offset_secs + 1e-4),
+            );
             std::array::from_fn(|joint| (after[joint] - before[joint]) / 2e-4)
         };
         let unit = |joint: usize| std::array::from_fn(|other| if joint == other { 1.0 } else { 0.0 });
@@ -178,7 +185,7 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
             camera: "wrist".into(),
             stamp: Stamp((secs * 1e9) as i64),
             size_px: SIZE_PX,
-            focal_px: FOCAL_PX.map(|focal| focal * (1.0 + wrong.focal_frac)),
+            focal_px: FOCAL_PX.map(|focal| focal * (1.0 + miscalibration.focal_frac)),
             principal_px: PRINCIPAL_PX,
             rgba_srgb: rgba.into(),
             depth: Some(DepthMap {
@@ -186,12 +193,16 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
                 focal_px: FOCAL_PX,
                 principal_px: PRINCIPAL_PX,
                 depth_m: depth_m.into(),
-                world_from_camera: claimed * depth_from_true * wrong.depth_pose,
+                world_from_camera: reported * depth_from_true * miscalibration.depth_pose,
             }),
-            world_from_camera: claimed,
-            twist: Some(attached(twist_along(claimed_joints, rates))),
-            readout_secs: if wrong.rolls { READOUT_SECS - wrong.readout_secs } else { 0.0 },
-            joint_twists: (0..4).map(|joint| attached(twist_along(claimed_joints, unit(joint)))).collect(),
+            world_from_camera: reported,
+            twist: Some(attached(twist_along(reported_joints, rates))),
+            readout_secs: if miscalibration.has_rolling_shutter {
+                READOUT_SECS - miscalibration.readout_secs
+            } else {
+                0.0
+            },
+            joint_twists: (0..4).map(|joint| attached(twist_along(reported_joints, unit(joint)))).collect(),
             base: None,
             split: Split::of(ix),
             truth: None,
@@ -200,264 +211,287 @@ pub(crate) fn capture(wrong: &Wrong) -> Vec<Arc<Keyframe>> {
     (0..N_IMAGES).into_par_iter().map(image).collect()
 }
 
-fn given(wrong: &Wrong, change: fn(&mut TermSet)) -> Alignment {
-    let mut set = TermSet::default();
+fn align_given(miscalibration: &Miscalibration, change: fn(&mut ParamSet)) -> Alignment {
+    let mut set = ParamSet::default();
     change(&mut set);
-    align(&capture(wrong), &CameraChoice::Given(set)).unwrap()
+    align(&capture(miscalibration), &CameraRefinement::Always(set)).unwrap()
 }
 
-fn tried(wrong: &Wrong) -> Alignment {
-    align(&capture(wrong), &CameraChoice::Try(candidates())).unwrap()
+fn align_by_trials(miscalibration: &Miscalibration) -> Alignment {
+    align(&capture(miscalibration), &CameraRefinement::Try(candidates())).unwrap()
 }
 
-pub(crate) fn wrong_mount() -> Transform {
+pub(crate) fn wrong_extrinsics() -> Transform {
     Transform::new(Vector3::new(0.003, -0.0035, 0.002), Vector3::new(0.01, 0.012, -0.008))
 }
 
 /// Turn and way of what is left of a mount, degrees and millimetres.
-pub(crate) fn left(fix: &CameraFix, wrong: &Transform) -> (f64, f64) {
-    let found = crate::splat::moved(fix.turn_rad.into(), fix.shift_m.into());
-    let left = wrong * found.inverse();
-    (left.rotation.angle().to_degrees(), 1e3 * left.translation.vector.norm())
+pub(crate) fn remaining(correction: &CameraCorrection, miscalibration: &Transform) -> (f64, f64) {
+    let estimated = crate::splat::rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+    let remaining = miscalibration * estimated.inverse();
+    (remaining.rotation.angle().to_degrees(), 1e3 * remaining.translation.vector.norm())
 }
 
 #[test]
-fn a_wrong_mount_is_found() {
-    let wrong = Wrong { mount: wrong_mount(), ..Wrong::nothing() };
-    let alignment = given(&wrong, |set| set.mount = true);
-    let (degrees, mm) = left(&alignment.fixes["wrist"], &wrong.mount);
+fn wrong_extrinsics_are_found() {
+    let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+    let alignment = align_given(&miscalibration, |set| set.extrinsics = true);
+    let (degrees, mm) = remaining(&alignment.corrections["wrist"], &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
 }
 
 #[test]
-fn a_wrong_delay_is_found() {
-    let alignment = given(&Wrong { delay_secs: 0.02, ..Wrong::nothing() }, |set| set.delay = true);
-    assert!((alignment.fixes["wrist"].delay_secs - 0.02).abs() < 5e-4);
+fn wrong_time_offset_is_found() {
+    let alignment =
+        align_given(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }, |set| set.time_offset = true);
+    assert!((alignment.corrections["wrist"].time_offset_secs - 0.02).abs() < 5e-4);
 }
 
 #[test]
-fn wrong_joints_are_found() {
-    let wrong = Wrong { joints: [0.0, 0.009, -0.007, 0.002], ..Wrong::nothing() };
-    let alignment = given(&wrong, |set| set.joints = true);
-    let offsets = &alignment.fixes["wrist"].joint_offsets;
+fn wrong_joint_offsets_are_found() {
+    let miscalibration = Miscalibration { joints: [0.0, 0.009, -0.007, 0.002], ..Miscalibration::none() };
+    let alignment = align_given(&miscalibration, |set| set.joints = true);
+    let offsets = &alignment.corrections["wrist"].joint_offsets;
     for joint in 1..4 {
-        assert!((offsets[joint] - wrong.joints[joint]).abs() < 5e-4, "{offsets:?}");
+        assert!((offsets[joint] - miscalibration.joints[joint]).abs() < 5e-4, "{offsets:?}");
     }
     // The first joint turns the whole world.
-    assert!(offsets[0].abs() < 1e-4 && alignment.unseen.len() == 1, "{offsets:?} {:?}", alignment.unseen);
-    assert_eq!(alignment.unseen[0].parts, ["offset of joint 0"]);
+    assert!(offsets[0].abs() < 1e-4 && alignment.unobservable.len() == 1, "{offsets:?} {:?}", alignment.unobservable);
+    assert_eq!(alignment.unobservable[0].parts, ["offset of joint 0"]);
 }
 
 #[test]
-fn a_wrong_depth_pose_is_found() {
-    let off = Transform::new(Vector3::new(0.004, -0.003, 0.002), Vector3::new(-0.006, 0.008, 0.005));
-    let alignment = given(&Wrong { depth_pose: off, ..Wrong::nothing() }, |set| set.depth_pose = true);
-    let fix = &alignment.fixes["wrist"];
+fn wrong_depth_pose_is_found() {
+    let deviation = Transform::new(Vector3::new(0.004, -0.003, 0.002), Vector3::new(-0.006, 0.008, 0.005));
+    let alignment =
+        align_given(&Miscalibration { depth_pose: deviation, ..Miscalibration::none() }, |set| set.depth_pose = true);
+    let correction = &alignment.corrections["wrist"];
     // The input has true * off; the fix stands on the left of color_from_depth.
     let base = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
-    let found = crate::splat::moved(fix.depth_turn_rad.into(), fix.depth_shift_m.into()) * base * off;
-    let left = base.inverse() * found;
-    assert!(left.rotation.angle().to_degrees() < 0.06 && left.translation.vector.norm() < 1e-3, "{left:?}");
+    let estimated =
+        crate::splat::rigid_transform(correction.depth_rotation_rad.into(), correction.depth_translation_m.into())
+            * base
+            * deviation;
+    let remaining = base.inverse() * estimated;
+    assert!(
+        remaining.rotation.angle().to_degrees() < 0.06 && remaining.translation.vector.norm() < 1e-3,
+        "{remaining:?}"
+    );
 }
 
 #[test]
-fn a_wrong_lens_is_found() {
-    let alignment = given(&Wrong { focal_frac: 0.01, ..Wrong::nothing() }, |set| set.lens = true);
-    let fix = &alignment.fixes["wrist"];
-    assert!(fix.log_focal.iter().all(|log| (log.exp() * 1.01 - 1.0).abs() < 1.5e-3), "{fix:?}");
-    assert!(fix.principal_focals.iter().all(|shift| shift.abs() < 1.5e-3), "{fix:?}");
+fn wrong_lens_is_found() {
+    let alignment = align_given(&Miscalibration { focal_frac: 0.01, ..Miscalibration::none() }, |set| set.lens = true);
+    let correction = &alignment.corrections["wrist"];
+    assert!(correction.log_focal.iter().all(|log| (log.exp() * 1.01 - 1.0).abs() < 1.5e-3), "{correction:?}");
+    assert!(correction.principal_offset_focals.iter().all(|translation| translation.abs() < 1.5e-3), "{correction:?}");
 }
 
 #[test]
-fn a_wrong_scale_of_depth_is_found() {
-    let alignment = given(&Wrong { depth_frac: 0.01, ..Wrong::nothing() }, |set| set.depth_scale = true);
-    assert!((alignment.fixes["wrist"].log_depth_scale.exp() * 0.99 - 1.0).abs() < 1e-3);
+fn wrong_depth_scale_is_found() {
+    let alignment =
+        align_given(&Miscalibration { depth_frac: 0.01, ..Miscalibration::none() }, |set| set.depth_scale = true);
+    assert!((alignment.corrections["wrist"].log_depth_scale.exp() * 0.99 - 1.0).abs() < 1e-3);
 }
 
 #[test]
-fn a_wrong_readout_is_found() {
-    let wrong = Wrong { rolls: true, readout_secs: 0.012, ..Wrong::nothing() };
-    let alignment = given(&wrong, |set| set.readout = true);
-    assert!((alignment.fixes["wrist"].readout_secs - 0.012).abs() < 1.5e-3);
+fn wrong_readout_time_is_found() {
+    let miscalibration = Miscalibration { has_rolling_shutter: true, readout_secs: 0.012, ..Miscalibration::none() };
+    let alignment = align_given(&miscalibration, |set| set.readout = true);
+    assert!((alignment.corrections["wrist"].readout_secs - 0.012).abs() < 1.5e-3);
 }
 
 #[test]
-fn what_a_motion_does_not_show_of_a_mount_is_told_where_the_mount_is_right_too() {
-    let alignment = tried(&Wrong { azimuth_only: true, ..Wrong::nothing() });
-    assert!(!alignment.is_any(), "{alignment:?}");
-    let parts: Vec<_> = alignment.unseen.iter().flat_map(|unseen| &unseen.parts).collect();
+fn unobservable_extrinsics_are_reported_even_if_correct() {
+    let alignment = align_by_trials(&Miscalibration { azimuth_only: true, ..Miscalibration::none() });
+    assert!(!alignment.has_corrections(), "{alignment:?}");
+    let parts: Vec<_> = alignment.unobservable.iter().flat_map(|unobservable| &unobservable.parts).collect();
     assert!(parts.iter().any(|part| part.starts_with("translation of camera \"wrist\" along")), "{parts:?}");
-    assert!(tried(&Wrong::nothing()).unseen.is_empty(), "a full motion shows all");
+    assert!(align_by_trials(&Miscalibration::none()).unobservable.is_empty(), "a full motion shows all");
 }
 
 #[test]
-fn a_turn_about_one_axis_does_not_show_all_of_a_mount() {
-    let wrong = Wrong { mount: wrong_mount(), azimuth_only: true, ..Wrong::nothing() };
-    let alignment = given(&wrong, |set| set.mount = true);
-    assert_eq!(alignment.unseen.len(), 2, "{:?}", alignment.unseen);
-    assert_eq!(alignment.unseen[0].parts.len(), 1);
-    assert!(alignment.unseen[0].parts[0].starts_with("translation of camera \"wrist\" along"));
+fn rotation_about_one_axis_leaves_extrinsics_unobservable() {
+    let miscalibration =
+        Miscalibration { extrinsics: wrong_extrinsics(), azimuth_only: true, ..Miscalibration::none() };
+    let alignment = align_given(&miscalibration, |set| set.extrinsics = true);
+    assert_eq!(alignment.unobservable.len(), 2, "{:?}", alignment.unobservable);
+    assert_eq!(alignment.unobservable[0].parts.len(), 1);
+    assert!(alignment.unobservable[0].parts[0].starts_with("translation of camera \"wrist\" along"));
     // Up in the base, in the camera's axes; nothing was found along it.
-    let up = (camera_at(joints_at(0.0, true)) * wrong.mount).rotation.inverse() * Vector3::z();
-    let shift: Vector3<f64> = alignment.fixes["wrist"].shift_m.into();
-    assert!(shift.dot(&up).abs() < 1e-4, "{shift:?} along {up:?}");
+    let up = (camera_at(joints_at(0.0, true)) * miscalibration.extrinsics).rotation.inverse() * Vector3::z();
+    let translation: Vector3<f64> = alignment.corrections["wrist"].translation_m.into();
+    assert!(translation.dot(&up).abs() < 1e-4, "{translation:?} along {up:?}");
 }
 
 #[test]
-fn nothing_is_kept_where_nothing_is_wrong() {
-    for rolls in [false, true] {
-        let alignment = tried(&Wrong { rolls, ..Wrong::nothing() });
-        assert!(!alignment.is_any(), "{:?}", alignment.found);
-        assert_eq!(alignment.trials.len(), if rolls { 8 } else { 7 });
+fn correct_calibration_is_left_unchanged() {
+    for has_rolling_shutter in [false, true] {
+        let alignment = align_by_trials(&Miscalibration { has_rolling_shutter, ..Miscalibration::none() });
+        assert!(!alignment.has_corrections(), "{:?}", alignment.estimates);
+        assert_eq!(alignment.trials.len(), if has_rolling_shutter { 8 } else { 7 });
     }
 }
 
 #[test]
-fn only_the_cause_is_kept() {
-    let kept = |wrong: &Wrong| -> Vec<String> {
-        tried(wrong).trials.iter().filter(|trial| trial.kept).map(|trial| trial.candidate.to_string()).collect()
+fn only_the_cause_is_corrected() {
+    let kept = |miscalibration: &Miscalibration| -> Vec<String> {
+        align_by_trials(miscalibration)
+            .trials
+            .iter()
+            .filter(|trial| trial.kept)
+            .map(|trial| trial.candidate.to_string())
+            .collect()
     };
-    assert_eq!(kept(&Wrong { mount: wrong_mount(), ..Wrong::nothing() }), ["camera mounts"]);
-    assert_eq!(kept(&Wrong { delay_secs: 0.02, ..Wrong::nothing() }), ["delays"]);
+    assert_eq!(kept(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() }), ["camera mounts"]);
+    assert_eq!(kept(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }), ["delays"]);
 }
 
 #[test]
-fn deviations_are_as_large_as_errors() {
+fn reported_sigmas_match_actual_errors() {
     const SEEDS: u64 = 6;
     let mut squares = Vec::new();
     for seed in 0..SEEDS {
-        let wrong = Wrong { mount: wrong_mount(), seed, noise: 3.0, ..Wrong::nothing() };
-        let scene = Scene::new(&capture(&wrong), false).unwrap();
-        let layout = Layout::new(TermSet { mount: true, ..TermSet::default() }, &scene.frames, 1);
-        let fit = fit::fit(&scene.frames, &scene.pairs, layout, &Corrections::none(1)).unwrap();
-        let fix = &fit.corrections.fixes[0];
-        let left = transform::log(
-            &(wrong.mount * crate::splat::moved(fix.turn_rad.into(), fix.shift_m.into()).inverse()),
+        let miscalibration =
+            Miscalibration { extrinsics: wrong_extrinsics(), seed, noise: 3.0, ..Miscalibration::none() };
+        let scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
+        let layout = Layout::new(ParamSet { extrinsics: true, ..ParamSet::default() }, &scene.images, 1);
+        let fit = fit::fit(&scene.images, &scene.pairs, layout, &Corrections::none(1)).unwrap();
+        let correction = &fit.corrections.by_camera[0];
+        let remaining = transform::log(
+            &(miscalibration.extrinsics
+                * crate::splat::rigid_transform(correction.rotation_rad.into(), correction.translation_m.into())
+                    .inverse()),
             1.0,
         );
-        let errors = left.linear_m_s.iter().chain(left.angular_rad_s.iter());
-        squares.extend(errors.enumerate().map(|(ix, error)| (error / fit.solved.sigma(ix)).powi(2)));
+        let errors = remaining.linear_m_s.iter().chain(remaining.angular_rad_s.iter());
+        squares.extend(errors.enumerate().map(|(ix, error)| (error / fit.solution.sigma(ix)).powi(2)));
     }
     let mean = squares.iter().sum::<f64>() / squares.len() as f64;
     assert!((0.25..4.0).contains(&mean), "{mean} of {squares:.1?}");
 }
 
 #[test]
-fn one_input_gives_one_result_however_many_threads() {
-    let keyframes = capture(&Wrong { mount: wrong_mount(), ..Wrong::nothing() });
-    let choice = CameraChoice::Given(TermSet { mount: true, image_poses: true, ..TermSet::default() });
-    let with = |n: usize| {
+fn result_does_not_depend_on_thread_count() {
+    let keyframes = capture(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() });
+    let choice = CameraRefinement::Always(ParamSet { extrinsics: true, image_poses: true, ..ParamSet::default() });
+    let with_threads = |n: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         pool.install(|| align(&keyframes, &choice)).unwrap()
     };
-    assert_eq!(with(1), with(3));
+    assert_eq!(with_threads(1), with_threads(3));
 }
 
 /// Brightness that rises evenly, so that it and its slopes are exact between pixels.
-fn evenly_lit(frame: &mut Frame) {
+fn set_linear_brightness(image: &mut PreparedImage) {
     let [width, height] = SIZE_PX.map(|side| side as usize);
     let value = |ix: usize| 40.0 + 0.5 * (ix % width) as f32 + 0.7 * (ix / width) as f32;
-    frame.levels = vec![frame::Grey::new([width, height], 1.0, &(0..width * height).map(value).collect::<Vec<_>>())];
+    image.levels =
+        vec![prepared_image::GrayImage::new([width, height], 1.0, &(0..width * height).map(value).collect::<Vec<_>>())];
 }
 
 /// Differences between slopes of a pair's residuals and central differences, as shares of the largest slope of the term.
 /// A few spots cross from one reading to the next and have a kink there: nine tenths are better than what comes back.
-fn worst_slopes(rolls: bool) -> Vec<(layout::Term, f64, f64)> {
+fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationParam, f64, f64)> {
     const STEP: f64 = 1e-3; // Of what a term may be.
-    let wrong = Wrong { noise: 0.0, rolls, ..Wrong::nothing() };
-    let mut scene = Scene::new(&capture(&wrong), false).unwrap();
-    scene.frames.iter_mut().for_each(evenly_lit);
-    let all = candidates().into_iter().fold(TermSet::default(), TermSet::and);
-    let layout = Layout::new(all, &scene.frames, 1);
+    let miscalibration = Miscalibration { noise: 0.0, has_rolling_shutter, ..Miscalibration::none() };
+    let mut scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
+    scene.images.iter_mut().for_each(set_linear_brightness);
+    let all = candidates().into_iter().fold(ParamSet::default(), ParamSet::and);
+    let layout = Layout::new(all, &scene.images, 1);
     let mut here = Corrections::none(1);
     // Joints start at zero: their columns are those of the joints as read, to first order.
-    let away = layout.terms.iter().enumerate().map(|(ix, term)| match term {
-        layout::Term::Joint(_) => 0.0,
-        term => 0.3 * term.scale() * (ix as f64 * 1.3).sin(),
+    let displaced = layout.params.iter().enumerate().map(|(ix, param)| match param {
+        layout::CalibrationParam::Joint(_) => 0.0,
+        param => 0.3 * param.scale() * (ix as f64 * 1.3).sin(),
     });
-    here.take(&layout, &nalgebra::DVector::from_iterator(layout.n(), away));
+    here.apply_step(&layout, &nalgebra::DVector::from_iterator(layout.n(), displaced));
     let tone = residual::Tone { gain: 0.9, offset: 4.0 };
     let pair = scene.pairs[scene.pairs.len() / 2];
-    let how = sums::Looks {
+    let options = sums::ResidualOptions {
         level: 0,
-        hidden_frac: 0.1,
+        occlusion_frac: 0.1,
         noise: sums::Noise { photo: 1.0, depth: 1.0 },
-        part: sums::Part::All,
+        part: sums::PixelSubset::All,
     };
-    let looked = |corrections: &Corrections| {
-        let views = corrections.views(&scene.frames, &layout);
-        let looks = sums::looks(sums::sides(&scene.frames, &views, pair), &scene.frames[pair.from].spots, &how);
-        (looks, views)
+    let cast_pixel = |corrections: &Corrections| {
+        let views = corrections.views(&scene.images, &layout);
+        let correspondences =
+            sums::correspondences(sums::sides(&scene.images, &views, pair), &scene.images[pair.from].samples, &options);
+        (correspondences, views)
     };
-    let (looks, views) = looked(&here);
-    let placed = [pair.from, pair.to].map(|ix| residual::Placed::new(&views[ix], |term| term));
-    let worst = |ix: usize, term: layout::Term| {
-        let nudged = |sign: f64| {
+    let (correspondences, views) = cast_pixel(&here);
+    let param_columns = [pair.from, pair.to].map(|ix| residual::ParamColumns::new(&views[ix], |param| param));
+    let max_errors = |ix: usize, param: layout::CalibrationParam| {
+        let perturbed = |sign: f64| {
             let mut there = here.clone();
             let mut step = nalgebra::DVector::zeros(layout.n());
-            step[ix] = sign * STEP * term.scale();
-            there.take(&layout, &step);
-            looked(&there).0
+            step[ix] = sign * STEP * param.scale();
+            there.apply_step(&layout, &step);
+            cast_pixel(&there).0
         };
-        let (ahead, behind) = (nudged(1.0), nudged(-1.0));
+        let (ahead, behind) = (perturbed(1.0), perturbed(-1.0));
         let mut row = vec![0.0; layout.n() + 2];
-        let (mut slopes, mut off) = ([0.0f64; 2], [Vec::new(), Vec::new()]);
-        for ((look, ahead), behind) in looks.iter().zip(&ahead).zip(&behind) {
-            let (Some(look), Some(ahead), Some(behind)) = (look, ahead, behind) else { continue };
+        let (mut max_gradients, mut deviation) = ([0.0f64; 2], [Vec::new(), Vec::new()]);
+        for ((correspondence, ahead), behind) in correspondences.iter().zip(&ahead).zip(&behind) {
+            let (Some(correspondence), Some(ahead), Some(behind)) = (correspondence, ahead, behind) else { continue };
             let numeric = [ahead.photo(tone) - behind.photo(tone), ahead.depth() - behind.depth()];
-            look.photo_slopes(&placed[0], &placed[1], tone, &mut row);
+            correspondence.photo_jacobian(&param_columns[0], &param_columns[1], tone, &mut row);
             let photo = row[ix];
-            look.depth_slopes(&placed[0], &placed[1], &mut row);
-            for (kind, slope) in [photo, row[ix]].into_iter().enumerate() {
-                slopes[kind] = slopes[kind].max(slope.abs() * term.scale());
-                off[kind].push((slope * term.scale() - numeric[kind] / (2.0 * STEP)).abs());
+            correspondence.depth_jacobian(&param_columns[0], &param_columns[1], &mut row);
+            for (kind, gradient) in [photo, row[ix]].into_iter().enumerate() {
+                max_gradients[kind] = max_gradients[kind].max(gradient.abs() * param.scale());
+                deviation[kind].push((gradient * param.scale() - numeric[kind] / (2.0 * STEP)).abs());
             }
         }
         let share = |kind: usize| {
-            let off = &mut off[kind].clone();
-            off.sort_by(f64::total_cmp);
+            let deviation = &mut deviation[kind].clone();
+            deviation.sort_by(f64::total_cmp);
             // A first joint changes nothing between images, and rounding of brightness to f32 is all there is.
-            off[off.len() * 9 / 10] / slopes[kind].max([0.1, 1e-3][kind])
+            deviation[deviation.len() * 9 / 10] / max_gradients[kind].max([0.1, 1e-3][kind])
         };
-        (term, share(0), share(1))
+        (param, share(0), share(1))
     };
-    layout.terms.iter().enumerate().map(|(ix, term)| worst(ix, *term)).collect()
+    layout.params.iter().enumerate().map(|(ix, param)| max_errors(ix, *param)).collect()
 }
 
 #[test]
-fn slopes_match_central_differences() {
-    const OFF: f64 = 0.01; // Readings are kept in f32, and the weight of one is held in the slope.
+fn jacobians_match_central_differences() {
+    const TOLERANCE: f64 = 0.01; // Readings are kept in f32, and the weight of one is held in the slope.
     // Left out: the lens moves points to other rows, and a mount elsewhere moves otherwise during the readout.
-    const OFF_WHILE_ROLLING: f64 = 0.05;
-    for (rolls, allowed) in [(false, OFF), (true, OFF_WHILE_ROLLING)] {
-        let worst = worst_slopes(rolls);
-        assert_eq!(worst.len(), if rolls { 23 } else { 22 });
-        for (term, photo, depth) in &worst {
-            assert!(*photo < allowed && *depth < allowed, "{term:?}: {photo:.4} {depth:.4} of {worst:.4?}");
+    const ROLLING_TOLERANCE: f64 = 0.05;
+    for (has_rolling_shutter, tolerance) in [(false, TOLERANCE), (true, ROLLING_TOLERANCE)] {
+        let max_errors = max_jacobian_errors(has_rolling_shutter);
+        assert_eq!(max_errors.len(), if has_rolling_shutter { 23 } else { 22 });
+        for (param, photo, depth) in &max_errors {
+            assert!(*photo < tolerance && *depth < tolerance, "{param:?}: {photo:.4} {depth:.4} of {max_errors:.4?}");
         }
     }
 }
 
 #[test]
-fn keyframes_without_depth_and_lone_ones_align_nothing() {
-    let keyframes = capture(&Wrong::nothing());
-    let choice = CameraChoice::Try(candidates());
+fn too_few_or_depthless_keyframes_give_none() {
+    let keyframes = capture(&Miscalibration::none());
+    let choice = CameraRefinement::Try(candidates());
     assert_eq!(align(&[], &choice), None);
     assert_eq!(align(&keyframes[..2], &choice), None);
     let flat = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() });
     assert_eq!(align(&keyframes.iter().map(flat).collect::<Vec<_>>(), &choice), None);
     // Test keyframes are not looked at: spoiling them changes nothing.
-    let spoiled = |keyframe: &Arc<Keyframe>| match keyframe.split {
+    let corrupted = |keyframe: &Arc<Keyframe>| match keyframe.split {
         Split::Test => Arc::new(Keyframe { world_from_camera: Transform::identity(), ..keyframe.as_ref().clone() }),
-        Split::Train | Split::Selection => keyframe.clone(),
+        Split::Train | Split::Validation => keyframe.clone(),
     };
-    let given = CameraChoice::Given(TermSet { mount: true, ..TermSet::default() });
-    assert_eq!(align(&keyframes, &given), align(&keyframes.iter().map(spoiled).collect::<Vec<_>>(), &given));
+    let align_given = CameraRefinement::Always(ParamSet { extrinsics: true, ..ParamSet::default() });
+    assert_eq!(
+        align(&keyframes, &align_given),
+        align(&keyframes.iter().map(corrupted).collect::<Vec<_>>(), &align_given)
+    );
 }
 
 #[test]
-fn drifting_images_are_moved_where_that_pays() {
-    let keyframes: Vec<Arc<Keyframe>> = capture(&Wrong::nothing())
+fn drifting_image_poses_are_corrected() {
+    let keyframes: Vec<Arc<Keyframe>> = capture(&Miscalibration::none())
         .iter()
         .map(|keyframe| {
             // Errs by millimetres, smoothly, as a SLAM system does; nothing is known about the motion.
@@ -477,9 +511,9 @@ fn drifting_images_are_moved_where_that_pays() {
             Arc::new(moved)
         })
         .collect();
-    let alignment = align(&keyframes, &CameraChoice::Try(candidates())).unwrap();
+    let alignment = align(&keyframes, &CameraRefinement::Try(candidates())).unwrap();
     let trial = alignment.trials.last().unwrap();
-    let has_poses = matches!(trial.candidate, Candidate::Cameras(terms) if terms.image_poses);
+    let has_poses = matches!(trial.candidate, Candidate::Cameras(params) if params.image_poses);
     assert!(has_poses && trial.kept && trial.gain_db > 3.0, "{:?}", alignment.lines());
 }
 
@@ -490,9 +524,9 @@ fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
             return keyframe.clone();
         }
         let axes = |stream: u64| Vector3::from_fn(|row, _| noise(7919 * ix as u64 + stream + row as u64 + 17));
-        let off = Transform::new(axes(0) * 1e-3 * mm, axes(3) * (0.1 * mm).to_radians());
+        let deviation = Transform::new(axes(0) * 1e-3 * mm, axes(3) * (0.1 * mm).to_radians());
         let mut moved = keyframe.as_ref().clone();
-        moved.world_from_camera *= off;
+        moved.world_from_camera *= deviation;
         if let Some(depth) = &mut moved.depth {
             depth.world_from_camera =
                 moved.world_from_camera * keyframe.world_from_camera.inverse() * depth.world_from_camera;
@@ -502,56 +536,60 @@ fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
         }
         Arc::new(moved)
     };
-    capture(&Wrong::nothing()).iter().enumerate().map(moved).collect()
+    capture(&Miscalibration::none()).iter().enumerate().map(moved).collect()
 }
 
 /// Pose errors relative to each other, after the common motion that takes most of them away: means, millimetres and degrees.
-fn apart(found: &[Transform], right: &[Transform]) -> (f64, f64) {
+fn relative_pose_errors(estimates: &[Transform], expected: &[Transform]) -> (f64, f64) {
     let mut common = Transform::identity();
     for _ in 0..10 {
-        let left: Vec<Twist> = found
+        let remaining: Vec<Twist> = estimates
             .iter()
-            .zip(right)
-            .map(|(found, right)| transform::log(&(common * found * right.inverse()), 1.0))
+            .zip(expected)
+            .map(|(estimates, expected)| transform::log(&(common * estimates * expected.inverse()), 1.0))
             .collect();
-        let n = left.len() as f64;
+        let n = remaining.len() as f64;
         let mean = Twist {
-            linear_m_s: left.iter().map(|left| left.linear_m_s).sum::<Vector3<f64>>() / n,
-            angular_rad_s: left.iter().map(|left| left.angular_rad_s).sum::<Vector3<f64>>() / n,
+            linear_m_s: remaining.iter().map(|remaining| remaining.linear_m_s).sum::<Vector3<f64>>() / n,
+            angular_rad_s: remaining.iter().map(|remaining| remaining.angular_rad_s).sum::<Vector3<f64>>() / n,
         };
         common = transform::exp(&mean, -1.0) * common;
     }
-    let left = |(found, right): (&Transform, &Transform)| {
-        let left = right.inverse() * common * found;
-        (1e3 * left.translation.vector.norm(), left.rotation.angle().to_degrees())
+    let remaining = |(estimates, expected): (&Transform, &Transform)| {
+        let remaining = expected.inverse() * common * estimates;
+        (1e3 * remaining.translation.vector.norm(), remaining.rotation.angle().to_degrees())
     };
-    let left: Vec<(f64, f64)> = found.iter().zip(right).map(left).collect();
-    let mean = |of: fn(&(f64, f64)) -> f64| left.iter().map(of).sum::<f64>() / left.len() as f64;
-    (mean(|left| left.0), mean(|left| left.1))
+    let remaining: Vec<(f64, f64)> = estimates.iter().zip(expected).map(remaining).collect();
+    let mean = |of: fn(&(f64, f64)) -> f64| remaining.iter().map(of).sum::<f64>() / remaining.len() as f64;
+    (mean(|remaining| remaining.0), mean(|remaining| remaining.1))
 }
 
 #[test]
-fn images_that_err_on_their_own_are_moved_and_test_images_are_not() {
-    let right = capture(&Wrong::nothing());
-    for (mm, most_mm, most_degrees, from_joints) in
+fn noisy_image_poses_are_corrected_except_test_images() {
+    let expected = capture(&Miscalibration::none());
+    for (mm, max_mm, max_degrees, from_joints) in
         [(2.0, 0.3, 0.02, false), (5.0, 0.3, 0.02, true), (10.0, 1.5, 0.2, true)]
     {
         let keyframes = noisy(mm, from_joints);
-        let alignment = align(&keyframes, &CameraChoice::Try(candidates())).unwrap();
+        let alignment = align(&keyframes, &CameraRefinement::Try(candidates())).unwrap();
         assert!(alignment.has_image_poses(), "{mm} mm: {:?}", alignment.lines());
-        let fix = &alignment.fixes["wrist"];
-        let left = |split: Split| {
-            let both = keyframes.iter().zip(&right).filter(|(keyframe, _)| keyframe.split == split);
-            let (found, right): (Vec<Transform>, Vec<Transform>) =
-                both.map(|(keyframe, right)| (fix.apply(keyframe).world_from_camera, right.world_from_camera)).unzip();
-            apart(&found, &right)
+        let correction = &alignment.corrections["wrist"];
+        let remaining = |split: Split| {
+            let both = keyframes.iter().zip(&expected).filter(|(keyframe, _)| keyframe.split == split);
+            let (estimates, expected): (Vec<Transform>, Vec<Transform>) = both
+                .map(|(keyframe, expected)| (correction.apply(keyframe).world_from_camera, expected.world_from_camera))
+                .unzip();
+            relative_pose_errors(&estimates, &expected)
         };
-        for split in [Split::Train, Split::Selection] {
-            let (left_mm, left_degrees) = left(split);
-            assert!(left_mm < most_mm && left_degrees < most_degrees, "{mm} mm: {left_mm} mm, {left_degrees} degrees");
+        for split in [Split::Train, Split::Validation] {
+            let (remaining_mm, remaining_degrees) = remaining(split);
+            assert!(
+                remaining_mm < max_mm && remaining_degrees < max_degrees,
+                "{mm} mm: {remaining_mm} mm, {remaining_degrees} degrees"
+            );
         }
-        let (test_mm, test_degrees) = left(Split::Test);
+        let (test_mm, test_degrees) = remaining(Split::Test);
         assert!(test_mm < 1e-6 && test_degrees < 1e-6, "{mm} mm of noise: test images were right: {test_mm} mm");
-        assert!(fix.drift_share == 0.0, "{}", fix.drift_share);
+        assert!(correction.drift_weight == 0.0, "{}", correction.drift_weight);
     }
 }

@@ -1,41 +1,44 @@
 //! A frame's cameras as the corrections at hand have them, and how they move with each term.
 
-use super::frame::Frame;
 use super::layout::Layout;
-use crate::splat::CameraFix;
+use super::prepared_image::PreparedImage;
+use crate::splat::CameraCorrection;
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Vector3};
 
 /// A rigid motion as a matrix: faster on many points.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Motion {
+pub(super) struct RigidTransform {
     pub(super) rotation: Matrix3<f64>,
-    pub(super) shift: Vector3<f64>,
+    pub(super) translation: Vector3<f64>,
 }
 
-impl Motion {
+impl RigidTransform {
     fn of(transform: &Transform) -> Self {
-        Self { rotation: transform.rotation.to_rotation_matrix().into_inner(), shift: transform.translation.vector }
+        Self {
+            rotation: transform.rotation.to_rotation_matrix().into_inner(),
+            translation: transform.translation.vector,
+        }
     }
 
-    pub(super) fn then(&self, point: &Vector3<f64>) -> Vector3<f64> {
-        self.rotation * point + self.shift
+    pub(super) fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation * point + self.translation
     }
 
-    pub(super) fn back(&self, point: &Vector3<f64>) -> Vector3<f64> {
-        self.rotation.tr_mul(&(point - self.shift))
+    pub(super) fn apply_inverse(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation.tr_mul(&(point - self.translation))
     }
 }
 
 /// A frame under the corrections at hand.
 #[derive(Clone, Debug)]
-pub(super) struct View {
-    pub(super) world_from_camera: Motion,
-    pub(super) color_from_depth: Motion,
+pub(super) struct CorrectedView {
+    pub(super) world_from_camera: RigidTransform,
+    pub(super) color_from_depth: RigidTransform,
     pub(super) focal_px: [f64; 2],
     pub(super) principal_px: [f64; 2],
     /// As the keyframe has it: what the terms of the lens are shares of.
-    pub(super) raw_focal_px: [f64; 2],
+    pub(super) keyframe_focal_px: [f64; 2],
     pub(super) height_px: f64,
     pub(super) twist: Twist,
     pub(super) readout_secs: f64,
@@ -51,86 +54,86 @@ pub(super) struct View {
     pub(super) shares_lens: bool,
 }
 
-impl View {
-    pub(super) fn new(frame: &Frame, fix: &CameraFix, layout: &Layout) -> Option<Self> {
-        let keyframe = frame.keyframe.as_ref();
+impl CorrectedView {
+    pub(super) fn new(image: &PreparedImage, correction: &CameraCorrection, layout: &Layout) -> Option<Self> {
+        let keyframe = image.keyframe.as_ref();
         let depth = keyframe.depth.as_ref()?;
-        let posed = fix.apply(keyframe);
+        let posed = correction.apply(keyframe);
         let raw_from_corrected = keyframe.world_from_camera.inverse() * posed.world_from_camera;
-        let terms = layout.of_camera(frame.camera);
+        let params = layout.of_camera(image.camera);
         let mut columns = Vec::new();
-        if let Some(mount) = terms.mount {
+        if let Some(extrinsics) = params.extrinsics {
             let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
-            columns.extend((0..3).map(|axis| (mount + axis, unit(axis), Vector3::zeros())));
-            columns.extend((0..3).map(|axis| (mount + 3 + axis, Vector3::zeros(), unit(axis))));
+            columns.extend((0..3).map(|axis| (extrinsics + axis, unit(axis), Vector3::zeros())));
+            columns.extend((0..3).map(|axis| (extrinsics + 3 + axis, Vector3::zeros(), unit(axis))));
         }
-        let mut moves = |term: usize, twist: &Twist, place: &Transform| {
-            let twist = twist.of_attached(place);
-            columns.push((term, twist.linear_m_s, twist.angular_rad_s));
+        let mut add_column = |param: usize, twist: &Twist, camera_from_twist: &Transform| {
+            let twist = twist.of_attached(camera_from_twist);
+            columns.push((param, twist.linear_m_s, twist.angular_rad_s));
         };
-        if let (Some(delay), Some(twist)) = (terms.delay, &keyframe.twist) {
-            moves(delay, twist, &raw_from_corrected);
+        if let (Some(time_offset), Some(twist)) = (params.time_offset, &keyframe.twist) {
+            add_column(time_offset, twist, &raw_from_corrected);
         }
         if let Some(joints) = layout.joints() {
-            let delayed_from_corrected = fix.delayed_from_given(keyframe) * raw_from_corrected;
+            let time_corrected_from_corrected = correction.time_corrected_from_input(keyframe) * raw_from_corrected;
             for (joint, twist) in keyframe.joint_twists.iter().enumerate() {
-                moves(joints + joint, twist, &delayed_from_corrected);
+                add_column(joints + joint, twist, &time_corrected_from_corrected);
             }
         }
         let share = |values: [f64; 2], change: &dyn Fn(usize, f64) -> f64| {
-            if frame.shares_lens { [change(0, values[0]), change(1, values[1])] } else { values }
+            if image.shares_lens { [change(0, values[0]), change(1, values[1])] } else { values }
         };
         Some(Self {
-            world_from_camera: Motion::of(&posed.world_from_camera),
-            color_from_depth: Motion::of(&fix.color_from_depth(keyframe, depth)),
+            world_from_camera: RigidTransform::of(&posed.world_from_camera),
+            color_from_depth: RigidTransform::of(&correction.color_from_depth(keyframe, depth)),
             focal_px: posed.focal_px,
             principal_px: posed.principal_px,
-            raw_focal_px: keyframe.focal_px,
+            keyframe_focal_px: keyframe.focal_px,
             height_px: f64::from(keyframe.size_px[1]),
             twist: keyframe.twist.map_or(Twist::zero(), |twist| twist.of_attached(&raw_from_corrected)),
-            readout_secs: (keyframe.readout_secs + fix.readout_secs).max(0.0),
-            depth_focal_px: share(depth.focal_px, &|axis, focal| focal * fix.log_focal[axis].exp()),
+            readout_secs: (keyframe.readout_secs + correction.readout_secs).max(0.0),
+            depth_focal_px: share(depth.focal_px, &|axis, focal| focal * correction.log_focal[axis].exp()),
             depth_principal_px: share(depth.principal_px, &|axis, principal| {
-                principal + fix.principal_focals[axis] * depth.focal_px[axis]
+                principal + correction.principal_offset_focals[axis] * depth.focal_px[axis]
             }),
-            depth_factor: fix.log_depth_scale.exp(),
+            depth_factor: correction.log_depth_scale.exp(),
             columns,
-            depth_pose: terms.depth_pose,
-            lens: terms.lens,
-            depth_scale: terms.depth_scale,
-            readout: terms.readout,
-            shares_lens: frame.shares_lens,
+            depth_pose: params.depth_pose,
+            lens: params.lens,
+            depth_scale: params.depth_scale,
+            readout: params.readout,
+            shares_lens: image.shares_lens,
         })
     }
 
     /// The camera elsewhere, carried along by the motions of a frame: terms 0 to 5 are its metres, then radians, in its own axes.
-    pub(super) fn carried(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
+    pub(super) fn moved_with_frame(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
         let frame_from_camera = world_from_frame.inverse() * world_from_camera;
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
-        let column = |term: usize| {
+        let column = |param: usize| {
             let (linear_m_s, angular_rad_s) =
-                if term < 3 { (unit(term), Vector3::zeros()) } else { (Vector3::zeros(), unit(term - 3)) };
+                if param < 3 { (unit(param), Vector3::zeros()) } else { (Vector3::zeros(), unit(param - 3)) };
             let twist = Twist { linear_m_s, angular_rad_s }.of_attached(&frame_from_camera);
-            (term, twist.linear_m_s, twist.angular_rad_s)
+            (param, twist.linear_m_s, twist.angular_rad_s)
         };
-        let world_from_camera = Motion::of(world_from_camera);
+        let world_from_camera = RigidTransform::of(world_from_camera);
         Self { world_from_camera, columns: (0..6).map(column).collect(), ..self.clone() }
     }
 
     /// Indices of all terms that move it, ascending.
-    pub(super) fn terms(&self) -> Vec<usize> {
-        let mut terms: Vec<usize> = self.columns.iter().map(|(term, _, _)| *term).collect();
+    pub(super) fn params(&self) -> Vec<usize> {
+        let mut params: Vec<usize> = self.columns.iter().map(|(param, _, _)| *param).collect();
         let range = |begin: Option<usize>, n: usize| begin.into_iter().flat_map(move |begin| begin..begin + n);
-        terms.extend(range(self.depth_pose, 6));
-        terms.extend(range(self.lens, 4));
-        terms.extend(range(self.depth_scale, 1));
-        terms.extend(range(self.readout, 1));
-        terms.sort_unstable();
-        terms
+        params.extend(range(self.depth_pose, 6));
+        params.extend(range(self.lens, 4));
+        params.extend(range(self.depth_scale, 1));
+        params.extend(range(self.readout, 1));
+        params.sort_unstable();
+        params
     }
 
     /// Where a point at rest in the camera's mid-exposure frame is when its row is read: it, and the share of the readout.
-    pub(super) fn when_read(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
+    pub(super) fn at_readout(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);
         }

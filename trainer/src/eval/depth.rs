@@ -7,7 +7,7 @@ use crate::{DepthMap, Error};
 /// `None` when there is no such pixel; fails when the images differ in size.
 pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, Error> {
     if rendered_m.len() != truth_m.len() {
-        return Err(Error::DepthSize { rendered: rendered_m.len(), truth: truth_m.len() });
+        return Err(Error::DepthSizeMismatch { rendered: rendered_m.len(), truth: truth_m.len() });
     }
     let (mut squares, mut n_known) = (0.0_f64, 0_u32);
     for (&rendered, &truth) in rendered_m.iter().zip(truth_m) {
@@ -37,39 +37,39 @@ impl SurfaceError {
 ///
 /// Measured pixels count where they tell how their surface is turned: with a reading on each side along both axes, none of
 /// which differs by more than 4 % (an edge). `None` when there is no such pixel; fails when the images differ in size.
-pub fn surface_error(drawn_m: &[f32], measured: &DepthMap) -> Result<Option<SurfaceError>, Error> {
+pub fn surface_error(rendered_m: &[f32], measured: &DepthMap) -> Result<Option<SurfaceError>, Error> {
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
     let n_pixels = width as usize * height as usize;
-    for depth_m in [drawn_m, &measured.depth_m] {
+    for depth_m in [rendered_m, &measured.depth_m] {
         if depth_m.len() != n_pixels {
-            return Err(Error::DepthSize { rendered: depth_m.len(), truth: n_pixels });
+            return Err(Error::DepthSizeMismatch { rendered: depth_m.len(), truth: n_pixels });
         }
     }
     let pixel = |x: u32, y: u32| y as usize * width as usize + x as usize;
     let z_m = |x: u32, y: u32| f64::from(measured.depth_m[pixel(x, y)]);
     let point = |x: u32, y: u32| measured.point(x, y, z_m(x, y));
-    let (mut sum_m, mut n_drawn, mut n_near, mut n_measured) = (0.0, 0_u32, 0_u32, 0_u32);
+    let (mut sum_m, mut n_rendered, mut n_near, mut n_measured) = (0.0, 0_u32, 0_u32, 0_u32);
     for (y, x) in (1..height.saturating_sub(1)).flat_map(|y| (1..width.saturating_sub(1)).map(move |x| (y, x))) {
         let z = z_m(x, y);
-        let is_beside = |near: f64| near > 0.0 && (near - z).abs() <= EDGE_FRAC * z;
+        let is_on_surface = |neighbor: f64| neighbor > 0.0 && (neighbor - z).abs() <= EDGE_FRAC * z;
         let around = [z_m(x - 1, y), z_m(x + 1, y), z_m(x, y - 1), z_m(x, y + 1)];
-        if !(z > 0.0 && z.is_finite() && around.into_iter().all(is_beside)) {
+        if !(z > 0.0 && z.is_finite() && around.into_iter().all(is_on_surface)) {
             continue;
         }
         let normal = (point(x + 1, y) - point(x - 1, y)).cross(&(point(x, y + 1) - point(x, y - 1)));
         let Some(normal) = normal.try_normalize(0.0) else { continue };
         n_measured += 1;
-        let drawn = f64::from(drawn_m[pixel(x, y)]);
-        if drawn > 0.0 {
-            let off_m = normal.dot(&measured.point(x, y, drawn - z)).abs();
-            sum_m += off_m;
-            n_drawn += 1;
-            n_near += u32::from(off_m <= SurfaceError::NEAR_M);
+        let rendered = f64::from(rendered_m[pixel(x, y)]);
+        if rendered > 0.0 {
+            let distance_m = normal.dot(&measured.point(x, y, rendered - z)).abs();
+            sum_m += distance_m;
+            n_rendered += 1;
+            n_near += u32::from(distance_m <= SurfaceError::NEAR_M);
         }
     }
     Ok((n_measured > 0).then(|| SurfaceError {
-        mean_m: (n_drawn > 0).then(|| sum_m / f64::from(n_drawn)),
+        mean_m: (n_rendered > 0).then(|| sum_m / f64::from(n_rendered)),
         near_frac: f64::from(n_near) / f64::from(n_measured),
     }))
 }
@@ -99,11 +99,11 @@ mod tests {
     }
 
     #[test]
-    fn the_distance_of_planes_is_that_along_their_normal() {
+    fn distance_is_measured_along_the_normal() {
         let normal = Vector3::new(0.3, -0.2, 1.0).normalize();
         let truth = measured(plane(normal, 1.0));
-        let score = |drawn: &[f32]| {
-            let error = surface_error(drawn, &truth).unwrap().unwrap();
+        let score = |rendered: &[f32]| {
+            let error = surface_error(rendered, &truth).unwrap().unwrap();
             (error.mean_m.unwrap(), error.near_frac)
         };
         let (mean_m, near_frac) = score(&plane(normal, 1.004));
@@ -120,34 +120,34 @@ mod tests {
     }
 
     #[test]
-    fn edges_and_holes_of_what_was_measured_say_nothing() {
+    fn edges_and_holes_are_ignored() {
         let mut depth_m = vec![1.0f32; 1200];
         depth_m[..600].fill(2.0); // Rows 0 to 14.
         depth_m[20 * 40 + 7] = 0.0;
         let truth = measured(depth_m.clone());
-        let near_frac = |drawn: &[f32]| surface_error(drawn, &truth).unwrap().unwrap().near_frac;
+        let near_frac = |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
         // 28 rows less two at the edge, of 38 pixels; five lie on or beside the hole.
         let n = 26.0 * 38.0 - 5.0;
-        let mut drawn = depth_m.clone();
-        drawn[10 * 40 + 10] = 3.0;
-        assert!((near_frac(&drawn) - (n - 1.0) / n).abs() < 1e-12);
-        drawn[10 * 40 + 10] = depth_m[10 * 40 + 10];
-        drawn[14 * 40 + 10] = 3.0;
-        drawn[20 * 40 + 7] = 3.0;
-        assert!((near_frac(&drawn) - 1.0).abs() < 1e-12);
+        let mut rendered = depth_m.clone();
+        rendered[10 * 40 + 10] = 3.0;
+        assert!((near_frac(&rendered) - (n - 1.0) / n).abs() < 1e-12);
+        rendered[10 * 40 + 10] = depth_m[10 * 40 + 10];
+        rendered[14 * 40 + 10] = 3.0;
+        rendered[20 * 40 + 7] = 3.0;
+        assert!((near_frac(&rendered) - 1.0).abs() < 1e-12);
         assert_eq!(surface_error(&depth_m, &measured(vec![0.0; 1200])).unwrap(), None);
         assert!(surface_error(&[1.0], &truth).is_err());
     }
 
     #[test]
-    fn only_pixels_known_to_both_count() {
+    fn only_pixels_with_both_depths_count() {
         let rmse = depth_rmse_m(&[1.0, 2.5, 0.0, 9.0], &[1.5, 2.0, 7.0, 0.0]).unwrap().unwrap();
         assert!((rmse - 0.5).abs() < 1e-12);
         assert_eq!(depth_rmse_m(&[0.0, 1.0], &[1.0, 0.0]).unwrap(), None);
     }
 
     #[test]
-    fn different_sizes_are_refused() {
-        assert!(matches!(depth_rmse_m(&[1.0], &[1.0, 2.0]), Err(Error::DepthSize { rendered: 1, truth: 2 })));
+    fn different_sizes_are_rejected() {
+        assert!(matches!(depth_rmse_m(&[1.0], &[1.0, 2.0]), Err(Error::DepthSizeMismatch { rendered: 1, truth: 2 })));
     }
 }

@@ -7,10 +7,10 @@ use std::collections::HashMap;
 use std::path::Path;
 
 /// Shortest side, pixels: the weights were fitted to patches of this size.
-const LEAST_SIDE_PX: u32 = 64;
+const MIN_SIDE_PX: u32 = 64;
 /// Channel means and deviations of the inputs, which lie in -1 to 1.
-const SHIFT: [f32; 3] = [-0.030, -0.088, -0.188];
-const SCALE: [f32; 3] = [0.458, 0.448, 0.450];
+const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
+const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
 /// Keeps the normalisation of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
 /// The parts of the network, each ending where features are compared. `true`: halve the size before the fire module.
@@ -43,7 +43,7 @@ impl Lpips {
             .map(|fires| fires.iter().map(|&(ix, halve)| Fire::of(&tensors, ix, halve)).collect())
             .collect::<candle_core::Result<_>>()?;
         let channel_weights = (0..=STAGES.len())
-            .map(|depth| named(&tensors, &format!("lin{depth}.weight"))?.reshape((1, (), 1, 1)))
+            .map(|depth| tensor_by_name(&tensors, &format!("lin{depth}.weight"))?.reshape((1, (), 1, 1)))
             .collect::<candle_core::Result<_>>()?;
         Ok(Self { first: Convolution::of(&tensors, "features.0")?, stages, channel_weights })
     }
@@ -52,9 +52,9 @@ impl Lpips {
     ///
     /// Fails for pictures with a side below 64 pixels, and when no pixel was seen.
     pub fn distance(&self, pair: &PixelPair<'_>) -> Result<f64, Error> {
-        pair.require_side("LPIPS", LEAST_SIDE_PX)?;
-        if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_seen(ix)) {
-            return Err(Error::NothingSeen);
+        pair.require_side("LPIPS", MIN_SIDE_PX)?;
+        if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_visible(ix)) {
+            return Err(Error::AllPixelsMasked);
         }
         self.distance_in_network(pair).map_err(Error::LpipsNetwork)
     }
@@ -80,8 +80,8 @@ fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tenso
     let mut planes = Vec::with_capacity(3 * n_pixels);
     for color in 0..3 {
         planes.extend((0..n_pixels).map(|ix| {
-            let value = if pair.is_seen(ix) { f32::from(rgba[4 * ix + color]) / 127.5 - 1.0 } else { 0.0 };
-            (value - SHIFT[color]) / SCALE[color]
+            let value = if pair.is_visible(ix) { f32::from(rgba[4 * ix + color]) / 127.5 - 1.0 } else { 0.0 };
+            (value - CHANNEL_MEAN[color]) / CHANNEL_DEVIATION[color]
         }));
     }
     let [width, height] = pair.size_px.map(|side| side as usize);
@@ -110,8 +110,8 @@ struct Convolution {
 
 impl Convolution {
     fn of(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Self> {
-        let weight = named(tensors, &format!("{name}.weight"))?;
-        let bias = named(tensors, &format!("{name}.bias"))?.reshape((1, (), 1, 1))?;
+        let weight = tensor_by_name(tensors, &format!("{name}.weight"))?;
+        let bias = tensor_by_name(tensors, &format!("{name}.bias"))?.reshape((1, (), 1, 1))?;
         Ok(Self { weight, bias })
     }
 
@@ -152,7 +152,7 @@ fn halved(feature: &Tensor) -> candle_core::Result<Tensor> {
     padded.max_pool2d_with_stride(3, 2)
 }
 
-fn named(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Tensor> {
+fn tensor_by_name(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Tensor> {
     let found = tensors.get(name).cloned();
     found.ok_or_else(|| candle_core::Error::Msg(format!("no tensor {name:?}")))
 }
@@ -162,14 +162,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pooling_of_an_even_side_reaches_past_the_edge() {
+    fn pooling_of_even_sides_pads_the_far_edge() {
         let feature = Tensor::arange(0_f32, 16.0, &Device::Cpu).unwrap().reshape((1, 1, 4, 4)).unwrap();
         let pooled = halved(&feature).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
         assert_eq!(pooled, [10.0, 11.0, 14.0, 15.0]);
     }
 
     #[test]
-    fn files_without_weights_are_refused_by_name() {
+    fn files_without_weights_are_rejected_by_name() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("weights.safetensors");
         assert!(matches!(Lpips::load(&path), Err(Error::Read { .. })));

@@ -35,17 +35,17 @@ impl<'a> PixelPair<'a> {
         Ok(Self { size_px, rendered_rgba, truth_rgba })
     }
 
-    /// Fails when a side is shorter than `least_px`, which `metric` needs.
-    fn require_side(&self, metric: &'static str, least_px: u32) -> Result<(), Error> {
+    /// Fails when a side is shorter than `min_px`, which `metric` needs.
+    fn require_side(&self, metric: &'static str, min_px: u32) -> Result<(), Error> {
         let [width, height] = self.size_px;
-        if width < least_px || height < least_px {
-            return Err(Error::PictureTooSmall { metric, least_px, width, height });
+        if width < min_px || height < min_px {
+            return Err(Error::PictureTooSmall { metric, min_px, width, height });
         }
         Ok(())
     }
 
     /// Whether the truth was seen at this pixel.
-    fn is_seen(&self, pixel_ix: usize) -> bool {
+    fn is_visible(&self, pixel_ix: usize) -> bool {
         self.truth_rgba[4 * pixel_ix + 3] != 0
     }
 }

@@ -29,11 +29,11 @@ fn json(path: &Path) -> Value {
 
 /// Whether the figure agrees; prints it where it does not.
 fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
-    let good = (got - expected).abs() <= tolerance;
-    if !good {
+    let all_agree = (got - expected).abs() <= tolerance;
+    if !all_agree {
         eprintln!("{what}: got {got}, expected {expected}");
     }
-    good
+    all_agree
 }
 
 #[test]
@@ -41,22 +41,22 @@ fn metrics_agree_with_the_oracle() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let rows = json(&folder.join("oracle_metrics.json"));
-    let mut good = true;
+    let mut all_agree = true;
     for row in rows.as_array().unwrap() {
         let (a, b) = (row["a"].as_str().unwrap(), row["b"].as_str().unwrap());
         let (first, second) = (picture(&folder, a), picture(&folder, b));
         let pair = PixelPair::new(first.size_px, &first.rgba, &second.rgba).unwrap();
         let expected = |column: &str| row[column].as_f64().unwrap();
-        good &= agrees(b, psnr(&pair).unwrap(), expected("psnr_skimage_255"), PSNR_TOLERANCE_DB);
-        good &= agrees(b, ssim(&pair).unwrap(), expected("ssim_3dgs_valid_crop5"), SSIM_TOLERANCE);
-        good &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
+        all_agree &= agrees(b, psnr(&pair).unwrap(), expected("psnr_skimage_255"), PSNR_TOLERANCE_DB);
+        all_agree &= agrees(b, ssim(&pair).unwrap(), expected("ssim_3dgs_valid_crop5"), SSIM_TOLERANCE);
+        all_agree &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
     }
-    assert!(good, "see the figures above");
+    assert!(all_agree, "see the figures above");
     assert_eq!(rows.as_array().unwrap().len(), 3);
 }
 
 #[test]
-fn lpips_agrees_pair_by_pair_and_is_zero_for_equal_pictures() {
+fn lpips_matches_the_oracle_pair_by_pair() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     for (names, row) in json(&folder.join("oracle_lpips_squeeze_ex.json")).as_object().unwrap() {
@@ -69,7 +69,7 @@ fn lpips_agrees_pair_by_pair_and_is_zero_for_equal_pictures() {
 }
 
 #[test]
-fn a_slightly_wrong_picture_does_not_agree() {
+fn slightly_brighter_picture_does_not_agree() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
@@ -84,7 +84,7 @@ fn a_slightly_wrong_picture_does_not_agree() {
 }
 
 #[test]
-fn lpips_leaves_masked_pixels_out_and_refuses_small_pictures() {
+fn lpips_ignores_masked_pixels_and_rejects_small_pictures() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, mut b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_a.png"));

@@ -20,15 +20,15 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     let width = pair.size_px[0] as usize;
     let n_rows = pair.size_px[1] as usize - WINDOW + 1;
     let signal = SumAndDifference::of(pair);
-    let unseen = unseen_counts(pair);
+    let masked = masked_counts(pair);
     // Each row's sum is kept apart and added in order, so the result does not depend on the threads.
     let rows: Vec<(f64, usize)> = (0..n_rows)
         .into_par_iter()
-        .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, unseen.as_deref(), y))
+        .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, masked.as_deref(), y))
         .collect();
     let n_windows: usize = rows.iter().map(|row| row.1).sum();
     if n_windows == 0 {
-        return Err(Error::NothingSeen);
+        return Err(Error::AllPixelsMasked);
     }
     Ok(rows.iter().map(|row| row.0).sum::<f64>() / (3 * n_windows) as f64)
 }
@@ -59,18 +59,18 @@ impl SumAndDifference {
 }
 
 /// For every column of every window row, how many of its 11 pixels are masked; none when no pixel is.
-fn unseen_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
+fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let [width, height] = pair.size_px.map(|side| side as usize);
-    if (0..width * height).all(|ix| pair.is_seen(ix)) {
+    if (0..width * height).all(|ix| pair.is_visible(ix)) {
         return None;
     }
-    let unseen = |x: usize, y: usize| u8::from(!pair.is_seen(y * width + x));
+    let masked = |x: usize, y: usize| u8::from(!pair.is_visible(y * width + x));
     let mut counts = vec![0; width * (height - WINDOW + 1)];
     for x in 0..width {
-        let mut count: u8 = (0..WINDOW).map(|y| unseen(x, y)).sum();
+        let mut count: u8 = (0..WINDOW).map(|y| masked(x, y)).sum();
         counts[x] = count;
         for y in 1..=height - WINDOW {
-            count = count + unseen(x, y + WINDOW - 1) - unseen(x, y - 1);
+            count = count + masked(x, y + WINDOW - 1) - masked(x, y - 1);
             counts[y * width + x] = count;
         }
     }
@@ -97,14 +97,14 @@ impl RowScratch {
     }
 
     /// The sum of SSIM over the windows whose first row is `y` and the three colours, and the number of windows.
-    fn ssim_of_row(&mut self, signal: &SumAndDifference, unseen: Option<&[u8]>, y: usize) -> (f64, usize) {
+    fn ssim_of_row(&mut self, signal: &SumAndDifference, masked: Option<&[u8]>, y: usize) -> (f64, usize) {
         self.blur_along_y(signal, y);
         self.blur_along_x();
         let n_columns = self.width - WINDOW + 1;
-        let unseen_row = unseen.map(|counts| &counts[y * self.width..(y + 1) * self.width]);
+        let masked_row = masked.map(|counts| &counts[y * self.width..(y + 1) * self.width]);
         let (mut total, mut n_windows) = (0.0, 0);
         for x in 0..n_columns {
-            if unseen_row.is_some_and(|row| row[x..x + WINDOW].iter().any(|&count| count > 0)) {
+            if masked_row.is_some_and(|row| row[x..x + WINDOW].iter().any(|&count| count > 0)) {
                 continue;
             }
             n_windows += 1;
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_pictures_give_one_and_unrelated_ones_almost_zero() {
+    fn equal_pictures_score_one_and_unrelated_ones_near_zero() {
         let (a, b) = (noise(40 * 30, 1), noise(40 * 30, 2));
         let same = ssim(&PixelPair::new([40, 30], &a, &a).unwrap()).unwrap();
         assert!((same - 1.0).abs() < 1e-6, "{same}");
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn a_masked_pixel_takes_out_exactly_the_windows_it_touches() {
+    fn masked_pixel_removes_only_windows_that_touch_it() {
         let a = noise(40 * 30, 1);
         let mut rendered = a.clone();
         let mut truth = a.clone();
@@ -202,17 +202,17 @@ mod tests {
         assert!(counted < 0.999_9, "{counted}");
         // A wrong pixel eight columns on still counts in the windows that do not reach back to the mask.
         rendered[pixel + 4 * 8] ^= 0x80;
-        let beside = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
-        assert!(beside < 0.999_9, "{beside}");
+        let with_wrong_pixel = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
+        assert!(with_wrong_pixel < 0.999_9, "{with_wrong_pixel}");
     }
 
     #[test]
-    fn small_and_wholly_masked_pictures_are_refused() {
+    fn small_and_fully_masked_pictures_are_rejected() {
         let a = noise(10 * 30, 1);
         let pair = PixelPair::new([10, 30], &a, &a).unwrap();
-        assert!(matches!(ssim(&pair), Err(Error::PictureTooSmall { least_px: 11, width: 10, .. })));
+        assert!(matches!(ssim(&pair), Err(Error::PictureTooSmall { min_px: 11, width: 10, .. })));
         let mut masked = noise(11 * 11, 1);
         masked[3] = 0;
-        assert!(matches!(ssim(&PixelPair::new([11, 11], &masked, &masked).unwrap()), Err(Error::NothingSeen)));
+        assert!(matches!(ssim(&PixelPair::new([11, 11], &masked, &masked).unwrap()), Err(Error::AllPixelsMasked)));
     }
 }

@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
 use std::time::Duration;
 
 /// How often the device is checked while a read-back has not arrived.
-const CHECK_EVERY: Duration = Duration::from_millis(100);
+const CHECK_PERIOD: Duration = Duration::from_millis(100);
 
 /// How to choose the adapter.
 #[derive(Clone, Copy, Debug)]
@@ -60,7 +60,7 @@ pub struct Gpu {
     limits: wgpu::Limits,
     memory_limit_bytes: u64,
     health: Arc<Health>,
-    live: Arc<Live>,
+    live: Arc<LiveBuffers>,
     peak_bytes: AtomicU64,
     next_id: AtomicU64,
     /// Read-back buffers for reuse, the oldest first.
@@ -71,12 +71,12 @@ pub struct Gpu {
 
 /// Bytes of the buffers in use.
 #[derive(Debug, Default)]
-struct Live {
+struct LiveBuffers {
     bytes: AtomicU64,
     by_label: Mutex<BTreeMap<Arc<str>, u64>>,
 }
 
-impl Live {
+impl LiveBuffers {
     /// Counts a new buffer; returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
         let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
@@ -87,8 +87,8 @@ impl Live {
 
     fn remove(&self, label: &str, bytes: u64) {
         let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(of_label) = by_label.get_mut(label) {
-            *of_label -= bytes;
+        if let Some(label_bytes) = by_label.get_mut(label) {
+            *label_bytes -= bytes;
         }
         self.bytes.fetch_sub(bytes, Ordering::Relaxed);
     }
@@ -110,7 +110,7 @@ enum Failure {
 }
 
 impl Health {
-    fn note(&self, error: wgpu::Error) {
+    fn record_error(&self, error: wgpu::Error) {
         let failure = match error {
             wgpu::Error::OutOfMemory { .. } => Failure::OutOfMemory,
             wgpu::Error::Validation { description, .. } | wgpu::Error::Internal { description, .. } => {
@@ -129,7 +129,7 @@ impl Health {
             on_loss.lost.get_or_init(|| message);
         });
         // Without a handler wgpu panics.
-        device.on_uncaptured_error(Arc::new(move |error| on_error.note(error)));
+        device.on_uncaptured_error(Arc::new(move |error| on_error.record_error(error)));
         health
     }
 }
@@ -392,16 +392,16 @@ impl Gpu {
 
     /// Submits the encoded commands, followed by a copy of the first bytes of each of these buffers. All of them share one
     /// read-back, which is one wait and one mapping.
-    pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, wanted: &[(&Buffer, usize)]) -> PendingRead {
+    pub(super) fn submit_reading(&self, mut encoder: wgpu::CommandEncoder, reads: &[(&Buffer, usize)]) -> PendingRead {
         let padded = |n_bytes: usize| n_bytes.next_multiple_of(4);
-        let n_all_bytes = wanted.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
+        let n_all_bytes = reads.iter().map(|(_, n_bytes)| padded(*n_bytes) as u64).sum();
         let Some(staging) = self.staging(n_all_bytes) else {
             self.queue.submit([encoder.finish()]); // The encoded commands still run.
             return PendingRead(Err(n_all_bytes));
         };
-        let mut parts = Vec::with_capacity(wanted.len());
+        let mut parts = Vec::with_capacity(reads.len());
         let mut begin = 0;
-        for (buffer, n_bytes) in wanted {
+        for (buffer, n_bytes) in reads {
             encoder.copy_buffer_to_buffer(&buffer.raw, 0, &staging, begin as u64, padded(*n_bytes) as u64);
             parts.push(begin..begin + n_bytes);
             begin += padded(*n_bytes);
@@ -472,7 +472,7 @@ impl Gpu {
         self.check().err().unwrap_or(Error::DeviceLost)
     }
 
-    pub(super) fn fresh_id(&self) -> u64 {
+    pub(super) fn next_unique_id(&self) -> u64 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
 
@@ -485,7 +485,7 @@ impl Gpu {
         });
         let (label, live_bytes) = self.live.add(label, bytes);
         self.peak_bytes.fetch_max(live_bytes, Ordering::Relaxed);
-        Buffer { id: self.fresh_id(), raw, bytes, label, live: self.live.clone() }
+        Buffer { id: self.next_unique_id(), raw, bytes, label, live: self.live.clone() }
     }
 }
 
@@ -515,7 +515,7 @@ impl PendingRead {
         gpu.poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })?;
         let is_mapped = loop {
             // Another waiting thread may run the callback, and a lost device may never do so.
-            match mapped.recv_timeout(CHECK_EVERY) {
+            match mapped.recv_timeout(CHECK_PERIOD) {
                 Ok(result) => break result.is_ok(),
                 Err(RecvTimeoutError::Timeout) => gpu.check()?,
                 Err(RecvTimeoutError::Disconnected) => break false,
@@ -545,7 +545,7 @@ pub struct Buffer {
     pub(super) raw: wgpu::Buffer,
     bytes: u64,
     label: Arc<str>,
-    live: Arc<Live>,
+    live: Arc<LiveBuffers>,
 }
 
 impl Buffer {
@@ -578,7 +578,7 @@ mod tests {
     }
 
     #[test]
-    fn buffers_that_grow_leave_no_holes_in_host_memory() {
+    fn growing_buffers_do_not_fragment_host_memory() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         if !gpu.is_software() {
             eprintln!("skipped: only on a software adapter are buffers in host memory");

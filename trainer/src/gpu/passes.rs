@@ -25,7 +25,7 @@ enum Pass {
 
 /// A list of GPU passes; listing them does not touch the GPU.
 ///
-/// Bind groups are kept between lists, keyed by kernel and buffers; [`Passes::forget_bindings`] lets go of them.
+/// Bind groups are kept between lists, keyed by kernel and buffers; [`Passes::clear_bindings`] lets go of them.
 #[derive(Default)]
 pub struct Passes {
     list: Vec<Pass>,
@@ -59,9 +59,9 @@ impl Passes {
         let find = |name: &str| buffers.iter().find(|(given, _)| *given == name).map(|(_, buffer)| *buffer);
         let found: Option<Vec<&Buffer>> = pipeline.bindings.iter().map(|binding| find(&binding.name)).collect();
         let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
-            let wanted: Vec<_> = pipeline.bindings.iter().map(|binding| binding.name.as_str()).collect();
+            let reads: Vec<_> = pipeline.bindings.iter().map(|binding| binding.name.as_str()).collect();
             let given: Vec<_> = buffers.iter().map(|(name, _)| *name).collect();
-            panic!("kernel {} binds {wanted:?}, given {given:?}", pipeline.name);
+            panic!("kernel {} binds {reads:?}, given {given:?}", pipeline.name);
         };
         let key = (pipeline.id, found.iter().map(|buffer| buffer.id).collect());
         let bind_group = self.bind_groups.entry(key).or_insert_with(|| {
@@ -116,7 +116,7 @@ impl Passes {
     }
 
     /// Lets go of kept bind groups, and so of buffers that nobody else holds.
-    pub fn forget_bindings(&mut self) {
+    pub fn clear_bindings(&mut self) {
         self.bind_groups.clear();
     }
 
@@ -129,16 +129,16 @@ impl Passes {
 
     /// Submits the list, empties it, and begins to read the first bytes of each of these buffers as they are after the list:
     /// one submit and one read-back for all.
-    pub fn submit_reading(&mut self, gpu: &Gpu, wanted: &[(&Buffer, usize)]) -> PendingRead {
+    pub fn submit_reading(&mut self, gpu: &Gpu, reads: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
-        gpu.submit_reading(encoder, wanted)
+        gpu.submit_reading(encoder, reads)
     }
 
     /// Sends the list, waits, and tells the GPU time from the first pass's beginning to the last one's end, milliseconds.
     ///
     /// `None` when the adapter has no timestamps.
-    pub fn submit_spanned(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
+    pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         let timed = gpu.optional.timestamps;
         let queries = timed.then(|| {
             gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -155,9 +155,9 @@ impl Passes {
         });
         let copy = gpu.storage("span.copy", 16)?;
         let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        mark(&mut encoder, queries.as_ref(), true);
+        write_timestamp(&mut encoder, queries.as_ref(), true);
         encode_all(&mut encoder, self.list.drain(..));
-        mark(&mut encoder, queries.as_ref(), false);
+        write_timestamp(&mut encoder, queries.as_ref(), false);
         if let Some(queries) = &queries {
             encoder.resolve_query_set(queries, 0..2, &stamps, 0);
             encoder.copy_buffer_to_buffer(&stamps, 0, &copy.raw, 0, 16);
@@ -226,7 +226,7 @@ impl Passes {
 }
 
 /// An empty pass that writes one timestamp at its beginning or end.
-fn mark(encoder: &mut wgpu::CommandEncoder, queries: Option<&wgpu::QuerySet>, first: bool) {
+fn write_timestamp(encoder: &mut wgpu::CommandEncoder, queries: Option<&wgpu::QuerySet>, first: bool) {
     let Some(query_set) = queries else { return };
     let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
         query_set,
@@ -278,7 +278,7 @@ mod tests {
     use crate::gpu::GpuOptions;
 
     #[test]
-    fn several_buffers_come_back_in_one_read_and_memory_for_it_is_used_again() {
+    fn reads_are_batched_and_staging_is_reused() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let first = gpu.storage_with("first", &[1, 2, 3, 4, 5, 6, 7, 8]).unwrap();
         let second = gpu.storage_with("second", bytemuck::cast_slice(&[0.5f32; 1000])).unwrap();

@@ -76,7 +76,7 @@ impl Pipeline {
             },
             cache: None,
         });
-        Ok(Self { id: gpu.fresh_id(), name, raw, layout, bindings })
+        Ok(Self { id: gpu.next_unique_id(), name, raw, layout, bindings })
     }
 }
 
@@ -86,13 +86,13 @@ mod tests {
     use crate::gpu::GpuOptions;
 
     #[test]
-    fn a_kernel_that_shares_too_much_memory_is_refused() {
+    fn kernel_exceeding_workgroup_memory_is_rejected() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let text = "var<workgroup> wg_all: array<vec4f, 100000>;
             @compute @workgroup_size(64)
             fn main(@builtin(local_invocation_index) lane: u32) { wg_all[lane] = vec4f(0.0); }";
         let kernel = Kernel { source: Source { name: "large", text }, shared: &[] };
-        let refused = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
-        assert!(matches!(refused, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. }), "{refused}");
+        let rejected = Pipeline::new(&gpu, kernel, &[]).unwrap_err();
+        assert!(matches!(rejected, Error::WorkgroupTooLarge { kernel: "large", bytes: 1_600_000, .. }), "{rejected}");
     }
 }

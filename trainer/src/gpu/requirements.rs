@@ -22,10 +22,10 @@ const HALF_MATRICES: wgpu::Features = wgpu::Features::EXPERIMENTAL_COOPERATIVE_M
 
 /// Whether matrices of the size and types that our kernels have are among those that the adapter multiplies.
 fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
-    adapter.cooperative_matrix_properties().iter().any(|offered| {
-        [offered.m_size, offered.n_size, offered.k_size] == [16; 3]
-            && offered.ab_type == wgpu::CooperativeScalarType::F16
-            && offered.cr_type == wgpu::CooperativeScalarType::F32
+    adapter.cooperative_matrix_properties().iter().any(|properties| {
+        [properties.m_size, properties.n_size, properties.k_size] == [16; 3]
+            && properties.ab_type == wgpu::CooperativeScalarType::F16
+            && properties.cr_type == wgpu::CooperativeScalarType::F32
     })
 }
 

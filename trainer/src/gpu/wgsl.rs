@@ -57,11 +57,11 @@ fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text:
 
 /// Parses and validates WGSL and lists the buffers of group 0 in order of their numbers.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
-    let refused = |message: String| Error::Wgsl { kernel: name, message };
-    let module = naga::front::wgsl::parse_str(text).map_err(|error| refused(error.emit_to_string(text)))?;
+    let rejected = |message: String| Error::Wgsl { kernel: name, message };
+    let module = naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
     naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
         .validate(&module)
-        .map_err(|error| refused(error.emit_to_string(text)))?;
+        .map_err(|error| rejected(error.emit_to_string(text)))?;
     Ok(module)
 }
 

@@ -17,9 +17,9 @@
 @group(0) @binding(4) var<storage, read> depth: array<f32>;
 @group(0) @binding(5) var<storage, read> target_image: array<u32>;
 @group(0) @binding(6) var<storage, read> target_depth: array<f32>;
-@group(0) @binding(7) var<storage, read> slopes: array<f32>;
+@group(0) @binding(7) var<storage, read> ssim_gradients: array<f32>;
 @group(0) @binding(8) var<storage, read_write> upstream: array<vec4f>;
-@group(0) @binding(9) var<storage, read_write> rest: array<vec2f>;
+@group(0) @binding(9) var<storage, read_write> pixel_totals: array<vec2f>;
 @group(0) @binding(10) var<storage, read_write> gain_sums: array<vec4f>;
 @group(0) @binding(11) var<storage, read> gains: vec4f;
 
@@ -40,33 +40,33 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let at = min(pixel.y * view.size_px.x + pixel.x, n_pixels - 1u);
     let packed = target_image[at];
     let color = image[at];
-    let seen = on_image && packed >= 0x01000000u;
+    let visible = on_image && packed >= 0x01000000u;
     let background = background_at(supervision, status[STEP]);
     let picture = gains.rgb * (color.rgb + color.w * background);
-    let wanted = rgb_of(packed);
+    let expected = rgb_of(packed);
     let per_value = 1.0 / (3.0 * f32(n_pixels));
-    var v_color = (1.0 - supervision.dssim_frac) * per_value * sign(picture - wanted);
+    var v_color = (1.0 - supervision.dssim_frac) * per_value * sign(picture - expected);
     if SSIM {
-        v_color -= supervision.dssim_frac * per_value * ssim_upstream(lane, corner, at, picture, wanted);
+        v_color -= supervision.dssim_frac * per_value * ssim_upstream(lane, corner, at, picture, expected);
     }
     var error = 0.0;
-    if seen { error = dot(abs(picture - wanted), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }
+    if visible { error = dot(abs(picture - expected), vec3f(1.0 / 3.0)); } else { v_color = vec3f(0.0); }
     let v_log_gain = v_color * picture;
     v_color *= gains.rgb;
     var v_transmittance = dot(v_color, background);
     var v_depth = 0.0;
     let depth_sum = depth[at];
     if DEPTH && on_image {
-        let wanted_m = target_depth[at];
-        let miss_m = depth_sum - (1.0 - color.w) * wanted_m;
-        if wanted_m > 0.0 && abs(miss_m) < supervision.depth_clip_m {
-            v_depth = supervision.depth_weight / f32(n_pixels) * sign(miss_m);
-            v_transmittance += v_depth * wanted_m;
+        let expected_m = target_depth[at];
+        let residual_m = depth_sum - (1.0 - color.w) * expected_m;
+        if expected_m > 0.0 && abs(residual_m) < supervision.depth_clip_m {
+            v_depth = supervision.depth_weight / f32(n_pixels) * sign(residual_m);
+            v_transmittance += v_depth * expected_m;
         }
     }
     if on_image {
         upstream[at] = vec4f(v_color, v_depth);
-        rest[at] = vec2f(dot(color.rgb, v_color) + depth_sum * v_depth + color.w * v_transmittance, error);
+        pixel_totals[at] = vec2f(dot(color.rgb, v_color) + depth_sum * v_depth + color.w * v_transmittance, error);
     }
     wg_gains[lane] = vec4f(v_log_gain, error);
     workgroupBarrier(); // All are there.

@@ -20,7 +20,7 @@ pub struct Target {
     /// Color, 0 to 1.
     pub rgb: Vec<[f64; 3]>,
     /// Which pixels have a color; the others say nothing about color, but may have a depth.
-    pub seen: Vec<bool>,
+    pub visible: Vec<bool>,
     /// Depth along z, metres; 0 where there is none. Empty where the camera has no depth.
     pub depth_m: Vec<f64>,
 }
@@ -65,7 +65,7 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
         let (ssim, v_ssim) = mean_ssim(target.size_px, &rendered, &truth);
         loss.l1 += l1 / 3.0;
         loss.dssim += (1.0 - ssim) / 3.0;
-        for pixel_ix in (0..n_pixels).filter(|&pixel_ix| target.seen[pixel_ix]) {
+        for pixel_ix in (0..n_pixels).filter(|&pixel_ix| target.visible[pixel_ix]) {
             let v = ((1.0 - weights.dssim_frac) * v_l1[pixel_ix] - weights.dssim_frac * v_ssim[pixel_ix]) / 3.0;
             upstream.rgb[pixel_ix][channel] = v;
             upstream.transmittance[pixel_ix] += v * weights.background_rgb[channel];
@@ -100,12 +100,12 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         let (x, y) = (mean_x[ix], mean_y[ix]);
         let luminance = (2.0 * x * y + C1, x * x + y * y + C1);
         let contrast = (2.0 * (mean_xy[ix] - x * y) + C2, mean_xx[ix] - x * x + mean_yy[ix] - y * y + C2);
-        let below = luminance.1 * contrast.1;
-        let ssim = luminance.0 * contrast.0 / below;
+        let denominator = luminance.1 * contrast.1;
+        let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
         // The variances hold the mean too, so the mean is reached on three ways.
-        let (v_variance, v_covariance) = (-ssim / contrast.1, 2.0 * luminance.0 / below);
-        let v_luminance = 2.0 * y * contrast.0 / below - 2.0 * x * ssim / luminance.1;
+        let (v_variance, v_covariance) = (-ssim / contrast.1, 2.0 * luminance.0 / denominator);
+        let v_luminance = 2.0 * y * contrast.0 / denominator - 2.0 * x * ssim / luminance.1;
         v_mean_x.push((v_luminance - 2.0 * x * v_variance - y * v_covariance) / n_pixels);
         v_mean_xx.push(v_variance / n_pixels);
         v_mean_xy.push(v_covariance / n_pixels);
@@ -142,7 +142,7 @@ fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f
 }
 
 fn masked(rgb: &[[f64; 3]], target: &Target) -> Vec<[f64; 3]> {
-    rgb.iter().zip(&target.seen).map(|(rgb, seen)| if *seen { *rgb } else { [0.0; 3] }).collect()
+    rgb.iter().zip(&target.visible).map(|(rgb, visible)| if *visible { *rgb } else { [0.0; 3] }).collect()
 }
 
 /// Weights of the SSIM window along one axis; they sum to 1.
@@ -159,9 +159,9 @@ pub fn window() -> [f64; 2 * WINDOW_RADIUS + 1] {
 fn blurred(size_px: [usize; 2], plane: &[f64]) -> Vec<f64> {
     let [width, height] = size_px;
     let window = window();
-    let along = |plane: &[f64], stride: usize, ix: usize, place: usize, side: usize| -> f64 {
-        let first = WINDOW_RADIUS.saturating_sub(place);
-        let end = window.len().min(side + WINDOW_RADIUS - place);
+    let along = |plane: &[f64], stride: usize, ix: usize, position: usize, side: usize| -> f64 {
+        let first = WINDOW_RADIUS.saturating_sub(position);
+        let end = window.len().min(side + WINDOW_RADIUS - position);
         (first..end).map(|tap| window[tap] * plane[ix + stride * tap - stride * WINDOW_RADIUS]).sum()
     };
     let by_x: Vec<_> = (0..plane.len()).map(|ix| along(plane, 1, ix, ix % width, width)).collect();
@@ -204,7 +204,7 @@ mod tests {
             image.depth.push((1.0 - transmittance) * depth_m + residual_m);
             image.last_contributor.push(None);
             target.rgb.push(truth);
-            target.seen.push(pixel_ix % 11 != 3 && pixel_ix % SIZE_PX[0] != 2);
+            target.visible.push(pixel_ix % 11 != 3 && pixel_ix % SIZE_PX[0] != 2);
             target.depth_m.push(depth_m);
         }
         (image, target)
@@ -217,7 +217,7 @@ mod tests {
         const REL: f64 = 1e-6;
         let (image, target) = image_and_target();
         let (_, upstream) = loss(&image, &target, &WEIGHTS);
-        let mut wrong = Mismatches::default();
+        let mut mismatches = Mismatches::default();
         let mut check = |name: String, analytic: f64, nudge: &dyn Fn(&mut RenderedImage, f64)| {
             let at = |step| {
                 let mut image = image.clone();
@@ -226,7 +226,7 @@ mod tests {
             };
             let numeric = (at(NUDGE) - at(-NUDGE)) / (2.0 * NUDGE);
             if (analytic, numeric) != (0.0, 0.0) {
-                wrong.check(name, analytic * factor, numeric, ABS, REL);
+                mismatches.check(name, analytic * factor, numeric, ABS, REL);
             }
         };
         for ix in 0..N_PIXELS {
@@ -238,7 +238,7 @@ mod tests {
             });
             check(format!("depth {ix}"), upstream.depth[ix], &|image, step| image.depth[ix] += step);
         }
-        wrong
+        mismatches
     }
 
     #[test]
@@ -247,13 +247,13 @@ mod tests {
     }
 
     #[test]
-    fn a_gradient_off_by_a_part_in_ten_thousand_is_noticed() {
-        let n_wrong = checked_gradient(1.0001).n_wrong();
-        assert!(n_wrong > 4 * N_PIXELS * 8 / 10, "only {n_wrong} of about {} are noticed", 4 * N_PIXELS);
+    fn gradient_error_of_one_in_ten_thousand_is_detected() {
+        let n_mismatches = checked_gradient(1.0001).n_mismatches();
+        assert!(n_mismatches > 4 * N_PIXELS * 8 / 10, "only {n_mismatches} of about {} are noticed", 4 * N_PIXELS);
     }
 
     #[test]
-    fn ssim_agrees_with_its_definition_written_out() {
+    fn ssim_matches_its_definition() {
         let (image, target) = image_and_target();
         let plane = |pixels: &[[f64; 3]]| pixels.iter().map(|pixel| pixel[1]).collect::<Vec<_>>();
         let (x, y) = (plane(&image.rgb), plane(&target.rgb));
@@ -282,16 +282,16 @@ mod tests {
     }
 
     #[test]
-    fn a_perfect_render_costs_nothing_and_unseen_pixels_pull_at_nothing() {
+    fn perfect_render_has_zero_loss_and_masked_pixels_no_gradient() {
         let (mut image, target) = image_and_target();
         let (_, upstream) = loss(&image, &target, &WEIGHTS);
-        for ix in (0..N_PIXELS).filter(|&ix| !target.seen[ix]) {
+        for ix in (0..N_PIXELS).filter(|&ix| !target.visible[ix]) {
             assert_eq!(upstream.rgb[ix], [0.0; 3]);
         }
         for ix in 0..N_PIXELS {
             let transmittance = image.transmittance[ix];
             image.depth[ix] = (1.0 - transmittance) * target.depth_m[ix];
-            if target.seen[ix] {
+            if target.visible[ix] {
                 image.rgb[ix] = std::array::from_fn(|c| target.rgb[ix][c] - transmittance * WEIGHTS.background_rgb[c]);
             }
         }
@@ -300,12 +300,12 @@ mod tests {
     }
 
     #[test]
-    fn known_values_of_a_flat_image() {
+    fn flat_image_gives_known_values() {
         // A render 0.25 too bright everywhere, seen fully; one pixel's depth 0.1 m off, another's beyond the clip.
         let n = N_PIXELS;
         let mut depth_m = vec![0.0; n];
         (depth_m[3], depth_m[4]) = (2.0, 2.0);
-        let target = Target { size_px: SIZE_PX, rgb: vec![[0.5; 3]; n], seen: vec![true; n], depth_m };
+        let target = Target { size_px: SIZE_PX, rgb: vec![[0.5; 3]; n], visible: vec![true; n], depth_m };
         let mut depth = vec![0.0; n];
         (depth[3], depth[4]) = (2.1, 1.0);
         let image = RenderedImage {

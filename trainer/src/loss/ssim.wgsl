@@ -58,11 +58,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 m += gaussian[k] * wg_means[lane + k * TILE_PX];
                 product += gaussian[k] * wg_products[lane + k * TILE_PX];
             }
-            let found = similarity_slopes(m.x, m.y, m.z, m.w, product);
+            let gradients = similarity_gradients(m.x, m.y, m.z, m.w, product);
             let at = channel * 3u * n_pixels + pixel.y * view.size_px.x + pixel.x;
-            slopes[at] = found.of_mean;
-            slopes[at + n_pixels] = found.of_square;
-            slopes[at + 2u * n_pixels] = found.of_product;
+            ssim_gradients[at] = gradients.of_mean;
+            ssim_gradients[at + n_pixels] = gradients.of_square;
+            ssim_gradients[at + 2u * n_pixels] = gradients.of_product;
         }
     }
 }

@@ -39,7 +39,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let d = pair_at(first + vec2i(3, 0), strip.channel, background);
         let x = vec4f(a.x, b.x, c.x, d.x);
         let y = vec4f(a.y, b.y, c.y, d.y);
-        let found = similarity_slopes(
+        let gradients = similarity_gradients(
             along_row(lane, add_row(&of_x, x)),
             along_row(lane, add_row(&of_y, y)),
             along_row(lane, add_row(&of_xx, x * x)),
@@ -51,9 +51,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let at = 3u * strip.channel * n_pixels + u32(middle.y * size.x + middle.x);
         for (var k = 0u; k < 4u; k++) {
             if middle.x + i32(k) >= size.x { continue; }
-            slopes[at + k] = found.of_mean[k];
-            slopes[at + k + n_pixels] = found.of_square[k];
-            slopes[at + k + 2u * n_pixels] = found.of_product[k];
+            ssim_gradients[at + k] = gradients.of_mean[k];
+            ssim_gradients[at + k + n_pixels] = gradients.of_square[k];
+            ssim_gradients[at + k + 2u * n_pixels] = gradients.of_product[k];
         }
     }
 }

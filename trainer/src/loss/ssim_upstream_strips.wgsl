@@ -16,15 +16,15 @@
 @group(0) @binding(2) var<storage, read> status: array<u32>;
 @group(0) @binding(3) var<storage, read> image: array<vec4f>;
 @group(0) @binding(4) var<storage, read> target_image: array<u32>;
-@group(0) @binding(5) var<storage, read> slopes: array<f32>;
+@group(0) @binding(5) var<storage, read> ssim_gradients: array<f32>;
 @group(0) @binding(6) var<storage, read> gains: vec4f;
 @group(0) @binding(7) var<storage, read_write> upstream: array<vec4f>;
 
-fn slopes_at(pixel: vec2i, channel: u32) -> vec3f {
+fn gradients_at(pixel: vec2i, channel: u32) -> vec3f {
     if any(pixel < vec2i(0)) || any(pixel >= vec2i(view.size_px)) { return vec3f(0.0); }
     let n_pixels = view.size_px.x * view.size_px.y;
     let at = 3u * channel * n_pixels + u32(pixel.y) * view.size_px.x + u32(pixel.x);
-    return vec3f(slopes[at], slopes[at + n_pixels], slopes[at + 2u * n_pixels]);
+    return vec3f(ssim_gradients[at], ssim_gradients[at + n_pixels], ssim_gradients[at + 2u * n_pixels]);
 }
 
 @compute @workgroup_size(LANES)
@@ -37,10 +37,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var of_products: Windows;
     for (var row = 0u; row < N_ROWS && strip.in_grid; row++) {
         let first = strip.corner + vec2i(0, i32(row));
-        let a = slopes_at(first, strip.channel);
-        let b = slopes_at(first + vec2i(1, 0), strip.channel);
-        let c = slopes_at(first + vec2i(2, 0), strip.channel);
-        let d = slopes_at(first + vec2i(3, 0), strip.channel);
+        let a = gradients_at(first, strip.channel);
+        let b = gradients_at(first + vec2i(1, 0), strip.channel);
+        let c = gradients_at(first + vec2i(2, 0), strip.channel);
+        let d = gradients_at(first + vec2i(3, 0), strip.channel);
         let of_mean = along_row(lane, add_row(&of_means, vec4f(a.x, b.x, c.x, d.x)));
         let of_square = along_row(lane, add_row(&of_squares, vec4f(a.y, b.y, c.y, d.y)));
         let of_product = along_row(lane, add_row(&of_products, vec4f(a.z, b.z, c.z, d.z)));
@@ -50,8 +50,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         for (var k = 0u; k < 4u; k++) {
             if middle.x + i32(k) >= size.x { continue; }
             let picture = gains[strip.channel] * (image[at + k][strip.channel] + image[at + k].w * background);
-            let wanted = rgb_of(target_image[at + k])[strip.channel];
-            upstream[at + k][strip.channel] = of_mean[k] + 2.0 * picture * of_square[k] + wanted * of_product[k];
+            let expected = rgb_of(target_image[at + k])[strip.channel];
+            upstream[at + k][strip.channel] = of_mean[k] + 2.0 * picture * of_square[k] + expected * of_product[k];
         }
     }
 }

@@ -3,21 +3,21 @@
 //! Rays begin anywhere in a cube that is occupied throughout and are all equally long, so that a step has a known number of
 //! samples; their colors are noise. The occupancy is not visited.
 
-use super::learner::{Compiled, Learner, STEPS_PER_SUBMIT};
-use super::options::{Effort, NerfOptions};
+use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
+use super::options::{NerfBudget, NerfOptions};
 use super::params::Ray;
-use super::rays::{mixed, unit};
+use super::rays::{mix_hash, unit};
 use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
-use crate::splat::TermSet;
+use crate::splat::ParamSet;
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
 
 /// Levels, coarsest and finest cells along an axis, and the logarithm of the entries of a level: as Mueller et al. 2022 have it.
-const GRID: (u32, u32, u32, u32) = (16, 16, 2048, 19);
+const GRID_SHAPE: (u32, u32, u32, u32) = (16, 16, 2048, 19);
 /// No multiple of the steps between two visits of the occupancy.
 const STEP: u64 = 1;
 
@@ -43,40 +43,40 @@ pub struct StepFigures {
 /// Times steps of `n_rays` rays with `n_samples` samples in all, a multiple of them.
 pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> Result<StepFigures, Error> {
     let options = NerfOptions::default();
-    let effort = Effort { n_rays, n_samples, ..Effort::FULL };
-    let (n_levels, coarsest, finest, log2_entries) = GRID;
+    let nerf_budget = NerfBudget { n_rays, n_samples, ..NerfBudget::FULL };
+    let (n_levels, coarsest, finest, log2_entries) = GRID_SHAPE;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);
-    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, has_depth: false, refines: false, effort };
-    let compiled = Arc::new(Compiled::new(gpu, &sizes.effort)?);
-    let mut learner = Learner::new(gpu, &options, sizes, compiled)?;
-    let rays = synthetic_rays(effort);
-    let submit = |learner: &mut Learner, n_steps: usize| {
+    let sizes = Sizes { n_cells: shape.n_cells, log2_entries, has_depth: false, can_refine: false, nerf_budget };
+    let compiled = Arc::new(Compiled::new(gpu, &sizes.nerf_budget)?);
+    let mut field_trainer = FieldTrainer::new(gpu, &options, sizes, compiled)?;
+    let rays = synthetic_rays(nerf_budget);
+    let submit = |field_trainer: &mut FieldTrainer, n_steps: usize| {
         for slot_ix in 0..n_steps {
-            learner.record_step(gpu, &options, slot_ix, STEP, &rays, TermSet::NONE)?;
+            field_trainer.record_step(gpu, &options, slot_ix, STEP, &rays, ParamSet::NONE)?;
         }
-        Ok(learner.submit(gpu))
+        Ok(field_trainer.submit(gpu))
     };
-    submit(&mut learner, STEPS_PER_SUBMIT)?.finish::<u32>(gpu)?;
+    submit(&mut field_trainer, STEPS_PER_SUBMIT)?.finish::<u32>(gpu)?;
     let n_submits = n_repeats.div_ceil(STEPS_PER_SUBMIT);
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
         // As in learning, the next submit is made while one runs.
-        if let Some(before) = before.replace(submit(&mut learner, STEPS_PER_SUBMIT)?) {
+        if let Some(before) = before.replace(submit(&mut field_trainer, STEPS_PER_SUBMIT)?) {
             before.finish::<u32>(gpu)?;
         }
     }
-    let taken = match before {
+    let counters = match before {
         Some(last) => last.finish::<u32>(gpu)?,
         None => Vec::new(),
     };
     let step_wall_millis = since.elapsed().as_secs_f64() * 1e3 / (n_submits * STEPS_PER_SUBMIT) as f64;
-    let timed = |learner: &mut Learner, list: &dyn Fn(&mut Learner) -> Result<(), Error>| {
+    let timed = |field_trainer: &mut FieldTrainer, list: &dyn Fn(&mut FieldTrainer) -> Result<(), Error>| {
         let mut timed = Vec::new();
         for _ in 0..n_repeats.max(1) {
-            list(learner)?;
+            list(field_trainer)?;
             let since = Instant::now();
-            let passes = learner.submit_timed(gpu)?;
+            let passes = field_trainer.submit_timed(gpu)?;
             let wall = since.elapsed().as_secs_f64() * 1e3;
             let sum = if passes.is_empty() { wall } else { passes.iter().map(|pass| pass.millis).sum() };
             timed.push((sum, passes));
@@ -84,15 +84,16 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
         Ok(timed.swap_remove(timed.len() / 2))
     };
-    let (step_millis, passes) =
-        timed(&mut learner, &|learner| learner.record_step(gpu, &options, 0, STEP, &rays, TermSet::NONE))?;
-    let (colors_millis, _) = timed(&mut learner, &|learner| {
-        learner.record_colors(gpu);
+    let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
+        field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::NONE)
+    })?;
+    let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| {
+        field_trainer.record_colors(gpu);
         Ok(())
     })?;
     Ok(StepFigures {
         n_rays,
-        n_samples: taken.get(1).copied().unwrap_or(0),
+        n_samples: counters.get(1).copied().unwrap_or(0),
         step_millis,
         step_wall_millis,
         colors_millis,
@@ -102,17 +103,17 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
 }
 
 /// Rays with equally many samples, filling the batch.
-fn synthetic_rays(effort: Effort) -> Vec<Ray> {
-    let Effort { n_rays, n_samples, n_steps, .. } = effort;
+fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
+    let NerfBudget { n_rays, n_samples, n_steps, .. } = nerf_budget;
     // Half a step to spare, so that rounding decides nothing.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
     let ray = |ix: u32| {
-        let number = |stream: u64| 2.0 * unit(mixed(u64::from(ix) << 8 | stream)) - 1.0;
+        let number = |stream: u64| 2.0 * unit(mix_hash(u64::from(ix) << 8 | stream)) - 1.0;
         let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
         let direction = triple(0).normalize();
         // Its middle in the cube, and all of it where steps are even.
         let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
-        let target = mixed(u64::from(ix) << 8 | 6).to_le_bytes();
+        let target = mix_hash(u64::from(ix) << 8 | 6).to_le_bytes();
         Ray {
             origin: f32s_of(origin.into()),
             direction: f32s_of(direction.into()),
@@ -131,7 +132,7 @@ mod tests {
     use crate::gpu::GpuOptions;
 
     #[test]
-    fn a_timed_step_has_as_many_samples_as_it_says() {
+    fn timed_step_has_requested_sample_count() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let figures = time_steps(&gpu, 64, 512, 1).unwrap();
         assert_eq!(figures.n_samples, 512);

@@ -1,7 +1,10 @@
 //! What the field and its samples take on the GPU.
 
 use super::kernels::{N_CHUNK, N_TILE, Widths};
-use super::params::{Batch, LearnRule, Level, March, Ray, RayLoss, TERM_STRIDE, Term, TermRule, Visit, levels};
+use super::params::{
+    AdamRule, Batch, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss,
+    levels,
+};
 use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
@@ -17,15 +20,15 @@ pub(crate) struct FieldBuffers {
     /// The same as two numbers of f16 each, as they were before the step, where layers are matrices.
     pub(crate) half_weights: Option<Buffer>,
     /// What kernels bind and do not use.
-    pub(crate) nothing: Buffer,
+    pub(crate) unused_buffer: Buffer,
     /// Terms of no image.
-    pub(crate) no_terms: Buffer,
+    pub(crate) no_image_params: Buffer,
     pub(crate) n_entries: u32,
 }
 
 /// Slopes towards the grid.
 #[derive(Debug)]
-pub(crate) struct FieldSlopes {
+pub(crate) struct FieldGradients {
     /// Two i32 an entry, times the scale of its level.
     pub(crate) grid: Buffer,
     /// A power of two a level.
@@ -46,7 +49,7 @@ pub(crate) struct FieldMoments {
     /// Steps so far, and visits of cells so far.
     pub(crate) steps: Buffer,
     /// How far the next step goes.
-    pub(crate) pace: Buffer,
+    pub(crate) step_scale: Buffer,
 }
 
 /// Where something is: the cells that rays are walked through.
@@ -55,40 +58,40 @@ pub(crate) struct Occupancy {
     /// A bit a cell, then a bit a block of cells.
     pub(crate) occupied: Buffer,
     /// An f32 a cell: the share of light that it lately held back over a step; negative: never visited; 0: never looked at.
-    pub(crate) thickness: Buffer,
-    pub(crate) thickness_sum: Buffer,
-    pub(crate) visit: Buffer,
+    pub(crate) cell_occupancy: Buffer,
+    pub(crate) occupancy_sum: Buffer,
+    pub(crate) occupancy_update: Buffer,
     pub(crate) n_points: u32,
     pub(crate) n_cells: u32,
 }
 
 /// Blocks of cells along an axis, as in `cell_blocks.wgsl`.
 pub(crate) fn n_blocks(n_cells: u32) -> u32 {
-    const MOST_BLOCKS: u32 = 16;
-    n_cells.min(MOST_BLOCKS)
+    const MAX_BLOCKS: u32 = 16;
+    n_cells.min(MAX_BLOCKS)
 }
 
 impl Occupancy {
     /// All cells hold something as far as anyone knows; where there is depth it is left to the depth to say so.
-    pub(crate) fn new(gpu: &Gpu, visit: &Visit, has_depth: bool) -> Result<Self, Error> {
-        let n = visit.n_cells.pow(3) as usize;
-        let n_words = n / 32 + n_blocks(visit.n_cells).pow(3).div_ceil(32) as usize;
+    pub(crate) fn new(gpu: &Gpu, occupancy_update: &OccupancyUpdate, has_depth: bool) -> Result<Self, Error> {
+        let n = occupancy_update.n_cells.pow(3) as usize;
+        let n_words = n / 32 + n_blocks(occupancy_update.n_cells).pow(3).div_ceil(32) as usize;
         Ok(Self {
             occupied: gpu.storage_with("nerf.occupied", &vec![255; 4 * n_words.next_multiple_of(4)])?,
-            thickness: gpu.storage_with(
-                "nerf.thickness",
+            cell_occupancy: gpu.storage_with(
+                "nerf.cell_occupancy",
                 bytemuck::cast_slice(&vec![if has_depth { 0.0f32 } else { -1.0 }; n]),
             )?,
-            thickness_sum: gpu.storage("nerf.thickness_sum", 4)?,
-            visit: gpu.uniform_with("nerf.visit", visit),
-            n_points: visit.n_points,
-            n_cells: visit.n_cells,
+            occupancy_sum: gpu.storage("nerf.occupancy_sum", 4)?,
+            occupancy_update: gpu.uniform_with("nerf.occupancy_update", occupancy_update),
+            n_points: occupancy_update.n_points,
+            n_cells: occupancy_update.n_cells,
         })
     }
 }
 
 /// Threads that walk one ray, `SHARES` of `march_shares.wgsl`.
-pub(crate) const N_SHARES: u32 = 8;
+pub(crate) const THREADS_PER_RAY: u32 = 8;
 
 /// The rays of one step or of part of a picture, and how they are looked along.
 #[derive(Debug)]
@@ -108,7 +111,7 @@ impl RaySlot {
             n_rays,
             rays: gpu.storage("nerf.rays", u64::from(n_rays) * size_of::<Ray>() as u64)?,
             n_found: gpu.storage("nerf.n_found", 4 * u64::from(n_rays))?,
-            n_before: gpu.storage("nerf.n_before", 4 * u64::from(N_SHARES * n_rays))?,
+            n_before: gpu.storage("nerf.n_before", 4 * u64::from(THREADS_PER_RAY * n_rays))?,
             march: gpu.uniform_with("nerf.march", &<March as bytemuck::Zeroable>::zeroed()),
             loss: gpu.uniform_with("nerf.loss", &<RayLoss as bytemuck::Zeroable>::zeroed()),
         })
@@ -125,7 +128,7 @@ pub(crate) struct SampleBuffers {
     /// Middles of the samples in the unit cube, four f32 each.
     pub(crate) points: Buffer,
     /// Logarithms of the densities.
-    pub(crate) told: Buffer,
+    pub(crate) log_density: Buffer,
     /// Before the sigmoid, four f32 each.
     pub(crate) colors: Buffer,
 }
@@ -134,12 +137,12 @@ pub(crate) struct SampleBuffers {
 #[derive(Debug)]
 pub(crate) struct StepBuffers {
     /// What goes into each layer, in numbers of [`Widths::bytes_per_number`], as the next.
-    pub(crate) held: Buffer,
+    pub(crate) activations: Buffer,
     /// Slopes towards what comes out of each layer.
-    pub(crate) v_held: Buffer,
+    pub(crate) v_activations: Buffer,
     pub(crate) v_log_density: Buffer,
     pub(crate) v_colors: Buffer,
-    pub(crate) seen: Buffer,
+    pub(crate) ray_colors: Buffer,
     pub(crate) ray_errors: Buffer,
     /// Slopes towards the weights, of each chunk of samples.
     pub(crate) partial_sums: Buffer,
@@ -147,29 +150,32 @@ pub(crate) struct StepBuffers {
 
 /// What is learned about images, and the slopes towards that.
 #[derive(Debug)]
-pub(crate) struct TermBuffers {
-    /// `[n_images, TERM_STRIDE]`.
-    pub(crate) terms: Buffer,
+pub(crate) struct ImageParamBuffers {
+    /// `[n_images, IMAGE_PARAM_STRIDE]`.
+    pub(crate) image_params: Buffer,
     pub(crate) rule: Buffer,
     pub(crate) n_images: u32,
     /// Of the places of each sample, and of each ray.
     pub(crate) v_points: Buffer,
     pub(crate) v_rays: Buffer,
     /// Of each sample.
-    pub(crate) v_codes: Buffer,
+    pub(crate) v_embeddings: Buffer,
 }
 
-impl TermBuffers {
+impl ImageParamBuffers {
     /// Of images that have right poses and the same light as far as anyone knows.
-    pub(crate) fn new(gpu: &Gpu, rule: &TermRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, rule: &ImageParamRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
         let n_images = rule.n_images;
         Ok(Self {
-            terms: gpu.storage("nerf.terms", u64::from(n_images) * (TERM_STRIDE * size_of::<Term>()) as u64)?,
+            image_params: gpu.storage(
+                "nerf.image_params",
+                u64::from(n_images) * (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64,
+            )?,
             rule: gpu.uniform_with("nerf.term_rule", rule),
             n_images,
             v_points: gpu.storage("nerf.v_points", 16 * u64::from(n_samples))?,
             v_rays: gpu.storage("nerf.v_rays", 32 * u64::from(n_rays))?,
-            v_codes: gpu.storage("nerf.v_codes", 16 * u64::from(n_samples))?,
+            v_embeddings: gpu.storage("nerf.v_embeddings", 16 * u64::from(n_samples))?,
         })
     }
 }
@@ -180,16 +186,16 @@ impl FieldBuffers {
         let levels: Vec<Level> = levels(shape);
         Ok(Self {
             levels: gpu.storage_with("nerf.levels", bytemuck::cast_slice(&levels))?,
-            grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_in_all()))?,
+            grid: gpu.storage("nerf.grid", 8 * u64::from(shape.n_entries_total()))?,
             weights: gpu.storage("nerf.weights", 4 * u64::from(widths.n_weights()))?,
-            half_weights: if widths.halves {
+            half_weights: if widths.is_half_precision {
                 Some(gpu.storage("nerf.half_weights", 4 * u64::from(widths.n_padded_weights()))?)
             } else {
                 None
             },
-            nothing: gpu.storage("nerf.nothing", 16)?,
-            no_terms: gpu.storage("nerf.no_terms", 16)?,
-            n_entries: shape.n_entries_in_all(),
+            unused_buffer: gpu.storage("nerf.nothing", 16)?,
+            no_image_params: gpu.storage("nerf.no_terms", 16)?,
+            n_entries: shape.n_entries_total(),
         })
     }
 
@@ -199,10 +205,10 @@ impl FieldBuffers {
     }
 }
 
-impl FieldSlopes {
+impl FieldGradients {
     pub(crate) fn new(gpu: &Gpu, shape: &GridShape) -> Result<Self, Error> {
         Ok(Self {
-            grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_in_all()))?,
+            grid: gpu.storage("nerf.v_grid", 8 * u64::from(shape.n_entries_total()))?,
             scales: gpu.storage("nerf.scales", 4 * shape.n_cells.len() as u64)?,
             counts: gpu.storage("nerf.counts", 8)?,
         })
@@ -210,13 +216,13 @@ impl FieldSlopes {
 }
 
 impl FieldMoments {
-    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, rule: &LearnRule) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths, rule: &AdamRule) -> Result<Self, Error> {
         Ok(Self {
-            grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_in_all()))?,
+            grid: gpu.storage("nerf.grid_moments", 16 * u64::from(shape.n_entries_total()))?,
             weights: gpu.storage("nerf.weight_moments", 8 * u64::from(widths.n_weights()))?,
             largest: gpu.storage("nerf.largest", 4 * shape.n_cells.len() as u64)?,
             steps: gpu.storage("nerf.steps", 8)?,
-            pace: gpu.storage_with("nerf.pace", bytemuck::bytes_of(&rule.first_pace()))?,
+            step_scale: gpu.storage_with("nerf.step_scale", bytemuck::bytes_of(&rule.first_step_scale()))?,
         })
     }
 }
@@ -230,7 +236,7 @@ impl SampleBuffers {
             batch: gpu.storage_with("nerf.batch", bytemuck::bytes_of(&Batch::of(0)))?,
             spans: floats("nerf.spans", 4)?,
             points: floats("nerf.points", 4)?,
-            told: floats("nerf.told", 1)?,
+            log_density: floats("nerf.log_density", 1)?,
             colors: floats("nerf.colors", 4)?,
         })
     }
@@ -242,11 +248,11 @@ impl StepBuffers {
         let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
         let in_tiles = u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());
         Ok(Self {
-            held: gpu.storage("nerf.held", in_tiles * u64::from(widths.n_held()))?,
-            v_held: gpu.storage("nerf.v_held", in_tiles * u64::from(widths.n_slopes()))?,
+            activations: gpu.storage("nerf.activations", in_tiles * u64::from(widths.n_activations()))?,
+            v_activations: gpu.storage("nerf.v_activations", in_tiles * u64::from(widths.n_gradients()))?,
             v_log_density: floats("nerf.v_log_density", n_samples, 1)?,
             v_colors: floats("nerf.v_colors", n_samples, 4)?,
-            seen: floats("nerf.seen", n_rays, 4)?,
+            ray_colors: floats("nerf.ray_colors", n_rays, 4)?,
             ray_errors: floats("nerf.ray_errors", n_rays, 2)?,
             partial_sums: floats("nerf.partial_sums", n_samples.div_ceil(N_CHUNK), widths.n_padded_weights())?,
         })

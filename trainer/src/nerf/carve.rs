@@ -9,23 +9,23 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 /// What is told of a cell, as in `hint_cells.wgsl`.
-const LOOKED_AT_WITHOUT_END: u32 = 0;
-const LOOKED_THROUGH: u32 = 1 << 30;
+const UNBOUNDED: u32 = 0;
+const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
 /// Where rays that meet nothing end, in units of the scene's radius.
-const NOWHERE: f64 = 50.0;
+const UNBOUNDED_DISTANCE: f64 = 50.0;
 /// Readings from one ray that is followed to the next: readings are told of every half cell, and so is where nothing was read, but what is
 /// empty before readings need be told once.
-const READINGS_PER_RAY: u32 = 4;
+const READINGS_PER_FREE_RAY: u32 = 4;
 /// Pixels to each side that tell a hole in what a depth camera read from what it cannot read.
-const HOLE_REACH_PX: u32 = 2;
+const HOLE_RADIUS_PX: u32 = 2;
 /// Share of the distance that a reading may be off by: so far in front of it nothing is taken for free.
-const OFF_FRAC: f64 = 0.03;
+const DEPTH_ERROR_FRAC: f64 = 0.03;
 
 /// Cells that images look at or through.
 #[derive(Debug)]
 struct Cells {
-    without_end: CellSet,
+    unbounded: CellSet,
     free: CellSet,
     surfaces: CellSet,
 }
@@ -44,13 +44,15 @@ impl CellSet {
     }
 
     fn extend(&mut self, other: &Self) {
-        self.0.iter_mut().zip(&other.0).for_each(|(own, others)| *own |= others);
+        self.0.iter_mut().zip(&other.0).for_each(|(own_word, other_words)| *own_word |= other_words);
     }
 
     /// The cells that `other` has not got, in their order.
-    fn without<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = u32> + 'a {
-        let others = other.0.iter().copied().chain(std::iter::repeat(0));
-        let words = (0u32..).zip(self.0.iter().zip(others)).map(|(ix, (own, others))| (ix, own & !others));
+    fn difference<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = u32> + 'a {
+        let other_words = other.0.iter().copied().chain(std::iter::repeat(0));
+        let words = (0u32..)
+            .zip(self.0.iter().zip(other_words))
+            .map(|(ix, (own_word, other_words))| (ix, own_word & !other_words));
         words
             .filter(|(_, word)| *word != 0)
             .flat_map(|(ix, word)| (0..64).filter(move |bit| word >> bit & 1 == 1).map(move |bit| 64 * ix + bit))
@@ -58,7 +60,7 @@ impl CellSet {
 }
 
 /// Origin and direction of a ray, in units of the radius.
-type RayOf = ([f64; 3], [f64; 3]);
+type UnitRay = ([f64; 3], [f64; 3]);
 
 /// Pixels from one ray that is followed to the next: half a cell apart a radius away.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
@@ -67,7 +69,7 @@ fn stride_of(focal_px: [f64; 2], march: &March) -> u32 {
 }
 
 /// Whether a depth image shows what lies far away in a direction, given in the axes of another camera.
-fn sees(depth: &DepthMap, depth_from_camera: &Transform, along: Vector3<f64>) -> bool {
+fn is_in_depth_image(depth: &DepthMap, depth_from_camera: &Transform, along: Vector3<f64>) -> bool {
     let along = depth_from_camera.rotation * along;
     let is_inside = |axis: usize| {
         let pixel = depth.focal_px[axis] * along[axis] / along.z + depth.principal_px[axis];
@@ -81,9 +83,11 @@ fn is_reading(z_m: f64) -> bool {
 }
 
 /// Whether most pixels around one without reading have one: it says nothing then, and what lies behind the others is not seen through it.
-fn is_pinhole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
+fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
-    let around = |at: u32, size: u32| at.saturating_sub(HOLE_REACH_PX)..(at + HOLE_REACH_PX + 1).min(size);
+    let around = |coordinate: u32, size: u32| {
+        coordinate.saturating_sub(HOLE_RADIUS_PX)..(coordinate + HOLE_RADIUS_PX + 1).min(size)
+    };
     let pixels = around(y, height).flat_map(|y| around(x, width).map(move |x| (y * width + x) as usize));
     let (n, n_read) = pixels
         .fold((0, 0), |(n, n_read), pixel| (n + 1, n_read + usize::from(is_reading(depth.depth_m[pixel].into()))));
@@ -97,40 +101,40 @@ fn cell_width(march: &March, point: [f64; 3]) -> f64 {
 
 /// What images tell about cells, each told once; of cells that none of them looks at nothing is told.
 pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
-    let none = || Cells::new(march.n_cells.pow(3));
-    let Cells { without_end, free, surfaces } = keyframes
+    let empty = || Cells::new(march.n_cells.pow(3));
+    let Cells { unbounded, free, surfaces } = keyframes
         .par_iter()
-        .fold(none, |mut cells, keyframe| {
+        .fold(empty, |mut cells, keyframe| {
             if let Some(depth) = &keyframe.depth {
-                cells.look(depth, extent, march);
+                cells.add_depth_image(depth, extent, march);
             }
-            cells.look_beside_depth(keyframe, extent, march);
+            cells.add_color_only_rays(keyframe, extent, march);
             cells
         })
-        .reduce(none, Cells::and);
-    let without_end = without_end.without(&free).map(|cell| cell | LOOKED_AT_WITHOUT_END);
-    let free = free.without(&surfaces).map(|cell| cell | LOOKED_THROUGH);
+        .reduce(empty, Cells::and);
+    let unbounded = unbounded.difference(&free).map(|cell| cell | UNBOUNDED);
+    let free = free.difference(&surfaces).map(|cell| cell | FREE);
     let nothing = CellSet::new(0);
-    without_end.chain(free).chain(surfaces.without(&nothing).map(|cell| cell | SURFACE)).collect()
+    unbounded.chain(free).chain(surfaces.difference(&nothing).map(|cell| cell | SURFACE)).collect()
 }
 
 impl Cells {
     fn new(n_cells: usize) -> Self {
-        let [without_end, free, surfaces] = [(); 3].map(|()| CellSet::new(n_cells));
-        Self { without_end, free, surfaces }
+        let [unbounded, free, surfaces] = [(); 3].map(|()| CellSet::new(n_cells));
+        Self { unbounded, free, surfaces }
     }
 
     fn and(mut self, other: Self) -> Self {
-        self.without_end.extend(&other.without_end);
+        self.unbounded.extend(&other.unbounded);
         self.free.extend(&other.free);
         self.surfaces.extend(&other.surfaces);
         self
     }
 
     /// Takes note of a depth image.
-    fn look(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
+    fn add_depth_image(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
         let stride = stride_of(depth.focal_px, march);
-        let origin = extent.in_units(&depth.world_from_camera).translation.vector.into();
+        let origin = extent.in_scene_units(&depth.world_from_camera).translation.vector.into();
         let [width, height] = depth.size_px;
         for y in (0..height).step_by(stride as usize) {
             for x in (0..width).step_by(stride as usize) {
@@ -138,47 +142,50 @@ impl Cells {
                 let z_m = f64::from(depth.depth_m[(y * width + x) as usize]);
                 let reading_m = if is_reading(z_m) { z_m * along.norm() } else { 0.0 };
                 let ray = (origin, (depth.world_from_camera.rotation * along.normalize()).into());
-                let is_open = reading_m == 0.0;
-                if is_open && is_pinhole(depth, [x, y]) {
+                let is_unbounded = reading_m == 0.0;
+                if is_unbounded && is_small_hole(depth, [x, y]) {
                     continue;
                 }
-                if is_open || [x, y].into_iter().all(|at| (at / stride).is_multiple_of(READINGS_PER_RAY)) {
-                    self.walk(march, ray, reading_m / extent.radius_m);
+                if is_unbounded
+                    || [x, y].into_iter().all(|coordinate| (coordinate / stride).is_multiple_of(READINGS_PER_FREE_RAY))
+                {
+                    self.mark_along_ray(march, ray, reading_m / extent.radius_m);
                 }
-                if !is_open {
-                    self.meet(march, ray, reading_m / extent.radius_m);
+                if !is_unbounded {
+                    self.mark_surface(march, ray, reading_m / extent.radius_m);
                 }
             }
         }
     }
 
     /// Takes note of what a color image sees where its depth image does not look, as far away as nowhere is.
-    fn look_beside_depth(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
+    fn add_color_only_rays(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
         let Keyframe { size_px: [width, height], focal_px, principal_px, world_from_camera, depth, .. } = keyframe;
         let depth = depth.as_ref().map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
-        let is_in_depth = |along: Vector3<f64>| depth.as_ref().is_some_and(|(depth, pose)| sees(depth, pose, along));
+        let is_in_depth =
+            |along: Vector3<f64>| depth.as_ref().is_some_and(|(depth, pose)| is_in_depth_image(depth, pose, along));
         let stride = stride_of(*focal_px, march) as usize;
-        let origin = extent.in_units(world_from_camera).translation.vector.into();
+        let origin = extent.in_scene_units(world_from_camera).translation.vector.into();
         for y in (0..*height).step_by(stride) {
             for x in (0..*width).step_by(stride) {
-                let at = [x, y].map(|pixel| f64::from(pixel) + 0.5);
-                let [right, down] = [0, 1].map(|axis| (at[axis] - principal_px[axis]) / focal_px[axis]);
+                let coordinate = [x, y].map(|pixel| f64::from(pixel) + 0.5);
+                let [right, down] = [0, 1].map(|axis| (coordinate[axis] - principal_px[axis]) / focal_px[axis]);
                 let along = Vector3::new(right, down, 1.0).normalize();
                 if !is_in_depth(along) {
-                    self.walk(march, (origin, (world_from_camera.rotation * along).into()), 0.0);
+                    self.mark_along_ray(march, (origin, (world_from_camera.rotation * along).into()), 0.0);
                 }
             }
         }
     }
 
     /// Follows a ray to its reading; to nowhere where that is 0.
-    fn walk(&mut self, march: &March, (origin, direction): RayOf, distance: f64) {
+    fn mark_along_ray(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let cell = |t: f64| march.cell(point(t)).0;
         let width = |t: f64| cell_width(march, point(t));
-        let is_open = distance == 0.0;
-        let end = if is_open { NOWHERE } else { distance * (1.0 - OFF_FRAC) - width(distance) };
-        let passed = if is_open { &mut self.without_end } else { &mut self.free };
+        let is_unbounded = distance == 0.0;
+        let end = if is_unbounded { UNBOUNDED_DISTANCE } else { distance * (1.0 - DEPTH_ERROR_FRAC) - width(distance) };
+        let passed = if is_unbounded { &mut self.unbounded } else { &mut self.free };
         let mut t = 0.0;
         while t < end {
             passed.insert(cell(t));
@@ -187,7 +194,7 @@ impl Cells {
     }
 
     /// Takes note of what a reading lies in, and of a cell before and behind it.
-    fn meet(&mut self, march: &March, (origin, direction): RayOf, distance: f64) {
+    fn mark_surface(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let width = cell_width(march, point(distance));
         for part in [-1.0, -0.5, 0.0, 0.5, 1.0] {

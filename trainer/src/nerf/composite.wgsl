@@ -19,15 +19,15 @@
 @group(0) @binding(1) var<uniform> loss: RayLoss;
 @group(0) @binding(2) var<storage, read> rays: array<Ray>;
 @group(0) @binding(3) var<storage, read> spans: array<Span>;
-@group(0) @binding(4) var<storage, read> told: array<f32>;
+@group(0) @binding(4) var<storage, read> log_density: array<f32>;
 @group(0) @binding(5) var<storage, read> colors: array<vec4f>;
-@group(0) @binding(6) var<storage, read_write> seen: array<vec4f>;
+@group(0) @binding(6) var<storage, read_write> ray_colors: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> ray_errors: array<vec2f>;
 @group(0) @binding(8) var<storage, read_write> v_log_density: array<f32>;
 @group(0) @binding(9) var<storage, read_write> v_colors: array<vec4f>;
 
 // Where a distance lies between near and infinity, 0 to 1.
-fn place_of(t: f32) -> f32 {
+fn normalized_distance(t: f32) -> f32 {
     return 1.0 - loss.near / max(t, loss.near);
 }
 
@@ -38,77 +38,77 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let ray = rays[ray_ix];
     let end = ray.first_sample + ray.n_samples;
     let band = vec2f(ray.target_distance, loss.band + loss.band_frac * ray.target_distance);
-    let sight = select(0.0, 2.0 * loss.sight / f32(batch.n_rays), ray.target_distance > 0.0);
-    var at_reading = 0.0;     // sum of the weights close to what the depth camera saw
-    var off_reading = 0.0;    // sum of the squares of the others
+    let line_of_sight = select(0.0, 2.0 * loss.line_of_sight / f32(batch.n_rays), ray.target_distance > 0.0);
+    var weight_near_reading = 0.0;     // sum of the weights close to what the depth camera saw
+    var weight_sq_elsewhere = 0.0;    // sum of the squares of the others
     var rgb = vec3f(0.0);
     var distance = 0.0;
     var transmittance = 1.0;
-    var in_all = vec2f(0.0); // sums of weights, and of weights times places
+    var total = vec2f(0.0); // sums of weights, and of weights times places
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
-        let weight = transmittance * (1.0 - sample.left);
+        let weight = transmittance * (1.0 - sample.transmitted);
         rgb += weight * sample.rgb;
         distance += weight * 0.5 * (sample.begin + sample.end);
-        if is_close(sample, band) { at_reading += weight; } else { off_reading += weight * weight; }
-        in_all += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
-        transmittance *= sample.left;
+        if is_near_reading(sample, band) { weight_near_reading += weight; } else { weight_sq_elsewhere += weight * weight; }
+        total += weight * vec2f(1.0, 0.5 * (normalized_distance(sample.begin) + normalized_distance(sample.end)));
+        transmittance *= sample.transmitted;
     }
-    seen[ray_ix] = vec4f(rgb, transmittance);
+    ray_colors[ray_ix] = vec4f(rgb, transmittance);
     let background = loss.background_srgb.rgb;
-    let miss = rgb + transmittance * background - unpack4x8unorm(ray.target_rgb).rgb;
-    ray_errors[ray_ix] = vec2f(dot(miss, miss) / 3.0, distance);
+    let residual = rgb + transmittance * background - unpack4x8unorm(ray.target_rgb).rgb;
+    ray_errors[ray_ix] = vec2f(dot(residual, residual) / 3.0, distance);
 
     let per_ray = 1.0 / f32(batch.n_rays);
-    let is_seen = ray.target_rgb >= 0x01000000u;
-    let v_rgb = select(vec3f(0.0), 2.0 / 3.0 * per_ray * miss, is_seen);
+    let is_unmasked = ray.target_rgb >= 0x01000000u;
+    let v_rgb = select(vec3f(0.0), 2.0 / 3.0 * per_ray * residual, is_unmasked);
     var v_transmittance = dot(v_rgb, background);
     var v_distance = 0.0;
-    let miss_far = distance - (1.0 - transmittance) * ray.target_distance;
-    if ray.target_distance > 0.0 && abs(miss_far) < loss.distance_clip {
-        v_distance = loss.distance_weight * per_ray * sign(miss_far);
+    let distance_residual = distance - (1.0 - transmittance) * ray.target_distance;
+    if ray.target_distance > 0.0 && abs(distance_residual) < loss.distance_clip {
+        v_distance = loss.distance_weight * per_ray * sign(distance_residual);
         v_transmittance += v_distance * ray.target_distance;
     }
     // What lies behind a sample is what all are worth less what lies in front of it and what it is worth itself.
-    var behind = dot(v_rgb, rgb) + v_distance * distance + sight * (off_reading - (1.0 - at_reading) * at_reading);
-    let spread = loss.distortion * per_ray;
+    var behind = dot(v_rgb, rgb) + v_distance * distance + line_of_sight * (weight_sq_elsewhere - (1.0 - weight_near_reading) * weight_near_reading);
+    let distortion_weight = loss.distortion * per_ray;
     var before = vec2f(0.0);
     // What the weights' own slopes add to it takes a pass of its own.
-    var light = 1.0;
-    for (var ix = ray.first_sample; ix < end && spread > 0.0; ix++) {
+    var transmittance_before = 1.0;
+    for (var ix = ray.first_sample; ix < end && distortion_weight > 0.0; ix++) {
         let sample = sample_at(ix);
-        let weight = light * (1.0 - sample.left);
-        behind += weight * spread_slope(sample, weight, before, in_all) * spread;
-        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
-        light *= sample.left;
+        let weight = transmittance_before * (1.0 - sample.transmitted);
+        behind += weight * distortion_gradient(sample, weight, before, total) * distortion_weight;
+        before += weight * vec2f(1.0, 0.5 * (normalized_distance(sample.begin) + normalized_distance(sample.end)));
+        transmittance_before *= sample.transmitted;
     }
     before = vec2f(0.0);
-    light = 1.0;
+    transmittance_before = 1.0;
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
-        let weight = light * (1.0 - sample.left);
+        let weight = transmittance_before * (1.0 - sample.transmitted);
         let middle = 0.5 * (sample.begin + sample.end);
-        var worth = dot(v_rgb, sample.rgb) + v_distance * middle;
-        worth += sight * select(weight, at_reading - 1.0, is_close(sample, band));
-        if spread > 0.0 { worth += spread * spread_slope(sample, weight, before, in_all); }
-        before += weight * vec2f(1.0, 0.5 * (place_of(sample.begin) + place_of(sample.end)));
-        light *= sample.left;
-        behind -= weight * worth;
-        let v_density = (sample.end - sample.begin) * (light * worth - behind - transmittance * v_transmittance);
-        v_log_density[ix] = select(v_density * sample.density, 0.0, sample.is_cut);
+        var v_weight = dot(v_rgb, sample.rgb) + v_distance * middle;
+        v_weight += line_of_sight * select(weight, weight_near_reading - 1.0, is_near_reading(sample, band));
+        if distortion_weight > 0.0 { v_weight += distortion_weight * distortion_gradient(sample, weight, before, total); }
+        before += weight * vec2f(1.0, 0.5 * (normalized_distance(sample.begin) + normalized_distance(sample.end)));
+        transmittance_before *= sample.transmitted;
+        behind -= weight * v_weight;
+        let v_density = (sample.end - sample.begin) * (transmittance_before * v_weight - behind - transmittance * v_transmittance);
+        v_log_density[ix] = select(v_density * sample.density, 0.0, sample.is_clamped);
         v_colors[ix] = vec4f(weight * v_rgb * sample.rgb * (1.0 - sample.rgb), 0.0);
     }
 }
 
 // Whether a sample lies where the depth camera saw something: band is its distance and what it may be off by.
-fn is_close(sample: Sample, band: vec2f) -> bool {
+fn is_near_reading(sample: Sample, band: vec2f) -> bool {
     return abs(0.5 * (sample.begin + sample.end) - band.x) <= band.y;
 }
 
-fn spread_slope(sample: Sample, weight: f32, before: vec2f, in_all: vec2f) -> f32 {
-    let places = vec2f(place_of(sample.begin), place_of(sample.end));
-    let middle = 0.5 * (places.x + places.y);
-    let after = in_all - before - weight * vec2f(1.0, middle);
-    let apart = middle * before.x - before.y + after.y - middle * after.x;
-    return 2.0 * apart + 2.0 / 3.0 * weight * (places.y - places.x);
+fn distortion_gradient(sample: Sample, weight: f32, before: vec2f, total: vec2f) -> f32 {
+    let normalized_ends = vec2f(normalized_distance(sample.begin), normalized_distance(sample.end));
+    let middle = 0.5 * (normalized_ends.x + normalized_ends.y);
+    let after = total - before - weight * vec2f(1.0, middle);
+    let separation = middle * before.x - before.y + after.y - middle * after.x;
+    return 2.0 * separation + 2.0 / 3.0 * weight * (normalized_ends.y - normalized_ends.x);
 }

@@ -11,7 +11,7 @@
 #import space
 #import cell_blocks
 #import march
-#import march_shares
+#import march_threads
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<uniform> march: March;
@@ -25,17 +25,17 @@ var<workgroup> wg_found: array<u32, 64>;
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = folded(wg, n_wgs) * 64u + lane;
-    let ray_ix = ix / SHARES;
-    let share = ix % SHARES;
+    let ray_ix = ix / THREADS_PER_RAY;
+    let share = ix % THREADS_PER_RAY;
     var n = 0u;
     if ray_ix < batch.n_rays {
         let ray = rays[ray_ix];
         let path = path_of(march, ray);
-        let range = share_of_pieces(path, share);
-        var piece = next_piece(march, ray, path, range.x, range.y);
-        while piece.ix < range.y {
+        let range = segments_of_thread(path, share);
+        var segment = next_segment(march, ray, path, range.x, range.y);
+        while segment.ix < range.y {
             n++;
-            piece = next_piece(march, ray, path, piece.ix + 1u, range.y);
+            segment = next_segment(march, ray, path, segment.ix + 1u, range.y);
         }
     }
     wg_found[lane] = n;
@@ -44,6 +44,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         var sum = 0u;
         for (var other = lane - share; other < lane; other++) { sum += wg_found[other]; }
         n_before[ix] = sum;
-        if share == SHARES - 1u { n_found[ray_ix] = sum + n; }
+        if share == THREADS_PER_RAY - 1u { n_found[ray_ix] = sum + n; }
     }
 }

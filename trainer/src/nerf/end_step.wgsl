@@ -6,34 +6,34 @@
 //
 // Every level's slopes are scaled by a power of two of its own, from what its largest sum was.
 
-#import learn_rule
+#import adam_rule
 
-@group(0) @binding(4) var<uniform> rule: LearnRule;
-@group(0) @binding(5) var<storage, read_write> pace: Pace;
+@group(0) @binding(4) var<uniform> rule: AdamRule;
+@group(0) @binding(5) var<storage, read_write> step_scale: StepScale;
 @group(0) @binding(0) var<storage, read_write> scales: array<f32>;
 @group(0) @binding(1) var<storage, read_write> largest: array<u32>;
 @group(0) @binding(2) var<storage, read_write> counts: array<u32>;
 @group(0) @binding(3) var<storage, read_write> steps: array<u32>;
 
-const WANTED_BITS = 23u;   // of the largest sum, of 31
-const MOST_SCALE = 1.0e30;
+const TARGET_BITS = 23u;   // of the largest sum, of 31
+const MAX_SCALE = 1.0e30;
 
 @compute @workgroup_size(64)
 fn main(@builtin(local_invocation_index) lane: u32) {
-    let n_lost = counts[0];
+    let n_saturated = counts[0];
     if lane < arrayLength(&scales) {
         let n_bits = 32u - countLeadingZeros(largest[lane]);
         // A level without slopes keeps its scale; what was lost was too large by an unknown factor.
-        var change = select(exp2(f32(WANTED_BITS) - f32(n_bits)), 1.0, n_bits == 0u);
-        if n_lost > 0u { change = min(change, 1.0) / 16.0; }
-        scales[lane] = clamp(scales[lane] * change, 1.0 / MOST_SCALE, MOST_SCALE);
+        var change = select(exp2(f32(TARGET_BITS) - f32(n_bits)), 1.0, n_bits == 0u);
+        if n_saturated > 0u { change = min(change, 1.0) / 16.0; }
+        scales[lane] = clamp(scales[lane] * change, 1.0 / MAX_SCALE, MAX_SCALE);
         largest[lane] = 0u;
     }
     storageBarrier(); // All have read how many were lost.
     if lane == 0u {
-        counts[1] += n_lost;
+        counts[1] += n_saturated;
         counts[0] = 0u;
         steps[0] += 1u;
-        pace = pace_at(rule, f32(steps[0]));
+        step_scale = step_scale_at(rule, f32(steps[0]));
     }
 }

@@ -7,16 +7,16 @@ use nalgebra::{Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// Readings of depth that are asked about the scene's size, of each keyframe.
-const READINGS_PER_KEYFRAME: usize = 64;
+const SAMPLES_PER_KEYFRAME: usize = 64;
 /// Share of the readings on each side that may lie outside.
 const OUTSIDE_FRAC: f64 = 0.02;
 /// What is further away than this many times the median is far: it is drawn in.
-const FAR: f64 = 2.0;
+const FAR_OVER_MEDIAN: f64 = 2.0;
 /// Where nothing is known, metres.
-const USUAL_RADIUS_M: f64 = 1.0;
-const LEAST_RADIUS_M: f64 = 0.01;
+const DEFAULT_RADIUS_M: f64 = 1.0;
+const MIN_RADIUS_M: f64 = 0.01;
 /// Who reaches this many radii far calls for a new field: further out too little of the grid is left.
-const MOST_REACH: f64 = 2.0;
+const MAX_REACH: f64 = 2.0;
 
 /// The cube that is learned at full resolution; what lies outside is drawn in.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,32 +35,34 @@ impl Extent {
     pub fn of<'a>(keyframes: impl Iterator<Item = &'a Keyframe> + Clone) -> Self {
         let cameras: Vec<Vector3<f64>> =
             keyframes.clone().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
-        let mut seen: Vec<(f64, Vector3<f64>)> = keyframes.clone().flat_map(readings).collect();
-        if seen.is_empty() {
+        let mut visible_points: Vec<(f64, Vector3<f64>)> = keyframes.clone().flat_map(depth_samples).collect();
+        if visible_points.is_empty() {
             return Self::without_depth(keyframes, &cameras);
         }
-        seen.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        let far_m = FAR * seen[seen.len() / 2].0;
-        seen.truncate(seen.partition_point(|(z_m, _)| *z_m <= far_m));
+        visible_points.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+        let far_m = FAR_OVER_MEDIAN * visible_points[visible_points.len() / 2].0;
+        visible_points.truncate(visible_points.partition_point(|(z_m, _)| *z_m <= far_m));
         let range = |axis: usize| {
-            let mut along: Vec<f64> = seen.iter().map(|(_, point)| point[axis]).collect();
+            let mut along: Vec<f64> = visible_points.iter().map(|(_, point)| point[axis]).collect();
             along.sort_by(f64::total_cmp);
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
-            let cut = (along.len() as f64 * OUTSIDE_FRAC) as usize;
-            let ends = [along[cut], along[along.len() - 1 - cut]];
-            let of_cameras = cameras.iter().map(|camera| camera[axis]);
-            of_cameras.fold(ends, |ends, camera| [ends[0].min(camera), ends[1].max(camera)])
+            let n_outliers = (along.len() as f64 * OUTSIDE_FRAC) as usize;
+            let trimmed_range = [along[n_outliers], along[along.len() - 1 - n_outliers]];
+            let camera_coords = cameras.iter().map(|camera| camera[axis]);
+            camera_coords.fold(trimmed_range, |trimmed_range, camera| {
+                [trimmed_range[0].min(camera), trimmed_range[1].max(camera)]
+            })
         };
         let ranges = [0, 1, 2].map(range);
-        let radius_m = ranges.iter().map(|[low, high]| 0.5 * (high - low)).fold(LEAST_RADIUS_M, f64::max);
+        let radius_m = ranges.iter().map(|[low, high]| 0.5 * (high - low)).fold(MIN_RADIUS_M, f64::max);
         Self { center_m: ranges.map(|[low, high]| 0.5 * (low + high)), radius_m }
     }
 
     fn without_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, cameras: &[Vector3<f64>]) -> Self {
         // The point with the least sum of squared distances to the optical axes, held weakly at the cameras' mean.
-        const HOLD: f64 = 1e-3;
+        const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
-        let (mut normal, mut right) = (Matrix3::identity() * HOLD, mean * HOLD);
+        let (mut normal, mut right) = (Matrix3::identity() * CENTER_REGULARIZATION, mean * CENTER_REGULARIZATION);
         for keyframe in keyframes {
             let axis = keyframe.world_from_camera.rotation * Vector3::z();
             let across = Matrix3::identity() - axis * axis.transpose();
@@ -68,37 +70,37 @@ impl Extent {
             right += across * keyframe.world_from_camera.translation.vector;
         }
         let center = normal.try_inverse().map_or(mean, |inverse| inverse * right);
-        let furthest = cameras.iter().map(|camera| (camera - center).amax()).fold(0.0, f64::max);
-        let radius_m = if furthest > LEAST_RADIUS_M { furthest } else { USUAL_RADIUS_M };
+        let max_offset = cameras.iter().map(|camera| (camera - center).amax()).fold(0.0, f64::max);
+        let radius_m = if max_offset > MIN_RADIUS_M { max_offset } else { DEFAULT_RADIUS_M };
         Self { center_m: center.into(), radius_m }
     }
 
     /// Whether a field learned here says too little about a scene that lies there.
     pub fn is_outgrown_by(&self, other: &Self) -> bool {
-        let off = Vector3::from(self.center_m) - Vector3::from(other.center_m);
-        off.amax() + other.radius_m > MOST_REACH * self.radius_m
+        let offset = Vector3::from(self.center_m) - Vector3::from(other.center_m);
+        offset.amax() + other.radius_m > MAX_REACH * self.radius_m
     }
 
     /// A pose with its place in units of the radius around the middle.
-    pub(crate) fn in_units(&self, world_from_other: &Transform) -> Transform {
+    pub(crate) fn in_scene_units(&self, world_from_other: &Transform) -> Transform {
         let mut pose = *world_from_other;
         pose.translation.vector = (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
         pose
     }
 
     /// A camera with all its lengths in units of the radius.
-    pub(crate) fn camera_in_units(&self, camera: &Camera) -> Camera {
+    pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
             twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },
             ..shutter
         });
         let crop = camera.crop.map(|crop| Aabb {
-            world_from_box: self.in_units(&crop.world_from_box),
+            world_from_box: self.in_scene_units(&crop.world_from_box),
             min_m: crop.min_m.map(|along| along / self.radius_m),
             max_m: crop.max_m.map(|along| along / self.radius_m),
         });
         Camera {
-            world_from_camera: self.in_units(&camera.world_from_camera),
+            world_from_camera: self.in_scene_units(&camera.world_from_camera),
             near_m: camera.near_m / self.radius_m,
             far_m: camera.far_m / self.radius_m,
             shutter,
@@ -109,24 +111,24 @@ impl Extent {
 }
 
 /// Some of what a keyframe's depth shows: how deep, and where in world.
-fn readings(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
+fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
     let Some(depth) = &keyframe.depth else { return Vec::new() };
     let width = depth.size_px[0].max(1);
     // Some of each column and row.
-    let step = (depth.depth_m.len() / READINGS_PER_KEYFRAME).max(1) | 1;
-    let believed = (0u32..).zip(depth.depth_m.iter()).step_by(step).filter(|(_, z)| **z > 0.0 && z.is_finite());
+    let step = (depth.depth_m.len() / SAMPLES_PER_KEYFRAME).max(1) | 1;
+    let valid = (0u32..).zip(depth.depth_m.iter()).step_by(step).filter(|(_, z)| **z > 0.0 && z.is_finite());
     let point = |(ix, z): (u32, &f32)| {
         let in_camera = depth.point(ix % width, ix / width, f64::from(*z));
         (f64::from(*z), (depth.world_from_camera * Point3::from(in_camera)).coords)
     };
-    believed.map(point).collect()
+    valid.map(point).collect()
 }
 
 /// The size that a pixel has in the scene, metres: median over the keyframes.
 pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, extent: &Extent) -> f64 {
     let size = |keyframe: &Keyframe| {
-        let looks = crate::splat::median_depth_m(keyframe).unwrap_or(extent.radius_m);
-        looks / keyframe.focal_px[0].max(1.0)
+        let typical_depth_m = crate::splat::median_depth_m(keyframe).unwrap_or(extent.radius_m);
+        typical_depth_m / keyframe.focal_px[0].max(1.0)
     };
     let mut sizes: Vec<f64> = keyframes.map(size).collect();
     sizes.sort_by(f64::total_cmp);

@@ -19,23 +19,23 @@
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
 @group(0) @binding(2) var<storage, read> points: array<vec4f>;
 @group(0) @binding(3) var<storage, read> weights: array<Four>;
-@group(0) @binding(4) var<storage, read> held: array<Four>;
+@group(0) @binding(4) var<storage, read> activations: array<Four>;
 @group(0) @binding(5) var<storage, read> v_log_density: array<f32>;
 @group(0) @binding(6) var<storage, read> v_colors: array<vec4f>;
 @group(0) @binding(7) var<storage, read> scales: array<f32>;
-@group(0) @binding(8) var<storage, read_write> v_held: array<Four>;
+@group(0) @binding(8) var<storage, read_write> v_activations: array<Four>;
 @group(0) @binding(9) var<storage, read_write> v_grid: array<atomic<i32>>;
 @group(0) @binding(10) var<storage, read_write> counts: array<atomic<u32>>;
 
 // One contribution is at most this: 2^7 of them fit into a sum.
-const MOST = 16777216.0;
-const NOT_CUT = 0xffffffffu;
-const NOT_KEPT = 0xffffffffu;
-const N_OF_COLOR = 3u;             // layers of the second network
+const MAX_ABS = 16777216.0;
+const NO_RELU = 0xffffffffu;
+const NOT_STORED = 0xffffffffu;
+const N_COLOR_LAYERS = 3u;             // layers of the second network
 const N_LAYERS = 5u;
 
-fn keep(tile: u32, row: u32, part: u32, value: vec4f) {
-    v_held[(tile * n_slope_rows() + row) * PARTS + part] = narrowed(value);
+fn store_activation(tile: u32, row: u32, part: u32, value: vec4f) {
+    v_activations[(tile * n_gradient_rows() + row) * PARTS + part] = narrowed(value);
 }
 
 struct Layer {
@@ -43,8 +43,8 @@ struct Layer {
     first_weight: u32,
     n_in: u32,
     n_out: u32,
-    cut_row: u32,          // what came in, which was cut at zero; NOT_CUT: it was not
-    kept_row: u32,         // NOT_KEPT: nobody needs them
+    relu_row: u32,          // what came in, which was cut at zero; NOT_CUT: it was not
+    stored_row: u32,         // NOT_KEPT: nobody needs them
 }
 
 // From the last one on.
@@ -52,63 +52,63 @@ fn layer_of(ix: u32) -> Layer {
     switch ix {
         case 0u: { return Layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row()); }
         case 1u: { return Layer(BANK, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_1_row(), v_hidden_1_row()); }
-        case 2u: { return Layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NOT_CUT, NOT_KEPT); }
-        case 3u: { return Layer(0u, told_weights(), N_HIDDEN, N_TOLD, hidden_0_row(), 0u); }
-        default: { return Layer(BANK, 0u, N_FEATURES, N_HIDDEN, NOT_CUT, v_features_row()); }
+        case 2u: { return Layer(0u, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, NO_RELU, NOT_STORED); }
+        case 3u: { return Layer(0u, density_out_weights(), N_HIDDEN, N_DENSITY_OUT, hidden_0_row(), 0u); }
+        default: { return Layer(BANK, 0u, N_FEATURES, N_HIDDEN, NO_RELU, v_features_row()); }
     }
 }
 
 // Slopes towards what goes into a layer, as they go on.
-fn finished(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
+fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
     var v = sum;
-    if layer.cut_row != NOT_CUT {
-        let was = held[(tile * n_held_rows() + layer.cut_row + row) * PARTS + part];
-        v = select(vec4f(0.0), v, was > Four());
+    if layer.relu_row != NO_RELU {
+        let activation = activations[(tile * n_activation_rows() + layer.relu_row + row) * PARTS + part];
+        v = select(vec4f(0.0), v, activation > Four());
     }
-    if layer.kept_row != NOT_KEPT { keep(tile, layer.kept_row + row, part, v); }
+    if layer.stored_row != NOT_STORED { store_activation(tile, layer.stored_row + row, part, v); }
     return v;
 }
 
 // What the compositing tells, in the first bank.
-fn color_slopes(tile: u32, lane: u32) {
+fn seed_color_gradients(tile: u32, lane: u32) {
     for (var item = lane; item < N_COLORS * PARTS; item += LANES) {
         let row = item / PARTS;
         let part = item % PARTS;
         var v = vec4f(0.0);
         for (var i = 0u; i < 4u; i++) {
             let sample = tile * TILE + 4u * part + i;
-            if sample < batch.n_samples && row < 4u { v[i] = v_colors[sample][row] * slope_scale(batch.n_rays); }
+            if sample < batch.n_samples && row < 4u { v[i] = v_colors[sample][row] * gradient_scale(batch.n_rays); }
         }
         put_four(0u, row, part, v);
-        keep(tile, v_color_row() + row, part, v);
+        store_activation(tile, v_color_row() + row, part, v);
     }
     workgroupBarrier(); // The slopes are there before the last layer reads them.
 }
 
 // What goes towards density and what was handed on, to the first bank.
-fn told_slopes(tile: u32, lane: u32) {
-    for (var item = lane; item < N_TOLD * PARTS; item += LANES) {
+fn seed_density_gradients(tile: u32, lane: u32) {
+    for (var item = lane; item < N_DENSITY_OUT * PARTS; item += LANES) {
         let row = item / PARTS;
         let part = item % PARTS;
         var v = vec4f(0.0);
         if row == 0u {
             for (var i = 0u; i < 4u; i++) {
                 let sample = tile * TILE + 4u * part + i;
-                if sample < batch.n_samples { v[i] = v_log_density[sample] * slope_scale(batch.n_rays); }
+                if sample < batch.n_samples { v[i] = v_log_density[sample] * gradient_scale(batch.n_rays); }
             }
         } else {
             v = out_four(BANK, N_HARMONICS - 1u + row, part);
         }
         put_four(0u, row, part, v);
-        keep(tile, v_told_row() + row, part, v);
+        store_activation(tile, v_density_out_row() + row, part, v);
     }
     workgroupBarrier(); // The slopes are there before the layer reads them.
 }
 
-fn add(entry: u32, slope: vec2f) {
+fn add(entry: u32, gradient: vec2f) {
     for (var feature = 0u; feature < 2u; feature++) {
-        let value = slope[feature];
-        if !(abs(value) < MOST) {
+        let value = gradient[feature];
+        if !(abs(value) < MAX_ABS) {
             atomicAdd(&counts[0], 1u);
         } else if value != 0.0 {
             atomicAdd(&v_grid[2u * entry + feature], i32(round(value)));
@@ -122,7 +122,7 @@ fn scatter(tile: u32, lane: u32) {
         let level_ix = item / PARTS;
         let level = levels[level_ix];
         let part = item % PARTS;
-        let scale = scales[level_ix] / slope_scale(batch.n_rays);
+        let scale = scales[level_ix] / gradient_scale(batch.n_rays);
         let v_0 = out_four(0u, 2u * level_ix, part) * scale;
         let v_1 = out_four(0u, 2u * level_ix + 1u, part) * scale;
         let first = tile * TILE + 4u * part;
@@ -146,11 +146,11 @@ fn scatter(tile: u32, lane: u32) {
 
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
-        color_slopes(tile, lane);
+        seed_color_gradients(tile, lane);
         // A loop, so that the code of a layer is there once: it is long.
         for (var ix = 0u; ix < N_LAYERS; ix++) {
-            if ix == N_OF_COLOR { told_slopes(tile, lane); }
-            work_out(layer_of(ix), tile, lane);
+            if ix == N_COLOR_LAYERS { seed_density_gradients(tile, lane); }
+            evaluate_layer(layer_of(ix), tile, lane);
         }
         scatter(tile, lane);
     }

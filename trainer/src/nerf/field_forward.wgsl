@@ -16,7 +16,7 @@
 #import rows
 #import forward_layer
 #import sh
-#import image_terms
+#import image_params
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<storage, read> levels: array<Level>;
@@ -25,42 +25,42 @@
 @group(0) @binding(4) var<storage, read> weights: array<Four>;
 @group(0) @binding(5) var<storage, read> rays: array<Ray>;
 @group(0) @binding(6) var<storage, read> spans: array<Span>;
-@group(0) @binding(7) var<storage, read> terms: array<vec4f>;
-@group(0) @binding(8) var<storage, read_write> told: array<f32>;
+@group(0) @binding(7) var<storage, read> image_params: array<vec4f>;
+@group(0) @binding(8) var<storage, read_write> log_density: array<f32>;
 @group(0) @binding(9) var<storage, read_write> colors: array<vec4f>;
-@group(0) @binding(10) var<storage, read_write> held: array<Four>;
+@group(0) @binding(10) var<storage, read_write> activations: array<Four>;
 
-override N_CODE: u32;
+override EMBEDDING_DIM: u32;
 override COLORS: bool;
-override KEEPS: bool;
+override STORE_ACTIVATIONS: bool;
 
-const NOT_KEPT = 0xffffffffu;
-const N_OF_DENSITY = 2u;           // layers of the first network
+const NOT_STORED = 0xffffffffu;
+const N_DENSITY_LAYERS = 2u;           // layers of the first network
 const N_LAYERS = 5u;
 
 struct ShSums {
     sample: u32,
 }
 
-fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
+fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, gradient: vec3f) {
     put(BANK, 1u + k, (*sums).sample, basis);
 }
 
-fn keep(tile: u32, row: u32, part: u32, value: vec4f) {
-    held[(tile * n_held_rows() + row) * PARTS + part] = narrowed(value);
+fn store_activation(tile: u32, row: u32, part: u32, value: vec4f) {
+    activations[(tile * n_activation_rows() + row) * PARTS + part] = narrowed(value);
 }
 
 // Keeps rows of a bank, which go into a layer.
-fn keep_inputs(tile: u32, bank: u32, first_row: u32, n_rows: u32, lane: u32) {
+fn store_inputs(tile: u32, bank: u32, first_row: u32, n_rows: u32, lane: u32) {
     for (var item = lane; item < n_rows * PARTS; item += LANES) {
         let row = item / PARTS;
-        keep(tile, first_row + row, item % PARTS, four(bank, row, item % PARTS));
+        store_activation(tile, first_row + row, item % PARTS, four(bank, row, item % PARTS));
     }
 }
 
 // What the grid holds around the points, in the first bank. Neighboring threads have neighboring samples of a level, which lie in the same cells
 // of coarse levels.
-fn look_up(tile: u32, lane: u32) {
+fn interpolate_features(tile: u32, lane: u32) {
     let n_levels = arrayLength(&levels);
     for (var item = lane; item < n_levels * TILE; item += LANES) {
         let level_ix = item / TILE;
@@ -81,7 +81,7 @@ fn look_up(tile: u32, lane: u32) {
         put_four(0u, item / PARTS, item % PARTS, vec4f(0.0));
     }
     workgroupBarrier(); // The features are there before they are read.
-    if KEEPS { keep_inputs(tile, 0u, 0u, N_FEATURES, lane); }
+    if STORE_ACTIVATIONS { store_inputs(tile, 0u, 0u, N_FEATURES, lane); }
 }
 
 struct Layer {
@@ -89,62 +89,62 @@ struct Layer {
     first_weight: u32,
     n_in: u32,
     n_out: u32,
-    kept_row: u32,         // NOT_KEPT: the last of its network, which is not cut at zero
+    stored_row: u32,         // NOT_KEPT: the last of its network, which is not cut at zero
 }
 
 fn layer_of(ix: u32) -> Layer {
     switch ix {
         case 0u: { return Layer(0u, 0u, N_FEATURES, N_HIDDEN, hidden_0_row()); }
-        case 1u: { return Layer(BANK, told_weights(), N_HIDDEN, N_TOLD, NOT_KEPT); }
+        case 1u: { return Layer(BANK, density_out_weights(), N_HIDDEN, N_DENSITY_OUT, NOT_STORED); }
         case 2u: { return Layer(BANK, hidden_1_weights(), N_COLOR_IN, N_HIDDEN, hidden_1_row()); }
         case 3u: { return Layer(0u, hidden_2_weights(), N_HIDDEN, N_HIDDEN, hidden_2_row()); }
-        default: { return Layer(BANK, color_weights(), N_HIDDEN, N_COLORS, NOT_KEPT); }
+        default: { return Layer(BANK, color_weights(), N_HIDDEN, N_COLORS, NOT_STORED); }
     }
 }
 
 // What comes out of a layer, as it goes on.
-fn finished(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
-    if layer.kept_row == NOT_KEPT { return sum; }
+fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
+    if layer.stored_row == NOT_STORED { return sum; }
     let cut = max(sum, vec4f(0.0));
-    if KEEPS { keep(tile, layer.kept_row + row, part, cut); }
+    if STORE_ACTIVATIONS { store_activation(tile, layer.stored_row + row, part, cut); }
     return cut;
 }
 
-fn code_of(image: u32, k: u32) -> f32 {
-    let at = image * TERM_STRIDE + CODE + k;
-    if at < arrayLength(&terms) { return terms[at].x; }
+fn embedding_of(image: u32, k: u32) -> f32 {
+    let at = image * IMAGE_PARAM_STRIDE + EMBEDDING + k;
+    if at < arrayLength(&image_params) { return image_params[at].x; }
     return 0.0;
 }
 
 // Direction, what is handed on, and the image's code, in the second bank.
-fn color_inputs(tile: u32, lane: u32) {
+fn gather_color_inputs(tile: u32, lane: u32) {
     for (var sample = lane; sample < TILE; sample += LANES) {
         let ix = min(tile * TILE + sample, batch.n_samples - 1u);
         let ray = rays[spans[ix].ray];
         put(BANK, 0u, sample, SH_0);
         var sums = ShSums(sample);
         each_sh(&sums, ray.direction, 3u);
-        for (var k = 0u; k < N_CODE; k++) { put(BANK, N_HARMONICS + N_HANDED_ON + k, sample, code_of(ray.code, k)); }
-        for (var row = N_HARMONICS + N_HANDED_ON + N_CODE; row < N_COLOR_IN; row++) { put(BANK, row, sample, 0.0); }
+        for (var k = 0u; k < EMBEDDING_DIM; k++) { put(BANK, N_HARMONICS + N_GEOMETRY_FEATURES + k, sample, embedding_of(ray.embedding, k)); }
+        for (var row = N_HARMONICS + N_GEOMETRY_FEATURES + EMBEDDING_DIM; row < N_COLOR_IN; row++) { put(BANK, row, sample, 0.0); }
     }
-    for (var item = lane; item < N_HANDED_ON * PARTS; item += LANES) {
+    for (var item = lane; item < N_GEOMETRY_FEATURES * PARTS; item += LANES) {
         let row = item / PARTS;
         put_four(BANK, N_HARMONICS + row, item % PARTS, out_four(0u, 1u + row, item % PARTS));
     }
     workgroupBarrier(); // All inputs are there before they are read.
-    if KEEPS { keep_inputs(tile, BANK, color_input_row(), N_COLOR_IN, lane); }
+    if STORE_ACTIVATIONS { store_inputs(tile, BANK, color_input_row(), N_COLOR_IN, lane); }
 }
 
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
-        look_up(tile, lane);
+        interpolate_features(tile, lane);
         // A loop, so that the code of a layer is there once: it is long.
-        for (var ix = 0u; ix < select(N_OF_DENSITY, N_LAYERS, COLORS); ix++) {
-            if ix == N_OF_DENSITY { color_inputs(tile, lane); }
-            work_out(layer_of(ix), tile, lane);
-            if ix + 1u == N_OF_DENSITY {
+        for (var ix = 0u; ix < select(N_DENSITY_LAYERS, N_LAYERS, COLORS); ix++) {
+            if ix == N_DENSITY_LAYERS { gather_color_inputs(tile, lane); }
+            evaluate_layer(layer_of(ix), tile, lane);
+            if ix + 1u == N_DENSITY_LAYERS {
                 for (var sample = lane; sample < TILE; sample += LANES) {
-                    if tile * TILE + sample < batch.n_samples { told[tile * TILE + sample] = out_four(0u, 0u, sample / 4u)[sample % 4u]; }
+                    if tile * TILE + sample < batch.n_samples { log_density[tile * TILE + sample] = out_four(0u, 0u, sample / 4u)[sample % 4u]; }
                 }
             }
         }

@@ -1,19 +1,20 @@
 //! A field on the GPU that learns from rays and draws pictures.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, Occupancy, RaySlot, SampleBuffers, StepBuffers, TermBuffers,
+    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
 };
 use super::kernels::{FieldPipelines, Widths};
-use super::options::{Effort, NerfOptions};
+use super::options::{NerfBudget, NerfOptions};
 use super::params::{
-    Backdrop, Batch, CODE, LearnRule, March, Ray, RayLoss, TERM_STRIDE, Term, TermRule, Visit, terms_of,
+    AdamRule, Backdrop, Batch, EMBEDDING, IMAGE_PARAM_STRIDE, ImageParam, ImageParamRule, March, OccupancyUpdate, Ray,
+    RayLoss, image_params_of,
 };
 use super::passes::{Canvas, FieldPasses};
-use super::rays::{mixed, unit};
+use super::rays::{mix_hash, unit};
 use super::reference::march as reference;
-use super::sizes::{LEAST_LEVELS, MOST_LEVELS, Sizes};
+use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::splat::{Camera, N_CODE, TermSet};
+use crate::splat::{Camera, EMBEDDING_DIM, ParamSet};
 use crate::{Error, Picture};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -21,52 +22,52 @@ use std::sync::Arc;
 /// Most steps of a submit: their rays lie on the GPU at once.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
 /// Steps between two visits of the occupancy.
-const VISIT_PERIOD: u64 = 16;
+const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
 /// Depth tells where something is until the field knows better: the first visit's step.
-const FIRST_VISIT_WITH_DEPTH: u64 = 128;
+const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
 /// What stays of a cell's thickness when it is visited.
-const KEPT_FRAC: f32 = 0.7;
+const OCCUPANCY_DECAY: f32 = 0.7;
 /// Share of the cells that a visit looks at, as far as a batch holds them.
-const VISITED_FRAC: f64 = 0.25;
+const UPDATED_FRAC: f64 = 0.25;
 /// Most samples of a ray that is learned from, in even shares of the batch.
-const MOST_SHARES: u32 = 4;
+const MAX_SAMPLES_OVER_MEAN: u32 = 4;
 /// Samples that a ray of a picture takes at once, `ROUND` of `find_samples.wgsl`.
-const SAMPLES_OF_ROUND: u32 = 8;
+const SAMPLES_PER_ROUND: u32 = 8;
 /// Rounds before it is asked whether any ray goes on, and how often it is asked: rays are no longer than that.
 const ROUNDS_PER_SUBMIT: u32 = 4;
-const MOST_SUBMITS: u32 = 64;
+const MAX_SUBMITS: u32 = 64;
 /// Range of the entries at the start (Mueller et al. 2022, section 4).
-const FIRST_ENTRY: f64 = 1e-4;
+const INITIAL_ENTRY_RANGE: f64 = 1e-4;
 /// Differences of distance beyond this pull no more, in units of the radius.
 const DISTANCE_CLIP: f32 = 0.5;
 /// Share of a distance by which a depth camera may be off.
-const BAND_FRAC: f32 = 0.01;
+const DEPTH_BAND_FRAC: f32 = 0.01;
 /// Where the places of the spread begin, in units of the radius.
-const SPREAD_NEAR: f32 = 0.05;
+const DISTORTION_NEAR: f32 = 0.05;
 /// How far an image turns in a step at the start, radians, and is shifted, units of the radius: what is looked at is a third of
 /// a radius away, roughly.
-const TURN_RATE: f32 = 5e-4;
-const SHIFT_RATE: f32 = TURN_RATE / 3.0;
+const ROTATION_RATE: f32 = 5e-4;
+const TRANSLATION_RATE: f32 = ROTATION_RATE / 3.0;
 /// How far a number of an image's code goes in a step at the start.
-const CODE_RATE: f32 = 2e-2;
+const EMBEDDING_RATE: f32 = 2e-2;
 /// Share of an image's turn, shift and code that is lost in a step at the start.
-const TERM_PULL: f32 = 5e-4;
+const IMAGE_PARAM_DECAY: f32 = 5e-4;
 /// Scale of slopes at the start, before their sizes are known.
-const FIRST_SCALE: f32 = 1_048_576.0;
+const INITIAL_GRADIENT_SCALE: f32 = 1_048_576.0;
 
 /// Where the terms of a picture lie, which is alone with them.
-const OF_PICTURE: u32 = 0;
+const PICTURE_EMBEDDING_IX: u32 = 0;
 
 /// All that one field takes on the GPU.
 #[derive(Debug)]
-pub(crate) struct Learner {
+pub(crate) struct FieldTrainer {
     pub(crate) sizes: Sizes,
     pub(crate) field: FieldBuffers,
     pub(crate) moments: FieldMoments,
-    pub(crate) slopes: FieldSlopes,
+    pub(crate) gradients: FieldGradients,
     pub(crate) occupancy: Occupancy,
     /// Where anything is learned about images.
-    pub(crate) images: Option<TermBuffers>,
+    pub(crate) images: Option<ImageParamBuffers>,
     compiled: Arc<Compiled>,
     samples: SampleBuffers,
     step: StepBuffers,
@@ -84,25 +85,30 @@ pub(crate) struct Compiled {
 }
 
 impl Compiled {
-    pub(crate) fn new(gpu: &Gpu, effort: &Effort) -> Result<Self, Error> {
-        let widths = Widths::new(gpu, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS), effort.n_hidden, n_code());
-        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, effort.n_samples, OF_PICTURE)?, widths })
+    pub(crate) fn new(gpu: &Gpu, nerf_budget: &NerfBudget) -> Result<Self, Error> {
+        let widths = Widths::new(
+            gpu,
+            nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS),
+            nerf_budget.n_hidden,
+            embedding_dim(),
+        );
+        Ok(Self { pipelines: FieldPipelines::new(gpu, &widths, nerf_budget.n_samples, PICTURE_EMBEDDING_IX)?, widths })
     }
 }
 
-impl Learner {
+impl FieldTrainer {
     /// A field that knows nothing.
     pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Arc<Compiled>) -> Result<Self, Error> {
-        let Effort { n_rays, n_samples, .. } = sizes.effort;
+        let NerfBudget { n_rays, n_samples, .. } = sizes.nerf_budget;
         let shape = sizes.shape();
         let widths = compiled.widths.clone();
         let field = FieldBuffers::new(gpu, &shape, &widths)?;
-        let slopes = FieldSlopes::new(gpu, &shape)?;
-        gpu.write(&slopes.scales, 0, bytemuck::cast_slice(&vec![FIRST_SCALE; shape.n_cells.len()]));
-        let learner = Self {
+        let gradients = FieldGradients::new(gpu, &shape)?;
+        gpu.write(&gradients.scales, 0, bytemuck::cast_slice(&vec![INITIAL_GRADIENT_SCALE; shape.n_cells.len()]));
+        let field_trainer = Self {
             compiled,
             moments: FieldMoments::new(gpu, &shape, &widths, &rule(options, 0.0))?,
-            occupancy: Occupancy::new(gpu, &visit_of(&sizes.effort), sizes.has_depth)?,
+            occupancy: Occupancy::new(gpu, &occupancy_update_of(&sizes.nerf_budget), sizes.has_depth)?,
             images: None,
             samples: SampleBuffers::new(gpu, n_samples)?,
             step: StepBuffers::new(gpu, &widths, n_rays, n_samples)?,
@@ -114,31 +120,31 @@ impl Learner {
             picture: None,
             passes: Passes::default(),
             field,
-            slopes,
+            gradients,
             sizes,
         };
-        learner.fill(gpu, options.seed, &widths);
-        Ok(learner)
+        field_trainer.initialize(gpu, options.seed, &widths);
+        Ok(field_trainer)
     }
 
     /// Random numbers to start from: small ones for entries, for weights as many as keep sums as large as their parts (Glorot
     /// and Bengio 2010).
-    fn fill(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
-        let uniform = |stream: u64, ix: usize, most: f64| {
-            f32_of(most * (2.0 * unit(mixed(seed ^ mixed(stream << 40 | ix as u64))) - 1.0))
+    fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
+        let uniform = |stream: u64, ix: usize, bound: f64| {
+            f32_of(bound * (2.0 * unit(mix_hash(seed ^ mix_hash(stream << 40 | ix as u64))) - 1.0))
         };
         let n_numbers = 2 * self.field.n_entries as usize;
-        let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, FIRST_ENTRY)).collect();
+        let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE)).collect();
         gpu.write(&self.field.grid, 0, bytemuck::cast_slice(&entries));
         let mut weights: Vec<f32> = Vec::new();
         let layers = widths.layers().into_iter().zip(widths.used_layers());
         for (([n_in, n_out], [used_in, used_out]), stream) in layers.zip(2..) {
-            let most = (6.0 / f64::from(used_in + used_out)).sqrt();
+            let bound = (6.0 / f64::from(used_in + used_out)).sqrt();
             for at in 0..n_in * n_out {
                 let (row, column) = (at / n_in, at % n_in);
                 let is_used = row < used_out && column < used_in;
                 let ix = (row * used_in + column) as usize;
-                weights.push(if is_used { uniform(stream, ix, most) } else { 0.0 });
+                weights.push(if is_used { uniform(stream, ix, bound) } else { 0.0 });
             }
         }
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
@@ -146,8 +152,8 @@ impl Learner {
 
     /// Bytes of what is learned, its slopes and moments.
     pub(crate) fn bytes(&self) -> u64 {
-        let Self { field, slopes, moments, occupancy, .. } = self;
-        let grids = [&field.grid, &slopes.grid, &moments.grid, &occupancy.thickness, &occupancy.occupied];
+        let Self { field, gradients, moments, occupancy, .. } = self;
+        let grids = [&field.grid, &gradients.grid, &moments.grid, &occupancy.cell_occupancy, &occupancy.occupied];
         grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
     }
 
@@ -159,147 +165,159 @@ impl Learner {
         slot_ix: usize,
         step: u64,
         rays: &[Ray],
-        learned: TermSet,
+        learned: ParamSet,
     ) -> Result<(), Error> {
         self.write_slot(gpu, options, slot_ix, step, rays)?;
-        let Self { compiled, field, samples, step: kept, occupancy, moments, slopes, images, passes: list, .. } = self;
-        let terms = images.as_ref().map_or(&field.no_terms, |images| &images.terms);
+        let Self { compiled, field, samples, step: kept, occupancy, moments, gradients, images, passes: list, .. } =
+            self;
+        let image_params = images.as_ref().map_or(&field.no_image_params, |images| &images.image_params);
         let slot = &self.slots[slot_ix];
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
         let images = images.as_ref().filter(|_| learned.any());
-        passes.halve(list);
-        let first_visit = if self.sizes.has_depth { FIRST_VISIT_WITH_DEPTH } else { VISIT_PERIOD };
-        if step.is_multiple_of(VISIT_PERIOD) && step >= first_visit {
-            passes.visit(list, occupancy, moments);
+        passes.convert_weights(list);
+        let first_update =
+            if self.sizes.has_depth { FIRST_OCCUPANCY_UPDATE_WITH_DEPTH } else { OCCUPANCY_UPDATE_PERIOD };
+        if step.is_multiple_of(OCCUPANCY_UPDATE_PERIOD) && step >= first_update {
+            passes.occupancy_update(list, occupancy, moments);
         }
         if images.is_some() && learned.image_poses {
-            passes.aim(list);
+            passes.apply_pose(list);
         }
         passes.count(list, occupancy);
-        passes.place(list, occupancy);
+        passes.place_samples_in_rays(list, occupancy);
         passes.forward(list, kept);
-        passes.backward(list, kept, slopes);
+        passes.backward(list, kept, gradients);
         if let Some(images) = images {
             if learned.image_poses {
-                passes.pose_slopes(list, kept, images);
+                passes.pose_gradients(list, kept, images);
             }
             if learned.image_gains {
-                passes.code_slopes(list, kept, images);
+                passes.embedding_gradients(list, kept, images);
             }
-            passes.learn_images(list, moments, images);
+            passes.update_images(list, moments, images);
         }
-        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, slopes, moments);
+        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
         Ok(())
     }
 
     /// What each of some rays sees, as they are given, of images with these codes: nothing is learned. What was sent must be done.
-    pub(crate) fn look(
+    pub(crate) fn render_rays(
         &mut self,
         gpu: &Gpu,
         options: &NerfOptions,
         rays: &[Ray],
-        codes: &[[f64; N_CODE]],
-    ) -> Result<Vec<Look>, Error> {
+        embeddings: &[[f64; EMBEDDING_DIM]],
+    ) -> Result<Vec<RayColor>, Error> {
         self.write_slot(gpu, options, 0, 0, rays)?;
         let Self { compiled, field, samples, step: kept, occupancy, slots, passes: list, .. } = self;
-        let of_others = match codes {
+        let embeddings_buffer = match embeddings {
             [] => None,
-            codes => Some(gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&terms_of(codes)))?),
+            embeddings => {
+                Some(gpu.storage_with("nerf.terms_of_others", bytemuck::cast_slice(&image_params_of(embeddings)))?)
+            }
         };
-        let terms = of_others.as_ref().unwrap_or(&field.no_terms);
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms };
-        passes.halve(list);
+        let image_params = embeddings_buffer.as_ref().unwrap_or(&field.no_image_params);
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params };
+        passes.convert_weights(list);
         passes.count(list, occupancy);
-        passes.place(list, occupancy);
+        passes.place_samples_in_rays(list, occupancy);
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        list.forget_bindings(); // These terms are used once.
-        let seen: Vec<[f32; 4]> = gpu.read(&kept.seen, rays.len())?;
+        list.clear_bindings(); // These terms are used once.
+        let ray_colors: Vec<[f32; 4]> = gpu.read(&kept.ray_colors, rays.len())?;
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
         let background = background(options, 0);
         let rgb = |[red, green, blue, left]: [f32; 4]| {
-            let over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
-            [over(0, red), over(1, green), over(2, blue)]
+            let composite_over = |channel: usize, color: f32| f64::from(color + left * background[channel]);
+            [composite_over(0, red), composite_over(1, green), composite_over(2, blue)]
         };
-        Ok(seen
+        Ok(ray_colors
             .into_iter()
             .zip(errors)
-            .map(|(seen, [error, _])| Look { error: error.into(), rgb: rgb(seen) })
+            .map(|(ray_colors, [error, _])| RayColor { error: error.into(), rgb: rgb(ray_colors) })
             .collect())
     }
 
     /// Makes room for what is learned about so many images, which stays as it is known, and says what of it is learned from here on.
-    pub(crate) fn hold_images(&mut self, gpu: &Gpu, n_images: usize, learned: TermSet) -> Result<(), Error> {
+    pub(crate) fn allocate_images(&mut self, gpu: &Gpu, n_images: usize, learned: ParamSet) -> Result<(), Error> {
         let n_images = u32::try_from(n_images).expect("few images");
-        let n_held = self.images.as_ref().map_or(0, |images| images.n_images);
-        let rule = TermRule {
-            learned: bits_of(learned),
-            n_images: if n_held >= n_images { n_held } else { n_images.next_power_of_two() },
-            turn_rate: TURN_RATE,
-            shift_rate: SHIFT_RATE,
-            code_rate: CODE_RATE,
-            pull: TERM_PULL,
+        let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
+        let rule = ImageParamRule {
+            learned: learned_bits(learned),
+            n_images: if n_allocated >= n_images { n_allocated } else { n_images.next_power_of_two() },
+            rotation_rate: ROTATION_RATE,
+            translation_rate: TRANSLATION_RATE,
+            embedding_rate: EMBEDDING_RATE,
+            weight_decay: IMAGE_PARAM_DECAY,
             unused: [0; 2],
         };
-        if let Some(images) = self.images.as_ref().filter(|_| n_held >= n_images) {
+        if let Some(images) = self.images.as_ref().filter(|_| n_allocated >= n_images) {
             gpu.write(&images.rule, 0, bytemuck::bytes_of(&rule));
             return Ok(());
         }
-        self.passes.forget_bindings();
-        let Effort { n_rays, n_samples, .. } = self.sizes.effort;
-        let images = TermBuffers::new(gpu, &rule, n_rays, n_samples)?;
+        self.passes.clear_bindings();
+        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
+        let images = ImageParamBuffers::new(gpu, &rule, n_rays, n_samples)?;
         if let Some(known) = self.images.take() {
-            gpu.copy((&known.terms, 0), (&images.terms, 0), known.terms.bytes());
+            gpu.copy((&known.image_params, 0), (&images.image_params, 0), known.image_params.bytes());
         }
         self.images = Some(images);
         Ok(())
     }
 
     /// Lets images from the `first_ix`-th on begin with these codes, and with their poses as they are given.
-    pub(crate) fn begin_images(&self, gpu: &Gpu, first_ix: usize, codes: &[[f64; N_CODE]]) {
+    pub(crate) fn initialize_images(&self, gpu: &Gpu, first_ix: usize, embeddings: &[[f64; EMBEDDING_DIM]]) {
         if let Some(images) = &self.images {
-            let row_bytes = TERM_STRIDE * size_of::<Term>();
-            gpu.write(&images.terms, (first_ix * row_bytes) as u64, bytemuck::cast_slice(&terms_of(codes)));
+            let row_bytes = IMAGE_PARAM_STRIDE * size_of::<ImageParam>();
+            gpu.write(
+                &images.image_params,
+                (first_ix * row_bytes) as u64,
+                bytemuck::cast_slice(&image_params_of(embeddings)),
+            );
         }
     }
 
     /// Of each of the first images its turn (rotation vector in world, radians), its shift (in world, units of the radius) and its
     /// code; empty where nothing is learned about images.
-    pub(crate) fn image_terms(&self, gpu: &Gpu, n_images: usize) -> Result<Vec<[f64; TERM_STRIDE]>, Error> {
+    pub(crate) fn image_param_values(
+        &self,
+        gpu: &Gpu,
+        n_images: usize,
+    ) -> Result<Vec<[f64; IMAGE_PARAM_STRIDE]>, Error> {
         let Some(images) = &self.images else { return Ok(Vec::new()) };
-        let terms = read_terms(gpu, images, n_images)?;
-        Ok(terms.iter().map(|image| image.map(|[value, ..]| f64::from(value))).collect())
+        let image_params = read_image_params(gpu, images, n_images)?;
+        Ok(image_params.iter().map(|image| image.map(|[value, ..]| f64::from(value))).collect())
     }
 
     /// Knows nothing about images.
-    pub(crate) fn forget_images(&mut self) {
-        self.passes.forget_bindings();
+    pub(crate) fn drop_images(&mut self) {
+        self.passes.clear_bindings();
         self.images = None;
     }
 
     /// Forgets an image; those after it move up.
-    pub(crate) fn forget_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
+    pub(crate) fn remove_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
         let Some(images) = &self.images else { return Ok(()) };
-        let mut terms = read_terms(gpu, images, images.n_images as usize)?;
-        if image_ix < terms.len() {
-            terms.remove(image_ix);
-            terms.push([[0.0; 4]; TERM_STRIDE]);
+        let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
+        if image_ix < image_params.len() {
+            image_params.remove(image_ix);
+            image_params.push([[0.0; 4]; IMAGE_PARAM_STRIDE]);
         }
-        gpu.write(&images.terms, 0, bytemuck::cast_slice(&terms));
+        gpu.write(&images.image_params, 0, bytemuck::cast_slice(&image_params));
         Ok(())
     }
 
     /// Forgets all terms of images but these.
-    pub(crate) fn forget_terms_but(&mut self, gpu: &Gpu, kept: TermSet) -> Result<(), Error> {
+    pub(crate) fn reset_image_params_except(&mut self, gpu: &Gpu, kept: ParamSet) -> Result<(), Error> {
         let Some(images) = &self.images else { return Ok(()) };
-        let mut terms = read_terms(gpu, images, images.n_images as usize)?;
-        for (ix, term) in terms.iter_mut().flat_map(|image| image.iter_mut().enumerate()) {
-            if bits_of(kept) & (1 << ix) == 0 {
-                *term = [0.0; 4];
+        let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
+        for (ix, image_param) in image_params.iter_mut().flat_map(|image| image.iter_mut().enumerate()) {
+            if learned_bits(kept) & (1 << ix) == 0 {
+                *image_param = [0.0; 4];
             }
         }
-        gpu.write(&images.terms, 0, bytemuck::cast_slice(&terms));
+        gpu.write(&images.image_params, 0, bytemuck::cast_slice(&image_params));
         Ok(())
     }
 
@@ -312,15 +330,15 @@ impl Learner {
         step: u64,
         rays: &[Ray],
     ) -> Result<(), Error> {
-        let Effort { n_rays, n_samples, .. } = self.sizes.effort;
+        let NerfBudget { n_rays, n_samples, .. } = self.sizes.nerf_budget;
         self.make_slot(gpu, slot_ix)?;
         let slot = &self.slots[slot_ix];
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(rays));
-        let share = n_samples / n_rays * MOST_SHARES;
+        let max_samples_per_ray = n_samples / n_rays * MAX_SAMPLES_OVER_MEAN;
         gpu.write(
             &slot.march,
             0,
-            bytemuck::bytes_of(&March { most_samples: share.max(1), ..march_of(self.sizes.effort) }),
+            bytemuck::bytes_of(&March { max_samples: max_samples_per_ray.max(1), ..march_of(self.sizes.nerf_budget) }),
         );
         let [red, green, blue] = background(options, step);
         let loss = RayLoss {
@@ -328,10 +346,10 @@ impl Learner {
             distance_weight: f32_of(options.distance_weight),
             distance_clip: DISTANCE_CLIP,
             distortion: f32_of(options.distortion),
-            near: SPREAD_NEAR,
-            sight: f32_of(options.sight),
-            band: 2.0 * march_of(self.sizes.effort).step,
-            band_frac: BAND_FRAC,
+            near: DISTORTION_NEAR,
+            line_of_sight: f32_of(options.line_of_sight),
+            band: 2.0 * march_of(self.sizes.nerf_budget).step,
+            band_frac: DEPTH_BAND_FRAC,
             unused: 0.0,
         };
         gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
@@ -344,8 +362,8 @@ impl Learner {
     /// Lists the networks as pictures have them, for the samples of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
         let Self { compiled, field, samples, slots, passes: list, .. } = self;
-        let terms = &field.no_terms;
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], terms }.colors(list);
+        let image_params = &field.no_image_params;
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }.colors(list);
     }
 
     /// Sends what is listed; the read tells when it is done.
@@ -360,34 +378,35 @@ impl Learner {
 
     /// Halves cells and steps; each half knows what the whole did. What was sent must be done.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
-        let n = self.sizes.effort.n_cells as usize;
-        let known: Vec<f32> = gpu.read(&self.occupancy.thickness, n.pow(3))?;
-        self.sizes.effort = self.sizes.effort.finer();
-        self.sizes.refines = false;
-        self.passes.forget_bindings();
-        self.occupancy = Occupancy::new(gpu, &visit_of(&self.sizes.effort), self.sizes.has_depth)?;
+        let n = self.sizes.nerf_budget.n_cells as usize;
+        let known: Vec<f32> = gpu.read(&self.occupancy.cell_occupancy, n.pow(3))?;
+        self.sizes.nerf_budget = self.sizes.nerf_budget.refined();
+        self.sizes.can_refine = false;
+        self.passes.clear_bindings();
+        self.occupancy = Occupancy::new(gpu, &occupancy_update_of(&self.sizes.nerf_budget), self.sizes.has_depth)?;
         // A step that is half as long holds back half as much; what is below zero says that nobody was there.
-        let of_half = |thickness: f32| if thickness > 0.0 { 0.5 * thickness } else { thickness };
+        let half_step_opacity =
+            |cell_occupancy: f32| if cell_occupancy > 0.0 { 0.5 * cell_occupancy } else { cell_occupancy };
         let row = |row: usize| {
             let (y, z) = (row % (2 * n), row / (2 * n));
             (0..2 * n).map(move |x| x / 2 + n * (y / 2 + n * (z / 2)))
         };
-        let finer: Vec<f32> =
-            (0..4 * n * n).into_par_iter().flat_map_iter(row).map(|cell| of_half(known[cell])).collect();
-        gpu.write(&self.occupancy.thickness, 0, bytemuck::cast_slice(&finer));
+        let refined: Vec<f32> =
+            (0..4 * n * n).into_par_iter().flat_map_iter(row).map(|cell| half_step_opacity(known[cell])).collect();
+        gpu.write(&self.occupancy.cell_occupancy, 0, bytemuck::cast_slice(&refined));
         self.make_slot(gpu, 0)?;
         let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
-        let (slot, terms) = (&slots[0], &field.no_terms);
-        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
-        passes.mark(list, occupancy, moments);
+        let (slot, image_params) = (&slots[0], &field.no_image_params);
+        let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
+        passes.mark_occupied_cells(list, occupancy, moments);
         list.submit(gpu);
         Ok(())
     }
 
     /// How its rays are walked.
     pub(crate) fn march(&self) -> reference::March {
-        let Effort { n_cells, n_steps, .. } = self.sizes.effort;
-        reference::March { step: 2.0 / f64::from(n_steps), most_samples: usize::MAX, n_cells: n_cells as usize }
+        let NerfBudget { n_cells, n_steps, .. } = self.sizes.nerf_budget;
+        reference::March { step: 2.0 / f64::from(n_steps), max_samples: usize::MAX, n_cells: n_cells as usize }
     }
 
     /// Takes note of what depth images tell about where something is.
@@ -395,20 +414,20 @@ impl Learner {
         if hints.is_empty() {
             return Ok(());
         }
-        let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&padded(hints)))?;
+        let buffer = gpu.storage_with("nerf.hints", bytemuck::cast_slice(&pad_hints(hints)))?;
         self.make_slot(gpu, 0)?;
         let Self { compiled, field, samples, occupancy, moments, slots, passes: list, .. } = self;
-        let (slot, terms) = (&slots[0], &field.no_terms);
-        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms }
+        let (slot, image_params) = (&slots[0], &field.no_image_params);
+        FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params }
             .hint(list, occupancy, moments, &buffer);
         list.submit(gpu);
-        list.forget_bindings(); // The hints are used once.
+        list.clear_bindings(); // The hints are used once.
         Ok(())
     }
 
     fn make_slot(&mut self, gpu: &Gpu, slot_ix: usize) -> Result<(), Error> {
         if self.slots.len() <= slot_ix {
-            self.slots.push(RaySlot::new(gpu, self.sizes.effort.n_rays)?);
+            self.slots.push(RaySlot::new(gpu, self.sizes.nerf_budget.n_rays)?);
         }
         Ok(())
     }
@@ -422,7 +441,7 @@ impl Learner {
         camera: &Camera,
         background_srgb: [f32; 3],
         radius_m: f64,
-        code: [f64; N_CODE],
+        embedding: [f64; EMBEDDING_DIM],
         depth: bool,
     ) -> Result<Picture, Error> {
         let n_pixels = camera.size_px[0] as usize * camera.size_px[1] as usize;
@@ -431,42 +450,42 @@ impl Learner {
         gpu.write(&canvas.view, 0, bytemuck::bytes_of(&camera.view()));
         let backdrop = Backdrop { srgb: background_srgb, radius_m: f32_of(radius_m) };
         gpu.write(&canvas.backdrop, 0, bytemuck::bytes_of(&backdrop));
-        gpu.write(&canvas.terms, 0, bytemuck::cast_slice(&terms_of(&[code])));
+        gpu.write(&canvas.image_params, 0, bytemuck::cast_slice(&image_params_of(&[embedding])));
         let Self { compiled, field, occupancy, passes: list, sizes, .. } = self;
-        let terms = &canvas.terms;
-        let of_pixels = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, terms };
-        of_pixels.halve(list);
+        let image_params = &canvas.image_params;
+        let picture_passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
+        picture_passes.convert_weights(list);
         for first in (0..n_pixels).step_by(slot.n_rays as usize) {
             let n = (n_pixels - first).min(slot.n_rays as usize);
             let [first_ray, n_rays] = [first, n].map(|ix| u32::try_from(ix).expect("an image's pixels"));
-            let march = March { first_ray, most_found: SAMPLES_OF_ROUND, ..march_of(sizes.effort) };
+            let march = March { first_ray, max_found: SAMPLES_PER_ROUND, ..march_of(sizes.nerf_budget) };
             gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
             gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
-            of_pixels.picture_rays(list, canvas);
-            for _ in 0..MOST_SUBMITS {
+            picture_passes.picture_rays(list, canvas);
+            for _ in 0..MAX_SUBMITS {
                 for _ in 0..ROUNDS_PER_SUBMIT {
-                    of_pixels.find(list, occupancy);
-                    of_pixels.colors(list);
-                    of_pixels.show(list, canvas);
+                    picture_passes.find(list, occupancy);
+                    picture_passes.colors(list);
+                    picture_passes.show(list, canvas);
                 }
                 if list.submit_reading(gpu, &[(&samples.batch, 8)]).finish::<u32>(gpu)?[1] == 0 {
                     break;
                 }
             }
         }
-        let wanted = Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths));
-        let read = list.submit_reading(gpu, &wanted);
-        read.finish_with(gpu, |parts| Picture::of_parts(camera.size_px, parts))
+        let buffers_to_read = Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths));
+        let read = list.submit_reading(gpu, &buffers_to_read);
+        read.finish_with(gpu, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
     fn make_canvas(&mut self, gpu: &Gpu, n_pixels: u64) -> Result<(), Error> {
-        let n_rays = u32::try_from(n_pixels).unwrap_or(u32::MAX).min(self.sizes.effort.picture_rays);
+        let n_rays = u32::try_from(n_pixels).unwrap_or(u32::MAX).min(self.sizes.nerf_budget.picture_rays);
         let fits =
             |(slot, _, canvas): &(RaySlot, SampleBuffers, Canvas)| canvas.n_pixels >= n_pixels && slot.n_rays >= n_rays;
         if !self.picture.as_ref().is_some_and(fits) {
-            self.passes.forget_bindings();
+            self.passes.clear_bindings();
             self.picture = None;
-            let samples = SampleBuffers::new(gpu, SAMPLES_OF_ROUND * n_rays)?;
+            let samples = SampleBuffers::new(gpu, SAMPLES_PER_ROUND * n_rays)?;
             self.picture = Some((RaySlot::new(gpu, n_rays)?, samples, Canvas::new(gpu, n_pixels, n_rays)?));
         }
         Ok(())
@@ -475,7 +494,7 @@ impl Learner {
 
 /// What a ray sees.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Look {
+pub(crate) struct RayColor {
     /// Mean squared difference of color.
     pub(crate) error: f64,
     /// Over the background.
@@ -484,57 +503,61 @@ pub(crate) struct Look {
 
 /// Whatever is behind the scene must not help to explain it.
 fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
-    [0, 1, 2].map(|ix| f32_of(unit(mixed(options.seed ^ mixed(step << 2 | ix)))))
+    [0, 1, 2].map(|ix| f32_of(unit(mix_hash(options.seed ^ mix_hash(step << 2 | ix)))))
 }
 
 /// All that is kept of the first images.
-fn read_terms(gpu: &Gpu, images: &TermBuffers, n_images: usize) -> Result<Vec<[Term; TERM_STRIDE]>, Error> {
-    gpu.read(&images.terms, n_images.min(images.n_images as usize))
+fn read_image_params(
+    gpu: &Gpu,
+    images: &ImageParamBuffers,
+    n_images: usize,
+) -> Result<Vec<[ImageParam; IMAGE_PARAM_STRIDE]>, Error> {
+    gpu.read(&images.image_params, n_images.min(images.n_images as usize))
 }
 
 /// Numbers of an image's code as the kernels have them.
-fn n_code() -> u32 {
-    u32::try_from(N_CODE).expect("a few")
+fn embedding_dim() -> u32 {
+    u32::try_from(EMBEDDING_DIM).expect("a few")
 }
 
 /// The terms that are learned, a bit each.
-fn bits_of(learned: TermSet) -> u32 {
+fn learned_bits(learned: ParamSet) -> u32 {
     let bits = |on: bool, first: usize, n: usize| if on { ((1 << n) - 1) << first } else { 0 };
-    bits(learned.image_poses, 0, CODE) | bits(learned.image_gains, CODE, N_CODE)
+    bits(learned.image_poses, 0, EMBEDDING) | bits(learned.image_gains, EMBEDDING, EMBEDDING_DIM)
 }
 
 /// How the occupancy is visited.
-fn visit_of(effort: &Effort) -> Visit {
-    let Effort { n_samples, n_cells, n_steps, .. } = *effort;
+fn occupancy_update_of(nerf_budget: &NerfBudget) -> OccupancyUpdate {
+    let NerfBudget { n_samples, n_cells, n_steps, .. } = *nerf_budget;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
-    let n_points = (f64::from(n_cells.pow(3)) * VISITED_FRAC) as u32;
-    Visit { n_cells, n_points: n_points.min(n_samples), kept_frac: KEPT_FRAC, step: 2.0 / n_steps as f32 }
+    let n_points = (f64::from(n_cells.pow(3)) * UPDATED_FRAC) as u32;
+    OccupancyUpdate { n_cells, n_points: n_points.min(n_samples), decay: OCCUPANCY_DECAY, step: 2.0 / n_steps as f32 }
 }
 
 /// Whole sixteens of bytes, as buffers are; the last hint is given more than once.
-fn padded(hints: &[u32]) -> Vec<u32> {
+fn pad_hints(hints: &[u32]) -> Vec<u32> {
     let n = hints.len().next_multiple_of(4);
     hints.iter().chain(std::iter::repeat_n(&hints[hints.len() - 1], n - hints.len())).copied().collect()
 }
 
-fn march_of(effort: Effort) -> March {
+fn march_of(nerf_budget: NerfBudget) -> March {
     March {
-        step: 2.0 / effort.n_steps as f32,
-        most_samples: 1,
-        n_cells: effort.n_cells,
+        step: 2.0 / nerf_budget.n_steps as f32,
+        max_samples: 1,
+        n_cells: nerf_budget.n_cells,
         first_ray: 0,
-        most_found: u32::MAX,
+        max_found: u32::MAX,
         unused: [0; 3],
     }
 }
 
-fn rule(options: &NerfOptions, pull: f32) -> LearnRule {
-    LearnRule {
+fn rule(options: &NerfOptions, weight_decay: f32) -> AdamRule {
+    AdamRule {
         rate: f32_of(options.rate),
         final_rate_frac: f32_of(options.final_rate_frac),
         betas: [0.9, 0.99],
         epsilon: 1e-15,
-        pull,
+        weight_decay,
         n_planned_steps: options.n_planned_steps as f32,
         unused: 0.0,
     }

@@ -9,18 +9,18 @@
 #import folded
 
 @group(0) @binding(0) var<storage, read> hints: array<u32>;
-@group(0) @binding(1) var<storage, read_write> thickness: array<f32>;
+@group(0) @binding(1) var<storage, read_write> cell_occupancy: array<f32>;
 
 override KIND: u32;
 
-const LOOKED_AT_WITHOUT_END = 0u; // Something may be there, too far or too dark for the depth camera.
-const LOOKED_THROUGH = 1u;
+const UNBOUNDED = 0u; // Something may be there, too far or too dark for the depth camera.
+const FREE = 1u;
 const SURFACE = 2u;
 
 // Of a cell that no image looks at, of one that was looked through, and of one that is to be walked until it was visited.
-const UNSEEN = 0.0;
+const OUTSIDE_VIEWS = 0.0;
 const EMPTY = 1e-30;
-const UNVISITED = -1.0;
+const NEVER_UPDATED = -1.0;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -29,12 +29,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let hint = hints[ix];
     if hint >> 30u != KIND { return; }
     let cell = hint & 0x3fffffffu;
-    let known = thickness[cell];
+    let previous = cell_occupancy[cell];
     if KIND == SURFACE {
-        thickness[cell] = max(known, 1.0);
-    } else if KIND == LOOKED_THROUGH {
-        if known <= 0.0 { thickness[cell] = EMPTY; }
-    } else if known == UNSEEN {
-        thickness[cell] = UNVISITED;
+        cell_occupancy[cell] = max(previous, 1.0);
+    } else if KIND == FREE {
+        if previous <= 0.0 { cell_occupancy[cell] = EMPTY; }
+    } else if previous == OUTSIDE_VIEWS {
+        cell_occupancy[cell] = NEVER_UPDATED;
     }
 }

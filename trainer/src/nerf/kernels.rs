@@ -31,7 +31,7 @@ macro_rules! layers {
             shared!("hash_grid"),
             shared!("network_tile"),
             shared!("network_layers"),
-            shared!("image_terms"),
+            shared!("image_params"),
             shared!("sh"),
             shared!("number", concat!("number_", $numbers)),
             shared!("rows", concat!("rows_", $numbers)),
@@ -41,7 +41,7 @@ macro_rules! layers {
     };
 }
 /// In f32, and on matrices of f16.
-const WHOLE: &[Source] = layers!("whole");
+const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
 
 const SHARED: &[Source] = &[
@@ -50,23 +50,23 @@ const SHARED: &[Source] = &[
     shared!("march_params"),
     shared!("space"),
     shared!("march"),
-    shared!("march_shares"),
+    shared!("march_threads"),
     shared!("density"),
     shared!("sample"),
     shared!("scan"),
     shared!("view"),
     shared!("picture_ray"),
-    shared!("visit"),
+    shared!("occupancy_update"),
     shared!("random"),
     shared!("hash_grid"),
-    shared!("image_terms"),
-    shared!("term_step"),
+    shared!("image_params"),
+    shared!("param_step"),
     shared!("network_tile"),
     shared!("network_layers"),
-    shared!("thickness_sum"),
+    shared!("occupancy_sum"),
     shared!("cell_blocks"),
     shared!("ray_loss"),
-    shared!("learn_rule"),
+    shared!("adam_rule"),
 ];
 
 /// All kernels of this folder.
@@ -76,31 +76,31 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("place_samples"),
     kernel!("write_samples"),
     kernel!("hint_cells"),
-    kernel!("visit_cells"),
-    kernel!("note_cells"),
+    kernel!("sample_cells"),
+    kernel!("update_cells"),
     kernel!("sum_cells"),
     kernel!("mark_cells"),
     kernel!("mark_blocks"),
     kernel!("picture_rays"),
     kernel!("show_rays"),
     kernel!("find_samples"),
-    kernel!("field_forward", WHOLE),
+    kernel!("field_forward", FULL),
     kernel!("field_forward", HALF),
     kernel!("composite"),
-    kernel!("field_backward", WHOLE),
+    kernel!("field_backward", FULL),
     kernel!("field_backward", HALF),
-    kernel!("aim_rays"),
-    kernel!("point_slopes", WHOLE),
-    kernel!("point_slopes", HALF),
-    kernel!("ray_slopes"),
-    kernel!("code_slopes", WHOLE),
-    kernel!("code_slopes", HALF),
-    kernel!("learn_images"),
-    kernel!("weight_slopes"),
-    kernel!("weight_slopes_half", HALF),
-    kernel!("halve_weights", HALF),
-    kernel!("learn_weights"),
-    kernel!("learn_grid"),
+    kernel!("apply_poses"),
+    kernel!("point_gradients", FULL),
+    kernel!("point_gradients", HALF),
+    kernel!("ray_gradients"),
+    kernel!("embedding_gradients", FULL),
+    kernel!("embedding_gradients", HALF),
+    kernel!("update_images"),
+    kernel!("weight_gradients"),
+    kernel!("weight_gradients_half", HALF),
+    kernel!("weights_to_half", HALF),
+    kernel!("update_weights"),
+    kernel!("update_grid"),
     kernel!("end_step"),
 ];
 
@@ -112,11 +112,11 @@ pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
 /// Threads that work on a tile with matrices: whole subgroups of any size.
 const HALF_LANES: u32 = 128;
 /// Most rows of a layer.
-const MOST_ROWS: u32 = 64;
+const MAX_ROWS: u32 = 64;
 /// Rows of a matrix.
 const MATRIX: u32 = 16;
 /// Numbers that the first network tells, and colors, as the kernels have them.
-const N_TOLD: u32 = 16;
+const N_DENSITY_OUT: u32 = 16;
 const N_COLORS: u32 = 4;
 
 /// Widths of both networks as the kernels have them: multiples of four, and of what a matrix has where layers are matrices. Those that
@@ -126,26 +126,32 @@ pub(crate) struct Widths {
     pub(crate) n_features: u32,
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
-    pub(crate) n_code: u32,
+    pub(crate) embedding_dim: u32,
     /// Whether layers are matrices of f16 ([`crate::gpu::Optional::half_matrices`]): what goes through them is f16 then.
-    pub(crate) halves: bool,
+    pub(crate) is_half_precision: bool,
     /// Features, hidden and inputs of the second network as they are without matrices.
     used: [u32; 3],
 }
 
 fn layers_of([n_features, n_hidden, n_color_in]: [u32; 3]) -> [[u32; 2]; 5] {
-    [[n_features, n_hidden], [n_hidden, N_TOLD], [n_color_in, n_hidden], [n_hidden, n_hidden], [n_hidden, N_COLORS]]
+    [
+        [n_features, n_hidden],
+        [n_hidden, N_DENSITY_OUT],
+        [n_color_in, n_hidden],
+        [n_hidden, n_hidden],
+        [n_hidden, N_COLORS],
+    ]
 }
 
 impl Widths {
-    pub(crate) fn new(gpu: &Gpu, n_levels: u32, hidden: u32, n_code: u32) -> Self {
-        let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + n_code;
-        let halves = gpu.optional().half_matrices;
+    pub(crate) fn new(gpu: &Gpu, n_levels: u32, hidden: u32, embedding_dim: u32) -> Self {
+        let inputs = u32::try_from(N_DIRECTION).expect("16") + 15 + embedding_dim;
+        let is_half_precision = gpu.optional().half_matrices;
         let used = [2 * n_levels, hidden, inputs].map(|width| width.next_multiple_of(4));
         let [n_features, n_hidden, n_color_in] =
-            if halves { used.map(|width| width.next_multiple_of(MATRIX)) } else { used };
-        assert!(n_features.max(n_hidden).max(n_color_in) <= MOST_ROWS, "a layer is wider than its rows");
-        Self { n_features, n_hidden, n_color_in, n_code, halves, used }
+            if is_half_precision { used.map(|width| width.next_multiple_of(MATRIX)) } else { used };
+        assert!(n_features.max(n_hidden).max(n_color_in) <= MAX_ROWS, "a layer is wider than its rows");
+        Self { n_features, n_hidden, n_color_in, embedding_dim, is_half_precision, used }
     }
 
     /// Inputs and outputs of all layers of both networks, in the order of their weights.
@@ -165,7 +171,7 @@ impl Widths {
 
     /// Outputs of the last layer: three colors, and nothing.
     fn n_colors(&self) -> u32 {
-        if self.halves { MATRIX } else { N_COLORS }
+        if self.is_half_precision { MATRIX } else { N_COLORS }
     }
 
     /// Weights of all layers as they are worked with, and sums of slopes towards them: those of the outputs that are nothing come last.
@@ -175,16 +181,16 @@ impl Widths {
 
     /// Bytes of a number that is kept for the way back.
     pub(crate) fn bytes_per_number(&self) -> u32 {
-        if self.halves { 2 } else { 4 }
+        if self.is_half_precision { 2 } else { 4 }
     }
 
     /// Numbers of a sample that are kept for the way back: what goes into each layer.
-    pub(crate) fn n_held(&self) -> u32 {
+    pub(crate) fn n_activations(&self) -> u32 {
         self.layers().iter().map(|[n_in, _]| n_in).sum()
     }
 
     /// Slopes of a sample: towards what comes out of each layer, and towards what the grid holds.
-    pub(crate) fn n_slopes(&self) -> u32 {
+    pub(crate) fn n_gradients(&self) -> u32 {
         self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS + self.n_features
     }
 }
@@ -198,8 +204,8 @@ pub(crate) struct FieldPipelines {
     pub(crate) find_samples: Pipeline,
     /// One a kind of hint, in the order in which they are taken.
     pub(crate) hint_cells: [Pipeline; 3],
-    pub(crate) visit_cells: Pipeline,
-    pub(crate) note_cells: Pipeline,
+    pub(crate) sample_cells: Pipeline,
+    pub(crate) update_cells: Pipeline,
     pub(crate) sum_cells: Pipeline,
     pub(crate) mark_cells: Pipeline,
     pub(crate) mark_blocks: Pipeline,
@@ -210,56 +216,66 @@ pub(crate) struct FieldPipelines {
     pub(crate) colors: Pipeline,
     pub(crate) forward: Pipeline,
     /// Where layers are matrices of f16.
-    pub(crate) halve_weights: Option<Pipeline>,
+    pub(crate) weights_to_half: Option<Pipeline>,
     pub(crate) composite: Pipeline,
     pub(crate) field_backward: Pipeline,
-    pub(crate) aim_rays: Pipeline,
-    pub(crate) point_slopes: Pipeline,
-    pub(crate) ray_slopes: Pipeline,
-    pub(crate) code_slopes: Pipeline,
-    pub(crate) learn_images: Pipeline,
-    pub(crate) weight_slopes: Pipeline,
-    pub(crate) learn_weights: Pipeline,
-    pub(crate) learn_grid: Pipeline,
+    pub(crate) apply_poses: Pipeline,
+    pub(crate) point_gradients: Pipeline,
+    pub(crate) ray_gradients: Pipeline,
+    pub(crate) embedding_gradients: Pipeline,
+    pub(crate) update_images: Pipeline,
+    pub(crate) weight_gradients: Pipeline,
+    pub(crate) update_weights: Pipeline,
+    pub(crate) update_grid: Pipeline,
     pub(crate) end_step: Pipeline,
 }
 
 impl FieldPipelines {
-    /// For so many samples at most; `of_picture` is where the terms of a picture lie among those that it is drawn with.
-    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, of_picture: u32) -> Result<Self, Error> {
-        let Widths { n_features, n_hidden, n_color_in, n_code, halves, .. } = *widths;
+    /// For so many samples at most; `picture_embedding_ix` is where the terms of a picture lie among those that it is drawn with.
+    pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, picture_embedding_ix: u32) -> Result<Self, Error> {
+        let Widths { n_features, n_hidden, n_color_in, embedding_dim, is_half_precision, .. } = *widths;
         let sizes = [
             ("N_FEATURES", f64::from(n_features)),
             ("N_HIDDEN", f64::from(n_hidden)),
             ("N_COLOR_IN", f64::from(n_color_in)),
             ("N_COLORS", f64::from(widths.n_colors())),
-            ("LANES", f64::from(if halves { HALF_LANES } else { 2 * n_hidden })),
+            ("LANES", f64::from(if is_half_precision { HALF_LANES } else { 2 * n_hidden })),
         ];
-        let layered = |[whole, half]: [Kernel; 2]| if halves { half } else { whole };
+        let select_precision = |[full, half]: [Kernel; 2]| if is_half_precision { half } else { full };
         let with = |more: &[(&'static str, f64)]| [&sizes[..], more].concat();
-        let forward = |colors: f64, keeps: f64| {
-            let kind = [("N_CODE", f64::from(n_code)), ("COLORS", colors), ("KEEPS", keeps)];
-            Pipeline::new(gpu, layered([kernel!("field_forward", WHOLE), kernel!("field_forward", HALF)]), &with(&kind))
+        let forward = |colors: f64, stores_activations: f64| {
+            let kind = [
+                ("EMBEDDING_DIM", f64::from(embedding_dim)),
+                ("COLORS", colors),
+                ("STORE_ACTIVATIONS", stores_activations),
+            ];
+            Pipeline::new(
+                gpu,
+                select_precision([kernel!("field_forward", FULL), kernel!("field_forward", HALF)]),
+                &with(&kind),
+            )
         };
         // A thread has 16 weights.
-        let most_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
+        let max_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
         let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
-        let sums = if halves { vec![chunk] } else { vec![chunk, ("SUM_LANES", f64::from(most_weights / 16))] };
+        let sums =
+            if is_half_precision { vec![chunk] } else { vec![chunk, ("SUM_LANES", f64::from(max_weights / 16))] };
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
         // These take long to compile.
-        let ((densities, colors), (learned, (field_backward, weight_slopes))) = rayon::join(
+        let ((densities, colors), (learned, (field_backward, weight_gradients))) = rayon::join(
             || rayon::join(|| forward(0.0, 0.0), || forward(1.0, 0.0)),
             || {
                 let backward = || {
-                    let kernel = layered([kernel!("field_backward", WHOLE), kernel!("field_backward", HALF)]);
+                    let kernel = select_precision([kernel!("field_backward", FULL), kernel!("field_backward", HALF)]);
                     Pipeline::new(gpu, kernel, &sizes)
                 };
-                let slopes = || {
-                    let kernel = layered([kernel!("weight_slopes"), kernel!("weight_slopes_half", HALF)]);
+                let gradients = || {
+                    let kernel =
+                        select_precision([kernel!("weight_gradients"), kernel!("weight_gradients_half", HALF)]);
                     Pipeline::new(gpu, kernel, &with(&sums))
                 };
-                rayon::join(|| forward(1.0, 1.0), || rayon::join(backward, slopes))
+                rayon::join(|| forward(1.0, 1.0), || rayon::join(backward, gradients))
             },
         );
         Ok(Self {
@@ -268,39 +284,43 @@ impl FieldPipelines {
             write_samples: plain(kernel!("write_samples"))?,
             find_samples: plain(kernel!("find_samples"))?,
             hint_cells: [hint(0.0)?, hint(1.0)?, hint(2.0)?],
-            visit_cells: plain(kernel!("visit_cells"))?,
-            note_cells: plain(kernel!("note_cells"))?,
+            sample_cells: plain(kernel!("sample_cells"))?,
+            update_cells: plain(kernel!("update_cells"))?,
             sum_cells: plain(kernel!("sum_cells"))?,
             mark_cells: plain(kernel!("mark_cells"))?,
             mark_blocks: plain(kernel!("mark_blocks"))?,
-            picture_rays: Pipeline::new(gpu, kernel!("picture_rays"), &[("OF_PICTURE", of_picture.into())])?,
+            picture_rays: Pipeline::new(
+                gpu,
+                kernel!("picture_rays"),
+                &[("PICTURE_EMBEDDING_IX", picture_embedding_ix.into())],
+            )?,
             show_rays: plain(kernel!("show_rays"))?,
             densities: densities?,
             colors: colors?,
             forward: learned?,
-            halve_weights: halves.then(|| plain(kernel!("halve_weights", HALF))).transpose()?,
+            weights_to_half: is_half_precision.then(|| plain(kernel!("weights_to_half", HALF))).transpose()?,
             composite: plain(kernel!("composite"))?,
             field_backward: field_backward?,
-            aim_rays: plain(kernel!("aim_rays"))?,
-            point_slopes: Pipeline::new(
+            apply_poses: plain(kernel!("apply_poses"))?,
+            point_gradients: Pipeline::new(
                 gpu,
-                layered([kernel!("point_slopes", WHOLE), kernel!("point_slopes", HALF)]),
+                select_precision([kernel!("point_gradients", FULL), kernel!("point_gradients", HALF)]),
                 &sizes,
             )?,
-            ray_slopes: plain(kernel!("ray_slopes"))?,
-            code_slopes: Pipeline::new(
+            ray_gradients: plain(kernel!("ray_gradients"))?,
+            embedding_gradients: Pipeline::new(
                 gpu,
-                layered([kernel!("code_slopes", WHOLE), kernel!("code_slopes", HALF)]),
-                &with(&[("N_CODE", n_code.into())]),
+                select_precision([kernel!("embedding_gradients", FULL), kernel!("embedding_gradients", HALF)]),
+                &with(&[("EMBEDDING_DIM", embedding_dim.into())]),
             )?,
-            learn_images: plain(kernel!("learn_images"))?,
-            weight_slopes: weight_slopes?,
-            learn_weights: Pipeline::new(
+            update_images: plain(kernel!("update_images"))?,
+            weight_gradients: weight_gradients?,
+            update_weights: Pipeline::new(
                 gpu,
-                kernel!("learn_weights"),
+                kernel!("update_weights"),
                 &[("CHUNK", f64::from(N_CHUNK)), ("N_SUMS", f64::from(widths.n_padded_weights() / 4))],
             )?,
-            learn_grid: plain(kernel!("learn_grid"))?,
+            update_grid: plain(kernel!("update_grid"))?,
             end_step: plain(kernel!("end_step"))?,
         })
     }

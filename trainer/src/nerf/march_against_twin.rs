@@ -2,7 +2,7 @@
 
 use super::buffers::{FieldBuffers, FieldMoments, Occupancy, RaySlot, SampleBuffers};
 use super::kernels::{FieldPipelines, Widths};
-use super::params::{self, Batch, Span, Visit};
+use super::params::{self, Batch, OccupancyUpdate, Span};
 use super::passes::FieldPasses;
 use super::reference::grid::GridShape;
 use super::reference::march::March;
@@ -15,9 +15,9 @@ const N_CELLS: u32 = 64;
 /// More than a workgroup scans at once.
 const N_RAYS: u32 = 300;
 const CAPACITY: u32 = 16_384;
-const MARCH: March = March { step: 0.03125, most_samples: 12, n_cells: N_CELLS as usize };
+const MARCH: March = March { step: 0.03125, max_samples: 12, n_cells: N_CELLS as usize };
 /// A place so close to a cell's side, in cells, may be taken for the next one in f32.
-const CLEAR: f64 = 1e-4;
+const MIN_MARGIN: f64 = 1e-4;
 
 /// Half of the cells in half of the blocks, which are 4 cells wide.
 fn is_occupied(cell: usize) -> bool {
@@ -43,7 +43,7 @@ fn rays() -> Vec<TestRay> {
 }
 
 #[test]
-fn samples_lie_where_something_is_no_more_than_wanted() {
+fn samples_lie_in_occupied_cells_within_limit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let shape = GridShape::between(2, 4, 2, 6);
     let widths = Widths::new(&gpu, 2, 4, 0);
@@ -51,19 +51,20 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     let field = FieldBuffers::new(&gpu, &shape, &widths).unwrap();
     let batch = SampleBuffers::new(&gpu, CAPACITY).unwrap();
     let occupancy =
-        Occupancy::new(&gpu, &Visit { n_cells: N_CELLS, n_points: 1, kept_frac: 1.0, step: 0.1 }, false).unwrap();
-    let thickness: Vec<f32> = (0..N_CELLS.pow(3) as usize).map(|cell| f32::from(u8::from(is_occupied(cell)))).collect();
-    gpu.write(&occupancy.thickness, 0, bytemuck::cast_slice(&thickness));
+        Occupancy::new(&gpu, &OccupancyUpdate { n_cells: N_CELLS, n_points: 1, decay: 1.0, step: 0.1 }, false).unwrap();
+    let cell_occupancy: Vec<f32> =
+        (0..N_CELLS.pow(3) as usize).map(|cell| f32::from(u8::from(is_occupied(cell)))).collect();
+    gpu.write(&occupancy.cell_occupancy, 0, bytemuck::cast_slice(&cell_occupancy));
     let rule = bytemuck::Zeroable::zeroed();
     let moments = FieldMoments::new(&gpu, &shape, &widths, &rule).unwrap();
     let slot = RaySlot::new(&gpu, N_RAYS).unwrap();
     let rays = rays();
-    let gpu_ray = |(origin, direction, range, shift): &TestRay| params::Ray {
+    let gpu_ray = |(origin, direction, range, jitter): &TestRay| params::Ray {
         origin: f32s_of(*origin),
         direction: f32s_of(*direction),
         begin: f32_of(range[0]),
         end: f32_of(range[1]),
-        shift: f32_of(*shift),
+        jitter: f32_of(*jitter),
         ..params::Ray::default()
     };
     let gpu_rays: Vec<params::Ray> = rays.iter().map(gpu_ray).collect();
@@ -71,19 +72,20 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     gpu.write(&batch.batch, 0, bytemuck::bytes_of(&Batch::of(N_RAYS)));
     let march = params::March {
         step: f32_of(MARCH.step),
-        most_samples: u32::try_from(MARCH.most_samples).unwrap(),
+        max_samples: u32::try_from(MARCH.max_samples).unwrap(),
         n_cells: N_CELLS,
         first_ray: 0,
-        most_found: u32::MAX,
+        max_found: u32::MAX,
         unused: [0; 3],
     };
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
-    let terms = &field.no_terms;
-    let passes = FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot, terms };
+    let image_params = &field.no_image_params;
+    let passes =
+        FieldPasses { gpu: &gpu, pipelines: &pipelines, field: &field, samples: &batch, slot: &slot, image_params };
     let mut list = Passes::default();
-    passes.mark(&mut list, &occupancy, &moments);
+    passes.mark_occupied_cells(&mut list, &occupancy, &moments);
     passes.count(&mut list, &occupancy);
-    passes.place(&mut list, &occupancy);
+    passes.place_samples_in_rays(&mut list, &occupancy);
     list.submit(&gpu);
 
     let [_, n_samples] = gpu.read::<u32>(&batch.batch, 2).unwrap()[..] else { panic!("two words") };
@@ -91,30 +93,30 @@ fn samples_lie_where_something_is_no_more_than_wanted() {
     let spans: Vec<Span> = gpu.read(&batch.spans, n_samples as usize).unwrap();
     let points: Vec<[f32; 4]> = gpu.read(&batch.points, n_samples as usize).unwrap();
     assert_eq!(placed.iter().map(|ray| ray.n_samples).sum::<u32>(), n_samples);
-    let (mut wrong, mut n_compared, mut n_thinned) = (Mismatches::default(), 0, 0);
-    for (ix, (ray, (origin, direction, range, shift))) in placed.iter().zip(&rays).enumerate() {
-        let (pieces, margin) = MARCH.pieces((*origin, *direction), *range, *shift, is_occupied);
-        assert!(ray.n_samples as usize <= MARCH.most_samples, "ray {ix}: {}", ray.n_samples);
-        if margin < CLEAR {
+    let (mut mismatches, mut n_compared, mut n_thinned) = (Mismatches::default(), 0, 0);
+    for (ix, (ray, (origin, direction, range, jitter))) in placed.iter().zip(&rays).enumerate() {
+        let (segments, margin) = MARCH.segments((*origin, *direction), *range, *jitter, is_occupied);
+        assert!(ray.n_samples as usize <= MARCH.max_samples, "ray {ix}: {}", ray.n_samples);
+        if margin < MIN_MARGIN {
             continue;
         }
         n_compared += 1;
-        n_thinned += usize::from(pieces.len() > MARCH.most_samples);
-        let expected = MARCH.spans(&pieces, *shift);
-        assert_eq!(ray.n_samples as usize, expected.len(), "ray {ix} of {} pieces", pieces.len());
+        n_thinned += usize::from(segments.len() > MARCH.max_samples);
+        let expected = MARCH.spans(&segments, *jitter);
+        assert_eq!(ray.n_samples as usize, expected.len(), "ray {ix} of {} pieces", segments.len());
         let begin = ray.first_sample as usize;
         for (sample, [low, high]) in expected.into_iter().enumerate() {
             let (span, point) = (spans[begin + sample], points[begin + sample]);
             assert_eq!(span.ray as usize, ix);
-            wrong.check(format!("begin {ix} {sample}"), span.begin.into(), low, 1e-4, 1e-4);
-            wrong.check(format!("end {ix} {sample}"), span.end.into(), high, 1e-4, 1e-4);
+            mismatches.check(format!("begin {ix} {sample}"), span.begin.into(), low, 1e-4, 1e-4);
+            mismatches.check(format!("end {ix} {sample}"), span.end.into(), high, 1e-4, 1e-4);
             let middle = 0.5 * (low + high);
             let at = contract(std::array::from_fn(|axis| origin[axis] + middle * direction[axis]));
             for axis in 0..3 {
-                wrong.check(format!("point {ix} {sample} {axis}"), point[axis].into(), at[axis], 1e-4, 0.0);
+                mismatches.check(format!("point {ix} {sample} {axis}"), point[axis].into(), at[axis], 1e-4, 0.0);
             }
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
     assert!(n_compared > 100 && n_thinned > 20, "only {n_compared} rays are clear, {n_thinned} of them thinned");
 }

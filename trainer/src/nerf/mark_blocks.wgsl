@@ -5,17 +5,17 @@
 // writes    occupied (behind the cells: a bit a block)
 
 #import folded
-#import visit
+#import occupancy_update
 #import cell_blocks
 
-@group(0) @binding(0) var<uniform> visit: Visit;
+@group(0) @binding(0) var<uniform> occupancy_update: OccupancyUpdate;
 @group(0) @binding(1) var<storage, read_write> occupied: array<u32>;
 
 fn any_in(block: vec3u, size: u32) -> bool {
     for (var z = block.z * size; z < (block.z + 1u) * size; z++) {
         for (var y = block.y * size; y < (block.y + 1u) * size; y++) {
             // The cells of a row lie in one word: sizes are powers of two up to 32.
-            let first = block.x * size + visit.n_cells * (y + visit.n_cells * z);
+            let first = block.x * size + occupancy_update.n_cells * (y + occupancy_update.n_cells * z);
             let row = occupied[first / 32u] >> (first % 32u);
             if (row & (0xffffffffu >> (32u - size))) != 0u { return true; }
         }
@@ -25,8 +25,8 @@ fn any_in(block: vec3u, size: u32) -> bool {
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
-    let size = block_cells_of(visit.n_cells);
-    let n_blocks = visit.n_cells / size;
+    let size = block_cells_of(occupancy_update.n_cells);
+    let n_blocks = occupancy_update.n_cells / size;
     let word = folded(wg, n_wgs) * 64u + lane;
     if 32u * word >= n_blocks * n_blocks * n_blocks { return; }
     var bits = 0u;
@@ -35,5 +35,5 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let block = vec3u(ix, ix / n_blocks, ix / n_blocks / n_blocks) % n_blocks;
         if any_in(block, size) { bits |= 1u << bit; }
     }
-    occupied[visit.n_cells * visit.n_cells * visit.n_cells / 32u + word] = bits;
+    occupied[occupancy_update.n_cells * occupancy_update.n_cells * occupancy_update.n_cells / 32u + word] = bits;
 }

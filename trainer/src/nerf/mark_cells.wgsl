@@ -5,26 +5,26 @@
 // writes    occupied (a bit a cell, before the blocks), steps ([1]: visits so far)
 
 #import folded
-#import thickness_sum
+#import occupancy_sum
 
-@group(0) @binding(0) var<storage, read> thickness: array<f32>;
-@group(0) @binding(1) var<storage, read> thickness_sum: array<u32>;
+@group(0) @binding(0) var<storage, read> cell_occupancy: array<f32>;
+@group(0) @binding(1) var<storage, read> occupancy_sum: array<u32>;
 @group(0) @binding(2) var<storage, read_write> occupied: array<u32>;
 @group(0) @binding(3) var<storage, read_write> steps: array<u32>;
 
 // A step through a cell that holds back less is left out, unless most hold back little: then half of their mean.
-const ENOUGH = 0.02;
+const MIN_OCCUPANCY = 0.02;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let word = folded(wg, n_wgs) * 64u + lane;
-    if 32u * word >= arrayLength(&thickness) { return; }
-    let mean = f32(thickness_sum[0]) / MOST_SUM;
-    let enough = min(ENOUGH, 0.5 * mean);
+    if 32u * word >= arrayLength(&cell_occupancy) { return; }
+    let mean = f32(occupancy_sum[0]) / MAX_SUM;
+    let threshold = min(MIN_OCCUPANCY, 0.5 * mean);
     var bits = 0u;
     for (var bit = 0u; bit < 32u; bit++) {
-        let here = thickness[32u * word + bit];
-        if here < 0.0 || here > enough { bits |= 1u << bit; }
+        let value = cell_occupancy[32u * word + bit];
+        if value < 0.0 || value > threshold { bits |= 1u << bit; }
     }
     occupied[word] = bits;
     if word == 0u { steps[1] += 1u; }

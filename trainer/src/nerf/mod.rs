@@ -6,8 +6,8 @@ pub mod bench;
 mod buffers;
 mod carve;
 mod extent;
+mod field_trainer;
 mod kernels;
-mod learner;
 #[cfg(test)]
 mod march_against_twin;
 mod model;
@@ -22,4 +22,4 @@ mod tests;
 
 pub use extent::Extent;
 pub use model::NerfModel;
-pub use options::{Effort, NerfOptions};
+pub use options::{NerfBudget, NerfOptions};

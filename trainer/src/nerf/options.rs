@@ -1,6 +1,6 @@
 //! How a neural field learns.
 
-use crate::splat::CameraChoice;
+use crate::splat::CameraRefinement;
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::NerfModel`].
@@ -16,7 +16,7 @@ pub struct NerfOptions {
     /// Weight of the difference of distances, per scene radius, against the squared difference of colors.
     pub distance_weight: f64,
     /// Weight of light that is held back elsewhere than where the depth says.
-    pub sight: f64,
+    pub line_of_sight: f64,
     /// Weight of the spread of light along a ray.
     pub distortion: f64,
     /// Learning rate at the start.
@@ -24,15 +24,15 @@ pub struct NerfOptions {
     /// What is left of it at the end of the planned steps.
     pub final_rate_frac: f64,
     /// What is learned about cameras with the field: of all terms it knows the poses of images.
-    pub cameras: CameraChoice,
+    pub cameras: CameraRefinement,
     /// Sizes of batch and networks; `None`: as suits the adapter.
-    pub effort: Option<Effort>,
+    pub nerf_budget: Option<NerfBudget>,
 }
 
 /// What a step takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Effort {
+pub struct NerfBudget {
     /// Rays of a step.
     pub n_rays: u32,
     /// Most samples of a step, of all its rays.
@@ -44,14 +44,14 @@ pub struct Effort {
     /// Steps through the inner cube along an axis.
     pub n_steps: u32,
     /// Most entries of a level, as a power of two.
-    pub most_log2_entries: u32,
+    pub max_log2_entries: u32,
     /// Most levels of the grid, an even number.
-    pub most_levels: u32,
+    pub max_levels: u32,
     /// Most rays of a picture that are followed at once.
     pub picture_rays: u32,
 }
 
-impl Effort {
+impl NerfBudget {
     /// For a processor in place of a GPU.
     pub const SMALL: Self = Self {
         n_rays: 512,
@@ -59,8 +59,8 @@ impl Effort {
         n_hidden: 16,
         n_cells: 64,
         n_steps: 128,
-        most_log2_entries: 15,
-        most_levels: 8,
+        max_log2_entries: 15,
+        max_levels: 8,
         picture_rays: 1 << 11,
     };
     /// For a GPU.
@@ -70,16 +70,16 @@ impl Effort {
         n_hidden: 64,
         n_cells: 128,
         n_steps: 256,
-        most_log2_entries: 19,
-        most_levels: 16,
+        max_log2_entries: 19,
+        max_levels: 16,
         picture_rays: 1 << 18,
     };
 }
 
-impl Effort {
+impl NerfBudget {
     /// With cells and steps half as wide, where these are those of a GPU: a processor would wait for them, and more would take too much memory.
     #[must_use]
-    pub(crate) fn finer(self) -> Self {
+    pub(crate) fn refined(self) -> Self {
         if self.n_cells != Self::FULL.n_cells {
             return self;
         }
@@ -94,12 +94,12 @@ impl Default for NerfOptions {
             max_bytes: None,
             n_planned_steps: 7000,
             distance_weight: 0.05,
-            sight: 0.1,
+            line_of_sight: 0.1,
             distortion: 0.01,
             rate: 2e-2,
             final_rate_frac: 0.03,
-            cameras: CameraChoice::default(),
-            effort: None,
+            cameras: CameraRefinement::default(),
+            nerf_budget: None,
         }
     }
 }

@@ -9,14 +9,14 @@ use crate::gpu::f32_of;
 pub(crate) struct Batch {
     pub(crate) n_rays: u32,
     pub(crate) n_samples: u32,
-    pub(crate) most_samples: u32,
+    pub(crate) max_samples: u32,
     pub(crate) unused: u32,
 }
 
 impl Batch {
     /// Rays whose samples are to be found.
     pub(crate) fn of(n_rays: u32) -> Self {
-        Self { n_rays, n_samples: 0, most_samples: 0, unused: 0 }
+        Self { n_rays, n_samples: 0, max_samples: 0, unused: 0 }
     }
 }
 
@@ -30,12 +30,12 @@ pub(crate) struct Ray {
     pub(crate) n_samples: u32,
     pub(crate) begin: f32,
     pub(crate) end: f32,
-    pub(crate) code: u32,
+    pub(crate) embedding: u32,
     pub(crate) target_rgb: u32,
     pub(crate) target_distance: f32,
-    pub(crate) shift: f32,
-    pub(crate) is_ended: u32,
-    pub(crate) next_piece: u32,
+    pub(crate) jitter: f32,
+    pub(crate) is_finished: u32,
+    pub(crate) next_segment: u32,
 }
 
 /// `Span` of `shared/ray_batch.wgsl`.
@@ -53,20 +53,20 @@ pub(crate) struct Span {
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct March {
     pub(crate) step: f32,
-    pub(crate) most_samples: u32,
+    pub(crate) max_samples: u32,
     pub(crate) n_cells: u32,
     pub(crate) first_ray: u32,
-    pub(crate) most_found: u32,
+    pub(crate) max_found: u32,
     pub(crate) unused: [u32; 3],
 }
 
-/// `Visit` of `shared/visit.wgsl`.
+/// `OccupancyUpdate` of `shared/occupancy_update.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct Visit {
+pub(crate) struct OccupancyUpdate {
     pub(crate) n_cells: u32,
     pub(crate) n_points: u32,
-    pub(crate) kept_frac: f32,
+    pub(crate) decay: f32,
     pub(crate) step: f32,
 }
 
@@ -97,67 +97,70 @@ pub(crate) struct RayLoss {
     pub(crate) distance_clip: f32,
     pub(crate) distortion: f32,
     pub(crate) near: f32,
-    pub(crate) sight: f32,
+    pub(crate) line_of_sight: f32,
     pub(crate) band: f32,
     pub(crate) band_frac: f32,
     pub(crate) unused: f32,
 }
 
-/// `LearnRule` of `shared/learn_rule.wgsl`.
+/// `AdamRule` of `shared/adam_rule.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct LearnRule {
+pub(crate) struct AdamRule {
     pub(crate) rate: f32,
     pub(crate) final_rate_frac: f32,
     pub(crate) betas: [f32; 2],
     pub(crate) epsilon: f32,
-    pub(crate) pull: f32,
+    pub(crate) weight_decay: f32,
     pub(crate) n_planned_steps: f32,
     pub(crate) unused: f32,
 }
 
-/// `Pace` of `shared/learn_rule.wgsl`.
+/// `StepScale` of `shared/adam_rule.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct Pace {
+pub(crate) struct StepScale {
     pub(crate) rate_frac: f32,
     pub(crate) unused: f32,
     pub(crate) correction: [f32; 2],
 }
 
-/// `TermRule` of `learn_images.wgsl`.
+/// `ImageParamRule` of `update_images.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct TermRule {
+pub(crate) struct ImageParamRule {
     pub(crate) learned: u32,
     pub(crate) n_images: u32,
-    pub(crate) turn_rate: f32,
-    pub(crate) shift_rate: f32,
-    pub(crate) code_rate: f32,
-    pub(crate) pull: f32,
+    pub(crate) rotation_rate: f32,
+    pub(crate) translation_rate: f32,
+    pub(crate) embedding_rate: f32,
+    pub(crate) weight_decay: f32,
     pub(crate) unused: [u32; 2],
 }
 
-/// What is kept of each image, [`TERM_STRIDE`] terms: three of its turn, three of its shift, and its code from [`CODE`] on, as in
+/// What is kept of each image, [`IMAGE_PARAM_STRIDE`] terms: three of its turn, three of its shift, and its code from [`EMBEDDING`] on, as in
 /// `shared/image_terms.wgsl`: value, Adam's two means, and the steps it took.
-pub(crate) type Term = [f32; 4];
-pub(crate) const TERM_STRIDE: usize = 9;
-pub(crate) const CODE: usize = 6;
+pub(crate) type ImageParam = [f32; 4];
+pub(crate) const IMAGE_PARAM_STRIDE: usize = 9;
+pub(crate) const EMBEDDING: usize = 6;
 
 /// The terms of images that have these codes and no more.
-pub(crate) fn terms_of<const N: usize>(codes: &[[f64; N]]) -> Vec<[Term; TERM_STRIDE]> {
-    let of_image = |code: &[f64; N]| {
-        let mut terms = [[0.0; 4]; TERM_STRIDE];
-        terms[CODE..].iter_mut().zip(code).for_each(|(term, value)| term[0] = f32_of(*value));
-        terms
+pub(crate) fn image_params_of<const N: usize>(embeddings: &[[f64; N]]) -> Vec<[ImageParam; IMAGE_PARAM_STRIDE]> {
+    let params_with_embedding = |embedding: &[f64; N]| {
+        let mut image_params = [[0.0; 4]; IMAGE_PARAM_STRIDE];
+        image_params[EMBEDDING..]
+            .iter_mut()
+            .zip(embedding)
+            .for_each(|(image_param, value)| image_param[0] = f32_of(*value));
+        image_params
     };
-    codes.iter().map(of_image).collect()
+    embeddings.iter().map(params_with_embedding).collect()
 }
 
-impl LearnRule {
+impl AdamRule {
     /// Of the first step.
-    pub(crate) fn first_pace(&self) -> Pace {
-        Pace { rate_frac: 1.0, unused: 0.0, correction: self.betas.map(|beta| 1.0 / (1.0 - beta)) }
+    pub(crate) fn first_step_scale(&self) -> StepScale {
+        StepScale { rate_frac: 1.0, unused: 0.0, correction: self.betas.map(|beta| 1.0 / (1.0 - beta)) }
     }
 }
 

@@ -1,11 +1,11 @@
 //! The stages of drawing and learning, as lists of passes.
 
 use super::buffers::{
-    FieldBuffers, FieldMoments, FieldSlopes, N_SHARES, Occupancy, RaySlot, SampleBuffers, StepBuffers, TermBuffers,
-    n_blocks,
+    FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
+    THREADS_PER_RAY, n_blocks,
 };
 use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
-use super::params::{Backdrop, TERM_STRIDE, Term};
+use super::params::{Backdrop, IMAGE_PARAM_STRIDE, ImageParam};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::View;
@@ -20,7 +20,7 @@ pub(crate) struct FieldPasses<'a> {
     pub(crate) samples: &'a SampleBuffers,
     pub(crate) slot: &'a RaySlot,
     /// Of the images that the rays belong to.
-    pub(crate) terms: &'a Buffer,
+    pub(crate) image_params: &'a Buffer,
 }
 
 /// A picture and where it is drawn.
@@ -31,7 +31,7 @@ pub(crate) struct Canvas {
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
     /// Of the image that it is to look like.
-    pub(crate) terms: Buffer,
+    pub(crate) image_params: Buffer,
     /// What the rays of a batch have seen so far.
     light: Buffer,
     pub(crate) n_pixels: u64,
@@ -44,7 +44,7 @@ impl Canvas {
             backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("nerf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("nerf.depths", 4 * n_pixels)?,
-            terms: gpu.storage("nerf.picture_terms", (TERM_STRIDE * size_of::<Term>()) as u64)?,
+            image_params: gpu.storage("nerf.picture_terms", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
             n_pixels,
         })
@@ -72,11 +72,11 @@ impl FieldPasses<'_> {
             ("n_found", &slot.n_found),
             ("n_before", &slot.n_before),
         ];
-        list.dispatch(gpu, &pipelines.count_samples, groups(N_SHARES * slot.n_rays, 64), &found);
+        list.dispatch(gpu, &pipelines.count_samples, groups(THREADS_PER_RAY * slot.n_rays, 64), &found);
     }
 
     /// After [`FieldPasses::count`]: makes samples of the pieces.
-    pub(crate) fn place(&self, list: &mut Passes, occupancy: &Occupancy) {
+    pub(crate) fn place_samples_in_rays(&self, list: &mut Passes, occupancy: &Occupancy) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shared =
             [("batch", &samples.batch), ("march", &slot.march), ("n_found", &slot.n_found), ("rays", &slot.rays)];
@@ -87,72 +87,87 @@ impl FieldPasses<'_> {
             ("spans", &samples.spans),
             ("points", &samples.points),
         ];
-        let n_groups = groups(N_SHARES * slot.n_rays, 64);
+        let n_groups = groups(THREADS_PER_RAY * slot.n_rays, 64);
         list.dispatch(gpu, &pipelines.write_samples, n_groups, &[&shared[..], &written].concat());
     }
 
     /// Looks at some cells of the occupancy anew. What the batch held is lost.
-    pub(crate) fn visit(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
+    pub(crate) fn occupancy_update(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
         let Self { gpu, pipelines, samples, .. } = *self;
-        let Occupancy { thickness, visit, n_points, .. } = occupancy;
-        let (visit, steps) = (("visit", visit), ("steps", &moments.steps));
-        let of_points = groups(*n_points, 64);
-        let visited = [visit, steps, ("batch", &samples.batch), ("points", &samples.points)];
-        list.dispatch(gpu, &pipelines.visit_cells, of_points, &visited);
+        let Occupancy { cell_occupancy, occupancy_update, n_points, .. } = occupancy;
+        let (occupancy_update, steps) = (("occupancy_update", occupancy_update), ("steps", &moments.steps));
+        let n_point_groups = groups(*n_points, 64);
+        let sampled = [occupancy_update, steps, ("batch", &samples.batch), ("points", &samples.points)];
+        list.dispatch(gpu, &pipelines.sample_cells, n_point_groups, &sampled);
         self.densities(list);
-        let thickness = ("thickness", thickness);
-        list.dispatch(gpu, &pipelines.note_cells, of_points, &[visit, steps, ("told", &samples.told), thickness]);
-        self.mark(list, occupancy, moments);
+        let cell_occupancy = ("cell_occupancy", cell_occupancy);
+        list.dispatch(
+            gpu,
+            &pipelines.update_cells,
+            n_point_groups,
+            &[occupancy_update, steps, ("log_density", &samples.log_density), cell_occupancy],
+        );
+        self.mark_occupied_cells(list, occupancy, moments);
     }
 
     /// Takes note of what depth tells, [`super::carve::hints`].
     pub(crate) fn hint(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments, hints: &Buffer) {
         for kernel in &self.pipelines.hint_cells {
             let n_groups = (hints.bytes() / 4).div_ceil(64);
-            list.dispatch(self.gpu, kernel, n_groups, &[("hints", hints), ("thickness", &occupancy.thickness)]);
+            list.dispatch(
+                self.gpu,
+                kernel,
+                n_groups,
+                &[("hints", hints), ("cell_occupancy", &occupancy.cell_occupancy)],
+            );
         }
-        self.mark(list, occupancy, moments);
+        self.mark_occupied_cells(list, occupancy, moments);
     }
 
     /// Marks the cells that rays are walked through.
-    pub(crate) fn mark(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
+    pub(crate) fn mark_occupied_cells(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
         let Self { gpu, pipelines, .. } = *self;
-        let Occupancy { occupied, thickness, thickness_sum, visit, n_cells, .. } = occupancy;
-        let (thickness, steps) = (("thickness", thickness), ("steps", &moments.steps));
-        list.clear(thickness_sum);
-        let (sum, of_words) = (("thickness_sum", thickness_sum), groups(n_cells.pow(3) / 32, 64));
-        list.dispatch(gpu, &pipelines.sum_cells, of_words, &[thickness, sum]);
-        list.dispatch(gpu, &pipelines.mark_cells, of_words, &[thickness, sum, ("occupied", occupied), steps]);
+        let Occupancy { occupied, cell_occupancy, occupancy_sum, occupancy_update, n_cells, .. } = occupancy;
+        let (cell_occupancy, steps) = (("cell_occupancy", cell_occupancy), ("steps", &moments.steps));
+        list.clear(occupancy_sum);
+        let (sum, n_word_groups) = (("occupancy_sum", occupancy_sum), groups(n_cells.pow(3) / 32, 64));
+        list.dispatch(gpu, &pipelines.sum_cells, n_word_groups, &[cell_occupancy, sum]);
+        list.dispatch(gpu, &pipelines.mark_cells, n_word_groups, &[cell_occupancy, sum, ("occupied", occupied), steps]);
         let n_words = n_blocks(*n_cells).pow(3).div_ceil(32);
-        list.dispatch(gpu, &pipelines.mark_blocks, groups(n_words, 64), &[("visit", visit), ("occupied", occupied)]);
+        list.dispatch(
+            gpu,
+            &pipelines.mark_blocks,
+            groups(n_words, 64),
+            &[("occupancy_update", occupancy_update), ("occupied", occupied)],
+        );
     }
 
     /// Makes layers take the weights as they are now.
-    pub(crate) fn halve(&self, list: &mut Passes) {
+    pub(crate) fn convert_weights(&self, list: &mut Passes) {
         let Self { gpu, pipelines, field, .. } = *self;
-        if let (Some(kernel), Some(half)) = (&pipelines.halve_weights, &field.half_weights) {
+        if let (Some(kernel), Some(half)) = (&pipelines.weights_to_half, &field.half_weights) {
             let n_groups = (half.bytes() / 16).div_ceil(64);
             list.dispatch(gpu, kernel, n_groups, &[("weights", &field.weights), ("half_weights", half)]);
         }
     }
 
-    /// After [`FieldPasses::halve`]: density of every point, before the exponential.
+    /// After [`FieldPasses::convert_weights`]: density of every point, before the exponential.
     fn densities(&self, list: &mut Passes) {
-        self.networks(list, &self.pipelines.densities, &self.field.nothing);
+        self.networks(list, &self.pipelines.densities, &self.field.unused_buffer);
     }
 
-    /// After [`FieldPasses::halve`]: density and color of every sample, before the exponential and the sigmoid.
+    /// After [`FieldPasses::convert_weights`]: density and color of every sample, before the exponential and the sigmoid.
     pub(crate) fn colors(&self, list: &mut Passes) {
-        self.networks(list, &self.pipelines.colors, &self.field.nothing);
+        self.networks(list, &self.pipelines.colors, &self.field.unused_buffer);
     }
 
     /// As [`FieldPasses::colors`], and all that is needed on the way back.
     pub(crate) fn forward(&self, list: &mut Passes, step: &StepBuffers) {
-        self.networks(list, &self.pipelines.forward, &step.held);
+        self.networks(list, &self.pipelines.forward, &step.activations);
     }
 
-    fn networks(&self, list: &mut Passes, pipeline: &Pipeline, held: &Buffer) {
-        let Self { gpu, field, samples, slot, terms, .. } = *self;
+    fn networks(&self, list: &mut Passes, pipeline: &Pipeline, activations: &Buffer) {
+        let Self { gpu, field, samples, slot, image_params, .. } = *self;
         let buffers = [
             ("batch", &samples.batch),
             ("levels", &field.levels),
@@ -161,10 +176,10 @@ impl FieldPasses<'_> {
             ("weights", field.working_weights()),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
-            ("terms", terms),
-            ("told", &samples.told),
+            ("image_params", image_params),
+            ("log_density", &samples.log_density),
             ("colors", &samples.colors),
-            ("held", held),
+            ("activations", activations),
         ];
         list.dispatch(gpu, pipeline, groups(samples.n_samples, N_TILE), &buffers);
     }
@@ -187,14 +202,14 @@ impl FieldPasses<'_> {
     /// Fills in the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
-        let aimed = [
+        let posed = [
             ("batch", &samples.batch),
             ("march", &slot.march),
             ("view", &canvas.view),
             ("rays", &slot.rays),
             ("light", &canvas.light),
         ];
-        list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &aimed);
+        list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &posed);
     }
 
     /// After [`FieldPasses::forward`]: the pixels that the rays see.
@@ -207,7 +222,7 @@ impl FieldPasses<'_> {
             ("backdrop", &canvas.backdrop),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
-            ("told", &samples.told),
+            ("log_density", &samples.log_density),
             ("colors", &samples.colors),
             ("pixels", &canvas.pixels),
             ("depths", &canvas.depths),
@@ -217,14 +232,14 @@ impl FieldPasses<'_> {
     }
 
     /// Moves the rays as their images' poses were found to be moved.
-    pub(crate) fn aim(&self, list: &mut Passes) {
-        let Self { gpu, pipelines, samples, slot, terms, .. } = *self;
-        let aimed = [("batch", &samples.batch), ("terms", terms), ("rays", &slot.rays)];
-        list.dispatch(gpu, &pipelines.aim_rays, groups(slot.n_rays, 64), &aimed);
+    pub(crate) fn apply_pose(&self, list: &mut Passes) {
+        let Self { gpu, pipelines, samples, slot, image_params, .. } = *self;
+        let posed = [("batch", &samples.batch), ("image_params", image_params), ("rays", &slot.rays)];
+        list.dispatch(gpu, &pipelines.apply_poses, groups(slot.n_rays, 64), &posed);
     }
 
     /// After [`FieldPasses::backward`]: slopes towards the poses of rays.
-    pub(crate) fn pose_slopes(&self, list: &mut Passes, step: &StepBuffers, images: &TermBuffers) {
+    pub(crate) fn pose_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, field, samples, slot, .. } = *self;
         let (batch, rays, spans) = (("batch", &samples.batch), ("rays", &slot.rays), ("spans", &samples.spans));
         let v_points = ("v_points", &images.v_points);
@@ -235,39 +250,39 @@ impl FieldPasses<'_> {
             ("grid", &field.grid),
             rays,
             spans,
-            ("v_held", &step.v_held),
+            ("v_activations", &step.v_activations),
             v_points,
         ];
-        list.dispatch(gpu, &pipelines.point_slopes, groups(samples.n_samples, 64), &looked_up);
+        list.dispatch(gpu, &pipelines.point_gradients, groups(samples.n_samples, 64), &looked_up);
         let summed = [batch, rays, spans, v_points, ("v_rays", &images.v_rays)];
-        list.dispatch(gpu, &pipelines.ray_slopes, groups(slot.n_rays, 64), &summed);
+        list.dispatch(gpu, &pipelines.ray_gradients, groups(slot.n_rays, 64), &summed);
     }
 
     /// After [`FieldPasses::backward`]: slopes of samples towards the codes of their images.
-    pub(crate) fn code_slopes(&self, list: &mut Passes, step: &StepBuffers, images: &TermBuffers) {
+    pub(crate) fn embedding_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, field, samples, .. } = *self;
         let carried = [
             ("batch", &samples.batch),
             ("weights", &field.weights),
-            ("v_held", &step.v_held),
-            ("v_codes", &images.v_codes),
+            ("v_activations", &step.v_activations),
+            ("v_embeddings", &images.v_embeddings),
         ];
-        list.dispatch(gpu, &pipelines.code_slopes, groups(samples.n_samples, 64), &carried);
+        list.dispatch(gpu, &pipelines.embedding_gradients, groups(samples.n_samples, 64), &carried);
     }
 
     /// After the slopes: one step of the terms of all images.
-    pub(crate) fn learn_images(&self, list: &mut Passes, moments: &FieldMoments, images: &TermBuffers) {
+    pub(crate) fn update_images(&self, list: &mut Passes, moments: &FieldMoments, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let learned = [
             ("batch", &samples.batch),
             ("rule", &images.rule),
-            ("pace", &moments.pace),
+            ("step_scale", &moments.step_scale),
             ("rays", &slot.rays),
             ("v_rays", &images.v_rays),
-            ("v_codes", &images.v_codes),
-            ("terms", &images.terms),
+            ("v_embeddings", &images.v_embeddings),
+            ("image_params", &images.image_params),
         ];
-        list.dispatch(gpu, &pipelines.learn_images, images.n_images.into(), &learned);
+        list.dispatch(gpu, &pipelines.update_images, images.n_images.into(), &learned);
     }
 
     /// After [`FieldPasses::forward`]: what every ray sees, its loss, and the slopes back to its samples.
@@ -278,9 +293,9 @@ impl FieldPasses<'_> {
             ("loss", &slot.loss),
             ("rays", &slot.rays),
             ("spans", &samples.spans),
-            ("told", &samples.told),
+            ("log_density", &samples.log_density),
             ("colors", &samples.colors),
-            ("seen", &step.seen),
+            ("ray_colors", &step.ray_colors),
             ("ray_errors", &step.ray_errors),
             ("v_log_density", &step.v_log_density),
             ("v_colors", &step.v_colors),
@@ -289,29 +304,29 @@ impl FieldPasses<'_> {
     }
 
     /// After [`FieldPasses::forward`]: the loss of every ray, and the slopes towards all that is learned.
-    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, slopes: &FieldSlopes) {
+    pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, gradients: &FieldGradients) {
         let Self { gpu, pipelines, field, samples, .. } = *self;
         self.composite(list, step);
         let batch = ("batch", &samples.batch);
         let (v_log_density, v_colors) = (("v_log_density", &step.v_log_density), ("v_colors", &step.v_colors));
-        let (held, v_held) = (("held", &step.held), ("v_held", &step.v_held));
+        let (activations, v_activations) = (("activations", &step.activations), ("v_activations", &step.v_activations));
         let carried = [
             batch,
             ("levels", &field.levels),
             ("points", &samples.points),
             ("weights", field.working_weights()),
-            held,
+            activations,
             v_log_density,
             v_colors,
-            ("scales", &slopes.scales),
-            v_held,
-            ("v_grid", &slopes.grid),
-            ("counts", &slopes.counts),
+            ("scales", &gradients.scales),
+            v_activations,
+            ("v_grid", &gradients.grid),
+            ("counts", &gradients.counts),
         ];
         list.dispatch(gpu, &pipelines.field_backward, groups(samples.n_samples, N_TILE), &carried);
         let n_chunks = groups(samples.n_samples, N_TILE * CHUNK_TILES);
-        let summed = [batch, held, v_held, ("partial_sums", &step.partial_sums)];
-        list.dispatch(gpu, &pipelines.weight_slopes, N_LAYERS * n_chunks, &summed);
+        let summed = [batch, activations, v_activations, ("partial_sums", &step.partial_sums)];
+        list.dispatch(gpu, &pipelines.weight_gradients, N_LAYERS * n_chunks, &summed);
     }
 
     /// After [`FieldPasses::backward`]: one step of the optimiser, each with a rule of its own for the grid and for the weights. The
@@ -319,39 +334,39 @@ impl FieldPasses<'_> {
     pub(crate) fn learn(
         &self,
         list: &mut Passes,
-        [of_grid, of_weights]: [&Buffer; 2],
+        [grid_rule, weights_rule]: [&Buffer; 2],
         step: &StepBuffers,
-        slopes: &FieldSlopes,
+        gradients: &FieldGradients,
         moments: &FieldMoments,
     ) {
         let Self { gpu, pipelines, field, samples, .. } = *self;
-        let (steps, pace) = (("steps", &moments.steps), ("pace", &moments.pace));
+        let (steps, step_scale) = (("steps", &moments.steps), ("step_scale", &moments.step_scale));
         let weighed = [
-            ("rule", of_weights),
-            pace,
+            ("rule", weights_rule),
+            step_scale,
             ("batch", &samples.batch),
             ("partial_sums", &step.partial_sums),
             ("weights", &field.weights),
             ("moments", &moments.weights),
         ];
-        list.dispatch(gpu, &pipelines.learn_weights, (field.weights.bytes() / 16).div_ceil(16), &weighed);
-        let (scales, largest) = (("scales", &slopes.scales), ("largest", &moments.largest));
+        list.dispatch(gpu, &pipelines.update_weights, (field.weights.bytes() / 16).div_ceil(16), &weighed);
+        let (scales, largest) = (("scales", &gradients.scales), ("largest", &moments.largest));
         let learned = [
-            ("rule", of_grid),
-            pace,
+            ("rule", grid_rule),
+            step_scale,
             scales,
             largest,
             ("levels", &field.levels),
             ("grid", &field.grid),
             ("moments", &moments.grid),
-            ("v_grid", &slopes.grid),
+            ("v_grid", &gradients.grid),
         ];
-        list.dispatch(gpu, &pipelines.learn_grid, groups(field.n_entries, 256), &learned);
+        list.dispatch(gpu, &pipelines.update_grid, groups(field.n_entries, 256), &learned);
         list.dispatch(
             gpu,
             &pipelines.end_step,
             1,
-            &[("rule", of_grid), steps, pace, scales, largest, ("counts", &slopes.counts)],
+            &[("rule", grid_rule), steps, step_scale, scales, largest, ("counts", &gradients.counts)],
         );
     }
 }

@@ -15,7 +15,7 @@
 @group(0) @binding(3) var<storage, read_write> rays: array<Ray>;
 @group(0) @binding(4) var<storage, read_write> light: array<vec4f>;
 
-override OF_PICTURE: u32;
+override PICTURE_EMBEDDING_IX: u32;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -27,5 +27,5 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let pixel = ray_of_pixel(vec2u(pixel_ix % view.size_px.x, pixel_ix / view.size_px.x));
     let speed = length(pixel.along);
     let range = pixel.range * speed;
-    rays[ray_ix] = Ray(pixel.origin, 0u, pixel.along / speed, 0u, range.x, range.y, OF_PICTURE, 0u, 0.0, 0.5, 0u, 0u);
+    rays[ray_ix] = Ray(pixel.origin, 0u, pixel.along / speed, 0u, range.x, range.y, PICTURE_EMBEDDING_IX, 0u, 0.0, 0.5, 0u, 0u);
 }

@@ -12,14 +12,14 @@ use std::sync::{Arc, OnceLock};
 /// Rays that one task draws.
 const RAYS_PER_TASK: usize = 512;
 /// Tries to find a pixel that was seen.
-const TRIES: u64 = 4;
+const MAX_ATTEMPTS: u64 = 4;
 /// Where rays end: far beyond this the field tells nothing apart.
-const END: f32 = 1e3;
+const MAX_DISTANCE: f32 = 1e3;
 
 /// So far behind a reading, in units of the radius and as a share of its distance, a ray is still looked along: what lies further
 /// back it says nothing about.
-const BEHIND: f64 = 0.03;
-const BEHIND_FRAC: f64 = 0.03;
+const BEHIND_SURFACE: f64 = 0.03;
+const BEHIND_SURFACE_FRAC: f64 = 0.03;
 
 /// A keyframe that rays are drawn from.
 #[derive(Clone, Debug)]
@@ -61,17 +61,21 @@ impl RayImage {
     }
 
     /// The ray through the middle of a pixel, with what is seen there.
-    fn ray(&self, extent: &Extent, pixel_ix: usize, begin: f32, shift: f32) -> params::Ray {
+    fn ray(&self, extent: &Extent, pixel_ix: usize, begin: f32, jitter: f32) -> params::Ray {
         let (origin, direction, distance) = self.reading(extent, pixel_ix);
         let pixel = &self.keyframe.rgba_srgb[4 * pixel_ix..4 * pixel_ix + 4];
         params::Ray {
             origin: f32s_of(origin),
             direction: f32s_of(direction),
             begin,
-            end: if distance > 0.0 { f32_of(distance * (1.0 + BEHIND_FRAC) + BEHIND) } else { END },
+            end: if distance > 0.0 {
+                f32_of(distance * (1.0 + BEHIND_SURFACE_FRAC) + BEHIND_SURFACE)
+            } else {
+                MAX_DISTANCE
+            },
             target_rgb: u32::from_le_bytes([pixel[0], pixel[1], pixel[2], pixel[3]]),
             target_distance: f32_of(distance),
-            shift,
+            jitter,
             ..params::Ray::default()
         }
     }
@@ -79,7 +83,7 @@ impl RayImage {
 
 /// Which rays, and how they begin.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Draw {
+pub(crate) struct RaySampling {
     pub(crate) seed: u64,
     pub(crate) step: u64,
     pub(crate) n_rays: u32,
@@ -88,34 +92,34 @@ pub(crate) struct Draw {
 }
 
 /// Rays of a step, all images alike, in the order of the images.
-pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &Draw) -> Vec<params::Ray> {
+pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> Vec<params::Ray> {
     if images.is_empty() {
         return Vec::new();
     }
-    let key = mixed(draw.seed ^ mixed(draw.step));
+    let key = mix_hash(draw.seed ^ mix_hash(draw.step));
     let ray = |ix: u64| {
-        let own = mixed(key ^ mixed(ix));
-        let share = (ix as f64 + unit(own)) / f64::from(draw.n_rays);
+        let ray_key = mix_hash(key ^ mix_hash(ix));
+        let share = (ix as f64 + unit(ray_key)) / f64::from(draw.n_rays);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
         let pick = |attempt: u64| {
-            let word = mixed(own.wrapping_add(1 + attempt));
+            let word = mix_hash(ray_key.wrapping_add(1 + attempt));
             // The upper half of a product of 64 bits: even over all pixels.
             usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64).expect("less than a length")
         };
-        let is_seen = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
-        let pixel_ix = (0..TRIES).map(pick).find(is_seen).unwrap_or_else(|| pick(0));
-        let shift = f32_of(unit(mixed(own ^ 0x5bd1_e995)));
-        let code = u32::try_from(image_ix).expect("few images");
-        params::Ray { code, ..image.ray(extent, pixel_ix, draw.begin, shift) }
+        let is_unmasked = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
+        let pixel_ix = (0..MAX_ATTEMPTS).map(pick).find(is_unmasked).unwrap_or_else(|| pick(0));
+        let jitter = f32_of(unit(mix_hash(ray_key ^ 0x5bd1_e995)));
+        let embedding = u32::try_from(image_ix).expect("few images");
+        params::Ray { embedding, ..image.ray(extent, pixel_ix, draw.begin, jitter) }
     };
     (0..draw.n_rays).into_par_iter().with_min_len(RAYS_PER_TASK).map(|ix| ray(ix.into())).collect()
 }
 
 /// A hash of a word (Steele et al. 2014, `SplitMix64`).
-pub(crate) fn mixed(word: u64) -> u64 {
+pub(crate) fn mix_hash(word: u64) -> u64 {
     let mut z = word.wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -24,41 +24,41 @@ struct Backdrop {
 @group(0) @binding(3) var<uniform> backdrop: Backdrop;
 @group(0) @binding(4) var<storage, read_write> rays: array<Ray>;
 @group(0) @binding(5) var<storage, read> spans: array<Span>;
-@group(0) @binding(6) var<storage, read> told: array<f32>;
+@group(0) @binding(6) var<storage, read> log_density: array<f32>;
 @group(0) @binding(7) var<storage, read> colors: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> pixels: array<u32>;
 @group(0) @binding(9) var<storage, read_write> depths: array<f32>;
 @group(0) @binding(10) var<storage, read_write> light: array<vec4f>;
 
-const LEAST_COVERAGE = 1e-3;
+const MIN_COVERAGE = 1e-3;
 // Behind what lets less light through nothing is looked at: it is half of the least difference of a color.
-const LEAST_TRANSMITTANCE = 1.0 / 512.0;
+const MIN_TRANSMITTANCE = 1.0 / 512.0;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ray_ix = folded(wg, n_wgs) * 64u + lane;
     if ray_ix >= batch.n_rays { return; }
     let ray = rays[ray_ix];
-    if ray.is_ended == 1u { return; }
+    if ray.is_finished == 1u { return; }
     var rgb = light[2u * ray_ix].rgb;
     var transmittance = light[2u * ray_ix].a;
     var distance = light[2u * ray_ix + 1u].x;
     let end = ray.first_sample + ray.n_samples;
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
-        let weight = transmittance * (1.0 - sample.left);
+        let weight = transmittance * (1.0 - sample.transmitted);
         rgb += weight * sample.rgb;
         distance += weight * 0.5 * (sample.begin + sample.end);
-        transmittance *= sample.left;
+        transmittance *= sample.transmitted;
     }
     light[2u * ray_ix] = vec4f(rgb, transmittance);
     light[2u * ray_ix + 1u] = vec4f(distance, 0.0, 0.0, 0.0);
-    let goes_on = ray.n_samples == march.most_found && transmittance > LEAST_TRANSMITTANCE;
-    if !goes_on { rays[ray_ix].is_ended = 1u; }
+    let is_unfinished = ray.n_samples == march.max_found && transmittance > MIN_TRANSMITTANCE;
+    if !is_unfinished { rays[ray_ix].is_finished = 1u; }
     let pixel_ix = march.first_ray + ray_ix;
     let pixel = ray_of_pixel(vec2u(pixel_ix % view.size_px.x, pixel_ix / view.size_px.x));
     let coverage = 1.0 - transmittance;
-    let depth_m = distance / max(coverage, LEAST_COVERAGE) / length(pixel.along) * backdrop.radius_m;
+    let depth_m = distance / max(coverage, MIN_COVERAGE) / length(pixel.along) * backdrop.radius_m;
     pixels[pixel_ix] = pack4x8unorm(vec4f(rgb + transmittance * backdrop.srgb, coverage));
-    depths[pixel_ix] = select(0.0, depth_m, coverage >= LEAST_COVERAGE);
+    depths[pixel_ix] = select(0.0, depth_m, coverage >= MIN_COVERAGE);
 }

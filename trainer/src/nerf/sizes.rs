@@ -1,23 +1,23 @@
 //! How large a field is: no larger than what its images show.
 
 use super::extent::{Extent, pixel_size_m};
-use super::options::{Effort, NerfOptions};
+use super::options::{NerfBudget, NerfOptions};
 use super::reference::grid::GridShape;
 use crate::{DepthMap, Error, Keyframe};
 use serde::{Deserialize, Serialize};
 
 /// Cells of the coarsest level along an axis.
-const COARSEST: u32 = 16;
+const N_CELLS_COARSEST: u32 = 16;
 /// How much finer each level is than the one before.
-const GROWTH: f64 = 1.5;
+const LEVEL_GROWTH: f64 = 1.5;
 /// Finest cells are this many pixels wide: finer ones would learn noise.
 const PIXELS_PER_CELL: f64 = 1.5;
 /// Pixels of an image for each entry of a level: many images see the same place, and a surface is few of a level's cells.
 const PIXELS_PER_ENTRY: f64 = 0.5;
 /// Levels of any field.
-pub(crate) const LEAST_LEVELS: u32 = 4;
-pub(crate) const MOST_LEVELS: u32 = 16;
-const LEAST_LOG2_ENTRIES: u32 = 12;
+pub(crate) const MIN_LEVELS: u32 = 4;
+pub(crate) const MAX_LEVELS: u32 = 16;
+const MIN_LOG2_ENTRIES: u32 = 12;
 /// Bytes of an entry: itself, its slopes, its moments.
 const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
 const MOMENT_BYTES_PER_ENTRY: u64 = 16;
@@ -33,12 +33,12 @@ pub(crate) struct Sizes {
     pub(crate) has_depth: bool,
     /// Whether cells of the occupancy become finer once something is known.
     #[serde(default)]
-    pub(crate) refines: bool,
-    pub(crate) effort: Effort,
+    pub(crate) can_refine: bool,
+    pub(crate) nerf_budget: NerfBudget,
 }
 
 /// Whether most images have depth for most of what they show: then few cells hold anything, and finer ones cost little.
-fn is_dense<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
+fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
     /// Every so manieth reading is looked at.
     const STRIDE: usize = 61;
     let is_known = |depth: &DepthMap| {
@@ -53,7 +53,7 @@ impl Sizes {
     /// Levels down to what a pixel sees, and entries for what an image shows, as far as limits allow.
     pub(crate) fn choose<'a>(
         options: &NerfOptions,
-        effort: Effort,
+        nerf_budget: NerfBudget,
         max_binding_bytes: u64,
         keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
         extent: &Extent,
@@ -63,28 +63,28 @@ impl Sizes {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
         let finest = (4.0 * extent.radius_m / cell_m).clamp(64.0, 8192.0) as u32;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
-        let n_levels = 1 + (f64::from(finest / COARSEST).ln() / GROWTH.ln()).ceil() as u32;
+        let n_levels = 1 + (f64::from(finest / N_CELLS_COARSEST).ln() / LEVEL_GROWTH.ln()).ceil() as u32;
         let n_levels =
-            n_levels.next_multiple_of(2).clamp(LEAST_LEVELS, effort.most_levels.clamp(LEAST_LEVELS, MOST_LEVELS));
+            n_levels.next_multiple_of(2).clamp(MIN_LEVELS, nerf_budget.max_levels.clamp(MIN_LEVELS, MAX_LEVELS));
         let has_depth = keyframes.clone().any(|keyframe| keyframe.depth.is_some());
-        let refines = effort.finer() != effort && is_dense(keyframes.clone());
+        let can_refine = nerf_budget.refined() != nerf_budget && has_dense_depth(keyframes.clone());
         let n_pixels = keyframes.map(|keyframe| keyframe.rgba_srgb.len() / 4).max().unwrap_or(0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a logarithm")]
-        let wanted = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
-        let most = effort.most_log2_entries.max(LEAST_LOG2_ENTRIES);
-        let mut log2_entries = wanted.clamp(LEAST_LOG2_ENTRIES, most);
+        let entries_for_pixels = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
+        let max_log2_entries_allowed = nerf_budget.max_log2_entries.max(MIN_LOG2_ENTRIES);
+        let mut log2_entries = entries_for_pixels.clamp(MIN_LOG2_ENTRIES, max_log2_entries_allowed);
         let max_bytes = options.max_bytes.unwrap_or(u64::MAX);
         loop {
-            let shape = GridShape::between(COARSEST, finest, n_levels, log2_entries);
-            let n_entries = u64::from(shape.n_entries_in_all());
+            let shape = GridShape::between(N_CELLS_COARSEST, finest, n_levels, log2_entries);
+            let n_entries = u64::from(shape.n_entries_total());
             let fits =
                 n_entries * BYTES_PER_ENTRY <= max_bytes && n_entries * MOMENT_BYTES_PER_ENTRY <= max_binding_bytes;
             if fits {
-                return Ok(Self { n_cells: shape.n_cells, log2_entries, has_depth, refines, effort });
+                return Ok(Self { n_cells: shape.n_cells, log2_entries, has_depth, can_refine, nerf_budget });
             }
-            if log2_entries == LEAST_LOG2_ENTRIES {
-                let least_bytes = n_entries * BYTES_PER_ENTRY;
-                return Err(Error::BudgetTooSmall { model: "neural field", max_bytes, least_bytes });
+            if log2_entries == MIN_LOG2_ENTRIES {
+                let min_bytes = n_entries * BYTES_PER_ENTRY;
+                return Err(Error::BudgetTooSmall { model: "neural field", max_bytes, min_bytes });
             }
             log2_entries -= 1;
         }
@@ -96,12 +96,13 @@ impl Sizes {
 
     /// Refuses sizes that no field has.
     pub(crate) fn check(&self) -> Result<(), Error> {
-        let Effort { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, most_levels, .. } = self.effort;
-        let rises = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
+        let NerfBudget { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, max_levels, .. } =
+            self.nerf_budget;
+        let is_increasing = self.n_cells.windows(2).all(|pair| pair[0] <= pair[1]);
         let is_usable = (1..=16).contains(&self.n_cells.len())
             && self.n_cells.iter().all(|n| (1..=1 << 20).contains(n))
-            && rises
-            && self.n_cells.len() <= most_levels.clamp(LEAST_LEVELS, MOST_LEVELS) as usize
+            && is_increasing
+            && self.n_cells.len() <= max_levels.clamp(MIN_LEVELS, MAX_LEVELS) as usize
             && (1..=28).contains(&self.log2_entries)
             && (1..=1 << 20).contains(&n_rays)
             && (n_rays..=1 << 24).contains(&n_samples)

@@ -2,14 +2,14 @@
 
 use super::carve;
 use super::extent::Extent;
-use super::options::{Effort, NerfOptions};
-use super::rays::{self, Draw, RayImage};
+use super::options::{NerfBudget, NerfOptions};
+use super::rays::{self, RayImage, RaySampling};
 use super::reference::march::March;
 use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
-use crate::splat::{CameraChoice, TermSet, moved};
+use crate::splat::{CameraRefinement, ParamSet, rigid_transform};
 use crate::test_scenes as scenes;
 use crate::{Aabb, DepthMap, Error, Keyframe, Method, Picture, Projection, RenderRequest, Split};
 use kinematics::{Stamp, Transform, Twist};
@@ -17,35 +17,35 @@ use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
 /// The ball's middle.
-const AT: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
+const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 const N_STEPS: u64 = 160;
 
 fn options() -> NerfOptions {
-    let effort = Effort {
+    let nerf_budget = NerfBudget {
         n_rays: 256,
         n_samples: 1 << 13,
         n_hidden: 16,
         n_cells: 32,
         n_steps: 64,
-        most_log2_entries: 13,
-        most_levels: 6,
+        max_log2_entries: 13,
+        max_levels: 6,
         picture_rays: 1 << 10,
     };
-    NerfOptions { effort: Some(effort), n_planned_steps: 300, ..NerfOptions::default() }
+    NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: 300, ..NerfOptions::default() }
 }
 
 /// The ball alone: pixels beside it are black, and have no depth.
 fn ball(n: usize) -> Vec<Arc<Keyframe>> {
-    scenes::ring(&[scenes::ball(AT)], AT, n)
+    scenes::ring(&[scenes::ball(BALL_CENTER)], BALL_CENTER, n)
 }
 
 /// A ball on a floor, seen from above so that all that is seen is near.
 fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
     let view = |ix: usize| {
-        let turn = 0.8 * ix as f64;
-        let eye = AT + Vector3::new(0.6 * turn.cos(), 0.6 * turn.sin(), 1.1);
-        let shapes = [scenes::ball(AT), scenes::floor()];
-        Arc::new(scenes::keyframe(i64::try_from(ix).unwrap(), &shapes, scenes::looking(eye, AT)))
+        let angle = 0.8 * ix as f64;
+        let eye = BALL_CENTER + Vector3::new(0.6 * angle.cos(), 0.6 * angle.sin(), 1.1);
+        let shapes = [scenes::ball(BALL_CENTER), scenes::floor()];
+        Arc::new(scenes::keyframe(i64::try_from(ix).unwrap(), &shapes, scenes::look_at(eye, BALL_CENTER)))
     };
     (0..n).map(view).collect()
 }
@@ -54,7 +54,7 @@ fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
-fn started(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
+fn model_with(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
     let mut model = NerfModel::new(gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -63,15 +63,15 @@ fn started(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
 }
 
 /// Learns up to a step.
-fn learn(model: &mut NerfModel, end: u64) {
+fn train_until(model: &mut NerfModel, end: u64) {
     while model.progress().step < end {
         model.step(end - model.progress().step).unwrap();
     }
 }
 
-fn learned(keyframes: &[Arc<Keyframe>]) -> NerfModel {
-    let mut model = started(options(), keyframes);
-    learn(&mut model, N_STEPS);
+fn trained_model(keyframes: &[Arc<Keyframe>]) -> NerfModel {
+    let mut model = model_with(options(), keyframes);
+    train_until(&mut model, N_STEPS);
     model
 }
 
@@ -92,52 +92,52 @@ fn state(model: &mut NerfModel) -> crate::checkpoint::Checkpoint {
 }
 
 #[test]
-fn an_unseen_view_is_drawn_with_its_depth_and_twice_the_same() {
-    const LEAST_PSNR: f64 = 20.0;
+fn novel_view_is_accurate_and_deterministic() {
+    const MIN_PSNR: f64 = 20.0;
     let all = ball_on_floor(9);
-    let unseen = &all[4];
+    let test_view = &all[4];
     let mut seen = all.clone();
     seen.remove(4);
-    let mut model = learned(&seen);
-    let picture = model.render(&request(unseen)).unwrap();
-    let psnr = psnr(&picture, unseen);
-    assert!(psnr > LEAST_PSNR, "{psnr:.2} dB");
-    let [width, height] = unseen.size_px;
+    let mut model = trained_model(&seen);
+    let picture = model.render(&request(test_view)).unwrap();
+    let psnr = psnr(&picture, test_view);
+    assert!(psnr > MIN_PSNR, "{psnr:.2} dB");
+    let [width, height] = test_view.size_px;
     let middle = (height / 2 * width + width / 2) as usize;
-    let eye = unseen.world_from_camera.translation.vector;
-    let expected_m = (eye - AT.coords).norm() - 0.3;
+    let eye = test_view.world_from_camera.translation.vector;
+    let expected_m = (eye - BALL_CENTER.coords).norm() - 0.3;
     assert!((f64::from(picture.depth_m[middle]) - expected_m).abs() < 0.05, "{} m", picture.depth_m[middle]);
     assert!(picture.depth_m.iter().all(|depth| depth.is_finite()));
-    let without_depth = model.render(&RenderRequest { depth: false, ..request(unseen) }).unwrap();
+    let without_depth = model.render(&RenderRequest { depth: false, ..request(test_view) }).unwrap();
     assert!(without_depth.depth_m.is_empty() && without_depth.rgba_srgb == picture.rgba_srgb);
 
     // Somebody looks before all keyframes are there.
-    let mut one_by_one = started(options(), &seen[..2]);
+    let mut one_by_one = model_with(options(), &seen[..2]);
     one_by_one.seed().unwrap();
-    assert!(one_by_one.render(&request(unseen)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
+    assert!(one_by_one.render(&request(test_view)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
     seen[2..].iter().for_each(|keyframe| one_by_one.push(keyframe.clone()).unwrap());
     while one_by_one.progress().step < N_STEPS {
         one_by_one.step(1).unwrap();
     }
     assert!(state(&mut model) == state(&mut one_by_one), "steps of a submit are not those of many");
-    let mut other = started(NerfOptions { seed: 1, ..options() }, &seen);
-    learn(&mut other, 4);
-    let mut first = started(options(), &seen);
-    learn(&mut first, 4);
+    let mut other = model_with(NerfOptions { seed: 1, ..options() }, &seen);
+    train_until(&mut other, 4);
+    let mut first = model_with(options(), &seen);
+    train_until(&mut first, 4);
     assert!(state(&mut other).arrays != state(&mut first).arrays, "the seed changes nothing");
 }
 
 #[test]
-fn two_halves_give_the_bits_of_the_whole_and_a_saved_field_draws_the_same() {
+fn resume_and_load_are_bit_exact() {
     let keyframes = ball(6);
-    let mut half = started(options(), &keyframes[..4]);
-    learn(&mut half, 70);
+    let mut half = model_with(options(), &keyframes[..4]);
+    train_until(&mut half, 70);
     half.push(keyframes[4].clone()).unwrap();
     let checkpoint = state(&mut half);
-    let (mut rest, unseen) = NerfModel::resume(gpu(), &checkpoint, &keyframes).unwrap();
-    assert_eq!(unseen.len(), 1);
-    learn(&mut half, N_STEPS);
-    learn(&mut rest, N_STEPS);
+    let (mut rest, test_view) = NerfModel::resume(gpu(), &checkpoint, &keyframes).unwrap();
+    assert_eq!(test_view.len(), 1);
+    train_until(&mut half, N_STEPS);
+    train_until(&mut rest, N_STEPS);
     assert!(state(&mut half) == state(&mut rest));
 
     let folder = tempfile::tempdir().unwrap();
@@ -157,21 +157,21 @@ fn two_halves_give_the_bits_of_the_whole_and_a_saved_field_draws_the_same() {
 }
 
 #[test]
-fn it_learns_without_depth_too() {
+fn trains_without_depth() {
     let strip = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..(**keyframe).clone() });
     let keyframes: Vec<_> = ball(9).iter().map(strip).collect();
-    let mut model = started(options(), &keyframes);
-    learn(&mut model, 2);
+    let mut model = model_with(options(), &keyframes);
+    train_until(&mut model, 2);
     let before = psnr(&model.render(&request(&keyframes[2])).unwrap(), &keyframes[2]);
-    learn(&mut model, N_STEPS);
+    train_until(&mut model, N_STEPS);
     let after = psnr(&model.render(&request(&keyframes[2])).unwrap(), &keyframes[2]);
     assert!(after > before + 4.0, "{before:.2} dB, then {after:.2} dB");
 }
 
 #[test]
-fn a_crop_a_range_and_all_directions_are_drawn() {
+fn renders_crop_range_and_equirectangular() {
     let keyframes = ball(8);
-    let mut model = learned(&keyframes);
+    let mut model = trained_model(&keyframes);
     let request = request(&keyframes[0]);
     let covered = |model: &mut NerfModel, request: &RenderRequest| {
         let picture = model.render(request).unwrap();
@@ -179,15 +179,15 @@ fn a_crop_a_range_and_all_directions_are_drawn() {
     };
     let whole = covered(&mut model, &request);
     assert!(whole > 1000, "{whole} pixels");
-    let to = |x: f64| Transform::translation(AT.x, AT.y + x, AT.z);
+    let to = |x: f64| Transform::translation(BALL_CENTER.x, BALL_CENTER.y + x, BALL_CENTER.z);
     let crop = |x: f64| Some(Aabb { world_from_box: to(x), min_m: [-0.5; 3], max_m: [0.5; 3] });
-    let within = covered(&mut model, &RenderRequest { crop: crop(0.0), ..request.clone() });
-    assert!(within > 1000, "{within} pixels of the ball in its box");
+    let n_covered_in_crop = covered(&mut model, &RenderRequest { crop: crop(0.0), ..request.clone() });
+    assert!(n_covered_in_crop > 1000, "{n_covered_in_crop} pixels of the ball in its box");
     assert_eq!(covered(&mut model, &RenderRequest { crop: crop(5.0), ..request.clone() }), 0, "an empty box");
     assert_eq!(covered(&mut model, &RenderRequest { far_m: 0.2, ..request.clone() }), 0, "before the ball");
     // From the ball's middle there is something in all directions.
     let all = RenderRequest {
-        world_from_camera: Transform::translation(AT.x, AT.y, AT.z),
+        world_from_camera: Transform::translation(BALL_CENTER.x, BALL_CENTER.y, BALL_CENTER.z),
         size_px: [64, 32],
         projection: Projection::Equirectangular,
         ..request
@@ -198,25 +198,26 @@ fn a_crop_a_range_and_all_directions_are_drawn() {
 
 /// Where depth is dense, cells become finer once something is known; stopping before or after changes nothing.
 #[test]
-fn cells_become_finer() {
+fn occupancy_cells_are_refined() {
     const PLANNED: u64 = 40;
     const END: u64 = 8;
-    let effort = Effort { n_cells: Effort::FULL.n_cells, ..options().effort.unwrap() };
-    let options = NerfOptions { effort: Some(effort), n_planned_steps: PLANNED, ..options() };
+    let nerf_budget = NerfBudget { n_cells: NerfBudget::FULL.n_cells, ..options().nerf_budget.unwrap() };
+    let options = NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: PLANNED, ..options() };
     let keyframes = ball_on_floor(5);
-    let mut whole = started(options.clone(), &keyframes);
+    let mut whole = model_with(options.clone(), &keyframes);
     let mut parts = Vec::new();
     for step in [3, 6] {
-        learn(&mut whole, step);
+        train_until(&mut whole, step);
         parts.push(state(&mut whole));
     }
-    learn(&mut whole, END);
-    let n_bytes = |checkpoint: &crate::checkpoint::Checkpoint| checkpoint.array("thickness", 4 << 24).map(<[u8]>::len);
+    train_until(&mut whole, END);
+    let n_bytes =
+        |checkpoint: &crate::checkpoint::Checkpoint| checkpoint.array("cell_occupancy", 4 << 24).map(<[u8]>::len);
     assert!(n_bytes(&parts[0]).is_err() && n_bytes(&parts[1]).is_ok(), "it became finer between these steps");
     let expected = state(&mut whole);
     for part in parts {
         let (mut resumed, _) = NerfModel::resume(gpu(), &part, &keyframes).unwrap();
-        learn(&mut resumed, END);
+        train_until(&mut resumed, END);
         assert!(state(&mut resumed) == expected, "resumed from step {}", part.state["step"]);
     }
 }
@@ -224,83 +225,91 @@ fn cells_become_finer() {
 /// Poses that drift from image to image are found along with the scene, where a trial says that it pays; stopping in its midst
 /// changes nothing.
 #[test]
-fn poses_that_drift_are_found() {
-    let right = ball_on_floor(24);
+fn drifting_poses_are_corrected() {
+    let true_keyframes = ball_on_floor(24);
     let drifted = |keyframe: &Arc<Keyframe>| {
         let phase = 0.35 * keyframe.stamp.0 as f64;
-        let turn_rad = Vector3::new(0.02 * phase.sin(), 0.02 * phase.cos(), 0.0);
-        let shift_m = Vector3::new(0.0, 0.01, -0.015) * phase.cos();
-        let off = moved(turn_rad, shift_m);
+        let rotation_rad = Vector3::new(0.02 * phase.sin(), 0.02 * phase.cos(), 0.0);
+        let translation_m = Vector3::new(0.0, 0.01, -0.015) * phase.cos();
+        let off = rigid_transform(rotation_rad, translation_m);
         let depth = keyframe
             .depth
             .as_ref()
             .map(|depth| DepthMap { world_from_camera: depth.world_from_camera * off, ..depth.clone() });
-        let split = if keyframe.stamp.0 % 4 == 2 { Split::Selection } else { Split::Train };
+        let split = if keyframe.stamp.0 % 4 == 2 { Split::Validation } else { Split::Train };
         Arc::new(Keyframe { world_from_camera: keyframe.world_from_camera * off, depth, split, ..(**keyframe).clone() })
     };
-    let wrong: Vec<Arc<Keyframe>> = right.iter().map(drifted).collect();
-    let off_m = |found: &Transform, right: &Keyframe| {
+    let drifted_keyframes: Vec<Arc<Keyframe>> = true_keyframes.iter().map(drifted).collect();
+    let position_error_m = |found: &Transform, true_keyframes: &Keyframe| {
         // Where a point half a metre ahead is seen.
         let ahead = Point3::new(0.0, 0.0, 0.5);
-        (found * ahead - right.world_from_camera * ahead).norm()
+        (found * ahead - true_keyframes.world_from_camera * ahead).norm()
     };
-    let mean_off_m = |model: &mut NerfModel, given: &[Arc<Keyframe>]| {
-        let off = given
-            .iter()
-            .zip(&right)
-            .map(|(given, right)| off_m(&model.posed_lens(given).unwrap().world_from_camera, right));
+    let mean_position_error_m = |model: &mut NerfModel, given: &[Arc<Keyframe>]| {
+        let off = given.iter().zip(&true_keyframes).map(|(given, true_keyframes)| {
+            position_error_m(&model.calibrated_camera(given).unwrap().world_from_camera, true_keyframes)
+        });
         off.sum::<f64>() / given.len() as f64
     };
-    let poses = TermSet { image_poses: true, ..TermSet::NONE };
+    let poses = ParamSet { image_poses: true, ..ParamSet::NONE };
     let options = |cameras| NerfOptions { cameras, n_planned_steps: 600, ..options() };
-    let mut model = started(options(CameraChoice::Try(vec![poses])), &wrong);
-    let before_m = mean_off_m(&mut model, &wrong);
-    learn(&mut model, 90); // In the midst of the trial.
+    let mut model = model_with(options(CameraRefinement::Try(vec![poses])), &drifted_keyframes);
+    let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
+    train_until(&mut model, 90); // In the midst of the trial.
     let checkpoint = state(&mut model);
-    learn(&mut model, 600);
-    let after_m = mean_off_m(&mut model, &wrong);
+    train_until(&mut model, 600);
+    let after_m = mean_position_error_m(&mut model, &drifted_keyframes);
     assert!(model.report()[0].kept, "{:?}", model.report());
     // A few hundred small steps, and where all images are moved together nobody can tell: 15 mm became 9.
     assert!(after_m < 0.75 * before_m, "{before_m} m, then {after_m} m");
 
-    let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &wrong).unwrap();
+    let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap();
     assert_eq!(rest.len(), 6, "images held back come back");
     rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
-    learn(&mut resumed, 600);
+    train_until(&mut resumed, 600);
     assert!(state(&mut model).arrays == state(&mut resumed).arrays, "the trial begins again, and ends the same");
 
     let folder = tempfile::tempdir().unwrap();
     model.save(folder.path()).unwrap();
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
-    assert_eq!(loaded.posed_lens(&wrong[3]).unwrap(), model.posed_lens(&wrong[3]).unwrap());
+    assert_eq!(
+        loaded.calibrated_camera(&drifted_keyframes[3]).unwrap(),
+        model.calibrated_camera(&drifted_keyframes[3]).unwrap()
+    );
 
-    let mut loses_one = NerfModel::resume(gpu(), &checkpoint, &wrong).unwrap().0;
-    wrong.iter().filter(|keyframe| keyframe.split == Split::Selection).for_each(|keyframe| {
-        loses_one.push(keyframe.clone()).unwrap();
+    let mut with_removed = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap().0;
+    drifted_keyframes.iter().filter(|keyframe| keyframe.split == Split::Validation).for_each(|keyframe| {
+        with_removed.push(keyframe.clone()).unwrap();
     });
-    learn(&mut loses_one, 96);
-    loses_one.remove(&wrong[1].camera, wrong[1].stamp).unwrap();
-    let off_m = mean_off_m(&mut loses_one, &wrong);
-    assert!((off_m - before_m).abs() < 1e-12 && loses_one.report().is_empty(), "what was saved no longer fits");
-    learn(&mut loses_one, 120);
+    train_until(&mut with_removed, 96);
+    with_removed.remove(&drifted_keyframes[1].camera, drifted_keyframes[1].stamp).unwrap();
+    let position_error_m = mean_position_error_m(&mut with_removed, &drifted_keyframes);
+    assert!(
+        (position_error_m - before_m).abs() < 1e-12 && with_removed.report().is_empty(),
+        "what was saved no longer fits"
+    );
+    train_until(&mut with_removed, 120);
 
     // Images of which none is held back cannot decide.
-    let mut unjudged = started(options(CameraChoice::Try(vec![poses])), &right);
-    learn(&mut unjudged, 120);
-    assert!(unjudged.report().is_empty() && mean_off_m(&mut unjudged, &right) == 0.0);
+    let mut without_validation = model_with(options(CameraRefinement::Try(vec![poses])), &true_keyframes);
+    train_until(&mut without_validation, 120);
+    assert!(
+        without_validation.report().is_empty()
+            && mean_position_error_m(&mut without_validation, &true_keyframes) == 0.0
+    );
 }
 
 /// Light that changes is found along with the scene, where a trial says that it pays; images that were not learned from are drawn in
 /// that of their neighbors in time, and others in the mean light.
 #[test]
-fn light_that_changes_is_found() {
-    const GAINS: TermSet = TermSet { image_gains: true, ..TermSet::NONE };
+fn changing_light_is_modeled() {
+    const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
     let options = |cameras| NerfOptions { cameras, n_planned_steps: 480, ..options() };
-    let held_back = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
+    let is_validation = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
     let even: Vec<Arc<Keyframe>> = ball_on_floor(32)
         .iter()
         .map(|keyframe| {
-            let split = if held_back(keyframe) { Split::Selection } else { Split::Train };
+            let split = if is_validation(keyframe) { Split::Validation } else { Split::Train };
             Arc::new(Keyframe { split, ..(**keyframe).clone() })
         })
         .collect();
@@ -313,23 +322,23 @@ fn light_that_changes_is_found() {
         Arc::new(Keyframe { rgba_srgb: rgba.into(), ..(**keyframe).clone() })
     };
     let changing: Vec<Arc<Keyframe>> = even.iter().map(lit).collect();
-    let mut unchanged = started(options(CameraChoice::Try(vec![GAINS])), &even);
-    learn(&mut unchanged, 100);
+    let mut unchanged = model_with(options(CameraRefinement::Try(vec![GAINS])), &even);
+    train_until(&mut unchanged, 100);
     assert!(!unchanged.report()[0].kept, "{:?}", unchanged.report());
-    assert_eq!(unchanged.n_taken().unwrap(), 100, "where the light stays nothing is taken back");
-    let mut model = started(options(CameraChoice::Try(vec![GAINS])), &changing);
-    learn(&mut model, 75); // In the midst of the trial.
+    assert_eq!(unchanged.n_total_steps().unwrap(), 100, "where the light stays nothing is taken back");
+    let mut model = model_with(options(CameraRefinement::Try(vec![GAINS])), &changing);
+    train_until(&mut model, 75); // In the midst of the trial.
     let checkpoint = state(&mut model);
-    learn(&mut model, 200);
-    assert!(model.report()[0].kept && model.report()[0].bought_db > 1.0, "{:?}", model.report());
+    train_until(&mut model, 200);
+    assert!(model.report()[0].kept && model.report()[0].gain_db > 1.0, "{:?}", model.report());
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &changing).unwrap();
     assert_eq!(rest.len(), 8, "images held back come back");
     rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
-    learn(&mut resumed, 200);
+    train_until(&mut resumed, 200);
     assert!(state(&mut model) == state(&mut resumed), "the trial begins again, and ends the same");
 
     let like = |keyframe: &Keyframe, stamp: i64| RenderRequest {
-        light_of: Some((keyframe.camera.clone(), Stamp(stamp))),
+        appearance_of: Some((keyframe.camera.clone(), Stamp(stamp))),
         ..request(keyframe)
     };
     let brightness = |picture: &Picture| picture.rgba_srgb.iter().map(|value| f64::from(*value)).sum::<f64>();
@@ -351,12 +360,12 @@ fn light_that_changes_is_found() {
     let before = model.render(&like(&changing[25], 25)).unwrap();
     model.remove(&changing[3].camera, changing[3].stamp).unwrap();
     assert!(model.render(&like(&changing[25], 25)).unwrap().rgba_srgb == before.rgba_srgb);
-    learn(&mut model, 203);
+    train_until(&mut model, 203);
 }
 
 /// Numbers that no camera should send change nothing that they do not have to.
 #[test]
-fn poisoned_keyframes_leave_no_trace_of_nan() {
+fn non_finite_keyframes_leave_no_nan() {
     let keyframes = ball(6);
     let depth = keyframes[0].depth.as_ref().unwrap();
     let mut depth_m = depth.depth_m.to_vec();
@@ -365,13 +374,13 @@ fn poisoned_keyframes_leave_no_trace_of_nan() {
     depth_m[n / 2..n / 2 + 200].fill(f32::INFINITY);
     depth_m[n / 4..n / 4 + 50].fill(-1.0);
     depth_m[n / 4 + 50..n / 4 + 90].fill(1e30);
-    let poisoned =
+    let non_finite =
         Keyframe { depth: Some(DepthMap { depth_m: depth_m.into(), ..depth.clone() }), ..(*keyframes[0]).clone() };
     let masked = Keyframe { rgba_srgb: vec![0; keyframes[1].rgba_srgb.len()].into(), ..(*keyframes[1]).clone() };
     let one_pixel = Keyframe { size_px: [1, 1], rgba_srgb: [255; 4].into(), depth: None, ..(*keyframes[2]).clone() };
-    let all = [Arc::new(poisoned), Arc::new(masked), Arc::new(one_pixel), keyframes[3].clone(), keyframes[5].clone()];
-    let mut model = started(options(), &all);
-    learn(&mut model, 40);
+    let all = [Arc::new(non_finite), Arc::new(masked), Arc::new(one_pixel), keyframes[3].clone(), keyframes[5].clone()];
+    let mut model = model_with(options(), &all);
+    train_until(&mut model, 40);
     let checkpoint = state(&mut model);
     let floats = ["grid", "grid_moments", "density_0", "density_1", "color_0", "color_1", "color_2"];
     for array in checkpoint.arrays.iter().filter(|array| floats.contains(&array.name.as_str())) {
@@ -384,21 +393,21 @@ fn poisoned_keyframes_leave_no_trace_of_nan() {
 }
 
 #[test]
-fn keyframes_for_tests_are_not_learned_from_and_removed_ones_are_forgotten() {
+fn test_and_removed_keyframes_are_not_trained_on() {
     let keyframes = ball(3);
-    let mut model = started(options(), &[Arc::new(Keyframe { split: Split::Test, ..(*keyframes[0]).clone() })]);
+    let mut model = model_with(options(), &[Arc::new(Keyframe { split: Split::Test, ..(*keyframes[0]).clone() })]);
     assert!(model.is_idle() && model.step(5).unwrap() == 0);
     let empty = model.render(&request(&keyframes[0])).unwrap();
     assert!(empty.depth_m.iter().all(|depth| *depth == 0.0), "there is nothing to draw");
     model.push(keyframes[1].clone()).unwrap();
     assert!(!model.is_idle());
-    learn(&mut model, 2);
+    train_until(&mut model, 2);
     model.remove(&keyframes[1].camera, keyframes[1].stamp).unwrap();
     assert!(model.is_idle() && model.step(5).unwrap() == 0);
 }
 
 #[test]
-fn rays_go_through_pixel_centers_at_the_time_of_their_row() {
+fn rays_pass_pixel_centers_at_row_time() {
     let linear_m_s = Vector3::new(0.5, -0.25, 0.125);
     let twist = Some(Twist { linear_m_s, angular_rad_s: Vector3::new(0.0, 0.0, 2.0) });
     let still = ball(1)[0].clone();
@@ -426,7 +435,7 @@ fn rays_go_through_pixel_centers_at_the_time_of_their_row() {
 }
 
 #[test]
-fn all_images_are_drawn_from_alike_and_masked_pixels_are_avoided() {
+fn images_are_sampled_evenly_without_masked_pixels() {
     let mut keyframes = ball(5);
     let mut half_masked = keyframes[0].rgba_srgb.to_vec();
     let n_bytes = half_masked.len();
@@ -434,81 +443,84 @@ fn all_images_are_drawn_from_alike_and_masked_pixels_are_avoided() {
     keyframes[0] = Arc::new(Keyframe { rgba_srgb: half_masked.into(), ..(*keyframes[0]).clone() });
     let images: Vec<RayImage> = keyframes.into_iter().map(RayImage::new).collect();
     let extent = Extent { center_m: [0.0; 3], radius_m: 1.0 };
-    let draw = Draw { seed: 3, step: 9, n_rays: 1000, begin: 0.1 };
+    let draw = RaySampling { seed: 3, step: 9, n_rays: 1000, begin: 0.1 };
     let drawn: Vec<params::Ray> = rays::draw(&images, &extent, &draw);
-    for code in 0..5 {
-        let n = drawn.iter().filter(|ray| ray.code == code).count();
-        assert!((195..=205).contains(&n), "{n} rays of image {code}");
+    for embedding in 0..5 {
+        let n = drawn.iter().filter(|ray| ray.embedding == embedding).count();
+        assert!((195..=205).contains(&n), "{n} rays of image {embedding}");
     }
-    assert!(drawn.is_sorted_by_key(|ray| ray.code));
+    assert!(drawn.is_sorted_by_key(|ray| ray.embedding));
     let n_masked = drawn.iter().filter(|ray| ray.target_rgb >> 24 == 0).count();
     assert!(n_masked < 30, "{n_masked} of 200 rays of the half masked image fall on its mask");
     assert_eq!(drawn, rays::draw(&images, &extent, &draw));
-    assert_ne!(drawn, rays::draw(&images, &extent, &Draw { step: 10, ..draw }));
+    assert_ne!(drawn, rays::draw(&images, &extent, &RaySampling { step: 10, ..draw }));
 }
 
 #[test]
-fn the_extent_holds_cameras_and_what_is_near_and_far_things_call_for_no_more() {
-    let keyframes = scenes::ring(&[scenes::ball(AT), scenes::floor()], AT, 18);
+fn extent_covers_cameras_and_ignores_far_points() {
+    let keyframes = scenes::ring(&[scenes::ball(BALL_CENTER), scenes::floor()], BALL_CENTER, 18);
     let extent = Extent::of(keyframes.iter().map(|keyframe| &**keyframe));
     assert!((1.0..2.5).contains(&extent.radius_m), "a floor without end makes {extent:?}");
-    let off = Vector3::from(extent.center_m) - AT.coords;
+    let off = Vector3::from(extent.center_m) - BALL_CENTER.coords;
     assert!(off.norm() < extent.radius_m, "{extent:?}");
-    let bare: Vec<Keyframe> =
+    let without_depth_keyframes: Vec<Keyframe> =
         keyframes.iter().map(|keyframe| Keyframe { depth: None, ..(**keyframe).clone() }).collect();
-    let extent = Extent::of(bare.iter());
-    assert!((Vector3::from(extent.center_m) - AT.coords).norm() < 0.05, "cameras look at the ball: {extent:?}");
+    let extent = Extent::of(without_depth_keyframes.iter());
+    assert!(
+        (Vector3::from(extent.center_m) - BALL_CENTER.coords).norm() < 0.05,
+        "cameras look at the ball: {extent:?}"
+    );
     assert!((1.0..1.5).contains(&extent.radius_m), "{extent:?}");
-    let alone = Extent::of(bare[..1].iter());
+    let alone = Extent::of(without_depth_keyframes[..1].iter());
     assert!(alone.radius_m > 0.0 && alone.center_m.iter().all(|along| along.is_finite()), "{alone:?}");
     assert!(!extent.is_outgrown_by(&Extent { radius_m: 1.8 * extent.radius_m, ..extent }));
     assert!(extent.is_outgrown_by(&Extent { radius_m: 2.2 * extent.radius_m, ..extent }));
 }
 
 #[test]
-fn a_field_that_is_outgrown_begins_anew_and_small_budgets_are_kept_or_refused() {
-    let near = scenes::ring(&[scenes::ball(AT)], AT, 2);
-    let far_at = AT + Vector3::new(9.0, 0.0, 0.0);
+fn outgrown_field_restarts_and_budget_is_enforced() {
+    let near = scenes::ring(&[scenes::ball(BALL_CENTER)], BALL_CENTER, 2);
+    let far_at = BALL_CENTER + Vector3::new(9.0, 0.0, 0.0);
     let far = scenes::ring(&[scenes::ball(far_at)], far_at, 2);
-    let mut model = started(options(), &near);
-    learn(&mut model, 3);
+    let mut model = model_with(options(), &near);
+    train_until(&mut model, 3);
     let before = *model.extent().unwrap();
     far.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
-    learn(&mut model, 6);
+    train_until(&mut model, 6);
     assert!(model.extent().unwrap().radius_m > 2.0 * before.radius_m);
     assert_eq!(model.progress().step, 6);
 
     let bytes = model.progress().bytes;
-    let mut small = started(NerfOptions { max_bytes: Some(bytes / 2), ..options() }, &near);
-    learn(&mut small, 1);
+    let mut small = model_with(NerfOptions { max_bytes: Some(bytes / 2), ..options() }, &near);
+    train_until(&mut small, 1);
     let keyframes = || near.iter().map(|keyframe| &**keyframe);
     let sizes = |max_bytes| {
         let options = NerfOptions { max_bytes: Some(max_bytes), ..options() };
-        Sizes::choose(&options, options.effort.unwrap(), 1 << 27, keyframes(), &before)
+        Sizes::choose(&options, options.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
     };
-    let n_entries = |sizes: &Sizes| sizes.shape().n_entries_in_all();
+    let n_entries = |sizes: &Sizes| sizes.shape().n_entries_total();
     assert!(n_entries(&sizes(900_000).unwrap()) < n_entries(&sizes(1 << 30).unwrap()));
     assert!(matches!(sizes(1000), Err(Error::BudgetTooSmall { .. })));
 }
 
 #[test]
-fn depth_tells_which_cells_are_empty_and_which_hold_something() {
+fn depth_marks_free_and_occupied_cells() {
     let keyframes = ball(1);
     let depth = keyframes[0].depth.as_ref().unwrap();
-    let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
-    let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
+    let extent = Extent { center_m: BALL_CENTER.into(), radius_m: 1.0 };
+    let march = March { step: 1.0 / 32.0, max_samples: 64, n_cells: 32 };
     let hints = carve::hints(&[&*keyframes[0]], &extent, &march);
-    let told = |at: Point3<f64>| {
-        let in_units: [f64; 3] = (at - AT).into();
-        let cell = u32::try_from(march.cell(in_units).0).unwrap();
+    let hint_at = |at: Point3<f64>| {
+        let in_scene_units: [f64; 3] = (at - BALL_CENTER).into();
+        let cell = u32::try_from(march.cell(in_scene_units).0).unwrap();
         hints.iter().filter(|hint| **hint & 0x3fff_ffff == cell).map(|hint| hint >> 30).max()
     };
     let eye = Point3::from(depth.world_from_camera.translation.vector);
-    let towards = (AT - eye).normalize();
-    let surface = eye + towards * ((AT - eye).norm() - 0.3);
-    assert_eq!(told(surface), Some(2), "the near side of the ball");
-    assert_eq!(told(eye + (surface - eye) * 0.5), Some(1), "between camera and ball");
-    assert_eq!(told(AT), None, "inside of the ball");
+    let towards = (BALL_CENTER - eye).normalize();
+    let surface = eye + towards * ((BALL_CENTER - eye).norm() - 0.3);
+    assert_eq!(hint_at(surface), Some(2), "the near side of the ball");
+    assert_eq!(hint_at(eye + (surface - eye) * 0.5), Some(1), "between camera and ball");
+    assert_eq!(hint_at(BALL_CENTER), None, "inside of the ball");
     let mut cells: Vec<u32> = hints.iter().filter(|hint| **hint >> 30 != 0).map(|hint| hint & 0x3fff_ffff).collect();
     cells.sort_unstable();
     assert!(cells.windows(2).all(|pair| pair[0] != pair[1]), "a cell is told twice");
@@ -516,12 +528,12 @@ fn depth_tells_which_cells_are_empty_and_which_hold_something() {
 }
 
 #[test]
-fn nothing_is_seen_through_a_hole_in_depth_but_colors_beside_it_see() {
+fn depth_holes_mark_no_free_space() {
     let whole = ball(1).remove(0);
-    let extent = Extent { center_m: AT.into(), radius_m: 1.0 };
-    let march = March { step: 1.0 / 32.0, most_samples: 64, n_cells: 32 };
+    let extent = Extent { center_m: BALL_CENTER.into(), radius_m: 1.0 };
+    let march = March { step: 1.0 / 32.0, max_samples: 64, n_cells: 32 };
     let inside = u32::try_from(march.cell([0.0; 3]).0).unwrap();
-    let told_inside = |depth: Option<DepthMap>| {
+    let hint_inside = |depth: Option<DepthMap>| {
         let keyframe = Keyframe { depth, ..(*whole).clone() };
         let hints = carve::hints(&[&keyframe], &extent, &march);
         hints.iter().filter(|hint| **hint & 0x3fff_ffff == inside).map(|hint| hint >> 30).max()
@@ -538,11 +550,11 @@ fn nothing_is_seen_through_a_hole_in_depth_but_colors_beside_it_see() {
         }
         DepthMap { depth_m: depth_m.into(), ..depth.clone() }
     };
-    assert_eq!(told_inside(Some(punched(&|x, y| x % 3 == 0 && y % 3 == 0))), None, "holes are looked through");
-    assert_eq!(told_inside(Some(punched(&|x, y| x.abs_diff(width / 2) < 12 && y.abs_diff(height / 2) < 12))), Some(0));
-    assert_eq!(told_inside(None), Some(0), "an image without depth sees nothing");
+    assert_eq!(hint_inside(Some(punched(&|x, y| x % 3 == 0 && y % 3 == 0))), None, "holes are looked through");
+    assert_eq!(hint_inside(Some(punched(&|x, y| x.abs_diff(width / 2) < 12 && y.abs_diff(height / 2) < 12))), Some(0));
+    assert_eq!(hint_inside(None), Some(0), "an image without depth sees nothing");
     let [wide, _] = depth.focal_px.map(|focal| focal * 1e3);
     let narrow = DepthMap { focal_px: [wide; 2], ..punched(&|_, _| false) };
-    let told_beside = carve::hints(&[&Keyframe { depth: Some(narrow), ..(*whole).clone() }], &extent, &march);
-    assert!(told_beside.iter().filter(|hint| **hint >> 30 == 0).count() > 500, "colors beside depth see nothing");
+    let hint_next_to_hole = carve::hints(&[&Keyframe { depth: Some(narrow), ..(*whole).clone() }], &extent, &march);
+    assert!(hint_next_to_hole.iter().filter(|hint| **hint >> 30 == 0).count() > 500, "colors beside depth see nothing");
 }

@@ -7,23 +7,23 @@
 
 #import folded
 #import density
-#import visit
+#import occupancy_update
 
-@group(0) @binding(0) var<uniform> visit: Visit;
+@group(0) @binding(0) var<uniform> occupancy_update: OccupancyUpdate;
 @group(0) @binding(1) var<storage, read> steps: array<u32>;
-@group(0) @binding(2) var<storage, read> told: array<f32>;
-@group(0) @binding(3) var<storage, read_write> thickness: array<f32>;
+@group(0) @binding(2) var<storage, read> log_density: array<f32>;
+@group(0) @binding(3) var<storage, read_write> cell_occupancy: array<f32>;
 
-const UNSEEN = 0.0;
-const LEAST_SEEN = 1e-30;
+const OUTSIDE_VIEWS = 0.0;
+const MIN_OCCUPANCY = 1e-30;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = folded(wg, n_wgs) * 64u + lane;
-    if ix >= visit.n_points { return; }
-    let cell = visited_cell(visit, steps[1], ix);
-    let seen = density_of(told[ix]) * visit.step;
-    let known = thickness[cell];
+    if ix >= occupancy_update.n_points { return; }
+    let cell = updated_cell(occupancy_update, steps[1], ix);
+    let opacity = density_of(log_density[ix]) * occupancy_update.step;
+    let previous = cell_occupancy[cell];
     // What no image looks at never learns what is there, so nothing it says is worth a sample.
-    if known != UNSEEN { thickness[cell] = max(max(visit.kept_frac * known, seen), LEAST_SEEN); }
+    if previous != OUTSIDE_VIEWS { cell_occupancy[cell] = max(max(occupancy_update.decay * previous, opacity), MIN_OCCUPANCY); }
 }

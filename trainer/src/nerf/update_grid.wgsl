@@ -8,10 +8,10 @@
 
 #import folded
 #import hash_grid
-#import learn_rule
+#import adam_rule
 
-@group(0) @binding(0) var<uniform> rule: LearnRule;
-@group(0) @binding(1) var<storage, read> pace: Pace;
+@group(0) @binding(0) var<uniform> rule: AdamRule;
+@group(0) @binding(1) var<storage, read> step_scale: StepScale;
 @group(0) @binding(2) var<storage, read> levels: array<Level>;
 @group(0) @binding(3) var<storage, read> scales: array<f32>;
 @group(0) @binding(4) var<storage, read_write> grid: array<vec2f>;
@@ -19,7 +19,7 @@
 @group(0) @binding(6) var<storage, read_write> v_grid: array<vec2i>;
 @group(0) @binding(7) var<storage, read_write> largest: array<atomic<u32>>;
 
-const MOST_LEVELS = 16u;
+const MAX_LEVELS = 16u;
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -29,15 +29,15 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if all(sum == vec2i(0)) { return; }
     v_grid[ix] = vec2i(0);
     var level = 0u;
-    for (var step = MOST_LEVELS / 2u; step > 0u; step /= 2u) {
+    for (var step = MAX_LEVELS / 2u; step > 0u; step /= 2u) {
         let above = min(level + step, arrayLength(&levels) - 1u);
         if ix >= levels[above].begin { level = above; }
     }
-    let most = max(abs(sum.x), abs(sum.y));
-    atomicMax(&largest[level], u32(most)); // The order of a maximum does not matter.
+    let max_abs = max(abs(sum.x), abs(sum.y));
+    atomicMax(&largest[level], u32(max_abs)); // The order of a maximum does not matter.
     let v = vec2f(sum) / scales[level];
     let moment = mix(vec4f(v, v * v), moments[ix], rule.betas.xxyy);
     moments[ix] = moment;
-    let corrected = moment * pace.correction.xxyy;
-    grid[ix] -= rule.rate * pace.rate_frac * corrected.xy / (sqrt(corrected.zw) + rule.epsilon);
+    let corrected = moment * step_scale.correction.xxyy;
+    grid[ix] -= rule.rate * step_scale.rate_frac * corrected.xy / (sqrt(corrected.zw) + rule.epsilon);
 }

@@ -9,29 +9,29 @@
 
 #import folded
 #import ray_batch
-#import learn_rule
-#import image_terms
-#import term_step
+#import adam_rule
+#import image_params
+#import param_step
 
-struct TermRule {
+struct ImageParamRule {
     learned: u32,          // bit i: term i
     n_images: u32,
-    turn_rate: f32,        // radians a step, at the start
-    shift_rate: f32,       // units of the radius a step, at the start
-    code_rate: f32,        // a step, at the start
-    pull: f32,             // share of a term that is lost in a step, at the start
+    rotation_rate: f32,        // radians a step, at the start
+    translation_rate: f32,       // units of the radius a step, at the start
+    embedding_rate: f32,        // a step, at the start
+    weight_decay: f32,             // share of a term that is lost in a step, at the start
     unused: vec2u,
 }
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
-@group(0) @binding(1) var<uniform> rule: TermRule;
-@group(0) @binding(2) var<storage, read> pace: Pace;
+@group(0) @binding(1) var<uniform> rule: ImageParamRule;
+@group(0) @binding(2) var<storage, read> step_scale: StepScale;
 @group(0) @binding(3) var<storage, read> rays: array<Ray>;
 @group(0) @binding(4) var<storage, read> v_rays: array<vec4f>;
-@group(0) @binding(5) var<storage, read> v_codes: array<vec4f>;
-@group(0) @binding(6) var<storage, read_write> terms: array<vec4f>;
+@group(0) @binding(5) var<storage, read> v_embeddings: array<vec4f>;
+@group(0) @binding(6) var<storage, read_write> image_params: array<vec4f>;
 
-const MOST = 1e30;
+const MAX_ABS = 1e30;
 const PARTS = 3u;          // turn, shift, code: three terms each
 
 var<workgroup> wg_sums: array<vec4f, 192>; // [PARTS, 64]
@@ -42,7 +42,7 @@ fn first_ray_of(image: u32) -> u32 {
     var end = batch.n_rays;
     while begin < end {
         let middle = (begin + end) / 2u;
-        if rays[middle].code < image { begin = middle + 1u; } else { end = middle; }
+        if rays[middle].embedding < image { begin = middle + 1u; } else { end = middle; }
     }
     return begin;
 }
@@ -63,7 +63,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         sums[1] += v_rays[2u * ix + 1u];
     }
     let end_sample = first_sample_of(end);
-    for (var ix = first_sample_of(begin) + lane; ix < end_sample; ix += 64u) { sums[2] += v_codes[ix]; }
+    for (var ix = first_sample_of(begin) + lane; ix < end_sample; ix += 64u) { sums[2] += v_embeddings[ix]; }
     for (var part = 0u; part < PARTS; part++) { wg_sums[part * 64u + lane] = sums[part]; }
     workgroupBarrier(); // All have told.
     for (var stride = 32u; stride > 0u; stride /= 2u) {
@@ -73,12 +73,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         workgroupBarrier(); // This half holds what the other knew.
     }
     let part = min(lane / 3u, PARTS - 1u);
-    let slope = wg_sums[part * 64u][lane % 3u];
-    let is_learned = lane < TERM_STRIDE && (rule.learned & (1u << lane)) != 0u;
+    let gradient = wg_sums[part * 64u][lane % 3u];
+    let is_learned = lane < IMAGE_PARAM_STRIDE && (rule.learned & (1u << lane)) != 0u;
     // What is not finite teaches nothing; nor does an image without rays.
-    if image < rule.n_images && is_learned && begin < end && abs(slope) < MOST {
-        let at = image * TERM_STRIDE + lane;
-        let rate = pace.rate_frac * vec3f(rule.turn_rate, rule.shift_rate, rule.code_rate)[part];
-        terms[at] = stepped(terms[at], slope, rate, rule.pull * pace.rate_frac);
+    if image < rule.n_images && is_learned && begin < end && abs(gradient) < MAX_ABS {
+        let at = image * IMAGE_PARAM_STRIDE + lane;
+        let rate = step_scale.rate_frac * vec3f(rule.rotation_rate, rule.translation_rate, rule.embedding_rate)[part];
+        image_params[at] = stepped(image_params[at], gradient, rate, rule.weight_decay * step_scale.rate_frac);
     }
 }

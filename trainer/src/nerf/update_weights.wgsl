@@ -7,10 +7,10 @@
 // source    Kingma and Ba 2015; pull of Loshchilov and Hutter 2019 (AdamW)
 
 #import ray_batch
-#import learn_rule
+#import adam_rule
 
-@group(0) @binding(0) var<uniform> rule: LearnRule;
-@group(0) @binding(1) var<storage, read> pace: Pace;
+@group(0) @binding(0) var<uniform> rule: AdamRule;
+@group(0) @binding(1) var<storage, read> step_scale: StepScale;
 @group(0) @binding(2) var<storage, read> batch: Batch;
 @group(0) @binding(3) var<storage, read> partial_sums: array<vec4f>;
 @group(0) @binding(4) var<storage, read_write> weights: array<vec4f>;
@@ -20,8 +20,8 @@ override CHUNK: u32;       // samples
 override N_SUMS: u32;      // vec4 of a chunk; those behind the weights are of none
 
 const WORDS = 16u;         // vec4 of weights of a workgroup
-const SHARES = 16u;
-const MOST = 1e30;
+const THREADS_PER_WEIGHT = 16u;
+const MAX_ABS = 1e30;
 
 var<workgroup> wg_sums: array<vec4f, 256>;
 
@@ -32,19 +32,19 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) lane:
     let n_chunks = (batch.n_samples + CHUNK - 1u) / CHUNK;
     var sum = vec4f(0.0);
     if ix < n {
-        for (var chunk = lane / WORDS; chunk < n_chunks; chunk += SHARES) { sum += partial_sums[chunk * N_SUMS + ix]; }
+        for (var chunk = lane / WORDS; chunk < n_chunks; chunk += THREADS_PER_WEIGHT) { sum += partial_sums[chunk * N_SUMS + ix]; }
     }
     wg_sums[lane] = sum;
     workgroupBarrier(); // All shares are there before they are added up.
     if lane < WORDS && ix < n {
         var v = vec4f(0.0);
-        for (var share = 0u; share < SHARES; share++) { v += wg_sums[share * WORDS + lane]; }
-        let is_usable = abs(v) < vec4f(MOST); // What is not finite teaches nothing.
+        for (var thread_ix = 0u; thread_ix < THREADS_PER_WEIGHT; thread_ix++) { v += wg_sums[thread_ix * WORDS + lane]; }
+        let is_usable = abs(v) < vec4f(MAX_ABS); // What is not finite teaches nothing.
         let first = select(moments[2u * ix], mix(v, moments[2u * ix], rule.betas.x), is_usable);
         let second = select(moments[2u * ix + 1u], mix(v * v, moments[2u * ix + 1u], rule.betas.y), is_usable);
         moments[2u * ix] = first;
         moments[2u * ix + 1u] = second;
-        let step = first * pace.correction.x / (sqrt(second * pace.correction.y) + rule.epsilon) + rule.pull * weights[ix];
-        weights[ix] = select(weights[ix], weights[ix] - rule.rate * pace.rate_frac * step, is_usable);
+        let step = first * step_scale.correction.x / (sqrt(second * step_scale.correction.y) + rule.epsilon) + rule.weight_decay * weights[ix];
+        weights[ix] = select(weights[ix], weights[ix] - rule.rate * step_scale.rate_frac * step, is_usable);
     }
 }

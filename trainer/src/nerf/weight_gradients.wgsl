@@ -13,8 +13,8 @@
 #import network_layers
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
-@group(0) @binding(1) var<storage, read> held: array<vec4f>;
-@group(0) @binding(2) var<storage, read> v_held: array<vec4f>;
+@group(0) @binding(1) var<storage, read> activations: array<vec4f>;
+@group(0) @binding(2) var<storage, read> v_activations: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
 
 override SUM_LANES: u32;
@@ -42,10 +42,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         var sums: mat4x4f; // a column an output
         for (var tile = first_tile; tile < min(first_tile + CHUNK_TILES, n_tiles); tile++) {
             for (var item = lane; item < layer.n_in * PARTS; item += SUM_LANES) {
-                wg_rows[item / PARTS * STRIDE + item % PARTS] = held[(tile * n_held_rows() + layer.held_row) * PARTS + item];
+                wg_rows[item / PARTS * STRIDE + item % PARTS] = activations[(tile * n_activation_rows() + layer.activation_row) * PARTS + item];
             }
             for (var item = lane; item < layer.n_out * PARTS; item += SUM_LANES) {
-                wg_rows[BANK + item / PARTS * STRIDE + item % PARTS] = v_held[(tile * n_slope_rows() + layer.v_row) * PARTS + item];
+                wg_rows[BANK + item / PARTS * STRIDE + item % PARTS] = v_activations[(tile * n_gradient_rows() + layer.v_row) * PARTS + item];
             }
             workgroupBarrier(); // All rows of the tile are there before they are read.
             if share < n_shares {

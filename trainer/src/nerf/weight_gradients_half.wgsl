@@ -14,8 +14,8 @@
 #import network_layers
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
-@group(0) @binding(1) var<storage, read> held: array<Four>;
-@group(0) @binding(2) var<storage, read> v_held: array<Four>;
+@group(0) @binding(1) var<storage, read> activations: array<Four>;
+@group(0) @binding(2) var<storage, read> v_activations: array<Four>;
 @group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
 
 override CHUNK_TILES: u32;
@@ -35,16 +35,16 @@ fn main(
         let input = block % n_in * 16u;
         var sums: coop_mat16x16<f32, C>;
         for (var tile = first_tile; tile < min(first_tile + CHUNK_TILES, n_tiles); tile++) {
-            let v_at = (tile * n_slope_rows() + layer.v_row + output) * PARTS;
-            let h_at = (tile * n_held_rows() + layer.held_row + input) * PARTS;
+            let v_at = (tile * n_gradient_rows() + layer.v_row + output) * PARTS;
+            let h_at = (tile * n_activation_rows() + layer.activation_row + input) * PARTS;
             for (var part = 0u; part < PARTS; part += 4u) {
-                let v = coopLoadT<coop_mat16x16<f16, A>>(&v_held[v_at + part], PARTS);
-                let h = coopLoad<coop_mat16x16<f16, B>>(&held[h_at + part], PARTS);
+                let v = coopLoadT<coop_mat16x16<f16, A>>(&v_activations[v_at + part], PARTS);
+                let h = coopLoad<coop_mat16x16<f16, B>>(&activations[h_at + part], PARTS);
                 sums = coopMultiplyAdd(v, h, sums);
             }
         }
         // Each has a name: naga 30 stores none that has not.
-        let total = sums * (1.0 / slope_scale(batch.n_rays));
+        let total = sums * (1.0 / gradient_scale(batch.n_rays));
         let stride = layer.n_in;
         let first = 4u * (ix / N_LAYERS * n_weight_words() + layer.first_weight) + output * stride + input;
         coopStoreT(total, &partial_sums[first], stride);

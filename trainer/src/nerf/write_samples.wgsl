@@ -11,7 +11,7 @@
 #import space
 #import cell_blocks
 #import march
-#import march_shares
+#import march_threads
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
 @group(0) @binding(1) var<uniform> march: March;
@@ -25,24 +25,24 @@
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = folded(wg, n_wgs) * 64u + lane;
-    let ray_ix = ix / SHARES;
+    let ray_ix = ix / THREADS_PER_RAY;
     if ray_ix >= batch.n_rays { return; }
     let ray = rays[ray_ix];
     if ray.n_samples == 0u { return; }
-    let thinning = thinning_of(batch.most_samples, ray, n_found[ray_ix]);
+    let thinning = thinning_of(batch.max_samples, ray, n_found[ray_ix]);
     let path = path_of(march, ray);
-    let range = share_of_pieces(path, ix % SHARES);
+    let range = segments_of_thread(path, ix % THREADS_PER_RAY);
     var n = n_before[ix];
-    var piece = next_piece(march, ray, path, range.x, range.y);
-    while piece.ix < range.y {
+    var segment = next_segment(march, ray, path, range.x, range.y);
+    while segment.ix < range.y {
         let at = n / thinning.stride;
         if n % thinning.stride == thinning.phase && at < ray.n_samples {
-            let middle = 0.5 * (piece.begin + piece.end);
-            let reach = 0.5 * (piece.end - piece.begin) * f32(thinning.stride);
+            let middle = 0.5 * (segment.begin + segment.end);
+            let reach = 0.5 * (segment.end - segment.begin) * f32(thinning.stride);
             spans[ray.first_sample + at] = Span(middle - reach, middle + reach, ray_ix, 0u);
             points[ray.first_sample + at] = vec4f(contract(ray.origin + middle * ray.direction), 0.0);
         }
         n++;
-        piece = next_piece(march, ray, path, piece.ix + 1u, range.y);
+        segment = next_segment(march, ray, path, segment.ix + 1u, range.y);
     }
 }

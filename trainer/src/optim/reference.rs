@@ -52,7 +52,7 @@ impl Adam {
     }
 
     /// Moves parameters that share one running mean of the squared gradient, and have none of the gradient itself.
-    pub fn update_alike(&self, step: u32, rate: f64, params: &mut [f64], gradients: &[f64], second: &mut f64) {
+    pub fn update_shared(&self, step: u32, rate: f64, params: &mut [f64], gradients: &[f64], second: &mut f64) {
         let mean_square = gradients.iter().map(|gradient| gradient * gradient).sum::<f64>() / gradients.len() as f64;
         *second = self.beta2 * *second + (1.0 - self.beta2) * mean_square;
         let unbiased = *second / (1.0 - self.beta2.powf(f64::from(step)));
@@ -68,12 +68,12 @@ mod tests {
     use crate::mismatches::Mismatches;
 
     #[test]
-    fn steps_agree_with_the_means_written_out() {
+    fn steps_match_explicit_means() {
         let adam = Adam::default();
         let gradients = [0.3, -0.1, 0.25, 2.0, -1.5, 1e-3];
         let (mut param, mut moments) = (1.0, Moments::default());
         let mut expected = 1.0;
-        let mut wrong = Mismatches::default();
+        let mut mismatches = Mismatches::default();
         for (ix, &gradient) in gradients.iter().enumerate() {
             let step = u32::try_from(ix + 1).expect("a few steps");
             adam.update(step, 0.01, &mut param, gradient, &mut moments);
@@ -85,13 +85,13 @@ mod tests {
                 sum / (0..=ix).map(weight).sum::<f64>()
             };
             expected -= 0.01 * mean(0.9, 1) / mean(0.999, 2).sqrt();
-            wrong.check(format!("step {step}"), param, expected, 1e-14, 0.0);
+            mismatches.check(format!("step {step}"), param, expected, 1e-14, 0.0);
         }
-        wrong.assert_none();
+        mismatches.assert_none();
     }
 
     #[test]
-    fn each_parameter_moves_at_its_own_rate_against_its_gradient() {
+    fn each_parameter_uses_its_own_rate() {
         // The first step is the rate itself, whatever the size of the gradient; a zero gradient moves nothing.
         let mut params = [1.0, 2.0, 3.0];
         let mut moments = [Moments::default(); 3];
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn finds_the_minimum_of_a_valley() {
+    fn converges_in_a_narrow_valley() {
         let (mut params, mut moments) = ([4.0, -3.0], [Moments::default(); 2]);
         for step in 1..=2000 {
             let gradients = [2.0 * (params[0] - 1.0), 200.0 * (params[1] + 0.5)];

@@ -1,7 +1,7 @@
 //! The header of a binary `.ply` file, and its tables. Source: Turk, "The PLY Polygon File Format", 1994.
 
 /// Longest header we look for; those of splats have about two thousand bytes.
-const LONGEST_HEADER: usize = 64 * 1024;
+const MAX_HEADER_BYTES: usize = 64 * 1024;
 
 /// What a file holds.
 pub(super) struct Header {
@@ -19,13 +19,13 @@ struct Element {
 
 struct Property {
     name: String,
-    number: Number,
+    number_type: NumberType,
     offset: usize,
 }
 
 /// How a number is stored.
 #[derive(Clone, Copy, Debug)]
-enum Number {
+enum NumberType {
     I8,
     U8,
     I16,
@@ -36,7 +36,7 @@ enum Number {
     F64,
 }
 
-impl Number {
+impl NumberType {
     fn of(word: &str) -> Option<Self> {
         Some(match word {
             "char" | "int8" => Self::I8,
@@ -65,7 +65,7 @@ impl Header {
     /// Reads the header and checks that the tables it promises are in the file.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header\n";
-        let searched = &bytes[..bytes.len().min(LONGEST_HEADER)];
+        let searched = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
         let end = searched.windows(END.len()).position(|window| window == END);
         let end = end.ok_or("no PLY header with unix line ends")?;
         let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "header is not text")?;
@@ -75,9 +75,9 @@ impl Header {
             return Err("does not begin with \"ply\"".to_owned());
         }
         for line in lines {
-            header.take_line(line)?;
+            header.parse_line(line)?;
         }
-        header.place_tables(end + END.len(), bytes.len())?;
+        header.locate_tables(end + END.len(), bytes.len())?;
         Ok(header)
     }
 
@@ -92,7 +92,7 @@ impl Header {
         Ok(Table { element, rows: &bytes[element.start..element.start + element.count * element.row_bytes] })
     }
 
-    fn take_line(&mut self, line: &str) -> Result<(), String> {
+    fn parse_line(&mut self, line: &str) -> Result<(), String> {
         let words: Vec<&str> = line.split_whitespace().collect();
         match (words.as_slice(), self.elements.last_mut()) {
             ([] | ["comment" | "obj_info", ..] | ["format", "binary_little_endian", "1.0"], _) => Ok(()),
@@ -104,16 +104,17 @@ impl Header {
                 Ok(())
             }
             (["property", word, name], Some(element)) => {
-                let number = Number::of(word).ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
-                element.properties.push(Property { name: (*name).to_owned(), number, offset: element.row_bytes });
-                element.row_bytes += number.bytes();
+                let number_type =
+                    NumberType::of(word).ok_or_else(|| format!("property {name}: unknown type {word:?}"))?;
+                element.properties.push(Property { name: (*name).to_owned(), number_type, offset: element.row_bytes });
+                element.row_bytes += number_type.bytes();
                 Ok(())
             }
             _ => Err(format!("header line {line:?} is not understood")),
         }
     }
 
-    fn place_tables(&mut self, mut start: usize, file_bytes: usize) -> Result<(), String> {
+    fn locate_tables(&mut self, mut start: usize, file_bytes: usize) -> Result<(), String> {
         for element in &mut self.elements {
             element.start = start;
             let end = element.count.checked_mul(element.row_bytes).and_then(|bytes| bytes.checked_add(start));
@@ -160,22 +161,22 @@ impl Column<'_> {
     /// The value as f32.
     #[expect(clippy::cast_possible_truncation, reason = "splats are f32 whatever the file holds")]
     pub(super) fn f32(&self, row: usize) -> f32 {
-        match self.property.number {
-            Number::I8 => f32::from(i8::from_le_bytes(self.bytes(row))),
-            Number::U8 => f32::from(u8::from_le_bytes(self.bytes(row))),
-            Number::I16 => f32::from(i16::from_le_bytes(self.bytes(row))),
-            Number::U16 => f32::from(u16::from_le_bytes(self.bytes(row))),
-            Number::I32 => i32::from_le_bytes(self.bytes(row)) as f32,
-            Number::U32 => u32::from_le_bytes(self.bytes(row)) as f32,
-            Number::F32 => f32::from_le_bytes(self.bytes(row)),
-            Number::F64 => f64::from_le_bytes(self.bytes(row)) as f32,
+        match self.property.number_type {
+            NumberType::I8 => f32::from(i8::from_le_bytes(self.bytes(row))),
+            NumberType::U8 => f32::from(u8::from_le_bytes(self.bytes(row))),
+            NumberType::I16 => f32::from(i16::from_le_bytes(self.bytes(row))),
+            NumberType::U16 => f32::from(u16::from_le_bytes(self.bytes(row))),
+            NumberType::I32 => i32::from_le_bytes(self.bytes(row)) as f32,
+            NumberType::U32 => u32::from_le_bytes(self.bytes(row)) as f32,
+            NumberType::F32 => f32::from_le_bytes(self.bytes(row)),
+            NumberType::F64 => f64::from_le_bytes(self.bytes(row)) as f32,
         }
     }
 
     /// The value as packed bits; refused when the property is not 32 bits of them.
     pub(super) fn bits(&self, row: usize) -> Result<u32, String> {
-        match self.property.number {
-            Number::U32 => Ok(u32::from_le_bytes(self.bytes(row))),
+        match self.property.number_type {
+            NumberType::U32 => Ok(u32::from_le_bytes(self.bytes(row))),
             other => Err(format!("property {:?} is {other:?}, expected uint", self.property.name)),
         }
     }

@@ -4,7 +4,7 @@ mod header;
 mod packed;
 
 use crate::splat::arrays::SplatArrays;
-use crate::{Error, whole_file};
+use crate::{Error, atomic_file};
 use header::{Column, Header, Table};
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -17,7 +17,7 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 
 /// Writes a `.ply` of splats, little endian, f32; a broken disk leaves no file under this name that looks whole.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
-    whole_file::write(path, |file| {
+    atomic_file::write(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, splats)?;
         file.flush()

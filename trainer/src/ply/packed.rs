@@ -4,18 +4,18 @@ use super::header::{Column, Header, Table};
 use super::rest_columns;
 use crate::splat::arrays::SplatArrays;
 
-const SPLATS_A_CHUNK: usize = 256;
+const SPLATS_PER_CHUNK: usize = 256;
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 const SH_0: f32 = 0.282_094_8;
 /// The higher colour coefficients span -4 to 4.
 const REST_SPAN: f32 = 8.0;
 /// Opacities of 0 and 255 would have infinite logits; they are read as half a step inside.
-const LEAST_OPACITY: f32 = 0.5 / 255.0;
+const MIN_OPACITY: f32 = 0.5 / 255.0;
 
 /// Unpacks the splats of a file.
 pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, String> {
     let (chunks, vertices) = (header.table("chunk", bytes)?, header.table("vertex", bytes)?);
-    if vertices.n_rows().div_ceil(SPLATS_A_CHUNK) != chunks.n_rows() {
+    if vertices.n_rows().div_ceil(SPLATS_PER_CHUNK) != chunks.n_rows() {
         return Err(format!("{} splats do not fill {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
     }
     let bounds = Bounds::of(&chunks)?;
@@ -32,13 +32,13 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
     };
     let mut splats = SplatArrays { sh_degree, ..SplatArrays::default() };
     for row in 0..vertices.n_rows() {
-        let chunk = row / SPLATS_A_CHUNK;
+        let chunk = row / SPLATS_PER_CHUNK;
         let [position, rotation, scale, color] = [0, 1, 2, 3].map(|ix| packed[ix].bits(row));
-        splats.means.push(bounds.position.between(chunk, thirds(position?)));
+        splats.means.push(bounds.position.lerp(chunk, three_fractions(position?)));
         splats.rotations_wxyz.push(rotation_wxyz(rotation?));
-        splats.log_scales.push(bounds.log_scale.between(chunk, thirds(scale?)));
+        splats.log_scales.push(bounds.log_scale.lerp(chunk, three_fractions(scale?)));
         let [red, green, blue, opacity] = color?.to_be_bytes().map(|byte| f32::from(byte) / 255.0);
-        let opacity = opacity.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY);
+        let opacity = opacity.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY);
         splats.opacity_logits.push((opacity / (1.0 - opacity)).ln());
         splats.sh.push(bounds.color(chunk, [red, green, blue]).map(|value| (value - 0.5) / SH_0));
         splats.sh.extend((0..rest.len() / 3).map(|ix| {
@@ -50,49 +50,49 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
 
 /// The bounds of each chunk.
 struct Bounds<'a> {
-    position: Span<'a>,
-    log_scale: Span<'a>,
+    position: PropertyRange<'a>,
+    log_scale: PropertyRange<'a>,
     /// Older files have none: colour then spans 0 to 1.
-    color: Option<Span<'a>>,
+    color: Option<PropertyRange<'a>>,
 }
 
 impl<'a> Bounds<'a> {
     fn of(chunks: &Table<'a>) -> Result<Self, String> {
-        let span = |least, most| -> Result<_, String> {
-            Ok(Span { least: chunks.columns(least)?, most: chunks.columns(most)? })
+        let range = |min, max| -> Result<_, String> {
+            Ok(PropertyRange { min: chunks.columns(min)?, max: chunks.columns(max)? })
         };
         Ok(Self {
-            position: span(["min_x", "min_y", "min_z"], ["max_x", "max_y", "max_z"])?,
-            log_scale: span(
+            position: range(["min_x", "min_y", "min_z"], ["max_x", "max_y", "max_z"])?,
+            log_scale: range(
                 ["min_scale_x", "min_scale_y", "min_scale_z"],
                 ["max_scale_x", "max_scale_y", "max_scale_z"],
             )?,
-            color: span(["min_r", "min_g", "min_b"], ["max_r", "max_g", "max_b"]).ok(),
+            color: range(["min_r", "min_g", "min_b"], ["max_r", "max_g", "max_b"]).ok(),
         })
     }
 
     fn color(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
-        self.color.as_ref().map_or(frac, |span| span.between(chunk, frac))
+        self.color.as_ref().map_or(frac, |range| range.lerp(chunk, frac))
     }
 }
 
 /// Least and largest value of three properties of each chunk.
-struct Span<'a> {
-    least: [Column<'a>; 3],
-    most: [Column<'a>; 3],
+struct PropertyRange<'a> {
+    min: [Column<'a>; 3],
+    max: [Column<'a>; 3],
 }
 
-impl Span<'_> {
-    fn between(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
+impl PropertyRange<'_> {
+    fn lerp(&self, chunk: usize, frac: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|axis| {
-            let (least, most) = (self.least[axis].f32(chunk), self.most[axis].f32(chunk));
-            least + (most - least) * frac[axis]
+            let (min, max) = (self.min[axis].f32(chunk), self.max[axis].f32(chunk));
+            min + (max - min) * frac[axis]
         })
     }
 }
 
 /// Three fractions from 11, 10 and 11 bits, the first on top.
-fn thirds(bits: u32) -> [f32; 3] {
+fn three_fractions(bits: u32) -> [f32; 3] {
     [frac(bits >> 21, 11), frac(bits >> 11, 10), frac(bits, 11)]
 }
 
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn rotations_survive_packing_whichever_part_is_largest() {
+    fn rotations_round_trip_for_any_largest_component() {
         for rotation in [[0.9, 0.1, -0.3, 0.3], [0.1, -0.9, 0.3, 0.3], [0.3, 0.1, 0.9, -0.3], [-0.3, 0.3, 0.1, 0.9]] {
             let norm = rotation.iter().map(|part: &f32| part * part).sum::<f32>().sqrt();
             let rotation = rotation.map(|part| part / norm);
@@ -152,10 +152,10 @@ mod tests {
     }
 
     #[test]
-    fn fractions_fill_their_bits() {
-        assert_eq!(thirds(0x7ff << 21), [1.0, 0.0, 0.0]);
-        assert_eq!(thirds(0x3ff << 11), [0.0, 1.0, 0.0]);
-        assert_eq!(thirds(0x7ff), [0.0, 0.0, 1.0]);
+    fn fractions_use_all_bits() {
+        assert_eq!(three_fractions(0x7ff << 21), [1.0, 0.0, 0.0]);
+        assert_eq!(three_fractions(0x3ff << 11), [0.0, 1.0, 0.0]);
+        assert_eq!(three_fractions(0x7ff), [0.0, 0.0, 1.0]);
         assert_eq!([0.0, 255.0].map(higher_coefficient), [-4.0, 4.0]);
     }
 }

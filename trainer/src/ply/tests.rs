@@ -12,7 +12,7 @@ fn cloud_of_degree(sh_degree: u32) -> SplatArrays {
 }
 
 #[test]
-fn every_degree_survives_a_round_trip_bit_for_bit() {
+fn every_degree_round_trips_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("splats.ply");
     for sh_degree in 0..=3 {
@@ -26,7 +26,7 @@ fn every_degree_survives_a_round_trip_bit_for_bit() {
 }
 
 #[test]
-fn the_layout_is_the_one_other_programs_read() {
+fn layout_matches_other_programs() {
     let mut file = Vec::new();
     let mut cloud = cloud_of_degree(1);
     cloud.sh[1] = [11.0, 12.0, 13.0];
@@ -41,7 +41,7 @@ fn the_layout_is_the_one_other_programs_read() {
 }
 
 #[test]
-fn properties_may_come_in_any_order_and_type() {
+fn properties_are_read_in_any_order_and_type() {
     let mut file = b"ply\r\n".to_vec();
     assert!(from_bytes(&file).unwrap_err().contains("unix line ends"));
     file.clear();
@@ -62,17 +62,17 @@ fn properties_may_come_in_any_order_and_type() {
 }
 
 #[test]
-fn broken_files_are_refused_with_the_reason() {
+fn broken_files_are_rejected_with_the_reason() {
     let mut file = Vec::new();
     write_to(&mut file, &cloud_of_degree(0)).unwrap();
-    let complaint = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
-    assert!(complaint(&file[..file.len() - 1]).contains("cut off: 5 rows of \"vertex\""));
-    assert!(complaint(b"solid").contains("no PLY header"));
+    let error_of = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
+    assert!(error_of(&file[..file.len() - 1]).contains("cut off: 5 rows of \"vertex\""));
+    assert!(error_of(b"solid").contains("no PLY header"));
     let text = String::from_utf8_lossy(&file).into_owned();
-    assert!(complaint(text.replace("binary_little_endian", "ascii").as_bytes()).contains("format ascii"));
-    assert!(complaint(text.replace("opacity", "opacitx").as_bytes()).contains("no property \"opacity\""));
-    assert!(complaint(text.replace("vertex 5", "vertex 99999999999999999999").as_bytes()).contains("no number"));
-    assert!(complaint(text.replace("vertex 5", "vertex 9999999999999999999").as_bytes()).contains("cut off"));
+    assert!(error_of(text.replace("binary_little_endian", "ascii").as_bytes()).contains("format ascii"));
+    assert!(error_of(text.replace("opacity", "opacitx").as_bytes()).contains("no property \"opacity\""));
+    assert!(error_of(text.replace("vertex 5", "vertex 99999999999999999999").as_bytes()).contains("no number"));
+    assert!(error_of(text.replace("vertex 5", "vertex 9999999999999999999").as_bytes()).contains("cut off"));
     let folder = tempfile::tempdir().unwrap();
     let mut not_finite = cloud_of_degree(0);
     not_finite.means[2][0] = f32::NAN;
@@ -97,10 +97,10 @@ fn packed_files_of_another_program_are_read() {
 }
 
 #[test]
-fn a_packed_file_with_colours_of_fewer_splats_is_refused() {
+fn packed_file_with_missing_colors_is_rejected() {
     let seed =
         |name: &str| std::fs::read(format!("{}/../fuzz/seeds/model/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap();
     assert_eq!(from_bytes(&seed("ply-packed")[1..]).unwrap().n_splats(), 2);
-    let refused = from_bytes(&seed("ply-packed-colours-missing")[1..]).unwrap_err();
-    assert_eq!(refused, "colours of 1 splats for 2 of them");
+    let error = from_bytes(&seed("ply-packed-colours-missing")[1..]).unwrap_err();
+    assert_eq!(error, "colours of 1 splats for 2 of them");
 }

@@ -4,7 +4,7 @@
 #import gradient
 
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
-@group(0) @binding(7) var<storage, read> rest: array<vec2f>;
+@group(0) @binding(7) var<storage, read> pixel_totals: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;
 
 const N_PARTS_OF_GRADIENT = 12u;
@@ -29,14 +29,14 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
     for (var k = 0u; k < PX; k++) {
         if !tile.in_grid || first.x + k >= view.size_px.x || first.y >= view.size_px.y { continue; }
         let at = first.y * view.size_px.x + first.x + k;
-        let slope = upstream[at];
-        let end = rest[at];
-        out.v_red = put(out.v_red, k, slope.x);
-        out.v_green = put(out.v_green, k, slope.y);
-        out.v_blue = put(out.v_blue, k, slope.z);
-        out.v_depth = put(out.v_depth, k, slope.w);
-        out.behind = put(out.behind, k, end.x);
-        out.error = put(out.error, k, end.y);
+        let gradient = upstream[at];
+        let totals = pixel_totals[at];
+        out.v_red = put(out.v_red, k, gradient.x);
+        out.v_green = put(out.v_green, k, gradient.y);
+        out.v_blue = put(out.v_blue, k, gradient.z);
+        out.v_depth = put(out.v_depth, k, gradient.w);
+        out.behind = put(out.behind, k, totals.x);
+        out.error = put(out.error, k, totals.y);
         out.last = put_u(out.last, k, last[at]);
     }
     return out;
@@ -44,17 +44,17 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
 
 // What a lane's pixels add to the gradient of the splat at hand, which then lies in front of them.
 //
-// Behind a splat lies `rest` minus what lies in front of it, so one number a pixel goes along beside the transmittance.
-fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: Drawn) -> Gradient {
+// Behind a splat lies `pixel_totals` minus what lies in front of it, so one number a pixel goes along beside the transmittance.
+fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: ProjectedSplat) -> Gradient {
     let falloff = select(Px(0.0), exp2(-power), hit);
-    let unclamped = splat.place.w * falloff;
+    let unclamped = splat.position.w * falloff;
     let alpha = min(Px(MAX_ALPHA), unclamped);
     let weight = alpha * (*pixels).transmittance;
-    let value = splat.color.x * (*pixels).v_red + splat.color.y * (*pixels).v_green + splat.color.z * (*pixels).v_blue + splat.place.z * (*pixels).v_depth;
+    let value = splat.color.x * (*pixels).v_red + splat.color.y * (*pixels).v_green + splat.color.z * (*pixels).v_blue + splat.position.z * (*pixels).v_depth;
     let behind = (*pixels).behind - weight * value;
     let v_alpha = (*pixels).transmittance * value - behind / (1.0 - alpha);
-    let v_free = select(v_alpha, Px(0.0), unclamped > Px(MAX_ALPHA));
-    let v_power = -alpha * v_free;
+    let v_unclamped = select(v_alpha, Px(0.0), unclamped > Px(MAX_ALPHA));
+    let v_power = -alpha * v_unclamped;
     (*pixels).transmittance *= 1.0 - alpha;
     (*pixels).behind = behind;
     let one = Px(1.0);
@@ -62,7 +62,7 @@ fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, s
     let v_0 = dot(v_power, one);
     let v_x = dot(v_dx, one);
     return Gradient(
-        vec4f(v_x, v_0 * dy, dot(weight, (*pixels).v_depth), dot(falloff, v_free)),
+        vec4f(v_x, v_0 * dy, dot(weight, (*pixels).v_depth), dot(falloff, v_unclamped)),
         vec4f(dot(v_dx, dx), v_x * dy, v_0 * dy * dy, dot(weight, (*pixels).error)),
         vec4f(dot(weight, (*pixels).v_red), dot(weight, (*pixels).v_green), dot(weight, (*pixels).v_blue), 0.0),
     );
@@ -70,9 +70,9 @@ fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, s
 
 // From the sums of `passed` to the gradient; see `halved`.
 fn finished(sum: Gradient, half: vec4f) -> Gradient {
-    let moved = LN_2 * sum.place.xy;
+    let moved = LN_2 * sum.position.xy;
     return Gradient(
-        vec4f(2.0 * half.x * moved.x + half.y * moved.y, half.y * moved.x + 2.0 * half.z * moved.y, sum.place.zw),
+        vec4f(2.0 * half.x * moved.x + half.y * moved.y, half.y * moved.x + 2.0 * half.z * moved.y, sum.position.zw),
         vec4f(0.5 * sum.conic.x, sum.conic.y, 0.5 * sum.conic.z, sum.conic.w),
         sum.color,
     );

@@ -1,6 +1,6 @@
 // backward_layer: slopes towards what goes into a layer, from rows of a bank to rows of the other.
 
-fn work_out(layer: Layer, tile: u32, lane: u32) {
+fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
     let n_words = layer.n_in / 4u;
     for (var group = lane / PARTS; group < n_words; group += LANES / PARTS) {
@@ -13,7 +13,7 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
             sums += v * transpose(w);
         }
         for (var i = 0u; i < 4u; i++) {
-            put_four(BANK - layer.from_bank, 4u * group + i, part, finished(layer, tile, 4u * group + i, part, sums[i]));
+            put_four(BANK - layer.from_bank, 4u * group + i, part, layer_output(layer, tile, 4u * group + i, part, sums[i]));
         }
     }
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.

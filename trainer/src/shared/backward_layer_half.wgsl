@@ -2,11 +2,11 @@
 //
 // Slopes are single numbers of f16: what they are off is nothing beside what they differ from step to step.
 
-fn put_rest(at: u32, i: u32, value: f32) {}
+fn put_residual(at: u32, i: u32, value: f32) {}
 
-fn put_rests(at: u32, value: vec4f) {}
+fn put_residuals(at: u32, value: vec4f) {}
 
-fn work_out(layer: Layer, tile: u32, lane: u32) {
+fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let n_words = layer.n_in / 4u;
     for (var row = 16u * subgroup; row < layer.n_in; row += 16u * n_subgroups) {
         var left: coop_mat16x16<f32, C>; // samples
@@ -21,11 +21,11 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
         coopStoreT(right, &wg_sums[row * STRIDE + 4u], STRIDE);
     }
     workgroupBarrier(); // The sums are there before they are read, and what went in was read before it is overwritten.
-    if layer.kept_row != NOT_KEPT {
+    if layer.stored_row != NOT_STORED {
         for (var item = lane; item < layer.n_in * PARTS; item += LANES) {
             let row = item / PARTS;
             let part = item % PARTS;
-            put_four(0u, row, part, finished(layer, tile, row, part, out_four(0u, row, part)));
+            put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
         }
         workgroupBarrier(); // The rows are there before the next layer reads them, and the sums were read before it overwrites them.
     }

@@ -21,7 +21,7 @@ fn block_and_window(group: u32, n_splats: u32, n_tiles: vec2u) -> BlockAndWindow
 }
 
 // Sets the bits of every lane's splat. Every lane must call it; the bits may be read when it returns.
-fn mark_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
+fn set_reached_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
     for (var i = lane; i < at.n_bins * WORDS; i += BLOCK) { atomicStore(&wg_reaching[i], 0u); }
     workgroupBarrier(); // All bits are zero before the first is set.
     let reached = bins_of(touched);
@@ -37,7 +37,7 @@ fn mark_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
 }
 
 // How many of the block's first `n` splats reach a bin of the window.
-fn n_marked(bin: u32, n: u32) -> u32 {
+fn n_reaching(bin: u32, n: u32) -> u32 {
     var sum = 0u;
     for (var word = 0u; word < WORDS; word++) {
         let n_bits = clamp(n, word * 32u, word * 32u + 32u) - word * 32u;

@@ -5,8 +5,8 @@
 var<workgroup> wg_camera: array<vec4f, 768>; // [256, 3]
 
 fn add_up_camera(lane: u32, block: u32, mine: CameraGradient) {
-    wg_camera[lane * 3u] = vec4f(mine.turn, mine.focal.x);
-    wg_camera[lane * 3u + 1u] = vec4f(mine.shift, mine.focal.y);
+    wg_camera[lane * 3u] = vec4f(mine.rotation, mine.focal.x);
+    wg_camera[lane * 3u + 1u] = vec4f(mine.translation, mine.focal.y);
     wg_camera[lane * 3u + 2u] = vec4f(mine.principal, 0.0, 0.0);
     workgroupBarrier(); // All have told.
     for (var stride = 128u; stride > 0u; stride /= 2u) {

@@ -54,8 +54,8 @@ fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: 
     var after = before;
     let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp2(-power));
     let next = before.transmittance * (1.0 - alpha);
-    let goes_on = next > Px(MIN_TRANSMITTANCE);
-    let adds = hit & goes_on;
+    let stays_live = next > Px(MIN_TRANSMITTANCE);
+    let adds = hit & stays_live;
     let weight = select(Px(0.0), alpha * before.transmittance, adds);
     after.red += weight * color.x;
     after.green += weight * color.y;
@@ -63,6 +63,6 @@ fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: 
     after.depth += weight * opacity_and_depth.y;
     after.transmittance = select(before.transmittance, next, adds);
     after.past_last = select(before.past_last, PxU(rank + 1u), adds);
-    after.live = before.live & (goes_on | !hit);
+    after.live = before.live & (stays_live | !hit);
     return after;
 }

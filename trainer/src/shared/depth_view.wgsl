@@ -1,6 +1,6 @@
 // depth_frame: one depth image, the color image that goes with it, and where both cameras were.
 
-struct DepthFrame {
+struct DepthView {
     depth_row_0: vec4f,       // depth_from_field, upper three rows
     depth_row_1: vec4f,
     depth_row_2: vec4f,
@@ -18,22 +18,22 @@ struct DepthFrame {
     color_size_px: vec2u,
 }
 
-fn depth_from_field(frame: DepthFrame, point: vec3f) -> vec3f {
+fn depth_from_field(depth_view: DepthView, point: vec3f) -> vec3f {
     let p = vec4f(point, 1.0);
-    return vec3f(dot(frame.depth_row_0, p), dot(frame.depth_row_1, p), dot(frame.depth_row_2, p));
+    return vec3f(dot(depth_view.depth_row_0, p), dot(depth_view.depth_row_1, p), dot(depth_view.depth_row_2, p));
 }
 
-fn field_from_depth(frame: DepthFrame, point: vec3f) -> vec3f {
+fn field_from_depth(depth_view: DepthView, point: vec3f) -> vec3f {
     let p = vec4f(point, 1.0);
-    return vec3f(dot(frame.field_row_0, p), dot(frame.field_row_1, p), dot(frame.field_row_2, p));
+    return vec3f(dot(depth_view.field_row_0, p), dot(depth_view.field_row_1, p), dot(depth_view.field_row_2, p));
 }
 
-fn color_from_field(frame: DepthFrame, point: vec3f) -> vec3f {
+fn color_from_field(depth_view: DepthView, point: vec3f) -> vec3f {
     let p = vec4f(point, 1.0);
-    return vec3f(dot(frame.color_row_0, p), dot(frame.color_row_1, p), dot(frame.color_row_2, p));
+    return vec3f(dot(depth_view.color_row_0, p), dot(depth_view.color_row_1, p), dot(depth_view.color_row_2, p));
 }
 
 // Point on the ray of a place in the depth image whose z is 1.
-fn ray_of(frame: DepthFrame, place_px: vec2f) -> vec3f {
-    return vec3f((place_px - frame.depth_principal_px) / frame.depth_focal_px, 1.0);
+fn ray_of(depth_view: DepthView, position_px: vec2f) -> vec3f {
+    return vec3f((position_px - depth_view.depth_principal_px) / depth_view.depth_focal_px, 1.0);
 }

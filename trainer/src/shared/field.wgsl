@@ -20,7 +20,7 @@ struct Field {
 
 const BLOCK_VOXELS = 512u;
 const NO_BLOCK = 0u;
-const BLOCK_WANTED = 0xffffffffu; // Taken note of where the pool was full.
+const BLOCK_REQUESTED = 0xffffffffu; // Taken note of where the pool was full.
 const WEIGHT_ONE = 256.0;
 const MAX_PROBES = 128u;
 const CHUNK_LIMIT = vec3i(1023, 1023, 511);

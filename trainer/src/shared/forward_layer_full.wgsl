@@ -1,6 +1,6 @@
 // forward_layer: one layer, from rows of a bank to rows of the other.
 
-fn work_out(layer: Layer, tile: u32, lane: u32) {
+fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
     let n_words = layer.n_in / 4u;
     for (var group = lane / PARTS; group < layer.n_out / 4u; group += LANES / PARTS) {
@@ -13,7 +13,7 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
             sums += x * w;
         }
         for (var j = 0u; j < 4u; j++) {
-            put_four(BANK - layer.from_bank, 4u * group + j, part, finished(layer, tile, 4u * group + j, part, sums[j]));
+            put_four(BANK - layer.from_bank, 4u * group + j, part, layer_output(layer, tile, 4u * group + j, part, sums[j]));
         }
     }
     workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.

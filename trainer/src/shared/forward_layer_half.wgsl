@@ -2,13 +2,13 @@
 //
 // What goes in and the weights are two numbers of f16 each, the second what the first leaves over: with 11 bits alone colors were noisy.
 
-var<workgroup> wg_rests: array<vec4<f16>, 640>;
+var<workgroup> wg_residuals: array<vec4<f16>, 640>;
 
-fn put_rest(at: u32, i: u32, value: f32) { wg_rests[at][i] = f16(clamp(value, -MOST_HALF, MOST_HALF)); }
+fn put_residual(at: u32, i: u32, value: f32) { wg_residuals[at][i] = f16(clamp(value, -MAX_HALF, MAX_HALF)); }
 
-fn put_rests(at: u32, value: vec4f) { wg_rests[at] = narrowed(value); }
+fn put_residuals(at: u32, value: vec4f) { wg_residuals[at] = narrowed(value); }
 
-fn work_out(layer: Layer, tile: u32, lane: u32) {
+fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let n_words = layer.n_in / 4u;
     for (var row = 16u * subgroup; row < layer.n_out; row += 16u * n_subgroups) {
         var left: coop_mat16x16<f32, C>; // samples
@@ -16,13 +16,13 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
         for (var k = 0u; k < layer.n_in; k += 16u) {
             let first = layer.first_weight + row * n_words + k / 4u;
             let w = coopLoadT<coop_mat16x16<f16, A>>(&weights[first], n_words);
-            let w_rest = coopLoadT<coop_mat16x16<f16, A>>(&weights[n_weight_words() + first], n_words);
+            let w_residual = coopLoadT<coop_mat16x16<f16, A>>(&weights[n_weight_words() + first], n_words);
             let x_left = coopLoadT<coop_mat16x16<f16, B>>(&wg_halves[k * HALF_STRIDE], HALF_STRIDE);
             let x_right = coopLoadT<coop_mat16x16<f16, B>>(&wg_halves[k * HALF_STRIDE + 4u], HALF_STRIDE);
-            left = coopMultiplyAdd(w, coopLoadT<coop_mat16x16<f16, B>>(&wg_rests[k * HALF_STRIDE], HALF_STRIDE), left);
-            right = coopMultiplyAdd(w, coopLoadT<coop_mat16x16<f16, B>>(&wg_rests[k * HALF_STRIDE + 4u], HALF_STRIDE), right);
-            left = coopMultiplyAdd(w_rest, x_left, left);
-            right = coopMultiplyAdd(w_rest, x_right, right);
+            left = coopMultiplyAdd(w, coopLoadT<coop_mat16x16<f16, B>>(&wg_residuals[k * HALF_STRIDE], HALF_STRIDE), left);
+            right = coopMultiplyAdd(w, coopLoadT<coop_mat16x16<f16, B>>(&wg_residuals[k * HALF_STRIDE + 4u], HALF_STRIDE), right);
+            left = coopMultiplyAdd(w_residual, x_left, left);
+            right = coopMultiplyAdd(w_residual, x_right, right);
             left = coopMultiplyAdd(w, x_left, left);
             right = coopMultiplyAdd(w, x_right, right);
         }
@@ -30,11 +30,11 @@ fn work_out(layer: Layer, tile: u32, lane: u32) {
         coopStoreT(right, &wg_sums[row * STRIDE + 4u], STRIDE);
     }
     workgroupBarrier(); // The sums are there before they are read, and what went in was read before it is overwritten.
-    if layer.kept_row != NOT_KEPT {
+    if layer.stored_row != NOT_STORED {
         for (var item = lane; item < layer.n_out * PARTS; item += LANES) {
             let row = item / PARTS;
             let part = item % PARTS;
-            put_four(0u, row, part, finished(layer, tile, row, part, out_four(0u, row, part)));
+            put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
         }
         workgroupBarrier(); // The rows are there before the next layer reads them, and the sums were read before it overwrites them.
     }

@@ -8,7 +8,7 @@ fn gradient_of(splat_ix: u32, n_touched: u32) -> Gradient {
     let begin = slot_begins[splat_ix];
     for (var slot = begin; slot < begin + n_touched; slot++) {
         let part = gradients[slot];
-        sum.place += part.place;
+        sum.position += part.position;
         sum.conic += part.conic;
         sum.color += part.color;
     }

@@ -7,11 +7,11 @@ fn slot_of(entry: u32, tile: Tile) -> u32 {
     return entries[entry].z + countOneBits(entries[entry].y & ((1u << tile.in_bin) - 1u));
 }
 
-fn tell(slot: u32, part: u32, value: f32) {
+fn write_gradient(slot: u32, part: u32, value: f32) {
     gradients[slot * N_PARTS_OF_GRADIENT + part] = value;
 }
 
 // What is hidden in its tile has nothing to tell, but its slot is read.
-fn tell_nothing(slot: u32, part: u32) {
+fn write_zero_gradient(slot: u32, part: u32) {
     gradients[slot * N_PARTS_OF_GRADIENT + part] = 0.0;
 }

@@ -7,8 +7,8 @@ fn slot_of(entry: u32, tile: Tile) -> u32 {
     return entries[entry].x;
 }
 
-fn tell(slot: u32, part: u32, value: f32) {
+fn write_gradient(slot: u32, part: u32, value: f32) {
     if value != 0.0 { atomicAdd(&gradients[slot * N_PARTS_OF_GRADIENT + part], value); }
 }
 
-fn tell_nothing(slot: u32, part: u32) {}
+fn write_zero_gradient(slot: u32, part: u32) {}

@@ -7,14 +7,14 @@ struct Growth {
     capacity: u32,        // stride between planes
     n_sh_rest: u32,       // planes of sh_rest that exist
     child_spread: f32,    // of a child's place, in standard deviations of its parent
-    least_opacity: f32,   // below it a splat is given a new place
+    min_opacity: f32,   // below it a splat is given a new place
     unused: f32,
 }
 
 const NO_PARENT = 0xffffffffu;
 
 // Whether a splat has died: hardly visible, or not a number.
-fn is_dead(mean: vec4f, shape: vec4f, least_opacity: f32) -> bool {
-    let alive = 1.0 / (1.0 + exp(-shape.w)) >= least_opacity && all(abs(mean.xyz) < vec3f(1e6)) && all(abs(shape.xyz) < vec3f(50.0));
+fn is_dead(mean: vec4f, shape: vec4f, min_opacity: f32) -> bool {
+    let alive = 1.0 / (1.0 + exp(-shape.w)) >= min_opacity && all(abs(mean.xyz) < vec3f(1e6)) && all(abs(shape.xyz) < vec3f(50.0));
     return !alive;
 }

@@ -2,6 +2,6 @@
 // how it is shifted in world, in units of the scene's radius. Its code: light and exposure, as the network of colors takes them. A term is
 // its value, Adam's two means, and the steps it took.
 
-const TERM_STRIDE = 9u;    // of an image
-const SHIFT = 3u;          // the first of the shift
-const CODE = 6u;           // the first of the code, which has three numbers at most
+const IMAGE_PARAM_STRIDE = 9u;    // of an image
+const TRANSLATION = 3u;          // the first of the shift
+const EMBEDDING = 6u;           // the first of the code, which has three numbers at most

@@ -13,7 +13,7 @@ struct Path {
     leave: f32,
     n_before: f32,         // steps before the inner cube
     n_inside: f32,
-    n_pieces: u32,
+    n_segments: u32,
 }
 
 // Steps, as a share of all to infinity, that lead so far away from the inner cube: each is the longer the further out it lies.
@@ -34,7 +34,7 @@ fn path_of(march: March, ray: Ray) -> Path {
     var n = path.n_before + path.n_inside + min(share_of(max(ray.end - path.leave, 0.0)) / march.step, 1.0 / march.step - 1.0);
     if ray.end < path.leave { n = path.n_before + (ray.end - path.enter) / march.step; }
     if ray.end < path.enter { n = path.n_before - share_of(path.enter - ray.end) / march.step; }
-    path.n_pieces = u32(clamp(ceil(n - ray.shift), 0.0, 1e6));
+    path.n_segments = u32(clamp(ceil(n - ray.jitter), 0.0, 1e6));
     return path;
 }
 
@@ -64,28 +64,28 @@ fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes:
 }
 
 // A piece of a ray in a cell that holds something; `end_ix` where there is none before that.
-struct Piece {
+struct RaySegment {
     ix: u32,
     begin: f32,
     end: f32,
 }
 
 // The first such piece from number `from_ix` on.
-fn next_piece(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> Piece {
+fn next_segment(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> RaySegment {
     let block_cells = block_cells_of(march.n_cells);
     let n_blocks = march.n_cells / block_cells;
     let n_words = march.n_cells * march.n_cells * march.n_cells / 32u;
     var ix = from_ix;
     while ix < end_ix {
-        let begin = distance_at(march, path, f32(ix) + ray.shift);
-        let end = distance_at(march, path, f32(ix + 1u) + ray.shift);
+        let begin = distance_at(march, path, f32(ix) + ray.jitter);
+        let end = distance_at(march, path, f32(ix + 1u) + ray.jitter);
         let middle = contract(ray.origin + 0.5 * (begin + end) * ray.direction);
         let cell = min(vec3u(middle * f32(march.n_cells)), vec3u(march.n_cells - 1u));
         let block = cell / block_cells;
         let block_is_empty = !bit_of(n_words, n_blocks, block);
-        if !block_is_empty && bit_of(0u, march.n_cells, cell) { return Piece(ix, begin, end); }
+        if !block_is_empty && bit_of(0u, march.n_cells, cell) { return RaySegment(ix, begin, end); }
         let at = ray.origin + begin * ray.direction;
         ix += n_empty_steps(march, at, ray.direction, select(cell, block, block_is_empty), select(march.n_cells, n_blocks, block_is_empty));
     }
-    return Piece(end_ix, 0.0, 0.0);
+    return RaySegment(end_ix, 0.0, 0.0);
 }

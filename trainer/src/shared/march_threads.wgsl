@@ -1,8 +1,8 @@
 // march_shares: the part of a ray that one of several threads walks. After `march`.
 
-const SHARES = 8u;
+const THREADS_PER_RAY = 8u;
 
-fn share_of_pieces(path: Path, share: u32) -> vec2u {
-    let n = (path.n_pieces + SHARES - 1u) / SHARES;
-    return min(vec2u(share, share + 1u) * n, vec2u(path.n_pieces));
+fn segments_of_thread(path: Path, share: u32) -> vec2u {
+    let n = (path.n_segments + THREADS_PER_RAY - 1u) / THREADS_PER_RAY;
+    return min(vec2u(share, share + 1u) * n, vec2u(path.n_segments));
 }

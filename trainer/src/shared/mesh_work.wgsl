@@ -1,14 +1,14 @@
 // mesh_work: which blocks get new triangles, and where these go.
 
 // Which of the listed blocks a dispatch does.
-struct MeshPiece {
+struct MeshBatch {
     first: u32,
-    n_most: u32,
+    max_blocks: u32,
 }
 
 // A block that was done.
-struct MeshPart {
-    place: array<i32, 3>,     // in blocks
+struct BlockMeshRange {
+    block_coord: array<i32, 3>,     // in blocks
     first_vertex: u32,
     n_vertices: u32,
     first_triangle: u32,

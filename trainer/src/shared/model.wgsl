@@ -8,8 +8,8 @@ struct Model {
 }
 
 // What rasterizing needs of one visible splat.
-struct Drawn {
-    place: vec4f,      // mean_px.xy, depth along z, opacity
+struct ProjectedSplat {
+    position: vec4f,      // mean_px.xy, depth along z, opacity
     conic: vec4f,      // A, B, C; w: reach = 2 ln(255 opacity)
     color: vec4f,      // linear in display space, not below 0; w unused
 }

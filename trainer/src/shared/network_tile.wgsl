@@ -13,13 +13,13 @@ override LANES: u32;               // of a workgroup
 const TILE = 32u;                  // samples of a workgroup
 const PARTS = 8u;                  // vec4 of a row
 const STRIDE = 9u;                 // from row to row: one vec4 of room, so that the same part of 8 rows comes from all memory banks
-const N_TOLD = 16u;                // that the first network tells: logarithm of the density, 15 that are handed on
-const N_HANDED_ON = 15u;
+const N_DENSITY_OUT = 16u;                // that the first network tells: logarithm of the density, 15 that are handed on
+const N_GEOMETRY_FEATURES = 15u;
 const N_HARMONICS = 16u;
 
 // A layer's weights, `[outputs, inputs]`, begin here in the vec4 of all weights, and slopes towards them in those.
-fn told_weights() -> u32 { return N_FEATURES * N_HIDDEN / 4u; }
-fn hidden_1_weights() -> u32 { return told_weights() + N_HIDDEN * N_TOLD / 4u; }
+fn density_out_weights() -> u32 { return N_FEATURES * N_HIDDEN / 4u; }
+fn hidden_1_weights() -> u32 { return density_out_weights() + N_HIDDEN * N_DENSITY_OUT / 4u; }
 fn hidden_2_weights() -> u32 { return hidden_1_weights() + N_COLOR_IN * N_HIDDEN / 4u; }
 fn color_weights() -> u32 { return hidden_2_weights() + N_HIDDEN * N_HIDDEN / 4u; }
 fn n_weight_words() -> u32 { return color_weights() + N_HIDDEN * N_COLORS / 4u; }
@@ -29,12 +29,12 @@ fn hidden_0_row() -> u32 { return N_FEATURES; }
 fn color_input_row() -> u32 { return N_FEATURES + N_HIDDEN; }
 fn hidden_1_row() -> u32 { return N_FEATURES + N_HIDDEN + N_COLOR_IN; }
 fn hidden_2_row() -> u32 { return N_FEATURES + 2u * N_HIDDEN + N_COLOR_IN; }
-fn n_held_rows() -> u32 { return N_FEATURES + 3u * N_HIDDEN + N_COLOR_IN; }
+fn n_activation_rows() -> u32 { return N_FEATURES + 3u * N_HIDDEN + N_COLOR_IN; }
 
 // Rows of slopes: towards the hidden layer of the first network, what it tells, both hidden layers of the second, colors, and features.
-fn v_told_row() -> u32 { return N_HIDDEN; }
-fn v_hidden_1_row() -> u32 { return N_HIDDEN + N_TOLD; }
-fn v_hidden_2_row() -> u32 { return 2u * N_HIDDEN + N_TOLD; }
-fn v_color_row() -> u32 { return 3u * N_HIDDEN + N_TOLD; }
-fn v_features_row() -> u32 { return 3u * N_HIDDEN + N_TOLD + N_COLORS; }
-fn n_slope_rows() -> u32 { return 3u * N_HIDDEN + N_TOLD + N_COLORS + N_FEATURES; }
+fn v_density_out_row() -> u32 { return N_HIDDEN; }
+fn v_hidden_1_row() -> u32 { return N_HIDDEN + N_DENSITY_OUT; }
+fn v_hidden_2_row() -> u32 { return 2u * N_HIDDEN + N_DENSITY_OUT; }
+fn v_color_row() -> u32 { return 3u * N_HIDDEN + N_DENSITY_OUT; }
+fn v_features_row() -> u32 { return 3u * N_HIDDEN + N_DENSITY_OUT + N_COLORS; }
+fn n_gradient_rows() -> u32 { return 3u * N_HIDDEN + N_DENSITY_OUT + N_COLORS + N_FEATURES; }

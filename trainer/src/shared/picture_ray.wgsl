@@ -8,7 +8,7 @@ struct PixelRay {
     range: vec2f,          // of depth
 }
 
-fn turned_to_world(v: vec3f) -> vec3f {
+fn rotated_to_world(v: vec3f) -> vec3f {
     return view.camera_row_0.xyz * v.x + view.camera_row_1.xyz * v.y + view.camera_row_2.xyz * v.z;
 }
 
@@ -23,13 +23,13 @@ fn within_box(range: vec2f, origin: vec3f, along: vec3f, low: vec3f, high: vec3f
 }
 
 fn ray_of_pixel(pixel: vec2u) -> PixelRay {
-    let place_px = vec2f(pixel) + 0.5;
-    let tau = place_px.y / f32(view.size_px.y) - 0.5;
-    let direction = vec3f((place_px - view.principal_px) / view.focal_px, 1.0);
+    let position_px = vec2f(pixel) + 0.5;
+    let tau = position_px.y / f32(view.size_px.y) - 0.5;
+    let direction = vec3f((position_px - view.principal_px) / view.focal_px, 1.0);
     // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
-    let turned = direction + tau * cross(view.shutter_angular.xyz, direction);
-    let origin = view.center_in_world.xyz + turned_to_world(tau * view.shutter_linear.xyz);
-    let along = turned_to_world(turned);
+    let rotated = direction + tau * cross(view.shutter_angular.xyz, direction);
+    let origin = view.center_in_world.xyz + rotated_to_world(tau * view.shutter_linear.xyz);
+    let along = rotated_to_world(rotated);
     var range = vec2f(view.shutter_linear.w, view.shutter_angular.w);
     if view.crop_min.w != 0.0 {
         let o = vec4f(origin, 1.0);

@@ -10,7 +10,7 @@ const MAX_ALPHA = 0.999;
 const MIN_TRANSMITTANCE = 1e-4;
 
 struct Projection {
-    seen: bool,
+    visible: bool,
     point: vec3f,             // in camera, after the shutter's shift
     tau: f32,                 // share of the readout, -0.5 to 0.5
     mean_px: vec2f,
@@ -44,11 +44,11 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     var out: Projection;
     let still = camera_from_world(view, mean);
     let row_px = view.focal_px.y * still.y / still.z + view.principal_px.y;
-    let turning = view.shutter_linear.xyz + cross(view.shutter_angular.xyz, still);
+    let apparent_motion = view.shutter_linear.xyz + cross(view.shutter_angular.xyz, still);
     out.tau = select(clamp(row_px / f32(view.size_px.y), 0.0, 1.0) - 0.5, 0.0, still.z < view.shutter_linear.w);
-    out.point = still - out.tau * turning;
+    out.point = still - out.tau * apparent_motion;
     let z = out.point.z;
-    out.seen = z >= view.shutter_linear.w && z <= view.shutter_angular.w;
+    out.visible = z >= view.shutter_linear.w && z <= view.shutter_angular.w;
     let inverse_z = 1.0 / max(z, 1e-6);
     out.mean_px = view.focal_px * out.point.xy * inverse_z + view.principal_px;
 
@@ -65,8 +65,8 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     out.camera_rotation = camera - out.tau * (cross_matrix(view.shutter_angular.xyz) * camera);
     out.rotation = rotation_of(rotation_wxyz);
     out.scale = exp(log_scale);
-    let turned = out.camera_rotation * out.rotation;
-    out.axes = mat3x3f(turned[0] * out.scale.x, turned[1] * out.scale.y, turned[2] * out.scale.z);
+    let rotated = out.camera_rotation * out.rotation;
+    out.axes = mat3x3f(rotated[0] * out.scale.x, rotated[1] * out.scale.y, rotated[2] * out.scale.z);
     let row_x = out.jacobian_x * out.axes;
     let row_y = out.jacobian_y * out.axes;
     let low_pass_px2 = view.center_in_world.w;

@@ -3,7 +3,7 @@
 struct Batch {
     n_rays: u32,
     n_samples: u32,
-    most_samples: u32,      // of a ray, so that all rays find room
+    max_samples: u32,      // of a ray, so that all rays find room
     unused: u32,
 }
 
@@ -14,12 +14,12 @@ struct Ray {
     n_samples: u32,
     begin: f32,             // along the ray: what lies before is not looked at
     end: f32,
-    code: u32,              // of the image it belongs to
+    embedding: u32,              // of the image it belongs to
     target_rgb: u32,        // rgba8; a = 0: not seen
     target_distance: f32,   // along the ray; 0: unknown
-    shift: f32,             // of its samples, in steps, 0 to 1
-    is_ended: u32,          // 1: of a picture, and nothing more can be seen along it
-    next_piece: u32,        // of a picture's ray: the first that was not looked for yet
+    jitter: f32,             // of its samples, in steps, 0 to 1
+    is_finished: u32,          // 1: of a picture, and nothing more can be seen along it
+    next_segment: u32,        // of a picture's ray: the first that was not looked for yet
 }
 
 // A sample's part of a ray.

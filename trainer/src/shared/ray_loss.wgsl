@@ -6,7 +6,7 @@ struct RayLoss {
     distance_clip: f32,       // differences of distance beyond this pull no more
     distortion: f32,
     near: f32,                // where the places of the spread begin
-    sight: f32,               // weight of light held back elsewhere than where the depth says
+    line_of_sight: f32,               // weight of light held back elsewhere than where the depth says
     band: f32,                // so close to a reading light may be held back; with the next, per distance
     band_frac: f32,
     unused: f32,

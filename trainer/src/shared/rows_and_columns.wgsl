@@ -45,7 +45,7 @@ struct Windows {
 // Adds a row to the windows; the sums down the one that ends with it.
 fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
     let before = *windows;
-    let done = before.in_1 + G[10] * row;
+    let finished = before.in_1 + G[10] * row;
     *windows = Windows(
         before.in_2 + G[9] * row,
         before.in_3 + G[8] * row,
@@ -58,7 +58,7 @@ fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
         before.in_10 + G[1] * row,
         G[0] * row,
     );
-    return done;
+    return finished;
 }
 
 // The sums along the row, around each of the lane's pixels; the Gaussian is the same both ways.

@@ -1,7 +1,7 @@
 // rows: what goes into layers and what comes out, in workgroup memory; the kernel is a function `work`.
 //
 // What goes in is of f16, what comes out of f32: there is one bank of each. A subgroup works on 16 rows of all samples. Whether what rounding
-// to f16 leaves over is kept is up to the layers (`put_rest`, `put_rests`).
+// to f16 leaves over is kept is up to the layers (`put_residual`, `put_residuals`).
 
 const BANK = 0u;
 const HALF_STRIDE = 10u;           // as STRIDE, in vec4 of f16
@@ -14,23 +14,23 @@ var<private> n_subgroups: u32;
 @compute @workgroup_size(LANES)
 fn main(
     @builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32,
-    @builtin(subgroup_id) subgroup_ix: u32, @builtin(num_subgroups) of_subgroups: u32,
+    @builtin(subgroup_id) subgroup_ix: u32, @builtin(num_subgroups) n_subgroups_total: u32,
 ) {
     subgroup = subgroup_ix;
-    n_subgroups = of_subgroups;
+    n_subgroups = n_subgroups_total;
     work(folded(wg, n_wgs), lane);
 }
 
 fn put(bank: u32, row: u32, sample: u32, value: f32) {
-    let high = f16(clamp(value, -MOST_HALF, MOST_HALF));
+    let high = f16(clamp(value, -MAX_HALF, MAX_HALF));
     wg_halves[row * HALF_STRIDE + sample / 4u][sample % 4u] = high;
-    put_rest(row * HALF_STRIDE + sample / 4u, sample % 4u, value - f32(high));
+    put_residual(row * HALF_STRIDE + sample / 4u, sample % 4u, value - f32(high));
 }
 
 fn put_four(bank: u32, row: u32, part: u32, value: vec4f) {
     let high = narrowed(value);
     wg_halves[row * HALF_STRIDE + part] = high;
-    put_rests(row * HALF_STRIDE + part, value - vec4f(high));
+    put_residuals(row * HALF_STRIDE + part, value - vec4f(high));
 }
 
 // What goes into a layer.

@@ -19,20 +19,20 @@ fn strip_px(strip: u32, lane: u32) -> vec2u {
 
 // Whether a splat may reach the two rows whose first has its pixel centres at `top`; exact but for a margin that
 // outweighs the rounding of c - b b / a.
-fn reaches_strip(place: vec4f, conic: vec4f, top: f32) -> bool {
-    let dy = max(max(top - place.y, place.y - (top + 1.0)), 0.0);
-    let least = (conic.z - conic.y * conic.y / conic.x - 1e-5 * conic.z) * dy * dy;
-    return least <= conic.w;
+fn reaches_strip(position: vec4f, conic: vec4f, top: f32) -> bool {
+    let dy = max(max(top - position.y, position.y - (top + 1.0)), 0.0);
+    let min_distance = (conic.z - conic.y * conic.y / conic.x - 1e-5 * conic.z) * dy * dy;
+    return min_distance <= conic.w;
 }
 
-fn or_of_lanes(mine: u32) -> u32 {
-    var all = mine | subgroupShuffleXor(mine, 1u);
+fn or_of_lanes(own: u32) -> u32 {
+    var all = own | subgroupShuffleXor(own, 1u);
     all |= subgroupShuffleXor(all, 2u);
     return all | subgroupShuffleXor(all, 4u);
 }
 
-fn max_of_lanes(mine: u32) -> u32 {
-    var all = max(mine, subgroupShuffleXor(mine, 1u));
+fn max_of_lanes(own: u32) -> u32 {
+    var all = max(own, subgroupShuffleXor(own, 1u));
     all = max(all, subgroupShuffleXor(all, 2u));
     return max(all, subgroupShuffleXor(all, 4u));
 }

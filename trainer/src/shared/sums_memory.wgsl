@@ -9,9 +9,9 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
 }
 
 // Writes the sum of what every lane tells.
-fn hand_in(lane: u32, slot: u32, mine: Gradient) {
+fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
     for (var k = 0u; k < 4u; k++) {
-        wg_lanes[lane * N_PARTS_OF_GRADIENT + k] = mine.place[k];
+        wg_lanes[lane * N_PARTS_OF_GRADIENT + k] = mine.position[k];
         wg_lanes[lane * N_PARTS_OF_GRADIENT + 4u + k] = mine.conic[k];
         wg_lanes[lane * N_PARTS_OF_GRADIENT + 8u + k] = mine.color[k];
     }
@@ -19,7 +19,7 @@ fn hand_in(lane: u32, slot: u32, mine: Gradient) {
     if lane < N_PARTS_OF_GRADIENT {
         var sum = 0.0;
         for (var k = 0u; k < LANES; k++) { sum += wg_lanes[k * N_PARTS_OF_GRADIENT + lane]; }
-        tell(slot, lane, sum);
+        write_gradient(slot, lane, sum);
     }
     workgroupBarrier(); // All are summed before the next splat is told of.
 }

@@ -20,8 +20,8 @@ fn sum_of_four(lane: u32, mine: vec4f) -> f32 {
 }
 
 // Writes the sum of what every lane tells.
-fn hand_in(lane: u32, slot: u32, mine: Gradient) {
-    var sum = vec3f(sum_of_four(lane, mine.place), sum_of_four(lane, mine.conic), sum_of_four(lane, mine.color));
+fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
+    var sum = vec3f(sum_of_four(lane, mine.position), sum_of_four(lane, mine.conic), sum_of_four(lane, mine.color));
     for (var stride = 4u; stride < min(SUBGROUP, LANES); stride *= 2u) { sum += subgroupShuffleXor(sum, stride); }
     let part = lane / 4u * 4u + 2u * (lane & 1u) + (lane & 2u) / 2u;
     var value = select(select(sum.x, sum.y, lane >= 4u), sum.z, lane >= 8u);
@@ -38,5 +38,5 @@ fn hand_in(lane: u32, slot: u32, mine: Gradient) {
         for (var subgroup = 0u; subgroup < LANES / SUBGROUP; subgroup++) { value += wg_parts[subgroup * N_PARTS_OF_GRADIENT + min(part, 11u)]; }
         workgroupBarrier(); // All have read before the next splat is told of.
     }
-    if lane < N_PARTS_OF_GRADIENT { tell(slot, part, value); }
+    if lane < N_PARTS_OF_GRADIENT { write_gradient(slot, part, value); }
 }

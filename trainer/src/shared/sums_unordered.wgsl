@@ -12,12 +12,12 @@ fn main(
 }
 
 // Adds the sum of what every lane of the subgroup tells; 16 of them at least.
-fn hand_in(lane: u32, slot: u32, mine: Gradient) {
-    let place = subgroupAdd(mine.place);
+fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
+    let position = subgroupAdd(mine.position);
     let conic = subgroupAdd(mine.conic);
     let color = subgroupAdd(mine.color);
     let part = lane % min(SUBGROUP, LANES);
-    let four = select(select(place, conic, part >= 4u), color, part >= 8u);
+    let four = select(select(position, conic, part >= 4u), color, part >= 8u);
     let two = select(four.xy, four.zw, (part & 2u) != 0u);
-    if part < N_PARTS_OF_GRADIENT { tell(slot, part, select(two.x, two.y, (part & 1u) != 0u)); }
+    if part < N_PARTS_OF_GRADIENT { write_gradient(slot, part, select(two.x, two.y, (part & 1u) != 0u)); }
 }

@@ -7,7 +7,7 @@ struct Supervision {
     dssim_frac: f32,          // share of D-SSIM in the color loss
     depth_weight: f32,        // per metre
     depth_clip_m: f32,        // past which a reading is ignored
-    varied_background: f32,   // above 0: up to this bright, and another one every step, so that leaving a place bare never pays
+    random_background: f32,   // above 0: up to this bright, and another one every step, so that leaving a place bare never pays
 }
 
 const WINDOW = 11u;
@@ -25,5 +25,5 @@ fn rgb_of(packed: u32) -> vec3f {
 }
 
 fn background_at(supervision: Supervision, step: u32) -> vec3f {
-    return supervision.background_srgb.rgb + supervision.varied_background * uniform3(vec3u(step, 1u, 2u));
+    return supervision.background_srgb.rgb + supervision.random_background * uniform3(vec3u(step, 1u, 2u));
 }

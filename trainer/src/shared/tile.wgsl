@@ -11,7 +11,7 @@
 @group(0) @binding(2) var<storage, read> bin_starts: array<u32>;
 @group(0) @binding(3) var<storage, read> tile_bits: array<u32>;
 @group(0) @binding(4) var<storage, read> entries: array<vec4u>; // splat, tiles, slot
-@group(0) @binding(5) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(5) var<storage, read> projected_splats: array<ProjectedSplat>;
 
 struct Tile {
     in_grid: bool,
@@ -24,11 +24,11 @@ struct Tile {
 fn tile_at(tile: u32) -> Tile {
     var out: Tile;
     out.in_grid = tile < view.n_tiles.x * view.n_tiles.y;
-    let place = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x);
-    out.corner = place * TILE_PX;
-    out.in_bin = place.y % BIN_TILES * BIN_TILES + place.x % BIN_TILES;
+    let position = vec2u(tile % view.n_tiles.x, tile / view.n_tiles.x);
+    out.corner = position * TILE_PX;
+    out.in_bin = position.y % BIN_TILES * BIN_TILES + position.x % BIN_TILES;
     if out.in_grid && status[FAILED] == 0u {
-        let bin = place.y / BIN_TILES * n_bins(view.n_tiles).x + place.x / BIN_TILES;
+        let bin = position.y / BIN_TILES * n_bins(view.n_tiles).x + position.x / BIN_TILES;
         out.begin = bin_starts[bin];
         out.end = bin_starts[bin + 1u];
     }

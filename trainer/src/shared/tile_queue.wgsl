@@ -10,7 +10,7 @@ const BATCH = LANES;
 const WORDS = 8u;          // of 32 entries, looked through at once
 var<workgroup> wg_words: array<u32, WORDS>;
 var<workgroup> wg_queue: array<u32, 256>;
-var<workgroup> wg_drawn: array<Drawn, BATCH>;  // conic: `halved`; color.w: bits of the rank in the bin's list
+var<workgroup> wg_splats: array<ProjectedSplat, BATCH>;  // conic: `halved`; color.w: bits of the rank in the bin's list
 var<workgroup> wg_quarters: array<u32, BATCH>; // that the splat may touch, see `quarters_touched`
 
 // Where in its quarter the lane's first pixel lies.
@@ -47,11 +47,11 @@ fn take_batch(lane: u32, batch: u32, n_queued: u32, tile: Tile) {
     workgroupBarrier(); // Nobody reads the last batch any more.
     if batch + lane < n_queued {
         let entry = wg_queue[batch + lane];
-        var splat = drawn[entries[entry].x];
+        var splat = projected_splats[entries[entry].x];
         splat.color.w = bitcast<f32>(entry - tile.begin);
-        wg_quarters[lane] = quarters_touched(Ellipse(splat.place.xy, splat.conic.xyz, splat.conic.w), vec2f(tile.corner));
+        wg_quarters[lane] = quarters_touched(Ellipse(splat.position.xy, splat.conic.xyz, splat.conic.w), vec2f(tile.corner));
         splat.conic = halved(splat.conic);
-        wg_drawn[lane] = splat;
+        wg_splats[lane] = splat;
     }
     workgroupBarrier(); // The batch is there.
 }

@@ -11,18 +11,18 @@ struct Digit {
 
 const LAST_KEY = 0xffffffffu; // Comes after all others, and counts in neither.
 
-struct Cut {
-    least: u32,
+struct KeyRange {
+    min_key: u32,
     shift: u32,
 }
 
-fn cut() -> Cut {
-    let least = ~status[digit.largest + 1u];
-    let span = max(status[digit.largest], least) - least;
-    return Cut(least, max(32u - countLeadingZeros(span), 16u) - 16u);
+fn key_range() -> KeyRange {
+    let min_key = ~status[digit.largest + 1u];
+    let span = max(status[digit.largest], min_key) - min_key;
+    return KeyRange(min_key, max(32u - countLeadingZeros(span), 16u) - 16u);
 }
 
-fn digit_of(key: u32, cut: Cut) -> u32 {
-    let short = select(min((key - cut.least) >> cut.shift, 0xfffeu), 0xffffu, key == LAST_KEY);
+fn digit_of(key: u32, key_range: KeyRange) -> u32 {
+    let short = select(min((key - key_range.min_key) >> key_range.shift, 0xfffeu), 0xffffu, key == LAST_KEY);
     return (short >> digit.shift) & 255u;
 }

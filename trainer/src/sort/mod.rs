@@ -56,7 +56,7 @@ pub struct RadixSort {
     count: Pipeline,
     scan: Pipeline,
     scatter: Pipeline,
-    scatter_places: Pipeline,
+    scatter_indices: Pipeline,
 }
 
 /// Memory of one sort: keys and values twice, and the digits' counts.
@@ -76,10 +76,10 @@ impl RadixSort {
     /// Compiles the form that suits the adapter.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
         let parallel = !gpu.is_software() && gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes >= 16);
-        Self::of_form(gpu, parallel)
+        Self::with_form(gpu, parallel)
     }
 
-    fn of_form(gpu: &Gpu, parallel: bool) -> Result<Self, Error> {
+    fn with_form(gpu: &Gpu, parallel: bool) -> Result<Self, Error> {
         let wide = gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes > 32);
         let [count, scan, scatter] = if parallel {
             [
@@ -95,7 +95,7 @@ impl RadixSort {
             count: Pipeline::new(gpu, count, &[])?,
             scan: Pipeline::new(gpu, scan, &[])?,
             scatter: Pipeline::new(gpu, scatter, &[])?,
-            scatter_places: Pipeline::new(gpu, scatter, &[("VALUES_ARE_PLACES", 1.0)])?,
+            scatter_indices: Pipeline::new(gpu, scatter, &[("VALUES_ARE_INDICES", 1.0)])?,
         })
     }
 
@@ -131,16 +131,17 @@ impl RadixSort {
             let keys = &buffers.keys[from];
             let base: [(&str, &Buffer); 3] = [("digit", digit), ("status", status), ("counts", &buffers.counts)];
             passes.dispatch(gpu, &self.count, n_groups.into(), &[base[0], base[1], base[2], ("keys", keys)]);
-            let scatter = if pass == 0 { &self.scatter_places } else { &self.scatter };
-            let mut scattered = vec![base[0], base[1], base[2], ("keys", keys), ("values", &buffers.values[from])];
-            scattered.extend([("keys_out", &buffers.keys[to]), ("values_out", &buffers.values[to])]);
+            let scatter = if pass == 0 { &self.scatter_indices } else { &self.scatter };
+            let mut scatter_buffers =
+                vec![base[0], base[1], base[2], ("keys", keys), ("values", &buffers.values[from])];
+            scatter_buffers.extend([("keys_out", &buffers.keys[to]), ("values_out", &buffers.values[to])]);
             if self.parallel {
                 passes.dispatch(gpu, &self.scan, 256, &[base[0], base[1], base[2], ("totals", &buffers.totals)]);
-                scattered.push(("totals", &buffers.totals));
+                scatter_buffers.push(("totals", &buffers.totals));
             } else {
                 passes.dispatch(gpu, &self.scan, 1, &base);
             }
-            passes.dispatch(gpu, scatter, n_groups.into(), &scattered);
+            passes.dispatch(gpu, scatter, n_groups.into(), &scatter_buffers);
         }
     }
 
@@ -154,16 +155,16 @@ mod tests {
     use super::*;
     use crate::gpu::GpuOptions;
 
-    fn sorted_on_gpu(keys: &[u32], ends: [u32; 2], parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
+    fn sorted_on_gpu(keys: &[u32], key_range: [u32; 2], parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         if parallel && gpu.optional().subgroup_lanes.is_none_or(|lanes| lanes < 16) {
             eprintln!("skipped: the adapter has no subgroups of 16 or more");
             return None;
         }
-        let sort = RadixSort::of_form(&gpu, parallel).unwrap();
+        let sort = RadixSort::with_form(&gpu, parallel).unwrap();
         let n = u32::try_from(keys.len()).unwrap();
         let buffers = sort.buffers(&gpu, "test", n, 0, 1).unwrap();
-        let status = gpu.storage_with("status", bytemuck::cast_slice(&[n, ends[1], !ends[0]])).unwrap();
+        let status = gpu.storage_with("status", bytemuck::cast_slice(&[n, key_range[1], !key_range[0]])).unwrap();
         gpu.write(&buffers.keys[0], 0, bytemuck::cast_slice(keys));
         let mut passes = Passes::default();
         sort.sort(&gpu, &mut passes, &buffers, &status);
@@ -172,29 +173,29 @@ mod tests {
     }
 
     fn check(n: u32, span: u32, parallel: bool) {
-        const LEAST: u32 = 1000;
+        const MIN_KEY: u32 = 1000;
         let key = |i: u32| match i % 7 {
             3 => u32::MAX,
-            _ => LEAST + i.wrapping_mul(2_654_435_761).rotate_left(7) % (span + 1),
+            _ => MIN_KEY + i.wrapping_mul(2_654_435_761).rotate_left(7) % (span + 1),
         };
         let keys: Vec<u32> = (0..n).map(key).collect();
-        let counted = || keys.iter().copied().filter(|key| *key != u32::MAX);
-        let ends = [counted().min().unwrap(), counted().max().unwrap()];
-        let shift = (32 - (ends[1] - ends[0]).leading_zeros()).saturating_sub(16);
+        let counted_keys = || keys.iter().copied().filter(|key| *key != u32::MAX);
+        let key_range = [counted_keys().min().unwrap(), counted_keys().max().unwrap()];
+        let shift = (32 - (key_range[1] - key_range[0]).leading_zeros()).saturating_sub(16);
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
         // Stable, as the GPU's must be.
         expected.sort_by_key(|(key, _)| match *key {
             u32::MAX => 0xffff,
-            key => ((key - ends[0]) >> shift).min(0xfffe),
+            key => ((key - key_range[0]) >> shift).min(0xfffe),
         });
-        if let Some((sorted, places)) = sorted_on_gpu(&keys, ends, parallel) {
-            let got: Vec<(u32, u32)> = sorted.into_iter().zip(places).collect();
+        if let Some((sorted, indices)) = sorted_on_gpu(&keys, key_range, parallel) {
+            let got: Vec<(u32, u32)> = sorted.into_iter().zip(indices).collect();
             assert_eq!(got, expected, "{n} keys over {span}, parallel {parallel}");
         }
     }
 
     #[test]
-    fn sorts_stably_at_awkward_sizes() {
+    fn sort_is_stable_at_block_boundaries() {
         for parallel in [false, true] {
             for n in [1, 255, 256, 257, 2049, 10_000] {
                 check(n, 50_000, parallel);

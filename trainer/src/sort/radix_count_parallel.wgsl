@@ -17,13 +17,13 @@ var<workgroup> wg_counts: array<atomic<u32>, 256>;
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let n = status[digit.counter];
-    let cut = cut();
+    let key_range = key_range();
     let block = folded(wg, n_wgs);
     atomicStore(&wg_counts[lane], 0u);
     workgroupBarrier(); // All are zero before anyone counts.
     for (var i = 0u; i < 8u; i++) {
         let at = block * 2048u + i * 256u + lane;
-        if at < n { atomicAdd(&wg_counts[digit_of(keys[at], cut)], 1u); } // Integer sums: the order does not matter.
+        if at < n { atomicAdd(&wg_counts[digit_of(keys[at], key_range)], 1u); } // Integer sums: the order does not matter.
     }
     workgroupBarrier(); // All have counted.
     if block < digit.max_blocks { counts[lane * digit.max_blocks + block] = atomicLoad(&wg_counts[lane]); }

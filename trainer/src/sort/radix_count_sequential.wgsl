@@ -18,11 +18,11 @@ override WG_SIZE = 8u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let n = status[digit.counter];
-    let cut = cut();
+    let key_range = key_range();
     let block = folded(wg, n_wgs) * WG_SIZE + lane;
     if block * 256u >= n || block >= digit.max_blocks { return; } // Allowed here: no barrier below.
     for (var i = 0u; i < 256u; i++) { counts[block * 256u + i] = 0u; }
     for (var at = block * 256u; at < min(block * 256u + 256u, n); at++) {
-        counts[block * 256u + digit_of(keys[at], cut)] += 1u;
+        counts[block * 256u + digit_of(keys[at], key_range)] += 1u;
     }
 }

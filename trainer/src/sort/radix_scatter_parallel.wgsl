@@ -19,7 +19,7 @@
 @group(0) @binding(6) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(7) var<storage, read_write> values_out: array<u32>;
 
-override VALUES_ARE_PLACES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
+override VALUES_ARE_INDICES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
 const ROUNDS = 8u;
 var<workgroup> wg_ranks: array<atomic<u32>, 4096>; // [subgroup, digit]; subgroups have 16 lanes or more
 
@@ -29,7 +29,7 @@ fn main(
     @builtin(subgroup_invocation_id) sub_lane: u32, @builtin(subgroup_size) sub_size: u32, @builtin(subgroup_id) subgroup: u32,
 ) {
     let n = status[digit.counter];
-    let cut = cut();
+    let key_range = key_range();
     let block = folded(wg, n_wgs);
     let n_subgroups = 256u / sub_size;
     for (var i = 0u; i < n_subgroups; i++) { atomicStore(&wg_ranks[i * 256u + lane], 0u); }
@@ -42,7 +42,7 @@ fn main(
         let at = first + round * sub_size;
         let valid = at < n;
         var key_digit = 0u;
-        if valid { key_digit = digit_of(keys[at], cut); }
+        if valid { key_digit = digit_of(keys[at], key_range); }
         let peers = peers_of(key_digit, valid);
         let leader = lowest_lane(peers);
         var base = 0u;
@@ -67,9 +67,9 @@ fn main(
     for (var round = 0u; round < ROUNDS; round++) {
         let at = first + round * sub_size;
         if at < n {
-            let place = atomicLoad(&wg_ranks[subgroup * 256u + digits[round]]) + ranks[round];
-            keys_out[place] = keys[at];
-            if VALUES_ARE_PLACES { values_out[place] = at; } else { values_out[place] = values[at]; }
+            let destination = atomicLoad(&wg_ranks[subgroup * 256u + digits[round]]) + ranks[round];
+            keys_out[destination] = keys[at];
+            if VALUES_ARE_INDICES { values_out[destination] = at; } else { values_out[destination] = values[at]; }
         }
     }
 }

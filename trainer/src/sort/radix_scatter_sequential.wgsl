@@ -15,20 +15,20 @@
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
 
-override VALUES_ARE_PLACES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
+override VALUES_ARE_INDICES: bool = false; // The first pass of sorting 0, 1, 2, ... by key.
 override WG_SIZE = 8u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let n = status[digit.counter];
-    let cut = cut();
+    let key_range = key_range();
     let block = folded(wg, n_wgs) * WG_SIZE + lane;
     if block * 256u >= n || block >= digit.max_blocks { return; } // Allowed here: no barrier below.
     for (var at = block * 256u; at < min(block * 256u + 256u, n); at++) {
         let key = keys[at];
-        let slot = block * 256u + digit_of(key, cut);
-        let place = counts[slot];
-        counts[slot] = place + 1u;
-        keys_out[place] = key;
-        if VALUES_ARE_PLACES { values_out[place] = at; } else { values_out[place] = values[at]; }
+        let slot = block * 256u + digit_of(key, key_range);
+        let destination = counts[slot];
+        counts[slot] = destination + 1u;
+        keys_out[destination] = key;
+        if VALUES_ARE_INDICES { values_out[destination] = at; } else { values_out[destination] = values[at]; }
     }
 }

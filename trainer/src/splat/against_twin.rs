@@ -2,8 +2,8 @@
 #![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::camera_terms::{CameraTerms, TermSet};
+use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use super::camera_params::{CameraParams, ParamSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
@@ -23,13 +23,13 @@ const GRADIENT_REL: f64 = 2e-3;
 /// Where a decision is this close to its threshold, f32 may decide otherwise.
 const MARGIN: f64 = 1e-4;
 
-pub(super) struct Bench {
+pub(super) struct KernelFixture {
     pub(super) gpu: Arc<Gpu>,
     pub(super) draw: DrawPipelines,
     pub(super) learn: LearnPipelines,
     pub(super) splats: SplatBuffers,
     pub(super) scratch: Scratch,
-    pub(super) frame: Frame,
+    pub(super) image_buffers: ImageBuffers,
     pub(super) status: Buffer,
     pub(super) view: Buffer,
     pub(super) size_px: [u32; 2],
@@ -65,7 +65,7 @@ fn camera_of(view: &View) -> Camera {
     }
 }
 
-impl Bench {
+impl KernelFixture {
     pub(super) fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
         let gpu = Gpu::open(options).unwrap();
         let draw = DrawPipelines::new(&gpu).unwrap();
@@ -80,12 +80,12 @@ impl Bench {
             ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(view.size_px) },
         )
         .unwrap();
-        let frame = Frame::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
+        let image_buffers = ImageBuffers::new(&gpu, view.size_px[0] * view.size_px[1], tiles, true).unwrap();
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
         let status = gpu.storage_with("status", bytemuck::cast_slice(&counters)).unwrap();
         let view_buffer = gpu.uniform_with("view", &camera_of(view).view());
-        Self { draw, learn, splats, scratch, frame, status, view: view_buffer, size_px: view.size_px, gpu }
+        Self { draw, learn, splats, scratch, image_buffers, status, view: view_buffer, size_px: view.size_px, gpu }
     }
 
     pub(super) fn passes(&self) -> ViewPasses<'_> {
@@ -93,7 +93,7 @@ impl Bench {
             gpu: &self.gpu,
             splats: &self.splats,
             scratch: &self.scratch,
-            frame: &self.frame,
+            image_buffers: &self.image_buffers,
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
@@ -105,23 +105,23 @@ impl Bench {
         self.passes().draw(&mut passes, &self.draw);
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
-        (self.gpu.read(&self.frame.image, n).unwrap(), self.gpu.read(&self.frame.depth, n).unwrap())
+        (self.gpu.read(&self.image_buffers.image, n).unwrap(), self.gpu.read(&self.image_buffers.depth, n).unwrap())
     }
 }
 
 /// Both forms: with the adapter's optional features, and without any.
-fn forms() -> [GpuOptions; 2] {
+fn adapter_options() -> [GpuOptions; 2] {
     [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
 }
 
-pub(super) fn clear_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
-    let clear: Vec<bool> =
+pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
+    let unambiguous: Vec<bool> =
         reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
     assert!(
-        clear.iter().filter(|clear| **clear).count() * 10 > clear.len() * 9,
+        unambiguous.iter().filter(|unambiguous| **unambiguous).count() * 10 > unambiguous.len() * 9,
         "the scene hides too much behind thresholds"
     );
-    clear
+    unambiguous
 }
 
 #[test]
@@ -129,13 +129,13 @@ fn pictures_match_the_twin() {
     for (view, seed) in [(scene::tilted_view(), 1), (scene::rolling_view(), 2)] {
         let splats = scene::small_scene(seed, 40);
         let expected = reference::render(&view, &splats);
-        let clear = clear_pixels(&view, &splats);
-        let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-        let (image, depth) = bench.render();
-        let mut wrong = Mismatches::default();
-        for pixel in (0..image.len()).filter(|pixel| clear[*pixel]) {
+        let unambiguous = unambiguous_pixels(&view, &splats);
+        let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+        let (image, depth) = fixture.render();
+        let mut mismatches = Mismatches::default();
+        for pixel in (0..image.len()).filter(|pixel| unambiguous[*pixel]) {
             for channel in 0..3 {
-                wrong.check(
+                mismatches.check(
                     format!("pixel {pixel} channel {channel}"),
                     image[pixel][channel].into(),
                     expected.rgb[pixel][channel],
@@ -143,16 +143,22 @@ fn pictures_match_the_twin() {
                     0.0,
                 );
             }
-            wrong.check(
+            mismatches.check(
                 format!("transmittance {pixel}"),
                 image[pixel][3].into(),
                 expected.transmittance[pixel],
                 COLOR_ABS,
                 0.0,
             );
-            wrong.check(format!("depth {pixel}"), depth[pixel].into(), expected.depth[pixel], 10.0 * COLOR_ABS, 0.0);
+            mismatches.check(
+                format!("depth {pixel}"),
+                depth[pixel].into(),
+                expected.depth[pixel],
+                10.0 * COLOR_ABS,
+                0.0,
+            );
         }
-        wrong.assert_none();
+        mismatches.assert_none();
     }
 }
 
@@ -163,24 +169,24 @@ pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_refere
     loss_reference::Target {
         size_px: size_px.map(|size| size as usize),
         rgb: image.rgb.iter().map(|rgb| rgb.map(byte)).collect(),
-        seen: (0..n).map(|pixel| pixel % 37 != 0).collect(),
+        visible: (0..n).map(|pixel| pixel % 37 != 0).collect(),
         depth_m: (0..n).map(|pixel| if pixel % 3 == 0 { 0.0 } else { 1.5 + 0.01 * (pixel % 50) as f64 }).collect(),
     }
 }
 
 #[test]
 fn gradients_match_the_twin() {
-    for options in forms() {
+    for options in adapter_options() {
         for (view, seed) in [(scene::tilted_view(), 3), (scene::rolling_view(), 4)] {
             let splats = scene::small_scene(seed, 40);
             let rendered = reference::render(&view, &splats);
-            let clear = clear_pixels(&view, &splats);
+            let unambiguous = unambiguous_pixels(&view, &splats);
             let mut target = target_of(&rendered, view.size_px);
-            for (seen, clear) in target.seen.iter_mut().zip(&clear) {
-                *seen &= clear;
+            for (visible, unambiguous) in target.visible.iter_mut().zip(&unambiguous) {
+                *visible &= unambiguous;
             }
-            for (depth_m, clear) in target.depth_m.iter_mut().zip(&clear) {
-                *depth_m = if *clear { f64::from(f32_of(*depth_m)) } else { 0.0 };
+            for (depth_m, unambiguous) in target.depth_m.iter_mut().zip(&unambiguous) {
+                *depth_m = if *unambiguous { f64::from(f32_of(*depth_m)) } else { 0.0 };
             }
             let weights = loss_reference::Weights {
                 dssim_frac: 0.25,
@@ -195,22 +201,22 @@ fn gradients_match_the_twin() {
 }
 
 /// What a picture is compared with, on the GPU.
-pub(super) struct Wanted {
+pub(super) struct TargetBuffers {
     image: Buffer,
     depth: Buffer,
     supervision: Buffer,
     gains: Buffer,
 }
 
-impl Wanted {
+impl TargetBuffers {
     pub(super) fn new(gpu: &Gpu, target: &loss_reference::Target, weights: &loss_reference::Weights) -> Self {
         let byte = |value: f64| u32::from(format!("{:.0}", value * 255.0).parse::<u8>().unwrap());
         let packed: Vec<u32> = target
             .rgb
             .iter()
-            .zip(&target.seen)
-            .map(|(rgb, seen)| {
-                byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *seen { 0xff00_0000 } else { 0 }
+            .zip(&target.visible)
+            .map(|(rgb, visible)| {
+                byte(rgb[0]) | byte(rgb[1]) << 8 | byte(rgb[2]) << 16 | if *visible { 0xff00_0000 } else { 0 }
             })
             .collect();
         let depth: Vec<f32> = target.depth_m.iter().map(|depth_m| f32_of(*depth_m)).collect();
@@ -221,7 +227,7 @@ impl Wanted {
             dssim_frac: f32_of(weights.dssim_frac),
             depth_weight: f32_of(weights.depth_per_m),
             depth_clip_m: f32_of(weights.depth_clip_m),
-            varied_background: 0.0,
+            random_background: 0.0,
         };
         let gains = gpu.storage_with("gains", bytemuck::cast_slice(&[1.0f32; 4])).unwrap();
         Self { image, depth, supervision: gpu.uniform_with("supervision", &supervision), gains }
@@ -247,47 +253,53 @@ fn check_gradients(
     upstream: &Upstream,
 ) {
     let expected = reference::render_backward(view, splats, upstream);
-    let bench = Bench::new(options, view, &arrays_of(splats));
-    let gpu = &bench.gpu;
-    let wanted = Wanted::new(gpu, target, weights);
+    let fixture = KernelFixture::new(options, view, &arrays_of(splats));
+    let gpu = &fixture.gpu;
+    let target_buffers = TargetBuffers::new(gpu, target, weights);
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
     let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
-    let view_passes = bench.passes();
-    view_passes.draw(&mut passes, &bench.draw);
-    view_passes.compare(&mut passes, &bench.learn, &wanted.target());
-    view_passes.backward(&mut passes, &bench.learn);
+    let view_passes = fixture.passes();
+    view_passes.draw(&mut passes, &fixture.draw);
+    view_passes.compare(&mut passes, &fixture.learn, &target_buffers.target());
+    view_passes.backward(&mut passes, &fixture.learn);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
-    let all =
-        TermSet { mount: true, delay: true, lens: true, image_poses: true, image_gains: true, ..TermSet::default() };
-    let mut cameras = CameraTerms::new(gpu, all).unwrap();
+    let all = ParamSet {
+        extrinsics: true,
+        time_offset: true,
+        lens: true,
+        image_poses: true,
+        image_gains: true,
+        ..ParamSet::default()
+    };
+    let mut cameras = CameraParams::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
     let refine = LearnPipelines::camera_gradients_only(gpu).unwrap();
     cameras.refine_with(&view_passes, &mut passes, &refine, &lens);
     passes.submit(gpu);
-    check_camera_gradients(&cameras.slopes(gpu), view, splats, &expected.view, upstream, weights.background_rgb);
+    check_camera_gradients(&cameras.param_values(gpu), view, splats, &expected.view, upstream, weights.background_rgb);
     let n = target.rgb.len();
-    let slopes: Vec<[f32; 4]> = gpu.read(&bench.frame.upstream, n).unwrap();
-    let mut wrong = Mismatches::default();
-    let largest = upstream.rgb.iter().flatten().fold(0.0f64, |most, value| most.max(value.abs()));
-    for (pixel, slope) in slopes.iter().enumerate() {
+    let param_values: Vec<[f32; 4]> = gpu.read(&fixture.image_buffers.upstream, n).unwrap();
+    let mut mismatches = Mismatches::default();
+    let largest = upstream.rgb.iter().flatten().fold(0.0f64, |max, value| max.max(value.abs()));
+    for (pixel, gradient) in param_values.iter().enumerate() {
         for channel in 0..3 {
-            wrong.check(
+            mismatches.check(
                 format!("upstream {pixel} {channel}"),
-                slope[channel].into(),
+                gradient[channel].into(),
                 upstream.rgb[pixel][channel],
                 1e-3 * largest,
                 1e-3,
             );
         }
-        wrong.check(format!("upstream depth {pixel}"), slope[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
+        mismatches.check(format!("upstream depth {pixel}"), gradient[3].into(), upstream.depth[pixel], 1e-9, 1e-5);
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 
-    let got = bench.splats.read(gpu).unwrap();
-    let mut wrong = Mismatches::default();
+    let got = fixture.splats.read(gpu).unwrap();
+    let mut mismatches = Mismatches::default();
     let largest = |of: fn(&Splat) -> Vec<f64>| {
-        expected.splats.iter().flat_map(of).fold(1e-12f64, |most, value| most.max(value.abs()))
+        expected.splats.iter().flat_map(of).fold(1e-12f64, |max, value| max.max(value.abs()))
     };
     let [mean, scale, rotation, opacity, sh] = [
         largest(|splat| splat.mean.to_vec()),
@@ -298,14 +310,14 @@ fn check_gradients(
     ];
     for (ix, splat) in expected.splats.iter().enumerate() {
         for axis in 0..3 {
-            wrong.check(
+            mismatches.check(
                 format!("mean {ix} {axis}"),
                 got.means[ix][axis].into(),
                 splat.mean[axis],
                 GRADIENT_REL * mean,
                 GRADIENT_REL,
             );
-            wrong.check(
+            mismatches.check(
                 format!("log_scale {ix} {axis}"),
                 got.log_scales[ix][axis].into(),
                 splat.log_scale[axis],
@@ -315,9 +327,9 @@ fn check_gradients(
         }
         for part in 0..4 {
             let (gpu, twin) = (got.rotations_wxyz[ix][part].into(), splat.rotation_wxyz[part]);
-            wrong.check(format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
+            mismatches.check(format!("rotation {ix} {part}"), gpu, twin, GRADIENT_REL * rotation, GRADIENT_REL);
         }
-        wrong.check(
+        mismatches.check(
             format!("opacity {ix}"),
             got.opacity_logits[ix].into(),
             splat.opacity_logit,
@@ -327,11 +339,17 @@ fn check_gradients(
         for (coeff, rgb) in splat.sh.iter().enumerate() {
             for channel in 0..3 {
                 let gpu = got.sh[16 * ix + coeff][channel].into();
-                wrong.check(format!("sh {ix} {coeff} {channel}"), gpu, rgb[channel], GRADIENT_REL * sh, GRADIENT_REL);
+                mismatches.check(
+                    format!("sh {ix} {coeff} {channel}"),
+                    gpu,
+                    rgb[channel],
+                    GRADIENT_REL * sh,
+                    GRADIENT_REL,
+                );
             }
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 fn moving_keyframe() -> Keyframe {
@@ -381,12 +399,12 @@ fn check_camera_gradients(
         };
         (dot(&high, 1.0) + dot(&low, -1.0)) / (2.0 * STEP)
     };
-    let [x, y, z, turn_x, turn_y, turn_z] = by_view.pose;
+    let [x, y, z, rotation_x, rotation_y, rotation_z] = by_view.pose;
     let twist = moving_keyframe().twist.unwrap();
-    let shift = Vector3::new(x, y, z);
-    let turn = Vector3::new(turn_x, turn_y, turn_z);
-    let mut expected = vec![turn_x, turn_y, turn_z, x, y, z];
-    expected.push(-twist.angular_rad_s.dot(&turn) - twist.linear_m_s.dot(&shift));
+    let translation = Vector3::new(x, y, z);
+    let rotation = Vector3::new(rotation_x, rotation_y, rotation_z);
+    let mut expected = vec![rotation_x, rotation_y, rotation_z, x, y, z];
+    expected.push(-twist.angular_rad_s.dot(&rotation) - twist.linear_m_s.dot(&translation));
     for axis in 0..2 {
         expected.push(along(&|view, step| view.focal_px[axis] *= step.exp()));
     }
@@ -398,61 +416,67 @@ fn check_camera_gradients(
         let picture = |pixel: usize| image.rgb[pixel][channel] + image.transmittance[pixel] * background_rgb[channel];
         expected.push((0..image.rgb.len()).map(|pixel| upstream.rgb[pixel][channel] * picture(pixel)).sum());
     }
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for group in [0..3, 3..6, 6..7, 7..9, 9..11, 11..14] {
-        let largest = expected[group.clone()].iter().fold(1e-12f64, |most, value| most.max(value.abs()));
-        for term in group {
-            wrong.check(format!("camera {term}"), got[term], expected[term], GRADIENT_REL * largest, GRADIENT_REL);
+        let largest = expected[group.clone()].iter().fold(1e-12f64, |max, value| max.max(value.abs()));
+        for param in group {
+            mismatches.check(
+                format!("camera {param}"),
+                got[param],
+                expected[param],
+                GRADIENT_REL * largest,
+                GRADIENT_REL,
+            );
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 /// A pile of opaque splats saturates its tile long before the list ends; what lies behind learns nothing from it, and in
 /// particular not what an earlier step left in its slots.
 #[test]
 fn hidden_splats_have_no_gradient() {
-    const N_SEEN: usize = 8;
+    const N_VISIBLE: usize = 8;
     let view = scene::tilted_view();
     let world_from_camera = view.camera_from_world.inverse();
     let size = view.size_px.map(|size| f64::from(size) / 2.0);
-    let mut pile = vec![scene::small_scene(6, 1)[0].clone(); 600];
-    for (ix, splat) in pile.iter_mut().enumerate() {
+    let mut stack = vec![scene::small_scene(6, 1)[0].clone(); 600];
+    for (ix, splat) in stack.iter_mut().enumerate() {
         let z = 2.0 + 0.001 * ix as f64;
         let on_axis = [0, 1].map(|axis| (size[axis] - view.principal_px[axis]) / view.focal_px[axis] * z);
         splat.mean = (world_from_camera * nalgebra::Point3::new(on_axis[0], on_axis[1], z)).coords.into();
         splat.log_scale = [3.0; 3]; // Far larger than the image.
         splat.opacity_logit = 8.0;
     }
-    for options in forms() {
-        let bench = Bench::new(&options, &view, &arrays_of(&pile));
-        let gpu = &bench.gpu;
+    for options in adapter_options() {
+        let fixture = KernelFixture::new(&options, &view, &arrays_of(&stack));
+        let gpu = &fixture.gpu;
         let n_pixels = (view.size_px[0] * view.size_px[1]) as usize;
-        gpu.write(&bench.scratch.gradients, 0, bytemuck::cast_slice(&vec![1.0f32; 12 << 14]));
-        gpu.write(&bench.frame.upstream, 0, bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]));
-        gpu.write(&bench.frame.rest, 0, bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]));
+        gpu.write(&fixture.scratch.gradients, 0, bytemuck::cast_slice(&vec![1.0f32; 12 << 14]));
+        gpu.write(&fixture.image_buffers.upstream, 0, bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]));
+        gpu.write(&fixture.image_buffers.pixel_totals, 0, bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]));
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
         let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
         let mut passes = Passes::default();
-        let view_passes = bench.passes();
-        view_passes.draw(&mut passes, &bench.draw);
-        view_passes.backward(&mut passes, &bench.learn);
+        let view_passes = fixture.passes();
+        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.backward(&mut passes, &fixture.learn);
         view_passes.update(&mut passes, &gradients_only, &rule, true);
         passes.submit(gpu);
-        let got = bench.splats.read(gpu).unwrap();
+        let got = fixture.splats.read(gpu).unwrap();
         let learns = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);
         assert!(learns(0), "the front splat is seen");
-        let late: Vec<usize> = (N_SEEN..pile.len()).filter(|ix| learns(*ix)).collect();
-        assert!(late.is_empty(), "hidden splats learn: {late:?}");
+        let hidden: Vec<usize> = (N_VISIBLE..stack.len()).filter(|ix| learns(*ix)).collect();
+        assert!(hidden.is_empty(), "hidden splats learn: {hidden:?}");
     }
 }
 
 #[test]
-fn hostile_splats_are_not_seen_and_do_no_harm() {
+fn invalid_splats_are_not_drawn() {
     let view = scene::tilted_view();
     let splats = scene::small_scene(5, 30);
-    let mut hostile = splats.clone();
-    let spoil: [fn(&mut Splat); 6] = [
+    let mut invalid_splats = splats.clone();
+    let corrupt: [fn(&mut Splat); 6] = [
         |splat| splat.mean[0] = f64::NAN,
         |splat| splat.mean[2] = f64::INFINITY,
         |splat| splat.rotation_wxyz = [0.0; 4],
@@ -460,28 +484,28 @@ fn hostile_splats_are_not_seen_and_do_no_harm() {
         |splat| splat.log_scale = [80.0; 3],
         |splat| splat.opacity_logit = f64::NAN,
     ];
-    for spoil in spoil {
+    for corrupt in corrupt {
         let mut splat = splats[0].clone();
-        spoil(&mut splat);
-        hostile.push(splat);
+        corrupt(&mut splat);
+        invalid_splats.push(splat);
     }
     let mut on_camera_plane = splats[1].clone();
     on_camera_plane.mean = view.camera_from_world.inverse().translation.vector.into();
-    hostile.push(on_camera_plane);
-    let (image, depth) = Bench::new(&GpuOptions::default(), &view, &arrays_of(&hostile)).render();
+    invalid_splats.push(on_camera_plane);
+    let (image, depth) = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&invalid_splats)).render();
     assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
 }
 
 /// Terms of nothing change nothing; the first step of Adam is as long as the rate, for the terms that are learned only.
 #[test]
-fn terms_of_cameras_start_at_nothing_and_step_by_their_rate() {
+fn camera_params_start_at_zero_and_step_by_their_rate() {
     let view = scene::tilted_view();
     let splats = scene::small_scene(5, 30);
-    for options in forms() {
-        let bench = Bench::new(&options, &view, &arrays_of(&splats));
-        let gpu = &bench.gpu;
-        let set = TermSet { lens: true, image_gains: true, ..TermSet::default() };
-        let mut cameras = CameraTerms::new(gpu, set).unwrap();
+    for options in adapter_options() {
+        let fixture = KernelFixture::new(&options, &view, &arrays_of(&splats));
+        let gpu = &fixture.gpu;
+        let set = ParamSet { lens: true, image_gains: true, ..ParamSet::default() };
+        let mut cameras = CameraParams::new(gpu, set).unwrap();
         let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
         cameras.write_rule(gpu, 0.0, 1.0);
         let target = target_of(&reference::render(&view, &splats), view.size_px);
@@ -491,26 +515,26 @@ fn terms_of_cameras_start_at_nothing_and_step_by_their_rate() {
             depth_clip_m: 1.0,
             background_rgb: [0.125, 0.25, 0.5],
         };
-        let wanted = Wanted::new(gpu, &target, &weights);
+        let target_buffers = TargetBuffers::new(gpu, &target, &weights);
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
         let mut passes = Passes::default();
-        cameras.correct(gpu, &mut passes, &bench.learn, &bench.view, &lens);
-        let view_passes = ViewPasses { view: &cameras.corrected, ..bench.passes() };
-        view_passes.draw(&mut passes, &bench.draw);
-        view_passes.compare(&mut passes, &bench.learn, &Target { gains: &cameras.gains, ..wanted.target() });
-        view_passes.backward(&mut passes, &bench.learn);
-        view_passes.update(&mut passes, &bench.learn.update_with_camera, &rule, true);
-        cameras.refine(&view_passes, &mut passes, &bench.learn, &lens);
+        cameras.correct(gpu, &mut passes, &fixture.learn, &fixture.view, &lens);
+        let view_passes = ViewPasses { view: &cameras.corrected, ..fixture.passes() };
+        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.compare(&mut passes, &fixture.learn, &Target { gains: &cameras.gains, ..target_buffers.target() });
+        view_passes.backward(&mut passes, &fixture.learn);
+        view_passes.update(&mut passes, &fixture.learn.update_with_camera, &rule, true);
+        cameras.refine(&view_passes, &mut passes, &fixture.learn, &lens);
         passes.submit(gpu);
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
         for (ix, (got, expected)) in corrected.iter().zip(bytemuck::cast_slice::<_, f32>(&[base])).enumerate() {
             assert!((got - expected).abs() <= 1e-6 * expected.abs().max(1.0), "word {ix}: {got} for {expected}");
         }
-        let steps: Vec<f64> = cameras.slopes(gpu);
-        for (term, step) in steps.iter().enumerate() {
-            let rate = if (7..11).contains(&term) { 1e-3 } else { 0.0 };
-            assert!((step.abs() - rate).abs() < 1e-5, "camera term {term} moved by {step}");
+        let steps: Vec<f64> = cameras.param_values(gpu);
+        for (param, step) in steps.iter().enumerate() {
+            let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };
+            assert!((step.abs() - rate).abs() < 1e-5, "camera term {param} moved by {step}");
         }
     }
 }

@@ -1,16 +1,16 @@
 //! Training with alignment: what it finds is in every camera, and stopping in between changes no bit.
 
-use super::learning::train;
-use super::{CameraChoice, SplatOptions, SplatTrainer, TermSet};
-use crate::align::tests::{Wrong, capture, left, wrong_mount};
+use super::training_tests::train;
+use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer};
+use crate::align::tests::{Miscalibration, capture, remaining, wrong_extrinsics};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::{Keyframe, Method, Split};
 use std::sync::Arc;
 
-fn started(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let options = SplatOptions {
-        align: CameraChoice::Try(vec![TermSet { mount: true, ..TermSet::default() }]),
-        cameras: CameraChoice::Try(vec![TermSet { image_poses: true, ..TermSet::default() }]),
+        align: CameraRefinement::Try(vec![ParamSet { extrinsics: true, ..ParamSet::default() }]),
+        cameras: CameraRefinement::Try(vec![ParamSet { image_poses: true, ..ParamSet::default() }]),
         max_splats: 2000,
         n_planned_steps: 120,
         coarse_steps: Some([1000, 1000]),
@@ -25,48 +25,48 @@ fn started(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
 }
 
 #[test]
-fn a_wrong_mount_is_corrected_in_every_camera_and_stopping_changes_nothing() {
-    const TAKEN_AT: u64 = 30;
+fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
+    const ALIGNMENT_STEP: u64 = 30;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let wrong = Wrong { mount: wrong_mount(), ..Wrong::nothing() };
-    let keyframes = capture(&wrong);
-    let mut whole = started(&gpu, &keyframes);
+    let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+    let keyframes = capture(&miscalibration);
+    let mut uninterrupted = new_trainer(&gpu, &keyframes);
     // The step at which the result is taken is step 0 of the new model.
-    train(&mut whole, TAKEN_AT);
-    assert!(whole.alignment().is_none());
-    whole.step(1).unwrap();
-    assert_eq!(whole.progress().step, 1, "training began anew");
-    let fix = whole.alignment().unwrap().fixes["wrist"].clone();
-    let (degrees, mm) = left(&fix, &wrong.mount);
+    train(&mut uninterrupted, ALIGNMENT_STEP);
+    assert!(uninterrupted.alignment().is_none());
+    uninterrupted.step(1).unwrap();
+    assert_eq!(uninterrupted.progress().step, 1, "training began anew");
+    let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
+    let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
     let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-    assert_eq!(whole.posed_lens(test).unwrap(), fix.apply(test));
-    train(&mut whole, 9);
+    assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
+    train(&mut uninterrupted, 9);
 
     // Stopped before the result was taken, and after.
-    let mut parts = started(&gpu, &keyframes);
-    train(&mut parts, 10);
+    let mut interrupted = new_trainer(&gpu, &keyframes);
+    train(&mut interrupted, 10);
     for n_steps in [21, 6, 3] {
-        let checkpoint = parts.checkpoint().unwrap().finish().unwrap();
-        let rest;
-        (parts, rest) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes).unwrap();
-        for keyframe in rest {
-            parts.push(keyframe).unwrap();
+        let checkpoint = interrupted.checkpoint().unwrap().finish().unwrap();
+        let untrained;
+        (interrupted, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes).unwrap();
+        for keyframe in untrained {
+            interrupted.push(keyframe).unwrap();
         }
-        let end = if n_steps == 21 { 1 } else { parts.progress().step + n_steps };
-        while parts.progress().step != end {
-            parts.step(1).unwrap();
+        let end = if n_steps == 21 { 1 } else { interrupted.progress().step + n_steps };
+        while interrupted.progress().step != end {
+            interrupted.step(1).unwrap();
         }
     }
-    assert_eq!(parts.progress().step, whole.progress().step);
-    assert_eq!(parts.alignment(), whole.alignment());
-    assert!(parts.arrays().unwrap() == whole.arrays().unwrap(), "splats differ");
+    assert_eq!(interrupted.progress().step, uninterrupted.progress().step);
+    assert_eq!(interrupted.alignment(), uninterrupted.alignment());
+    assert!(interrupted.arrays().unwrap() == uninterrupted.arrays().unwrap(), "splats differ");
 
     // The model on disk knows it, too.
     let folder = tempfile::tempdir().unwrap();
-    whole.save(folder.path()).unwrap();
-    let arrays = whole.arrays().unwrap();
+    uninterrupted.save(folder.path()).unwrap();
+    let arrays = uninterrupted.arrays().unwrap();
     let loaded = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &arrays).unwrap();
-    let mut loaded = loaded.with_fixes(folder.path()).unwrap();
-    assert_eq!(loaded.posed_lens(test).unwrap(), fix.apply(test));
+    let mut loaded = loaded.with_saved_corrections(folder.path()).unwrap();
+    assert_eq!(loaded.calibrated_camera(test).unwrap(), correction.apply(test));
 }

@@ -3,7 +3,7 @@
 use crate::Error;
 
 /// Colour coefficients a splat has at most (degree 3).
-const MOST_COEFFICIENTS: usize = 16;
+const MAX_COEFFICIENTS: usize = 16;
 
 /// A cloud of splats in the world frame: raw optimised values, one entry a splat.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -25,7 +25,7 @@ pub struct SplatArrays {
 impl SplatArrays {
     /// Refuses arrays of different lengths, degrees above 3, values that are not finite and rotations of length zero.
     pub fn checked(self) -> Result<Self, Error> {
-        if self.n_coefficients() > MOST_COEFFICIENTS {
+        if self.n_coefficients() > MAX_COEFFICIENTS {
             return Err(Error::SplatArrays(format!("colour degree {}, at most 3", self.sh_degree)));
         }
         self.check_lengths()?;
@@ -97,25 +97,25 @@ mod tests {
     }
 
     /// What the check says about two splats changed so.
-    fn complaint(change: impl FnOnce(&mut SplatArrays)) -> String {
+    fn error_after(change: impl FnOnce(&mut SplatArrays)) -> String {
         let mut splats = two_splats();
         change(&mut splats);
         splats.checked().unwrap_err().to_string()
     }
 
     #[test]
-    fn good_arrays_pass_unchanged() {
+    fn valid_arrays_pass_unchanged() {
         assert_eq!(two_splats().checked().unwrap(), two_splats());
         assert_eq!(SplatArrays::default().checked().unwrap().n_splats(), 0);
     }
 
     #[test]
-    fn each_wrong_array_is_named() {
-        assert_eq!(complaint(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
-        assert_eq!(complaint(|s| s.sh.truncate(5)), "splats: 5 colour coefficients for 2 means, expected 8");
-        assert_eq!(complaint(|s| s.sh_degree = 4), "splats: colour degree 4, at most 3");
-        assert_eq!(complaint(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
-        assert_eq!(complaint(|s| s.sh[4][0] = f32::INFINITY), "splats: colour of splat 1 is not finite");
-        assert_eq!(complaint(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
+    fn each_invalid_array_is_named() {
+        assert_eq!(error_after(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
+        assert_eq!(error_after(|s| s.sh.truncate(5)), "splats: 5 colour coefficients for 2 means, expected 8");
+        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: colour degree 4, at most 3");
+        assert_eq!(error_after(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
+        assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: colour of splat 1 is not finite");
+        assert_eq!(error_after(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
     }
 }

@@ -22,18 +22,18 @@ var<workgroup> wg_past_last: atomic<u32>;
 var<workgroup> wg_past: u32;
 var<workgroup> wg_slots: array<u32, BATCH>;
 
-fn pass_over(pixels: ptr<function, Pixels>, sum: ptr<function, Gradient>, splat: Drawn, dx: Px, dy: f32) {
+fn pass_over(pixels: ptr<function, Pixels>, sum: ptr<function, Gradient>, splat: ProjectedSplat, dx: Px, dy: f32) {
     let power = power_at(splat.conic, dx, dy);
     let hit = (PxU(bitcast<u32>(splat.color.w)) < (*pixels).last) & within_reach(splat.conic, power);
     if any(hit) {
         let part = passed(pixels, hit, power, dx, dy, splat);
-        (*sum).place += part.place;
+        (*sum).position += part.position;
         (*sum).conic += part.conic;
         (*sum).color += part.color;
     }
 }
 
-fn most_of(last: PxU) -> u32 {
+fn max_last(last: PxU) -> u32 {
     return max(pick_u(last, 0u), pick_u(last, 1u));
 }
 
@@ -51,7 +51,7 @@ fn backward(tile_ix: u32, lane: u32) {
     var b = pixels_at(tile, first + vec2u(8u, 0u));
     var c = pixels_at(tile, first + vec2u(0u, 8u));
     var d = pixels_at(tile, first + vec2u(8u, 8u));
-    atomicMax(&wg_past_last, max(max(most_of(a.last), most_of(b.last)), max(most_of(c.last), most_of(d.last))));
+    atomicMax(&wg_past_last, max(max(max_last(a.last), max_last(b.last)), max(max_last(c.last), max_last(d.last))));
     workgroupBarrier(); // All have told their last.
     if lane == 0u { wg_past = atomicLoad(&wg_past_last); }
     let past_last = workgroupUniformLoad(&wg_past);
@@ -62,24 +62,24 @@ fn backward(tile_ix: u32, lane: u32) {
             if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile); }
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
-            if bitcast<u32>(wg_drawn[0].color.w) >= past_last {
+            if bitcast<u32>(wg_splats[0].color.w) >= past_last {
                 // All of them are hidden in this tile.
                 for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
-                    tell_nothing(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT);
+                    write_zero_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT);
                 }
                 continue;
             }
             for (var i = 0u; i < n; i++) {
-                let splat = wg_drawn[i];
+                let splat = wg_splats[i];
                 let quarters = wg_quarters[i];
-                let dx = splat.place.x - center_x;
-                let dy = splat.place.y - center_y;
+                let dx = splat.position.x - center_x;
+                let dy = splat.position.y - center_y;
                 var sum: Gradient;
                 if (quarters & 1u) != 0u { pass_over(&a, &sum, splat, dx, dy); }
                 if (quarters & 2u) != 0u { pass_over(&b, &sum, splat, dx - 8.0, dy); }
                 if (quarters & 4u) != 0u { pass_over(&c, &sum, splat, dx, dy - 8.0); }
                 if (quarters & 8u) != 0u { pass_over(&d, &sum, splat, dx - 8.0, dy - 8.0); }
-                hand_in(lane, wg_slots[i], finished(sum, splat.conic));
+                write_gradient_sum(lane, wg_slots[i], finished(sum, splat.conic));
             }
         }
     }

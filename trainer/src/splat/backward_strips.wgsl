@@ -16,30 +16,30 @@
 
 const BATCH = 32u;
 // What lies around the splats at hand, between two batches.
-struct Between {
+struct StripState {
     transmittance: Px,
     behind: Px,
 }
-var<workgroup> wg_between: array<Between, 64>; // [N_STRIPS, LANES]
+var<workgroup> wg_strip_states: array<StripState, 64>; // [N_STRIPS, LANES]
 
 // Eight of the batch's splats, one a lane, and the sum of their gradients so far.
 struct Owned {
     entry: u32,        // past the list where the lane has none
-    splat: Drawn,
+    splat: ProjectedSplat,
     half: vec4f,       // its conic, `halved`
     sum: Gradient,     // still before `finished`
 }
 
 fn owned_splat(at: u32, n_queued: u32) -> Owned {
-    var own: Owned;
-    own.entry = 0xffffffffu;
-    own.splat.conic.w = -1.0; // Reaches nothing.
+    var owned: Owned;
+    owned.entry = 0xffffffffu;
+    owned.splat.conic.w = -1.0; // Reaches nothing.
     if at < n_queued {
-        own.entry = wg_queue[at];
-        own.splat = drawn[entries[own.entry].x];
-        own.half = halved(own.splat.conic);
+        owned.entry = wg_queue[at];
+        owned.splat = projected_splats[entries[owned.entry].x];
+        owned.half = halved(owned.splat.conic);
     }
-    return own;
+    return owned;
 }
 
 // The lane's pixels of a strip.
@@ -52,52 +52,52 @@ struct Strip {
 }
 
 // Lets eight splats pass the strip's pixels, in order.
-fn pass_strip(lane: u32, own: ptr<function, Owned>, strip: Strip, pixels: ptr<function, Pixels>) {
-    let splat = (*own).splat;
-    let rank = (*own).entry - strip.begin;
-    let reaches = rank < strip.past_last && splat.conic.w >= 0.0 && reaches_strip(splat.place, splat.conic, strip.top);
+fn pass_strip(lane: u32, owned: ptr<function, Owned>, strip: Strip, pixels: ptr<function, Pixels>) {
+    let splat = (*owned).splat;
+    let rank = (*owned).entry - strip.begin;
+    let reaches = rank < strip.past_last && splat.conic.w >= 0.0 && reaches_strip(splat.position, splat.conic, strip.top);
     var reaching = or_of_lanes(select(0u, 1u << lane, reaches));
     loop {
         let some = reaching != 0u; // The loop's body runs at least once.
         let i = firstTrailingBit(reaching) & 7u;
         reaching &= reaching - 1u;
-        let passing = Drawn(subgroupShuffle(splat.place, i), subgroupShuffle((*own).half, i), subgroupShuffle(splat.color, i));
-        let dx = passing.place.x - strip.center_x;
-        let dy = passing.place.y - strip.center_y;
+        let passing = ProjectedSplat(subgroupShuffle(splat.position, i), subgroupShuffle((*owned).half, i), subgroupShuffle(splat.color, i));
+        let dx = passing.position.x - strip.center_x;
+        let dy = passing.position.y - strip.center_y;
         let power = power_at(passing.conic, dx, dy);
         let hit = (PxU(subgroupShuffle(rank, i)) < (*pixels).last) & within_reach(passing.conic, power) & PxB(some);
         let part = passed(pixels, hit, power, dx, dy, passing);
-        let mine = select(0.0, 1.0, some && lane == i);
-        (*own).sum.place += mine * sum_of_lanes(part.place);
-        (*own).sum.conic += mine * sum_of_lanes(part.conic);
-        (*own).sum.color += mine * sum_of_lanes(part.color);
+        let is_owner = select(0.0, 1.0, some && lane == i);
+        (*owned).sum.position += is_owner * sum_of_lanes(part.position);
+        (*owned).sum.conic += is_owner * sum_of_lanes(part.conic);
+        (*owned).sum.color += is_owner * sum_of_lanes(part.color);
         continuing {
             break if reaching == 0u;
         }
     }
 }
 
-fn hand_in(own: Owned, tile: Tile) {
-    if own.entry == 0xffffffffu { return; }
-    let sum = finished(own.sum, own.half);
-    let slot = slot_of(own.entry, tile);
+fn write_gradient_sum(owned: Owned, tile: Tile) {
+    if owned.entry == 0xffffffffu { return; }
+    let sum = finished(owned.sum, owned.half);
+    let slot = slot_of(owned.entry, tile);
     for (var k = 0u; k < 4u; k++) {
-        tell(slot, k, sum.place[k]);
-        tell(slot, 4u + k, sum.conic[k]);
-        tell(slot, 8u + k, sum.color[k]);
+        write_gradient(slot, k, sum.position[k]);
+        write_gradient(slot, 4u + k, sum.conic[k]);
+        write_gradient(slot, 8u + k, sum.color[k]);
     }
 }
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(subgroup_invocation_id) lane: u32) {
     let tile = tile_at(folded(wg, n_wgs));
-    var most_of_tile = 0u;
+    var max_of_tile = 0u;
     for (var strip = 0u; strip < N_STRIPS; strip++) {
         let pixels = pixels_at(tile, tile.corner + strip_px(strip, lane));
-        most_of_tile = max(most_of_tile, max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w)));
-        wg_between[strip * LANES + lane] = Between(pixels.transmittance, pixels.behind);
+        max_of_tile = max(max_of_tile, max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w)));
+        wg_strip_states[strip * LANES + lane] = StripState(pixels.transmittance, pixels.behind);
     }
-    let past_last = max_of_lanes(most_of_tile);
+    let past_last = max_of_lanes(max_of_tile);
     var next = tile.begin / 32u;
     while next * 32u < tile.end {
         let queued = queue_entries(lane, next, tile);
@@ -112,22 +112,22 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             for (var strip_ix = 0u; strip_ix < N_STRIPS && reached; strip_ix++) {
                 let first = tile.corner + strip_px(strip_ix, lane);
                 var pixels = pixels_at(tile, first);
-                let between = wg_between[strip_ix * LANES + lane];
-                pixels.transmittance = between.transmittance;
-                pixels.behind = between.behind;
-                let most = max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w));
+                let strip_state = wg_strip_states[strip_ix * LANES + lane];
+                pixels.transmittance = strip_state.transmittance;
+                pixels.behind = strip_state.behind;
+                let max_of_strip = max(max(pixels.last.x, pixels.last.y), max(pixels.last.z, pixels.last.w));
                 let top = f32(tile.corner.y + strip_ix * 2u) + 0.5;
-                let strip = Strip(f32(first.x) + 0.5 + RAMP, f32(first.y) + 0.5, top, tile.begin, max_of_lanes(most));
+                let strip = Strip(f32(first.x) + 0.5 + RAMP, f32(first.y) + 0.5, top, tile.begin, max_of_lanes(max_of_strip));
                 pass_strip(lane, &a, strip, &pixels);
                 pass_strip(lane, &b, strip, &pixels);
                 pass_strip(lane, &c, strip, &pixels);
                 pass_strip(lane, &d, strip, &pixels);
-                wg_between[strip_ix * LANES + lane] = Between(pixels.transmittance, pixels.behind);
+                wg_strip_states[strip_ix * LANES + lane] = StripState(pixels.transmittance, pixels.behind);
             }
-            hand_in(a, tile);
-            hand_in(b, tile);
-            hand_in(c, tile);
-            hand_in(d, tile);
+            write_gradient_sum(a, tile);
+            write_gradient_sum(b, tile);
+            write_gradient_sum(c, tile);
+            write_gradient_sum(d, tile);
         }
     }
 }

@@ -4,7 +4,7 @@
 //! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
+use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
@@ -21,15 +21,15 @@ const RATE: f32 = 1e-5;
 #[derive(Clone, Debug)]
 pub struct KernelFigures {
     /// Intersections of splats and tiles.
-    pub n_isect: u64,
+    pub n_intersections: u64,
     /// GPU time of a picture from the first pass to the last, milliseconds, median; wall time where there are no timestamps.
     pub render_millis: f64,
     /// GPU time of a step that updates every splat, milliseconds, median.
     pub step_millis: f64,
     /// Likewise of one that updates only the splats it sees.
-    pub step_touched_millis: f64,
+    pub step_visible_millis: f64,
     /// Splats it sees.
-    pub n_touched: u64,
+    pub n_visible: u64,
     /// Likewise of one that updates every splat, but whose gradients meet in any order; `None` where the adapter cannot.
     pub step_unordered_millis: Option<f64>,
     /// Wall time of a picture, mean of a row of them back to back, milliseconds.
@@ -72,7 +72,7 @@ pub struct Repeats {
     /// With timestamps.
     pub n_timed: usize,
     /// Back to back for the wall clock.
-    pub n_row: usize,
+    pub n_consecutive: usize,
 }
 
 struct KernelBench {
@@ -81,7 +81,7 @@ struct KernelBench {
     learn: LearnPipelines,
     splats: SplatBuffers,
     scratch: Scratch,
-    frame: Frame,
+    image_buffers: ImageBuffers,
     status: Buffer,
     view: Buffer,
     image: Buffer,
@@ -89,7 +89,7 @@ struct KernelBench {
     supervision: Buffer,
     gains: Buffer,
     rule: Buffer,
-    rule_touched: Buffer,
+    rule_visible: Buffer,
     unordered: Option<Unordered>,
     size_px: [u32; 2],
 }
@@ -110,28 +110,28 @@ pub fn time_kernels(
     repeats: Repeats,
 ) -> Result<KernelFigures, Error> {
     let mut bench = KernelBench::new(gpu.clone(), cloud, size_px, eye)?;
-    bench.fit()?;
+    bench.size_buffers()?;
     let mut passes = Passes::default();
     let mean_rgb = bench.mean_rgb(&mut passes)?;
-    let n_isect = u64::from(bench.counters()?[status::NEED_SLOTS]);
-    let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_picture)?;
-    let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::list_step)?;
-    bench.list_step(&mut passes);
+    let n_intersections = u64::from(bench.counters()?[status::NEED_SLOTS]);
+    let (render_millis, render_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_picture)?;
+    let (step_millis, step_wall_millis) = bench.time(&mut passes, repeats, KernelBench::record_step)?;
+    bench.record_step(&mut passes);
     let timings = passes.submit_timed(gpu)?;
     let peak_bytes = gpu.peak_bytes();
-    let (step_touched_millis, _) = bench.time(&mut passes, repeats, KernelBench::list_step_touched)?;
-    let n_touched = bench.n_touched()?;
+    let (step_visible_millis, _) = bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
+    let n_visible = bench.n_visible()?;
     bench.unordered = bench.new_unordered(&[])?;
     let step_unordered_millis = match &bench.unordered {
-        Some(_) => Some(bench.time(&mut passes, repeats, KernelBench::list_step_unordered)?.0),
+        Some(_) => Some(bench.time(&mut passes, repeats, KernelBench::record_step_unordered)?.0),
         None => None,
     };
     Ok(KernelFigures {
-        n_isect,
+        n_intersections,
         render_millis,
         step_millis,
-        step_touched_millis,
-        n_touched,
+        step_visible_millis,
+        n_visible,
         step_unordered_millis,
         render_wall_millis,
         step_wall_millis,
@@ -166,12 +166,12 @@ impl KernelBench {
             .map(|pixel| pixel.wrapping_mul(2_654_435_761).rotate_left(11).wrapping_mul(0x85eb_ca6b) | 0xff00_0000)
             .collect();
         let tiles = n_tiles(size_px);
-        let first_guess = ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(size_px) };
+        let initial_size = ScratchSize { n_splats, n_entries: 1 << 14, n_slots: 1 << 14, n_bins: n_bins(size_px) };
         let mut counters = [0u32; status::LEN];
         counters[status::N_SPLATS as usize] = n_splats;
         Ok(Self {
-            scratch: Scratch::new(&gpu, &draw, first_guess)?,
-            frame: Frame::new(&gpu, n_pixels, tiles, true)?,
+            scratch: Scratch::new(&gpu, &draw, initial_size)?,
+            image_buffers: ImageBuffers::new(&gpu, n_pixels, tiles, true)?,
             status: gpu.storage_with("bench.status", bytemuck::cast_slice(&counters))?,
             view: gpu.uniform_with("bench.view", &camera.view()),
             image: gpu.storage_with("bench.target", bytemuck::cast_slice(&noise))?,
@@ -179,7 +179,7 @@ impl KernelBench {
             supervision: gpu.uniform_with("bench.supervision", &<Supervision as bytemuck::Zeroable>::zeroed()),
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
-            rule_touched: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
+            rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
             unordered: None,
             draw,
             learn,
@@ -190,17 +190,17 @@ impl KernelBench {
     }
 
     /// Finds how large the intersection buffers must be.
-    fn fit(&mut self) -> Result<(), Error> {
+    fn size_buffers(&mut self) -> Result<(), Error> {
         for _ in 0..2 {
             let mut passes = Passes::default();
             self.view_passes().draw(&mut passes, &self.draw);
             passes.submit(&self.gpu);
             let counters = self.counters()?;
-            let with_room = |need: u32| need + need / 16 + 64;
+            let with_headroom = |need: u32| need + need / 16 + 64;
             let size = ScratchSize {
                 n_splats: self.splats.n_splats,
-                n_entries: with_room(counters[status::NEED_ENTRIES]),
-                n_slots: with_room(counters[status::NEED_SLOTS]),
+                n_entries: with_headroom(counters[status::NEED_ENTRIES]),
+                n_slots: with_headroom(counters[status::NEED_SLOTS]),
                 n_bins: n_bins(self.size_px),
             };
             drop(passes);
@@ -217,41 +217,41 @@ impl KernelBench {
             gpu: &self.gpu,
             splats: &self.splats,
             scratch: &self.scratch,
-            frame: &self.frame,
+            image_buffers: &self.image_buffers,
             status: &self.status,
             view: &self.view,
             size_px: self.size_px,
         }
     }
 
-    fn list_picture(&self, passes: &mut Passes) {
+    fn record_picture(&self, passes: &mut Passes) {
         self.view_passes().draw(passes, &self.draw);
     }
 
-    fn list_step(&self, passes: &mut Passes) {
-        let view = self.list_slopes(passes);
+    fn record_step(&self, passes: &mut Passes) {
+        let view = self.record_gradients(passes);
         view.backward(passes, &self.learn);
         view.update(passes, &self.learn.update, &self.rule, false);
-        self.list_end(passes);
+        self.record_end(passes);
     }
 
-    fn list_step_touched(&self, passes: &mut Passes) {
-        let view = self.list_slopes(passes);
+    fn record_step_visible(&self, passes: &mut Passes) {
+        let view = self.record_gradients(passes);
         view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule_touched, false);
-        self.list_end(passes);
+        view.update(passes, &self.learn.update, &self.rule_visible, false);
+        self.record_end(passes);
     }
 
-    /// As [`Self::list_step`] where there are no pipelines without an order.
-    fn list_step_unordered(&self, passes: &mut Passes) {
-        let Some(Unordered { pipelines, sums }) = &self.unordered else { return self.list_step(passes) };
-        let view = self.list_slopes(passes);
+    /// As [`Self::record_step`] where there are no pipelines without an order.
+    fn record_step_unordered(&self, passes: &mut Passes) {
+        let Some(Unordered { pipelines, sums }) = &self.unordered else { return self.record_step(passes) };
+        let view = self.record_gradients(passes);
         view.backward_and_update_unordered(passes, pipelines, &self.rule, sums);
-        self.list_end(passes);
+        self.record_end(passes);
     }
 
     /// Draws and compares.
-    fn list_slopes(&self, passes: &mut Passes) -> ViewPasses<'_> {
+    fn record_gradients(&self, passes: &mut Passes) -> ViewPasses<'_> {
         let view = self.view_passes();
         view.draw(passes, &self.draw);
         view.compare(
@@ -268,7 +268,7 @@ impl KernelBench {
         view
     }
 
-    fn list_end(&self, passes: &mut Passes) {
+    fn record_end(&self, passes: &mut Passes) {
         passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
     }
 
@@ -278,37 +278,37 @@ impl KernelBench {
         Ok(Some(Unordered { pipelines, sums }))
     }
 
-    fn n_touched(&self) -> Result<u64, Error> {
+    fn n_visible(&self) -> Result<u64, Error> {
         let tile_counts: Vec<u32> = self.gpu.read(&self.scratch.tile_counts, self.splats.n_splats as usize)?;
         Ok(tile_counts.iter().filter(|n_tiles| **n_tiles > 0).count() as u64)
     }
 
-    fn time(&self, passes: &mut Passes, repeats: Repeats, list: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
+    fn time(&self, passes: &mut Passes, repeats: Repeats, record: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
         // For tenths of a second after large buffers were freed, some GPUs are busy with them.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {
-            list(self, passes);
+            record(self, passes);
             passes.submit(&self.gpu);
             self.gpu.wait()?;
             n_warm += 1;
         }
         let since = Instant::now();
-        for _ in 0..repeats.n_row {
-            list(self, passes);
+        for _ in 0..repeats.n_consecutive {
+            record(self, passes);
             passes.submit(&self.gpu);
         }
         self.gpu.wait()?;
-        let row_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_row as f64;
+        let consecutive_millis = since.elapsed().as_secs_f64() * 1e3 / repeats.n_consecutive as f64;
         let mut spans = Vec::new();
         for _ in 0..repeats.n_timed {
-            list(self, passes);
+            record(self, passes);
             let since = Instant::now();
-            let span = passes.submit_spanned(&self.gpu)?;
+            let span = passes.submit_timed_total(&self.gpu)?;
             spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
         }
         spans.sort_by(f64::total_cmp);
-        Ok((spans[spans.len() / 2], row_millis))
+        Ok((spans[spans.len() / 2], consecutive_millis))
     }
 
     fn counters(&self) -> Result<Vec<u32>, Error> {
@@ -316,10 +316,10 @@ impl KernelBench {
     }
 
     fn mean_rgb(&self, passes: &mut Passes) -> Result<[f64; 3], Error> {
-        self.list_picture(passes);
+        self.record_picture(passes);
         passes.submit(&self.gpu);
         let n = (self.size_px[0] * self.size_px[1]) as usize;
-        let image: Vec<[f32; 4]> = self.gpu.read(&self.frame.image, n)?;
+        let image: Vec<[f32; 4]> = self.gpu.read(&self.image_buffers.image, n)?;
         Ok(std::array::from_fn(|channel| image.iter().map(|pixel| f64::from(pixel[channel])).sum::<f64>() / n as f64))
     }
 }
@@ -355,16 +355,16 @@ mod tests {
     use crate::splat::cloud::synthetic_cloud;
 
     /// Sums of a few hundred f32 terms in another order, against the largest sum: a hundred times their rounding.
-    const OTHER_ORDER: f64 = 1e-5;
+    const ORDER_TOLERANCE: f64 = 1e-5;
 
     /// The slopes towards all means, scales and constant colors, in place of the parameters.
-    fn slopes(unordered: bool) -> Vec<f64> {
+    fn gradients(unordered: bool) -> Vec<f64> {
         let gpu = Gpu::open(&GpuOptions { float_atomics: true, ..GpuOptions::default() }).unwrap();
         let cloud = synthetic_cloud(3000, 0);
         let mut bench = KernelBench::new(gpu.clone(), &cloud, [112, 96], Eye::Outside).unwrap();
-        bench.fit().unwrap();
+        bench.size_buffers().unwrap();
         let mut passes = Passes::default();
-        let view = bench.list_slopes(&mut passes);
+        let view = bench.record_gradients(&mut passes);
         if unordered {
             let unordered = bench.new_unordered(&[("GRADIENTS_ONLY", 1.0)]).unwrap().expect("lavapipe adds atomically");
             view.backward_and_update_unordered(&mut passes, &unordered.pipelines, &bench.rule, &unordered.sums);
@@ -377,27 +377,27 @@ mod tests {
             view.update(&mut passes, &update, &bench.rule, true);
             passes.submit(&gpu);
         }
-        assert!(bench.n_touched().unwrap() > 1000);
-        let told = bench.splats.read(&gpu).unwrap();
-        let constant = told.sh.chunks_exact(told.n_coefficients()).map(|coeffs| coeffs[0]);
-        let all = told.means.iter().chain(&told.log_scales).copied().chain(constant);
+        assert!(bench.n_visible().unwrap() > 1000);
+        let gradients_read = bench.splats.read(&gpu).unwrap();
+        let constant = gradients_read.sh.chunks_exact(gradients_read.n_coefficients()).map(|coeffs| coeffs[0]);
+        let all = gradients_read.means.iter().chain(&gradients_read.log_scales).copied().chain(constant);
         all.flatten().map(f64::from).collect()
     }
 
     #[test]
-    fn gradients_that_meet_in_any_order_are_the_same_but_for_rounding() {
-        let (ordered, unordered) = (slopes(false), slopes(true));
+    fn unordered_gradients_match_ordered_ones() {
+        let (ordered, unordered) = (gradients(false), gradients(true));
         let third = ordered.len() / 3;
-        let mut wrong = Mismatches::default();
+        let mut mismatches = Mismatches::default();
         for (kind, name) in ["mean", "log scale", "color"].into_iter().enumerate() {
             let range = kind * third..(kind + 1) * third;
-            let largest = ordered[range.clone()].iter().fold(0.0f64, |most, slope| most.max(slope.abs()));
+            let largest = ordered[range.clone()].iter().fold(0.0f64, |max, gradient| max.max(gradient.abs()));
             assert!(largest > 0.0);
             for ix in range {
                 let label = format!("{name} {}", ix % third);
-                wrong.check(label, unordered[ix], ordered[ix], OTHER_ORDER * largest, OTHER_ORDER);
+                mismatches.check(label, unordered[ix], ordered[ix], ORDER_TOLERANCE * largest, ORDER_TOLERANCE);
             }
         }
-        wrong.assert_none();
+        mismatches.assert_none();
     }
 }

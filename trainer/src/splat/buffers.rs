@@ -13,7 +13,7 @@ pub(crate) const WINDOW_BINS: u32 = 256;
 pub(crate) const GROUP: u32 = 16;
 
 /// Buffers with an entry a splat.
-pub(crate) const N_PLANED: usize = 9;
+pub(crate) const N_PLANAR_BUFFERS: usize = 9;
 
 /// Floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
@@ -70,7 +70,7 @@ impl SplatBuffers {
     }
 
     /// A copy with room for `capacity` splats of `sh_degree`; the moments come along.
-    pub(crate) fn reshaped(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
+    pub(crate) fn resized(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
         let mut larger = Self::new(gpu, capacity, sh_degree)?;
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
         let mut copies = Passes::default();
@@ -85,12 +85,12 @@ impl SplatBuffers {
         }
         copies.submit(gpu);
         larger.active_degree = self.active_degree.min(sh_degree);
-        larger.set_n(gpu, self.n_splats);
+        larger.set_n_splats(gpu, self.n_splats);
         Ok(larger)
     }
 
     /// Says how many splats there are.
-    pub(crate) fn set_n(&mut self, gpu: &Gpu, n_splats: u32) {
+    pub(crate) fn set_n_splats(&mut self, gpu: &Gpu, n_splats: u32) {
         self.n_splats = n_splats;
         self.write_model(gpu);
     }
@@ -149,7 +149,7 @@ impl SplatBuffers {
             zeros.submit(gpu);
         }
         let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
-        self.set_n(gpu, self.n_splats + n_new);
+        self.set_n_splats(gpu, self.n_splats + n_new);
     }
 
     /// Reads the parameters back.
@@ -203,7 +203,7 @@ impl SplatBuffers {
     }
 
     /// Every per-splat buffer with its planes and bytes an entry.
-    pub(crate) fn planes(&self) -> [(&Buffer, u32, u64); N_PLANED] {
+    pub(crate) fn planes(&self) -> [(&Buffer, u32, u64); N_PLANAR_BUFFERS] {
         let rest = n_sh_rest(self.sh_degree);
         [
             (&self.means, 1, 16),
@@ -224,7 +224,7 @@ impl SplatBuffers {
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
     pub(crate) capacity: Buffer,
-    pub(crate) drawn: Buffer,
+    pub(crate) projected_splats: Buffer,
     pub(crate) tile_counts: Buffer,
     pub(crate) touched: Buffer,
     pub(crate) slot_offsets: Buffer,
@@ -261,7 +261,7 @@ impl Scratch {
         Ok(Self {
             n_entries,
             capacity: gpu.uniform_with("splat.capacity", &Capacity { n_entries, n_slots, unused: [0; 2] }),
-            drawn: gpu.storage("splat.drawn", 48 * u64::from(n_splats))?,
+            projected_splats: gpu.storage("splat.projected_splats", 48 * u64::from(n_splats))?,
             tile_counts: words("splat.tile_counts", n_splats)?,
             touched: gpu.storage("splat.touched", 12 * u64::from(n_splats))?,
             slot_offsets: words("splat.slot_offsets", n_splats)?,
@@ -282,7 +282,7 @@ impl Scratch {
 
 /// Memory of one picture, and of its slopes where it is learned from.
 #[derive(Debug)]
-pub(crate) struct Frame {
+pub(crate) struct ImageBuffers {
     pub(crate) n_pixels: u32,
     pub(crate) n_tiles: u32,
     pub(crate) image: Buffer,
@@ -291,17 +291,18 @@ pub(crate) struct Frame {
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
     pub(crate) products: Buffer,
-    pub(crate) slopes: Buffer,
+    pub(crate) ssim_gradients: Buffer,
     pub(crate) upstream: Buffer,
-    pub(crate) rest: Buffer,
+    pub(crate) pixel_totals: Buffer,
     pub(crate) gain_sums: Buffer,
 }
 
-impl Frame {
+impl ImageBuffers {
     /// Memory for pictures of up to `size_px`.
     pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, learned: bool) -> Result<Self, Error> {
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
-        let slope = |name: &str, bytes: u64| gpu.storage(name, if learned { bytes * u64::from(n_pixels) } else { 0 });
+        let gradient_buffer =
+            |name: &str, bytes: u64| gpu.storage(name, if learned { bytes * u64::from(n_pixels) } else { 0 });
         let tiles = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_tiles));
         Ok(Self {
             n_pixels,
@@ -312,9 +313,9 @@ impl Frame {
             pixels: each("splat.pixels", 4)?,
             depths: each("splat.depths", 4)?,
             products: gpu.storage("splat.products", 48 * u64::from(n_pixels.div_ceil(256)))?,
-            slopes: slope("splat.slopes", 36)?,
-            upstream: slope("splat.upstream", 16)?,
-            rest: slope("splat.rest", 8)?,
+            ssim_gradients: gradient_buffer("splat.ssim_gradients", 36)?,
+            upstream: gradient_buffer("splat.upstream", 16)?,
+            pixel_totals: gradient_buffer("splat.pixel_totals", 8)?,
             gain_sums: tiles("splat.gain_sums", 16)?,
         })
     }

@@ -4,7 +4,7 @@
 //! the view of a step, `refine_camera` takes the step of its terms.
 
 use super::kernels::LearnPipelines;
-use super::params::{CameraRule, Lens, N_TERMS};
+use super::params::{CameraRule, Lens, N_PARAMS};
 use super::passes::ViewPasses;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline, f32_of, f32s_of};
@@ -17,11 +17,11 @@ use std::sync::Arc;
 /// Which terms are learned.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
-pub struct TermSet {
+pub struct ParamSet {
     /// How each camera is mounted: rotation and translation between camera and what carries it (hand-eye).
-    pub mount: bool,
+    pub extrinsics: bool,
     /// By how much the poses of each camera lag behind its images.
-    pub delay: bool,
+    pub time_offset: bool,
     /// Focal lengths and principal point of each camera.
     pub lens: bool,
     /// A small pose error of each image.
@@ -38,11 +38,11 @@ pub struct TermSet {
     pub readout: bool,
 }
 
-impl TermSet {
+impl ParamSet {
     /// Nothing is learned.
     pub const NONE: Self = Self {
-        mount: false,
-        delay: false,
+        extrinsics: false,
+        time_offset: false,
         lens: false,
         image_poses: false,
         image_gains: false,
@@ -61,8 +61,8 @@ impl TermSet {
     #[must_use]
     pub fn and(self, other: Self) -> Self {
         Self {
-            mount: self.mount || other.mount,
-            delay: self.delay || other.delay,
+            extrinsics: self.extrinsics || other.extrinsics,
+            time_offset: self.time_offset || other.time_offset,
             lens: self.lens || other.lens,
             image_poses: self.image_poses || other.image_poses,
             image_gains: self.image_gains || other.image_gains,
@@ -73,22 +73,22 @@ impl TermSet {
         }
     }
 
-    fn of_camera(self) -> u32 {
+    fn camera_mask(self) -> u32 {
         let bits = |on: bool, bits: u32| if on { bits } else { 0 };
-        bits(self.mount, 0b11_1111) | bits(self.delay, 1 << 6) | bits(self.lens, 0b1111 << 7)
+        bits(self.extrinsics, 0b11_1111) | bits(self.time_offset, 1 << 6) | bits(self.lens, 0b1111 << 7)
     }
 
-    fn of_image(self) -> u32 {
+    fn image_mask(self) -> u32 {
         let bits = |on: bool, bits: u32| if on { bits } else { 0 };
         bits(self.image_poses, 0b11_1111) | bits(self.image_gains, 0b111 << 11)
     }
 }
 
-impl std::fmt::Display for TermSet {
+impl std::fmt::Display for ParamSet {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let names = [
-            (self.mount, "camera mounts"),
-            (self.delay, "delays"),
+            (self.extrinsics, "camera mounts"),
+            (self.time_offset, "delays"),
             (self.lens, "lenses"),
             (self.image_poses, "poses of images"),
             (self.image_gains, "gains of images"),
@@ -105,23 +105,23 @@ impl std::fmt::Display for TermSet {
 /// What was learned about one camera.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
-pub struct CameraFix {
+pub struct CameraCorrection {
     /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
-    pub turn_rad: [f64; 3],
+    pub rotation_rad: [f64; 3],
     /// Metres, in the camera's axes.
-    pub shift_m: [f64; 3],
+    pub translation_m: [f64; 3],
     /// The poses belong to this much later, seconds.
-    pub delay_secs: f64,
+    pub time_offset_secs: f64,
     /// Logarithm of the factor on the focal lengths.
     pub log_focal: [f64; 2],
     /// Shift of the principal point, in focal lengths.
-    pub principal_focals: [f64; 2],
+    pub principal_offset_focals: [f64; 2],
     /// What is added to the readings of the joints that carry the camera, radians or metres; empty where nothing is.
     pub joint_offsets: Vec<f64>,
     /// Rotation vector in the camera's own axes, radians: `color_from_depth` becomes turn and shift after it.
-    pub depth_turn_rad: [f64; 3],
+    pub depth_rotation_rad: [f64; 3],
     /// Metres, in the camera's axes.
-    pub depth_shift_m: [f64; 3],
+    pub depth_translation_m: [f64; 3],
     /// Logarithm of the factor on depth.
     pub log_depth_scale: f64,
     /// What is added to the readout time, seconds.
@@ -129,40 +129,40 @@ pub struct CameraFix {
     /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
     pub drift: BTreeMap<i64, [f64; 6]>,
     /// How much of the drift between them holds for images that are not among them, 0 to 1.
-    pub drift_share: f64,
+    pub drift_weight: f64,
     /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
     /// What a neural field knows of light and exposure of the images learned from, likewise; what the numbers mean is its own affair.
-    pub codes: BTreeMap<i64, [f64; N_CODE]>,
+    pub appearance_embeddings: BTreeMap<i64, [f64; EMBEDDING_DIM]>,
 }
 
 /// Numbers of an image's code.
-pub const N_CODE: usize = 1;
+pub const EMBEDDING_DIM: usize = 1;
 
-impl Default for CameraFix {
+impl Default for CameraCorrection {
     fn default() -> Self {
         Self {
-            turn_rad: [0.0; 3],
-            shift_m: [0.0; 3],
-            delay_secs: 0.0,
+            rotation_rad: [0.0; 3],
+            translation_m: [0.0; 3],
+            time_offset_secs: 0.0,
             log_focal: [0.0; 2],
-            principal_focals: [0.0; 2],
+            principal_offset_focals: [0.0; 2],
             joint_offsets: Vec::new(),
-            depth_turn_rad: [0.0; 3],
-            depth_shift_m: [0.0; 3],
+            depth_rotation_rad: [0.0; 3],
+            depth_translation_m: [0.0; 3],
             log_depth_scale: 0.0,
             readout_secs: 0.0,
             drift: BTreeMap::new(),
-            drift_share: 1.0,
+            drift_weight: 1.0,
             log_gains: BTreeMap::new(),
-            codes: BTreeMap::new(),
+            appearance_embeddings: BTreeMap::new(),
         }
     }
 }
 
 /// A pinhole camera somewhere.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PosedLens {
+pub struct CalibratedCamera {
     /// Pose.
     pub world_from_camera: Transform,
     /// Focal length, pixels.
@@ -177,7 +177,7 @@ pub struct PosedLens {
     pub gains: [f64; 3],
 }
 
-impl PosedLens {
+impl CalibratedCamera {
     /// As the keyframe has it.
     pub fn of(keyframe: &Keyframe) -> Self {
         Self {
@@ -194,69 +194,71 @@ impl PosedLens {
     }
 }
 
-impl CameraFix {
-    /// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
-    pub fn apply(&self, keyframe: &Keyframe) -> PosedLens {
-        let lens = PosedLens::of(keyframe);
-        let delay = self.delayed_from_given(keyframe);
+impl CameraCorrection {
+    /// The camera of a keyframe as it is, where the input has it as [`CalibratedCamera::of`].
+    pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
+        let lens = CalibratedCamera::of(keyframe);
+        let time_offset = self.time_corrected_from_input(keyframe);
         let mut by_joints = Twist::zero();
         for (twist, offset) in keyframe.joint_twists.iter().zip(&self.joint_offsets) {
             by_joints.linear_m_s += twist.linear_m_s * *offset;
             by_joints.angular_rad_s += twist.angular_rad_s * *offset;
         }
         let joints = transform::exp(&by_joints, -1.0);
-        let mount = moved(self.turn_rad.into(), self.shift_m.into());
-        let [turn_x, turn_y, turn_z, x, y, z] = self.drift_at(keyframe.stamp);
-        let drift = moved(Vector3::new(turn_x, turn_y, turn_z), Vector3::new(x, y, z));
-        let world_from_camera = (mount * drift * joints * delay * lens.world_from_camera.inverse()).inverse();
+        let extrinsics = rigid_transform(self.rotation_rad.into(), self.translation_m.into());
+        let [rotation_x, rotation_y, rotation_z, x, y, z] = self.drift_at(keyframe.stamp);
+        let drift = rigid_transform(Vector3::new(rotation_x, rotation_y, rotation_z), Vector3::new(x, y, z));
+        let world_from_camera =
+            (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse()).inverse();
         let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
         let shutter = |shutter: Shutter| Shutter {
             twist: shutter.twist.of_attached(&raw_from_corrected),
             readout_secs: (shutter.readout_secs + self.readout_secs).max(0.0),
         };
-        PosedLens {
+        CalibratedCamera {
             world_from_camera,
             shutter: lens.shutter.map(shutter),
             focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
             principal_px: std::array::from_fn(|axis| {
-                lens.principal_px[axis] + self.principal_focals[axis] * lens.focal_px[axis]
+                lens.principal_px[axis] + self.principal_offset_focals[axis] * lens.focal_px[axis]
             }),
             color_from_depth: keyframe.depth.as_ref().map(|depth| self.color_from_depth(keyframe, depth)),
-            gains: between(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
+            gains: interpolate(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
         }
     }
 
     /// Turn and shift of an image: its own, or as far as poses drift those between its neighbours in time.
     pub(crate) fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
-        let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_share };
-        between(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
+        let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_weight };
+        interpolate(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
     }
 
     /// From the camera as the input has it to the camera at the time the image was taken.
-    pub(crate) fn delayed_from_given(&self, keyframe: &Keyframe) -> Transform {
+    pub(crate) fn time_corrected_from_input(&self, keyframe: &Keyframe) -> Transform {
         keyframe.twist.map_or(Transform::identity(), |twist| {
-            moved(-self.delay_secs * twist.angular_rad_s, -self.delay_secs * twist.linear_m_s)
+            rigid_transform(-self.time_offset_secs * twist.angular_rad_s, -self.time_offset_secs * twist.linear_m_s)
         })
     }
 
     /// Where the depth frame of a keyframe is in its color frame.
     pub fn color_from_depth(&self, keyframe: &Keyframe, depth: &DepthMap) -> Transform {
-        let moved = moved(self.depth_turn_rad.into(), self.depth_shift_m.into());
-        moved * keyframe.world_from_camera.inverse() * depth.world_from_camera
+        let rigid_transform = rigid_transform(self.depth_rotation_rad.into(), self.depth_translation_m.into());
+        rigid_transform * keyframe.world_from_camera.inverse() * depth.world_from_camera
     }
 
     /// The keyframe as it would be had the input been right.
     pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
-        let PosedLens { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
+        let CalibratedCamera { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
         let depth = keyframe.depth.as_ref().map(|depth| {
-            let same_lens = shares_lens(keyframe, depth);
+            let has_same_lens = shares_lens(keyframe, depth);
             let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
-            let principal = |axis: usize| depth.principal_px[axis] + self.principal_focals[axis] * depth.focal_px[axis];
+            let principal =
+                |axis: usize| depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis];
             let factor = f32_of(self.log_depth_scale.exp());
             DepthMap {
                 size_px: depth.size_px,
-                focal_px: if same_lens { [0, 1].map(focal) } else { depth.focal_px },
-                principal_px: if same_lens { [0, 1].map(principal) } else { depth.principal_px },
+                focal_px: if has_same_lens { [0, 1].map(focal) } else { depth.focal_px },
+                principal_px: if has_same_lens { [0, 1].map(principal) } else { depth.principal_px },
                 depth_m: match factor {
                     1.0 => depth.depth_m.clone(),
                     factor => depth.depth_m.iter().map(|z| z * factor).collect(),
@@ -279,7 +281,7 @@ impl CameraFix {
 }
 
 /// What holds at a stamp, from the entries before and after it; `None` of nothing.
-pub(crate) fn between<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
+pub(crate) fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
     let before = known.range(..=stamp.0).next_back();
     let after = known.range(stamp.0..).next();
     match (before, after) {
@@ -298,54 +300,54 @@ pub(crate) fn between<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: St
 /// 0 where each image errs on its own, where a guess leaves more than nothing would, and where there are too few to tell.
 ///
 /// * `scene_size_m`: what makes a turn a way.
-pub(crate) fn drift_share(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
+pub(crate) fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
     /// Less may be chance.
-    const LEAST: f64 = 0.2;
+    const MIN_WEIGHT: f64 = 0.2;
     let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
     let squares = |parts: [f64; 6]| {
-        let [turn, shift] = [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
-        turn * scene_size_m * scene_size_m + shift
+        let [rotation, translation] = [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
+        rotation * scene_size_m * scene_size_m + translation
     };
-    let (mut left, mut all) = (0.0, 0.0);
+    let (mut residual, mut all) = (0.0, 0.0);
     for neighbors in known.windows(3) {
         let [(begin, from), (stamp, own), (end, to)] = [neighbors[0], neighbors[1], neighbors[2]];
         let frac = (stamp - begin) / (end - begin);
-        left += squares(std::array::from_fn(|ix| own[ix] - from[ix] - frac * (to[ix] - from[ix])));
+        residual += squares(std::array::from_fn(|ix| own[ix] - from[ix] - frac * (to[ix] - from[ix])));
         all += squares(*own);
     }
-    let share = if all > 0.0 { 1.0 - left / all } else { 0.0 };
-    if share < LEAST { 0.0 } else { share }
+    let share = if all > 0.0 { 1.0 - residual / all } else { 0.0 };
+    if share < MIN_WEIGHT { 0.0 } else { share }
 }
 
 /// Turn, then shift.
-pub(crate) fn moved(turn_rad: Vector3<f64>, shift_m: Vector3<f64>) -> Transform {
-    Transform::from_parts(Translation3::from(shift_m), UnitQuaternion::from_scaled_axis(turn_rad))
+pub(crate) fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) -> Transform {
+    Transform::from_parts(Translation3::from(translation_m), UnitQuaternion::from_scaled_axis(rotation_rad))
 }
 
 /// Whether depth was registered to the color image, or comes through the same lens: what is wrong with that is wrong with both.
 pub(crate) fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
-    const SAME_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
+    const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
     [0, 1].into_iter().all(|axis| {
         let share = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
-        let off_px = (depth.focal_px[axis] - share * keyframe.focal_px[axis]).abs()
+        let difference_px = (depth.focal_px[axis] - share * keyframe.focal_px[axis]).abs()
             + (depth.principal_px[axis] - share * keyframe.principal_px[axis]).abs();
-        off_px <= SAME_FRAC * depth.focal_px[axis]
+        difference_px <= TOLERANCE_FRAC * depth.focal_px[axis]
     })
 }
 
-/// The first of the gains among the terms, as in `shared/camera_terms.wgsl`.
+/// The first of the gains among the terms, as in `shared/camera_params.wgsl`.
 const LOG_GAIN: u32 = 11;
 /// Rate of rotations at the start, radians a step; the others follow from it.
-const TURN_RATE: f64 = 1e-3;
+const ROTATION_RATE: f64 = 1e-3;
 /// What is left of the rates at the end of the plan.
 const FINAL_FRAC: f64 = 0.01;
-const IMAGE_PULL: f64 = 0.001;
+const IMAGE_DECAY: f64 = 0.001;
 
 /// The terms on the GPU.
 #[derive(Debug)]
-pub(crate) struct CameraTerms {
-    pub(crate) set: TermSet,
-    pub(crate) terms: Buffer,
+pub(crate) struct CameraParams {
+    pub(crate) set: ParamSet,
+    pub(crate) params: Buffer,
     rule: Buffer,
     /// The view of the step at hand.
     pub(crate) corrected: Buffer,
@@ -358,18 +360,18 @@ pub(crate) struct CameraTerms {
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
-/// Where the terms of a camera and of its images lie, in slots of [`N_TERMS`].
+/// Where the terms of a camera and of its images lie, in slots of [`N_PARAMS`].
 #[derive(Debug)]
 struct Slots {
     camera: u32,
     images: BTreeMap<Stamp, u32>,
 }
 
-impl CameraTerms {
-    pub(crate) fn new(gpu: &Gpu, set: TermSet) -> Result<Self, Error> {
+impl CameraParams {
+    pub(crate) fn new(gpu: &Gpu, set: ParamSet) -> Result<Self, Error> {
         Ok(Self {
             set,
-            terms: gpu.storage("splat.camera_terms", SLOT_BYTES)?,
+            params: gpu.storage("splat.camera_params", SLOT_BYTES)?,
             rule: gpu.uniform_with("splat.camera_rule", &<CameraRule as bytemuck::Zeroable>::zeroed()),
             corrected: gpu.uniform_and_storage("splat.corrected_view", size_of::<super::params::View>() as u64),
             gains: gpu.storage_with("splat.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
@@ -379,7 +381,7 @@ impl CameraTerms {
     }
 
     /// Learns more.
-    pub(crate) fn learn_also(&mut self, more: TermSet) {
+    pub(crate) fn enable(&mut self, more: ParamSet) {
         self.set = self.set.and(more);
     }
 
@@ -388,14 +390,14 @@ impl CameraTerms {
         let camera = match self.cameras.get(&keyframe.camera) {
             Some(slots) => slots.camera,
             None => {
-                let slots = Slots { camera: self.take_slot(gpu)?, images: BTreeMap::new() };
+                let slots = Slots { camera: self.allocate_slot(gpu)?, images: BTreeMap::new() };
                 self.cameras.entry(keyframe.camera.clone()).or_insert(slots).camera
             }
         };
         let known = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp).copied());
         let image = match known {
             Some(slot) => slot,
-            None => self.take_slot(gpu)?,
+            None => self.allocate_slot(gpu)?,
         };
         if let Some(slots) = self.cameras.get_mut(&keyframe.camera) {
             slots.images.insert(keyframe.stamp, image);
@@ -407,20 +409,20 @@ impl CameraTerms {
         let lens = Lens {
             linear: part(|twist| twist.linear_m_s),
             angular: part(|twist| twist.angular_rad_s),
-            camera_terms: camera * N_TERMS,
-            image_terms: image * N_TERMS,
+            camera_params: camera * N_PARAMS,
+            image_params: image * N_PARAMS,
             unused: [0; 2],
         };
         Ok(gpu.uniform_with("splat.lens", &lens))
     }
 
     /// Lets the gains of an image begin at these logarithms.
-    pub(crate) fn begin_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
+    pub(crate) fn initialize_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
         let slot = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp));
         let values = log_gains.map(|value| [f32_of(value), 0.0, 0.0, 0.0]);
         if let Some(slot) = slot {
             gpu.write(
-                &self.terms,
+                &self.params,
                 SLOT_BYTES * u64::from(*slot) + 16 * u64::from(LOG_GAIN),
                 bytemuck::cast_slice(&values),
             );
@@ -429,46 +431,46 @@ impl CameraTerms {
 
     /// A copy of all terms.
     pub(crate) fn copy(&self, gpu: &Gpu) -> Result<Buffer, Error> {
-        let copy = gpu.storage("splat.camera_terms", self.terms.bytes())?;
-        gpu.copy((&self.terms, 0), (&copy, 0), self.terms.bytes());
+        let copy = gpu.storage("splat.camera_params", self.params.bytes())?;
+        gpu.copy((&self.params, 0), (&copy, 0), self.params.bytes());
         Ok(copy)
     }
 
     /// Goes back to a copy; slots handed out since then keep their place, with nothing learned.
-    pub(crate) fn go_back(&mut self, gpu: &Gpu, (set, terms): (TermSet, Buffer)) -> Result<(), Error> {
+    pub(crate) fn restore_snapshot(&mut self, gpu: &Gpu, (set, params): (ParamSet, Buffer)) -> Result<(), Error> {
         self.set = set;
-        if terms.bytes() < self.used_bytes() {
-            self.terms = gpu.storage("splat.camera_terms", self.used_bytes())?; // Zeros.
-            gpu.copy((&terms, 0), (&self.terms, 0), terms.bytes());
+        if params.bytes() < self.used_bytes() {
+            self.params = gpu.storage("splat.camera_params", self.used_bytes())?; // Zeros.
+            gpu.copy((&params, 0), (&self.params, 0), params.bytes());
         } else {
-            self.terms = terms;
+            self.params = params;
         }
         Ok(())
     }
 
-    fn take_slot(&mut self, gpu: &Gpu) -> Result<u32, Error> {
+    fn allocate_slot(&mut self, gpu: &Gpu) -> Result<u32, Error> {
         self.n_used += 1;
         let bytes = SLOT_BYTES * u64::from(self.n_used);
-        if bytes > self.terms.bytes() {
-            let larger = gpu.storage("splat.camera_terms", 2 * bytes)?;
-            gpu.copy((&self.terms, 0), (&larger, 0), self.terms.bytes());
-            self.terms = larger;
+        if bytes > self.params.bytes() {
+            let larger = gpu.storage("splat.camera_params", 2 * bytes)?;
+            gpu.copy((&self.params, 0), (&larger, 0), self.params.bytes());
+            self.params = larger;
         }
         Ok(self.n_used - 1)
     }
 
-    /// Says how fast the terms learn; `done` is the share of the plan that lies behind.
-    pub(crate) fn write_rule(&self, gpu: &Gpu, done: f64, scene_size_m: f64) {
-        let rate = TURN_RATE * FINAL_FRAC.powf(done.clamp(0.0, 1.0));
+    /// Says how fast the terms learn; `progress` is the share of the plan that lies behind.
+    pub(crate) fn write_rule(&self, gpu: &Gpu, progress: f64, scene_size_m: f64) {
+        let rate = ROTATION_RATE * FINAL_FRAC.powf(progress.clamp(0.0, 1.0));
         let rule = CameraRule {
-            of_camera: self.set.of_camera(),
-            of_image: self.set.of_image(),
-            turn_rate: f32_of(rate),
-            shift_rate_m: f32_of(rate * scene_size_m),
-            delay_rate: f32_of(rate),
+            camera_mask: self.set.camera_mask(),
+            image_mask: self.set.image_mask(),
+            rotation_rate: f32_of(rate),
+            translation_rate_m: f32_of(rate * scene_size_m),
+            time_offset_rate: f32_of(rate),
             focal_rate: f32_of(rate),
             gain_rate: f32_of(10.0 * rate),
-            image_pull: f32_of(IMAGE_PULL),
+            image_decay: f32_of(IMAGE_DECAY),
         };
         gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
@@ -479,7 +481,7 @@ impl CameraTerms {
             ("base", base),
             ("lens", lens),
             ("rule", &self.rule),
-            ("terms", &self.terms),
+            ("params", &self.params),
             ("corrected", &self.corrected),
             ("gains", &self.gains),
         ];
@@ -498,18 +500,18 @@ impl CameraTerms {
             ("lens", lens),
             ("rule", &self.rule),
             ("camera_sums", &view.scratch.camera_sums),
-            ("gain_sums", &view.frame.gain_sums),
+            ("gain_sums", &view.image_buffers.gain_sums),
             ("status", view.status),
-            ("terms", &self.terms),
+            ("params", &self.params),
         ];
         passes.dispatch(view.gpu, refine, 1, &buffers);
     }
 
     /// The values of the first camera's terms.
     #[cfg(test)]
-    pub(crate) fn slopes(&self, gpu: &Gpu) -> Vec<f64> {
-        let terms: Vec<[f32; 4]> = gpu.read(&self.terms, N_TERMS as usize).unwrap();
-        terms.iter().map(|term| f64::from(term[0])).collect()
+    pub(crate) fn param_values(&self, gpu: &Gpu) -> Vec<f64> {
+        let params: Vec<[f32; 4]> = gpu.read(&self.params, N_PARAMS as usize).unwrap();
+        params.iter().map(|param| f64::from(param[0])).collect()
     }
 
     /// Bytes of the slots in use.
@@ -530,7 +532,7 @@ impl CameraTerms {
         &mut self,
         gpu: &Gpu,
         slots: &CameraSlots,
-        set: TermSet,
+        set: ParamSet,
         checkpoint: &Checkpoint,
     ) -> Result<(), Error> {
         let n_slots: usize = slots.0.values().map(|(_, images)| 1 + images.len()).sum();
@@ -539,8 +541,8 @@ impl CameraTerms {
         if (self.n_used as usize) < n_slots {
             return Err(Error::CheckpointState { reason: "two cameras share their terms".to_owned() });
         }
-        let bytes = checkpoint.array("camera_terms", self.used_bytes())?;
-        self.terms = gpu.storage_with("splat.camera_terms", bytes)?;
+        let bytes = checkpoint.array("camera_params", self.used_bytes())?;
+        self.params = gpu.storage_with("splat.camera_params", bytes)?;
         self.set = set;
         self.cameras = slots
             .0
@@ -554,49 +556,49 @@ impl CameraTerms {
     }
 
     /// What the terms, or a copy of them, tell about each camera.
-    pub(crate) fn fixes(
+    pub(crate) fn corrections(
         &self,
         gpu: &Gpu,
-        set: TermSet,
-        terms: &Buffer,
+        set: ParamSet,
+        params: &Buffer,
         scene_size_m: f64,
-    ) -> Result<BTreeMap<String, CameraFix>, Error> {
+    ) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         // A copy may be older than the last slots.
-        let mut terms: Vec<[f32; 4]> = gpu.read(terms, (self.used_bytes().min(terms.bytes()) / 16) as usize)?;
-        terms.resize((self.n_used * N_TERMS) as usize, [0.0; 4]);
-        let value = |slot: u32, term: u32, learned: u32| {
-            let on = learned & (1 << term) != 0;
-            if on { f64::from(terms[(slot * N_TERMS + term) as usize][0]) } else { 0.0 }
+        let mut params: Vec<[f32; 4]> = gpu.read(params, (self.used_bytes().min(params.bytes()) / 16) as usize)?;
+        params.resize((self.n_used * N_PARAMS) as usize, [0.0; 4]);
+        let value = |slot: u32, param: u32, learned: u32| {
+            let on = learned & (1 << param) != 0;
+            if on { f64::from(params[(slot * N_PARAMS + param) as usize][0]) } else { 0.0 }
         };
-        let fix = |slots: &Slots| {
-            let of_camera = |term| value(slots.camera, term, set.of_camera());
-            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|term| value(*slot, term, set.of_image()));
+        let correction_of = |slots: &Slots| {
+            let camera_value = |param| value(slots.camera, param, set.camera_mask());
+            let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|param| value(*slot, param, set.image_mask()));
             let log_gains =
-                |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|term| value(*slot, term, set.of_image()));
+                |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|param| value(*slot, param, set.image_mask()));
             let drift: BTreeMap<i64, [f64; 6]> = if set.image_poses {
                 slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
             } else {
                 BTreeMap::new()
             };
-            CameraFix {
-                turn_rad: [0, 1, 2].map(of_camera),
-                shift_m: [3, 4, 5].map(of_camera),
-                delay_secs: of_camera(6),
-                log_focal: [7, 8].map(of_camera),
-                principal_focals: [9, 10].map(of_camera),
-                drift_share: if set.image_poses { drift_share(&drift, scene_size_m) } else { 1.0 },
+            CameraCorrection {
+                rotation_rad: [0, 1, 2].map(camera_value),
+                translation_m: [3, 4, 5].map(camera_value),
+                time_offset_secs: camera_value(6),
+                log_focal: [7, 8].map(camera_value),
+                principal_offset_focals: [9, 10].map(camera_value),
+                drift_weight: if set.image_poses { drift_weight(&drift, scene_size_m) } else { 1.0 },
                 drift,
                 log_gains: if set.image_gains {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, log_gains(slot))).collect()
                 } else {
                     BTreeMap::new()
                 },
-                ..CameraFix::default()
+                ..CameraCorrection::default()
             }
         };
-        Ok(self.cameras.iter().map(|(name, slots)| (name.to_string(), fix(slots))).collect())
+        Ok(self.cameras.iter().map(|(name, slots)| (name.to_string(), correction_of(slots))).collect())
     }
 }
 
 /// Bytes of the terms of one camera, or of one image.
-const SLOT_BYTES: u64 = 16 * N_TERMS as u64;
+const SLOT_BYTES: u64 = 16 * N_PARAMS as u64;

@@ -1,6 +1,6 @@
 //! The kernels that bin, move and multiply splats, against their f64 twins.
 
-use super::against_twin::{Bench, Wanted, arrays_of, clear_pixels, target_of};
+use super::against_twin::{KernelFixture, TargetBuffers, arrays_of, target_of, unambiguous_pixels};
 use super::arrays::SplatArrays;
 use super::params::{Growth, Rule, status};
 use super::passes::{GrowthBuffers, grow};
@@ -11,7 +11,7 @@ use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 
 /// A small scene whose splats all have the same number of coefficients, and values that f32 holds.
-fn even_scene(seed: u64, n: usize) -> Vec<Splat> {
+fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {
     let mut splats = scene::small_scene(seed, n);
     for splat in &mut splats {
         splat.sh.resize(16, [0.0; 3]);
@@ -33,23 +33,29 @@ fn splats_of(arrays: &SplatArrays) -> Vec<Splat> {
 /// Checks every value; `of_*` are the tolerances of means, log scales, rotations, opacities and colors.
 fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     let [of_mean, of_scale, of_rotation, of_opacity, of_color] = tolerances;
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for (ix, (got, expected)) in got.iter().zip(expected).enumerate() {
         for axis in 0..3 {
-            wrong.check(format!("mean {ix} {axis}"), got.mean[axis], expected.mean[axis], of_mean, 0.0);
-            wrong.check(format!("scale {ix} {axis}"), got.log_scale[axis], expected.log_scale[axis], of_scale, 0.0);
+            mismatches.check(format!("mean {ix} {axis}"), got.mean[axis], expected.mean[axis], of_mean, 0.0);
+            mismatches.check(
+                format!("scale {ix} {axis}"),
+                got.log_scale[axis],
+                expected.log_scale[axis],
+                of_scale,
+                0.0,
+            );
         }
         for part in 0..4 {
             let [got, expected] = [got, expected].map(|splat| splat.rotation_wxyz[part]);
-            wrong.check(format!("rotation {ix} {part}"), got, expected, of_rotation, 0.0);
+            mismatches.check(format!("rotation {ix} {part}"), got, expected, of_rotation, 0.0);
         }
-        wrong.check(format!("opacity {ix}"), got.opacity_logit, expected.opacity_logit, of_opacity, 0.0);
+        mismatches.check(format!("opacity {ix}"), got.opacity_logit, expected.opacity_logit, of_opacity, 0.0);
         let colors = got.sh.as_flattened().iter().zip(expected.sh.as_flattened());
         for (part, (got, expected)) in colors.enumerate() {
-            wrong.check(format!("sh {ix} {part}"), *got, *expected, of_color, 0.0);
+            mismatches.check(format!("sh {ix} {part}"), *got, *expected, of_color, 0.0);
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 /// Large enough against the gradients that none decides a step by its sign alone.
@@ -76,14 +82,14 @@ const RULE: Rule = Rule {
 };
 
 #[test]
-fn optimiser_steps_match_the_twin() {
+fn optimizer_steps_match_the_twin() {
     const N_STEPS: u32 = 3;
     let view = scene::rolling_view();
-    let mut splats = even_scene(7, 40);
+    let mut splats = full_degree_scene(7, 40);
     splats[3].opacity_logit = -5.5; // Barely seen: noise moves it.
     splats = splats_of(&arrays_of(&splats));
-    let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-    let gpu = &bench.gpu;
+    let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+    let gpu = &fixture.gpu;
     let rule = gpu.uniform_with("rule", &RULE);
     let weights = loss_reference::Weights {
         dssim_frac: 0.25,
@@ -92,11 +98,11 @@ fn optimiser_steps_match_the_twin() {
         background_rgb: [0.125, 0.25, 0.5],
     };
     let mut target = target_of(&reference::render(&view, &splats), view.size_px);
-    for (seen, clear) in target.seen.iter_mut().zip(clear_pixels(&view, &splats)) {
-        *seen &= clear;
+    for (visible, unambiguous) in target.visible.iter_mut().zip(unambiguous_pixels(&view, &splats)) {
+        *visible &= unambiguous;
     }
     target.depth_m.iter_mut().for_each(|depth_m| *depth_m = f64::from(f32_of(*depth_m)));
-    let wanted = Wanted::new(gpu, &target, &weights);
+    let target_buffers = TargetBuffers::new(gpu, &target, &weights);
     let mut moments: Vec<SplatMoments> = vec![vec![Default::default(); 11 + 48]; splats.len()];
     for step in 0..N_STEPS {
         let (_, upstream) = loss_reference::loss(&reference::render(&view, &splats), &target, &weights);
@@ -107,19 +113,19 @@ fn optimiser_steps_match_the_twin() {
             .collect();
 
         let mut passes = Passes::default();
-        let view_passes = bench.passes();
-        view_passes.draw(&mut passes, &bench.draw);
-        view_passes.compare(&mut passes, &bench.learn, &wanted.target());
-        view_passes.backward(&mut passes, &bench.learn);
-        view_passes.update(&mut passes, &bench.learn.update, &rule, false);
+        let view_passes = fixture.passes();
+        view_passes.draw(&mut passes, &fixture.draw);
+        view_passes.compare(&mut passes, &fixture.learn, &target_buffers.target());
+        view_passes.backward(&mut passes, &fixture.learn);
+        view_passes.update(&mut passes, &fixture.learn.update, &rule, false);
         passes.submit(gpu);
-        gpu.write(&bench.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
+        gpu.write(&fixture.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }
     // A step is at most about a rate long; gradients agree to a few thousandths of the largest, and EPSILON damps small ones.
     let of = |rate: f32| 0.02 * f64::from(rate);
     let tolerances =
         [RULE.mean_rate_m, RULE.log_scale_rate, RULE.rotation_rate, RULE.opacity_rate, RULE.sh_dc_rate].map(of);
-    check(&splats_of(&bench.splats.read(gpu).unwrap()), &splats, tolerances);
+    check(&splats_of(&fixture.splats.read(gpu).unwrap()), &splats, tolerances);
 }
 
 fn growth_buffers(gpu: &Gpu, growth: &Growth) -> GrowthBuffers {
@@ -138,44 +144,44 @@ fn growth_buffers(gpu: &Gpu, growth: &Growth) -> GrowthBuffers {
 fn growth_matches_the_twin() {
     const N_BEFORE: u32 = 700; // Three blocks, the last one part full.
     const N_AFTER: u32 = 900;
-    let mut splats = even_scene(8, N_BEFORE as usize);
+    let mut splats = full_degree_scene(8, N_BEFORE as usize);
     for ix in [0, 255, 256, 699] {
         splats[ix].opacity_logit = -9.0; // Dead.
     }
     let mut random = scene::Random::new(9);
     let errors: Vec<f32> = (0..N_BEFORE).map(|_| f32_of(random.uniform(0.0, 1.0).powi(8))).collect();
-    let mut bench = Bench::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
-    let gpu = bench.gpu.clone();
-    bench.splats = bench.splats.reshaped(&gpu, N_AFTER, bench.splats.sh_degree).unwrap();
+    let mut fixture = KernelFixture::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
+    let gpu = fixture.gpu.clone();
+    fixture.splats = fixture.splats.resized(&gpu, N_AFTER, fixture.splats.sh_degree).unwrap();
     let growth = Growth {
         n_before: N_BEFORE,
         n_after: N_AFTER,
         key: 5,
-        capacity: bench.splats.capacity,
+        capacity: fixture.splats.capacity,
         n_sh_rest: 45,
         child_spread: 0.5,
-        least_opacity: 0.005,
+        min_opacity: 0.005,
         unused: 0.0,
     };
     let expected = change::grow(&splats, &errors.iter().map(|error| f64::from(*error)).collect::<Vec<_>>(), &growth);
     assert!(expected.margin > 1e-6, "a choice of f32 may differ: {}", expected.margin);
-    let families = expected.parents.iter().flatten().count();
-    assert_eq!(families, 204, "the dead and the new");
+    let n_children = expected.parents.iter().flatten().count();
+    assert_eq!(n_children, 204, "the dead and the new");
 
-    gpu.write(&bench.splats.error_sums, 0, bytemuck::cast_slice(&errors));
+    gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let n_planes = 6 * growth.capacity as usize;
     let moments: Vec<[f32; 4]> = (0..n_planes).map(|ix| [f32_of(1.0 + ix as f64); 4]).collect();
-    gpu.write(&bench.splats.moments, 0, bytemuck::cast_slice(&moments));
+    gpu.write(&fixture.splats.moments, 0, bytemuck::cast_slice(&moments));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &bench.learn, &bench.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
-    bench.splats.set_n(&gpu, N_AFTER);
+    fixture.splats.set_n_splats(&gpu, N_AFTER);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
     let expected_parents: Vec<u32> =
         expected.parents.iter().map(|parent| parent.map_or(u32::MAX, |ix| u32::try_from(ix).unwrap())).collect();
     assert_eq!(parents, expected_parents);
-    let after: Vec<[f32; 4]> = gpu.read(&bench.splats.moments, n_planes).unwrap();
+    let after: Vec<[f32; 4]> = gpu.read(&fixture.splats.moments, n_planes).unwrap();
     for (ix, parent) in expected.parents.iter().enumerate() {
         let is_parent = expected.parents.contains(&Some(ix));
         for plane in 0..6 {
@@ -184,15 +190,15 @@ fn growth_matches_the_twin() {
             assert_eq!(after[at(ix)], kept, "splat {ix}, plane {plane}");
         }
     }
-    let sums: Vec<f32> = gpu.read(&bench.splats.error_sums, N_AFTER as usize).unwrap();
+    let sums: Vec<f32> = gpu.read(&fixture.splats.error_sums, N_AFTER as usize).unwrap();
     assert!(sums.iter().all(|sum| *sum == 0.0), "errors are counted anew");
-    check(&splats_of(&bench.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
+    check(&splats_of(&fixture.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
 }
 
 /// Rounded sums lead to some of the dead, which another thread may be giving a new place: whether that has happened must not
 /// count.
 #[test]
-fn the_dead_have_no_children() {
+fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
     const N_AFTER: u32 = 1_200_000; // Some of a million choices are rounded into the dead.
     let mut random = scene::Random::new(12);
@@ -207,31 +213,31 @@ fn the_dead_have_no_children() {
         sh_degree: 0,
     };
     let errors: Vec<f32> = (0..n).map(|_| f32_of(random.uniform(0.5, 1.0))).collect();
-    let mut bench = Bench::new(&GpuOptions::default(), &scene::tilted_view(), &arrays);
-    let gpu = bench.gpu.clone();
-    bench.splats = bench.splats.reshaped(&gpu, N_AFTER, 0).unwrap();
+    let mut fixture = KernelFixture::new(&GpuOptions::default(), &scene::tilted_view(), &arrays);
+    let gpu = fixture.gpu.clone();
+    fixture.splats = fixture.splats.resized(&gpu, N_AFTER, 0).unwrap();
     let growth = Growth {
         n_before: N_BEFORE,
         n_after: N_AFTER,
         key: 6,
-        capacity: bench.splats.capacity,
+        capacity: fixture.splats.capacity,
         n_sh_rest: 0,
         child_spread: 0.5,
-        least_opacity: 0.005,
+        min_opacity: 0.005,
         unused: 0.0,
     };
-    gpu.write(&bench.splats.error_sums, 0, bytemuck::cast_slice(&errors));
+    gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &bench.learn, &bench.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
     let of_dead =
         parents.iter().filter(|parent| is_dead.get(**parent as usize).is_some_and(|is_dead| *is_dead)).count();
     assert_eq!(of_dead, 0);
     let n_children = parents.iter().filter(|parent| **parent != u32::MAX).count();
-    let n_asked = is_dead.iter().filter(|is_dead| **is_dead).count() + (N_AFTER - N_BEFORE) as usize;
-    assert!(n_children <= n_asked && n_asked - n_children < 100, "{n_children} of {n_asked} found a parent");
+    let n_expected = is_dead.iter().filter(|is_dead| **is_dead).count() + (N_AFTER - N_BEFORE) as usize;
+    assert!(n_children <= n_expected && n_expected - n_children < 100, "{n_children} of {n_expected} found a parent");
 }
 
 fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
@@ -240,44 +246,44 @@ fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
 
 /// Bins by hand: a splat belongs to a tile when it reaches one of its pixels.
 #[test]
-fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
+fn tile_lists_are_complete_and_depth_ordered() {
     /// Squared Mahalanobis distance within which f32 may decide either way.
     const MARGIN: f64 = 1e-3;
     let view = scene::tilted_view();
-    let splats = even_scene(10, 300);
-    let bench = Bench::new(&GpuOptions::default(), &view, &arrays_of(&splats));
-    bench.render();
-    let gpu = &bench.gpu;
-    let drawn: Vec<[[f32; 4]; 3]> = gpu.read(&bench.scratch.drawn, splats.len()).unwrap();
+    let splats = full_degree_scene(10, 300);
+    let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
+    fixture.render();
+    let gpu = &fixture.gpu;
+    let projected_splats: Vec<[[f32; 4]; 3]> = gpu.read(&fixture.scratch.projected_splats, splats.len()).unwrap();
     let n_tiles = view.size_px.map(|size| size.div_ceil(16));
     let n_bins = n_tiles.map(|n| n.div_ceil(4));
-    let starts: Vec<u32> = gpu.read(&bench.scratch.bin_starts, (n_bins[0] * n_bins[1]) as usize + 1).unwrap();
+    let starts: Vec<u32> = gpu.read(&fixture.scratch.bin_starts, (n_bins[0] * n_bins[1]) as usize + 1).unwrap();
     let n_entries = starts[starts.len() - 1] as usize;
-    let entries: Vec<[u32; 4]> = gpu.read(&bench.scratch.entries, n_entries).unwrap();
+    let entries: Vec<[u32; 4]> = gpu.read(&fixture.scratch.entries, n_entries).unwrap();
     let (splat_of, masks, slots) = (column(&entries, 0), column(&entries, 1), column(&entries, 2));
     let mut taken: Vec<u32> =
         masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
     taken.sort_unstable();
     assert!(taken.iter().copied().eq(0..u32::try_from(taken.len()).unwrap()), "every slot has one owner");
     // 16 bits over the range of depths: their octaves, each of as many steps.
-    let depths = || drawn.iter().map(|[place, ..]| place[2]).filter(|z| *z > 0.0);
+    let depths = || projected_splats.iter().map(|[position, ..]| position[2]).filter(|z| *z > 0.0);
     let octaves = (depths().fold(0.0, f32::max) / depths().fold(f32::INFINITY, f32::min)).log2();
     let key_step = (octaves + 1.0).log2().ceil().exp2() / 65536.0;
-    let (mut n_listed, mut n_needless) = (0, 0);
+    let (mut n_listed, mut n_unnecessary) = (0, 0);
     for tile in 0..n_tiles[0] * n_tiles[1] {
         let at = [tile % n_tiles[0], tile / n_tiles[0]];
         let bin = (at[1] / 4 * n_bins[0] + at[0] / 4) as usize;
         let bit = 1 << (at[1] % 4 * 4 + at[0] % 4);
         let entries = (starts[bin] as usize..starts[bin + 1] as usize).filter(|entry| masks[*entry] & bit != 0);
         let list: Vec<u32> = entries.map(|entry| splat_of[entry]).collect();
-        let depths: Vec<f32> = list.iter().map(|ix| drawn[*ix as usize][0][2]).collect();
+        let depths: Vec<f32> = list.iter().map(|ix| projected_splats[*ix as usize][0][2]).collect();
         assert!(depths.windows(2).all(|pair| pair[0] <= pair[1] * (1.0 + key_step)), "tile {tile} is out of order");
         let corner = [tile % n_tiles[0] * 16, tile / n_tiles[0] * 16];
-        for (splat_ix, [place, conic, _]) in (0..).zip(&drawn) {
+        for (splat_ix, [position, conic, _]) in (0..).zip(&projected_splats) {
             let [a, b, c, reach] = conic.map(f64::from);
             let distance = |pixel: u32| {
                 let at = [corner[0] + pixel % 16, corner[1] + pixel / 16].map(|px| f64::from(px) + 0.5);
-                let [dx, dy] = [at[0] - f64::from(place[0]), at[1] - f64::from(place[1])];
+                let [dx, dy] = [at[0] - f64::from(position[0]), at[1] - f64::from(position[1])];
                 a * dx * dx + 2.0 * b * dx * dy + c * dy * dy
             };
             let nearest = (0..256).map(distance).fold(f64::INFINITY, f64::min);
@@ -285,9 +291,9 @@ fn tiles_list_every_splat_that_reaches_them_in_order_of_depth() {
             assert!(n_times <= 1, "tile {tile} lists splat {splat_ix} {n_times} times");
             assert!(n_times == 1 || nearest > reach - MARGIN, "tile {tile} misses splat {splat_ix}");
             n_listed += n_times;
-            n_needless += usize::from(n_times == 1 && nearest > reach + MARGIN);
+            n_unnecessary += usize::from(n_times == 1 && nearest > reach + MARGIN);
         }
     }
     assert!(n_listed > 300, "{n_listed} intersections");
-    assert!(n_needless * 20 < n_listed, "{n_needless} of {n_listed} reach no pixel");
+    assert!(n_unnecessary * 20 < n_listed, "{n_unnecessary} of {n_listed} reach no pixel");
 }

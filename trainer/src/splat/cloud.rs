@@ -61,12 +61,12 @@ fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) ->
 struct Random {
     state: u64,
     /// Box and Muller make two at once.
-    kept: Option<f64>,
+    spare: Option<f64>,
 }
 
 impl Random {
     fn new(seed: u64) -> Self {
-        Self { state: seed, kept: None }
+        Self { state: seed, spare: None }
     }
 
     fn next(&mut self) -> u64 {
@@ -85,12 +85,12 @@ impl Random {
 
     /// Mean 0, deviation 1.
     fn normal(&mut self) -> f64 {
-        if let Some(kept) = self.kept.take() {
-            return kept;
+        if let Some(spare) = self.spare.take() {
+            return spare;
         }
         let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
         let (sine, cosine) = (TAU * self.uniform()).sin_cos();
-        self.kept = Some(radius * sine);
+        self.spare = Some(radius * sine);
         radius * cosine
     }
 }
@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn the_cloud_has_the_spreads_it_promises() {
+    fn cloud_has_the_documented_distribution() {
         let n_splats = 20_000;
         let cloud = synthetic_cloud(n_splats, 0).checked().unwrap();
         assert_eq!(cloud.n_splats(), n_splats);
@@ -136,13 +136,13 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_names_one_cloud() {
+    fn same_seed_gives_the_same_cloud() {
         assert_eq!(synthetic_cloud(50, 7), synthetic_cloud(50, 7));
         assert_ne!(synthetic_cloud(50, 7), synthetic_cloud(50, 8));
     }
 
     /// Writes the arrays of a cloud as numpy does, leaving one out.
-    fn write_npz(path: &Path, cloud: &SplatArrays, left_out: &str) {
+    fn write_npz(path: &Path, cloud: &SplatArrays, omitted: &str) {
         let n = cloud.n_splats();
         let array = |values: &[f32], shape: &[usize]| Tensor::from_slice(values, shape, &Device::Cpu).unwrap();
         let mut arrays = vec![
@@ -152,12 +152,12 @@ mod tests {
             ("opacities_logit", array(&cloud.opacity_logits, &[n])),
             ("sh", array(cloud.sh.as_flattened(), &[n, 16, 3])),
         ];
-        arrays.retain(|(name, _)| *name != left_out);
+        arrays.retain(|(name, _)| *name != omitted);
         Tensor::write_npz(&arrays, path).unwrap();
     }
 
     #[test]
-    fn arrays_of_a_peer_are_read_back() {
+    fn numpy_arrays_round_trip() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cloud.npz");
         let cloud = synthetic_cloud(9, 3);

@@ -16,14 +16,14 @@
 @group(0) @binding(1) var<uniform> model: Model;
 @group(0) @binding(2) var<storage, read> by_depth: array<u32>;
 @group(0) @binding(3) var<storage, read> depth_keys: array<u32>;
-@group(0) @binding(4) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(4) var<storage, read> projected_splats: array<ProjectedSplat>;
 @group(0) @binding(5) var<storage, read_write> touched: array<Touched>;
 @group(0) @binding(6) var<storage, read_write> tile_counts: array<u32>;
 @group(0) @binding(7) var<storage, read_write> slot_offsets: array<u32>;
 @group(0) @binding(8) var<storage, read_write> block_slots: array<u32>;
 @group(0) @binding(9) var<storage, read_write> bin_counts: array<u32>;
 
-const UNSEEN = 0xffffffffu; // As in project.
+const INVISIBLE = 0xffffffffu; // As in project.
 @compute @workgroup_size(BLOCK)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = block_and_window(folded(wg, n_wgs), model.n_splats, view.n_tiles);
@@ -32,17 +32,17 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var splat_ix = 0u;
     if rank < model.n_splats {
         splat_ix = by_depth[rank];
-        if depth_keys[rank] != UNSEEN {
-            let place = drawn[splat_ix].place;
-            let conic = drawn[splat_ix].conic;
-            touches = tiles_touched(Ellipse(place.xy, conic.xyz, conic.w), view.n_tiles);
+        if depth_keys[rank] != INVISIBLE {
+            let position = projected_splats[splat_ix].position;
+            let conic = projected_splats[splat_ix].conic;
+            touches = tiles_touched(Ellipse(position.xy, conic.xyz, conic.w), view.n_tiles);
         }
     }
     var n_slots = 0u;
     let offset = exclusive_scan(lane, n_tiles_of(touches), &n_slots);
-    mark_bins(lane, at, touches);
+    set_reached_bins(lane, at, touches);
     if at.block >= at.n_blocks { return; } // Past the last barrier.
-    if lane < at.n_bins { bin_counts[at.block * at.bins.x * at.bins.y + at.first_bin + lane] = n_marked(lane, BLOCK); }
+    if lane < at.n_bins { bin_counts[at.block * at.bins.x * at.bins.y + at.first_bin + lane] = n_reaching(lane, BLOCK); }
     if at.first_bin > 0u { return; }
     if lane == 0u { block_slots[at.block] = n_slots; }
     if rank < model.n_splats {

@@ -41,7 +41,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         }
         wg_begins[lane] = begin;
     }
-    mark_bins(lane, at, touches);
+    set_reached_bins(lane, at, touches);
     if status[N_ENTRIES] == 0u || rank >= model.n_splats { return; } // Past the last barrier.
     let splat_ix = by_depth[rank];
     var slot = block_slots[at.block] + slot_offsets[rank];
@@ -52,7 +52,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             let tiles = tiles_in_bin(touches, column, row);
             let bin = row * at.bins.x + column - at.first_bin; // Wraps where the bin is before the window.
             if bin < at.n_bins && tiles != 0u {
-                entries[wg_begins[bin] + n_marked(bin, lane)] = vec4u(splat_ix, tiles, slot, 0u);
+                entries[wg_begins[bin] + n_reaching(bin, lane)] = vec4u(splat_ix, tiles, slot, 0u);
             }
             slot += countOneBits(tiles);
         }

@@ -33,24 +33,24 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let child = folded(wg, n_wgs) * WG_SIZE + lane;
     if child >= growth.n_after { return; } // Allowed here: no barrier below.
     parents[child] = NO_PARENT;
-    if child < growth.n_before && !is_dead(means[child], shapes[child], growth.least_opacity) { return; }
+    if child < growth.n_before && !is_dead(means[child], shapes[child], growth.min_opacity) { return; }
     let n_blocks = (growth.n_before + 255u) / 256u;
     let total = block_weights[n_blocks - 1u];
-    let wanted = uniform3(vec3u(child, growth.key, 7u)).x * total;
+    let threshold = uniform3(vec3u(child, growth.key, 7u)).x * total;
     // The first block, then the first splat, whose sum passes the number.
     var low = 0u;
     var high = n_blocks - 1u;
     while low < high {
         let middle = (low + high) / 2u;
-        if block_weights[middle] > wanted { high = middle; } else { low = middle + 1u; }
+        if block_weights[middle] > threshold { high = middle; } else { low = middle + 1u; }
     }
-    var within = wanted;
-    if low > 0u { within -= block_weights[low - 1u]; }
+    var within_block = threshold;
+    if low > 0u { within_block -= block_weights[low - 1u]; }
     var parent = low * 256u;
     high = min(parent + 255u, growth.n_before - 1u);
     while parent < high {
         let middle = (parent + high) / 2u;
-        if cumulative[middle] > within { high = middle; } else { parent = middle + 1u; }
+        if cumulative[middle] > within_block { high = middle; } else { parent = middle + 1u; }
     }
     if weights[parent] <= 0.0 {
         // Nothing to learn from yet: invisible until the next change of the count.

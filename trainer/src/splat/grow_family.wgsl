@@ -16,7 +16,7 @@
 @group(0) @binding(5) var<storage, read_write> error_sums: array<f32>;
 
 override WG_SIZE = 256u;
-const MOST = 16u; // Larger families are treated as this large.
+const MAX_FAMILY = 16u; // Larger families are treated as this large.
 
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -26,7 +26,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     var parent = parents[splat_ix];
     if parent == NO_PARENT { parent = splat_ix; }
     if parent >= growth.n_before || n_children[parent] == 0u { return; }
-    let n = min(n_children[parent] + 1u, MOST);
+    let n = min(n_children[parent] + 1u, MAX_FAMILY);
     let shape = shapes[splat_ix];
     let opacity = clamp(1.0 / (1.0 + exp(-shape.w)), 1e-4, 0.9999);
     let shared_opacity = clamp(1.0 - pow(1.0 - opacity, 1.0 / f32(n)), 0.005, 0.9999);

@@ -13,9 +13,9 @@
 @compute @workgroup_size(256)
 fn main(@builtin(local_invocation_index) lane: u32) {
     let n_blocks = (growth.n_before + 255u) / 256u;
-    let share = (n_blocks + 255u) / 256u;
-    let begin = min(lane * share, n_blocks);
-    let end = min(begin + share, n_blocks);
+    let blocks_per_lane = (n_blocks + 255u) / 256u;
+    let begin = min(lane * blocks_per_lane, n_blocks);
+    let end = min(begin + blocks_per_lane, n_blocks);
     var sum = 0.0;
     for (var block = begin; block < end; block++) { sum += block_weights[block]; }
     var running = inclusive_scan_f32(lane, sum) - sum;

@@ -22,7 +22,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let block = folded(wg, n_wgs);
     let splat_ix = block * 256u + lane;
     var weight = 0.0;
-    if splat_ix < growth.n_before && !is_dead(means[splat_ix], shapes[splat_ix], growth.least_opacity) {
+    if splat_ix < growth.n_before && !is_dead(means[splat_ix], shapes[splat_ix], growth.min_opacity) {
         weight = clamp(error_sums[splat_ix], 0.0, 1e12);
     }
     let sum = inclusive_scan_f32(lane, weight);

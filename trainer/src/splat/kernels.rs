@@ -39,8 +39,8 @@ const SHARED: &[Source] = &[
     BINS,
     TILES,
     source!("block_bins"),
-    source!("camera_terms"),
-    source!("term_step"),
+    source!("camera_params"),
+    source!("param_step"),
     source!("camera_sums", "camera_sums_none"),
     source!("ssim_bindings"),
     source!("ssim_upstream", "ssim_upstream_window"),
@@ -75,7 +75,7 @@ macro_rules! update_sources {
 const WITH_CAMERA: &[Source] = update_sources!(GRADIENT_SUM, "camera_sums_tree");
 /// Where gradients meet unordered.
 const UPDATE_UNORDERED: &[Source] =
-    update_sources!(source!("gradient_sum", "gradient_sum_meeting"), "camera_sums_none");
+    update_sources!(source!("gradient_sum", "gradient_sum_unordered"), "camera_sums_none");
 
 /// What the kernels over pixels import.
 macro_rules! blend_sources {
@@ -106,16 +106,16 @@ const BLEND_STRIPS: &[Source] = blend_sources!(
 );
 /// What `backward` imports where gradients meet unordered, in both forms.
 const BACKWARD_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_meeting"),
+    source!("gradients", "gradients_unordered"),
     source!("pixels", "pixels_2"),
     source!("tile_queue"),
-    source!("sums", "sums_any")
+    source!("sums", "sums_unordered")
 );
 const BACKWARD_STRIPS_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_meeting"),
+    source!("gradients", "gradients_unordered"),
     source!("pixels", "pixels_4"),
     source!("strips"),
-    source!("lane_sums", "lane_sums_any")
+    source!("lane_sums", "lane_sums_unordered")
 );
 
 macro_rules! kernel {
@@ -370,7 +370,7 @@ mod tests {
     }
 
     #[test]
-    fn structs_have_the_same_fields_in_rust_and_wgsl() {
+    fn structs_have_the_same_layout_in_rust_and_wgsl() {
         use crate::splat::params::{CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View};
         assert_layout!(
             View,
@@ -416,21 +416,30 @@ mod tests {
                 unused
             ]
         );
-        assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, varied_background]);
-        assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, least_opacity, unused]);
-        assert_layout!(Lens, [linear, angular, camera_terms, image_terms, unused]);
+        assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]);
+        assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]);
+        assert_layout!(Lens, [linear, angular, camera_params, image_params, unused]);
         assert_layout!(
             CameraRule,
-            [of_camera, of_image, turn_rate, shift_rate_m, delay_rate, focal_rate, gain_rate, image_pull]
+            [
+                camera_mask,
+                image_mask,
+                rotation_rate,
+                translation_rate_m,
+                time_offset_rate,
+                focal_rate,
+                gain_rate,
+                image_decay
+            ]
         );
         assert_layout!(Capacity, [n_entries, n_slots, unused]);
         assert_layout!(Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
     }
 
     #[test]
-    fn every_kernel_parses_and_validates() {
+    fn every_kernel_is_valid() {
         let kernels = super::KERNELS.iter().chain(crate::sort::KERNELS);
-        let refused: Vec<String> = kernels
+        let invalid: Vec<String> = kernels
             .filter_map(|kernel| {
                 resolve(kernel.source, kernel.shared)
                     .and_then(|text| reflect(kernel.source.name, &text).map(|_| ()))
@@ -438,6 +447,6 @@ mod tests {
             })
             .map(|error| error.to_string())
             .collect();
-        assert!(refused.is_empty(), "{}", refused.join("\n"));
+        assert!(invalid.is_empty(), "{}", invalid.join("\n"));
     }
 }

@@ -2,7 +2,7 @@
 
 use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
-use super::learning::{keyframes, options, test_psnr, train};
+use super::training_tests::{keyframes, options, test_psnr, train};
 use crate::gpu::{Gpu, GpuOptions, f32_of};
 use crate::{DepthMap, Keyframe, Method};
 use kinematics::{Stamp, Transform, Twist};
@@ -11,17 +11,17 @@ use std::sync::Arc;
 
 /// Spoiled keyframes among good ones: whatever is wrong with them, the others are learned from as if they were not there.
 #[test]
-fn spoiled_keyframes_cost_no_parameter_and_no_other_keyframe() {
+fn invalid_keyframes_do_not_affect_training() {
     const N_STEPS: u64 = 120;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let good = keyframes(&gpu, true);
+    let valid_keyframes = keyframes(&gpu, true);
     let with_depth = |of: fn(usize, f32) -> f32| {
-        let spoiled = good[1].as_ref().clone();
-        let depth = spoiled.depth.clone().unwrap();
+        let corrupted = valid_keyframes[1].as_ref().clone();
+        let depth = corrupted.depth.clone().unwrap();
         let depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| of(ix, *z)).collect();
-        Keyframe { depth: Some(DepthMap { depth_m, ..depth }), ..spoiled }
+        Keyframe { depth: Some(DepthMap { depth_m, ..depth }), ..corrupted }
     };
-    let plain = good[1].as_ref().clone();
+    let plain = valid_keyframes[1].as_ref().clone();
     let one_pixel = |depth: Option<DepthMap>| Keyframe {
         size_px: [1, 1],
         principal_px: [0.5; 2],
@@ -29,7 +29,7 @@ fn spoiled_keyframes_cost_no_parameter_and_no_other_keyframe() {
         depth,
         ..plain.clone()
     };
-    let spoiled = [
+    let corrupted = [
         with_depth(|ix, z| if ix % 2 == 0 { f32::NAN } else { z }),
         with_depth(|_, _| f32::INFINITY),
         with_depth(|ix, z| if ix % 3 == 0 { -z } else { f32::MAX }),
@@ -44,32 +44,32 @@ fn spoiled_keyframes_cost_no_parameter_and_no_other_keyframe() {
             ..plain.clone()
         },
     ];
-    let learned = |spoiled: &[Keyframe]| {
+    let learned = |corrupted: &[Keyframe]| {
         let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
-        for keyframe in &good {
+        for keyframe in &valid_keyframes {
             trainer.push(keyframe.clone()).unwrap();
         }
-        for (keyframe, stamp) in spoiled.iter().zip(900..) {
+        for (keyframe, stamp) in corrupted.iter().zip(900..) {
             trainer.push(Arc::new(Keyframe { stamp: Stamp(stamp), ..keyframe.clone() })).unwrap();
         }
         train(&mut trainer, N_STEPS);
         assert!(trainer.arrays().unwrap().checked().is_ok());
-        test_psnr(&mut trainer, &good)
+        test_psnr(&mut trainer, &valid_keyframes)
     };
-    let (without, with) = (learned(&[]), learned(&spoiled));
+    let (without, with) = (learned(&[]), learned(&corrupted));
     assert!(with > without - 1.5, "{with:.2} dB beside spoiled keyframes, {without:.2} dB without");
 }
 
 /// Splats that a file may hold: on the camera's plane, without rotation, huge, almost transparent.
 #[test]
-fn hostile_splats_learn_nothing_that_is_not_finite() {
+fn invalid_splats_stay_finite_in_training() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let good = keyframes(&gpu, true);
+    let valid_keyframes = keyframes(&gpu, true);
     let mut arrays = synthetic_cloud(200, 5);
-    let center = good[1].world_from_camera.translation.vector;
+    let center = valid_keyframes[1].world_from_camera.translation.vector;
     let at = |z_m: f64| {
-        let place = good[1].world_from_camera * Point3::new(0.0, 0.0, z_m);
-        [place.x, place.y, place.z].map(f32_of)
+        let position = valid_keyframes[1].world_from_camera * Point3::new(0.0, 0.0, z_m);
+        [position.x, position.y, position.z].map(f32_of)
     };
     arrays.means[0] = center.map(f32_of).into();
     (arrays.means[1], arrays.means[2], arrays.means[3]) = (at(0.0101), at(-1e-6), [f32::MAX; 3]);
@@ -80,7 +80,7 @@ fn hostile_splats_learn_nothing_that_is_not_finite() {
     (arrays.opacity_logits[8], arrays.opacity_logits[9]) = (1e30, -1e30);
     arrays.sh[16 * 10] = [f32::MAX; 3];
     let mut trainer = SplatTrainer::from_arrays(gpu, options(), &arrays).unwrap();
-    for keyframe in &good {
+    for keyframe in &valid_keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
     train(&mut trainer, 60);

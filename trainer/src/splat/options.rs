@@ -1,6 +1,6 @@
 //! How a splat model learns.
 
-use super::trials::{CameraChoice, CountChoice};
+use super::trials::{CameraRefinement, CountPolicy};
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::SplatTrainer`].
@@ -12,7 +12,7 @@ pub struct SplatOptions {
     /// Most splats the model may have.
     pub max_splats: u32,
     /// How many it takes.
-    pub count: CountChoice,
+    pub count: CountPolicy,
     /// Most bytes of GPU memory the model (parameters and the optimiser's moments) may take.
     pub max_bytes: Option<u64>,
     /// Highest degree of spherical harmonics, 0 to 3.
@@ -25,7 +25,7 @@ pub struct SplatOptions {
     pub depth_per_m: f64,
     /// How bright the background may be that changes every step: enough to keep black things solid. Up to 1 costs 1 dB
     /// in the first few hundred steps, while much is still bare.
-    pub varied_background: f64,
+    pub random_background: f64,
     /// Opacity and size cost the square of this over the number of images, against the color loss: the fewer images there
     /// are, the more must speak for a splat. 0: they cost nothing.
     pub cost_images: f64,
@@ -37,10 +37,10 @@ pub struct SplatOptions {
     /// processor, where a step takes as long as the image has pixels.
     pub coarse_steps: Option<[u64; 2]>,
     /// What is learned about cameras.
-    pub cameras: CameraChoice,
+    pub cameras: CameraRefinement,
     /// What is found about cameras by laying keyframes with depth over each other, before it is learned from the splats.
     #[serde(default)]
-    pub align: CameraChoice,
+    pub align: CameraRefinement,
     /// Splats that one depth image may add; `None`: fewer on a processor.
     pub seeds_per_image: Option<f64>,
 }
@@ -50,19 +50,19 @@ impl Default for SplatOptions {
         Self {
             seed: 0,
             max_splats: 400_000,
-            count: CountChoice::default(),
+            count: CountPolicy::default(),
             max_bytes: None,
             sh_degree: 3,
             n_planned_steps: 7000,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
-            varied_background: 0.25,
+            random_background: 0.25,
             cost_images: 13.0,
             growth_frac: 0.1,
             noise: 5e5,
             coarse_steps: None,
-            cameras: CameraChoice::default(),
-            align: CameraChoice::default(),
+            cameras: CameraRefinement::default(),
+            align: CameraRefinement::default(),
             seeds_per_image: None,
         }
     }

@@ -48,7 +48,7 @@ pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
     /// The pinhole camera that a picture is asked from.
-    pub(crate) fn of_request(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
+    pub(crate) fn from_request(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
         Self {
             world_from_camera: request.world_from_camera,
             size_px: request.size_px,
@@ -155,32 +155,32 @@ pub(crate) struct Rule {
     pub(crate) unused: u32,
 }
 
-/// Terms of a camera or of an image, as in `shared/camera_terms.wgsl`.
-pub(crate) const N_TERMS: u32 = 16;
+/// Terms of a camera or of an image, as in `shared/camera_params.wgsl`.
+pub(crate) const N_PARAMS: u32 = 16;
 
-/// `Lens` of `shared/camera_terms.wgsl`.
+/// `Lens` of `shared/camera_params.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Lens {
     pub(crate) linear: [f32; 4],
     pub(crate) angular: [f32; 4],
-    pub(crate) camera_terms: u32,
-    pub(crate) image_terms: u32,
+    pub(crate) camera_params: u32,
+    pub(crate) image_params: u32,
     pub(crate) unused: [u32; 2],
 }
 
-/// `CameraRule` of `shared/camera_terms.wgsl`.
+/// `CameraRule` of `shared/camera_params.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct CameraRule {
-    pub(crate) of_camera: u32,
-    pub(crate) of_image: u32,
-    pub(crate) turn_rate: f32,
-    pub(crate) shift_rate_m: f32,
-    pub(crate) delay_rate: f32,
+    pub(crate) camera_mask: u32,
+    pub(crate) image_mask: u32,
+    pub(crate) rotation_rate: f32,
+    pub(crate) translation_rate_m: f32,
+    pub(crate) time_offset_rate: f32,
     pub(crate) focal_rate: f32,
     pub(crate) gain_rate: f32,
-    pub(crate) image_pull: f32,
+    pub(crate) image_decay: f32,
 }
 
 /// `Supervision` of shared/supervision.wgsl: what a picture is compared with and how.
@@ -191,7 +191,7 @@ pub(crate) struct Supervision {
     pub(crate) dssim_frac: f32,
     pub(crate) depth_weight: f32,
     pub(crate) depth_clip_m: f32,
-    pub(crate) varied_background: f32,
+    pub(crate) random_background: f32,
 }
 
 /// Indices into the status array, as in shared/status.wgsl.
@@ -201,7 +201,7 @@ pub(crate) mod status {
     pub(crate) const NEED_ENTRIES: usize = 4;
     pub(crate) const NEED_SLOTS: usize = 5;
     pub(crate) const STEP: usize = 6;
-    pub(crate) const N_POISONED: usize = 7;
+    pub(crate) const N_NON_FINITE: usize = 7;
     pub(crate) const FURTHEST: u32 = 8;
     /// Length of the array.
     pub(crate) const LEN: usize = 16;
@@ -217,7 +217,7 @@ pub(crate) struct Growth {
     pub(crate) capacity: u32,
     pub(crate) n_sh_rest: u32,
     pub(crate) child_spread: f32,
-    pub(crate) least_opacity: f32,
+    pub(crate) min_opacity: f32,
     pub(crate) unused: f32,
 }
 

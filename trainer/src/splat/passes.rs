@@ -1,6 +1,6 @@
 //! The stages of drawing and learning, as lists of passes.
 
-use super::buffers::{BLOCK, Frame, GROUP, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
+use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines, Ssim, UnorderedPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -11,7 +11,7 @@ pub(crate) struct ViewPasses<'a> {
     pub(crate) gpu: &'a Gpu,
     pub(crate) splats: &'a SplatBuffers,
     pub(crate) scratch: &'a Scratch,
-    pub(crate) frame: &'a Frame,
+    pub(crate) image_buffers: &'a ImageBuffers,
     pub(crate) status: &'a Buffer,
     pub(crate) view: &'a Buffer,
     pub(crate) size_px: [u32; 2],
@@ -110,7 +110,7 @@ fn n_color_strips(size_px: [u32; 2]) -> u64 {
 impl ViewPasses<'_> {
     /// Projects, sorts, bins and rasterizes.
     pub(crate) fn draw(&self, passes: &mut Passes, pipelines: &DrawPipelines) {
-        let Self { gpu, splats, scratch, frame, status, view, size_px } = *self;
+        let Self { gpu, splats, scratch, image_buffers, status, view, size_px } = *self;
         let n_blocks = u64::from(splats.n_splats.div_ceil(BLOCK));
         let [view, model] = [("view", view), ("model", &splats.model)];
         passes.dispatch(
@@ -121,7 +121,7 @@ impl ViewPasses<'_> {
                 &[
                     view,
                     model,
-                    ("drawn", &scratch.drawn),
+                    ("projected_splats", &scratch.projected_splats),
                     ("depth_keys", &scratch.by_depth.keys[0]),
                     ("status", status),
                 ][..],
@@ -132,13 +132,25 @@ impl ViewPasses<'_> {
         pipelines.sort.sort(gpu, passes, &scratch.by_depth, status);
         let by_depth = ("by_depth", &scratch.by_depth.values[0]);
         let n_windows = u64::from(n_bins(size_px).div_ceil(WINDOW_BINS));
-        let [drawn, tile_counts] = [("drawn", &scratch.drawn), ("tile_counts", &scratch.tile_counts)];
+        let [projected_splats, tile_counts] =
+            [("projected_splats", &scratch.projected_splats), ("tile_counts", &scratch.tile_counts)];
         let [bin_counts, group_counts] = [("bin_counts", &scratch.bin_counts), ("group_counts", &scratch.group_counts)];
         let [bin_totals, bin_starts] = [("bin_totals", &scratch.bin_totals), ("bin_starts", &scratch.bin_starts)];
         let [block_slots, status] = [("block_slots", &scratch.block_slots), ("status", status)];
         let [touched, slot_offsets] = [("touched", &scratch.touched), ("slot_offsets", &scratch.slot_offsets)];
         let keys = ("depth_keys", &scratch.by_depth.keys[0]);
-        let counted = [view, model, keys, by_depth, drawn, touched, tile_counts, slot_offsets, block_slots, bin_counts];
+        let counted = [
+            view,
+            model,
+            keys,
+            by_depth,
+            projected_splats,
+            touched,
+            tile_counts,
+            slot_offsets,
+            block_slots,
+            bin_counts,
+        ];
         passes.dispatch(gpu, &pipelines.count_bins, n_blocks * n_windows, &counted);
         let n_groups = n_blocks.div_ceil(u64::from(GROUP));
         passes.dispatch(gpu, &pipelines.sum_bins, n_groups * n_windows, &[view, model, bin_counts, group_counts]);
@@ -175,10 +187,10 @@ impl ViewPasses<'_> {
                 bin_starts,
                 tile_bits,
                 entries,
-                drawn,
-                ("image", &frame.image),
-                ("depth", &frame.depth),
-                ("last", &frame.last),
+                projected_splats,
+                ("image", &image_buffers.image),
+                ("depth", &image_buffers.depth),
+                ("last", &image_buffers.last),
             ],
         );
     }
@@ -193,47 +205,47 @@ impl ViewPasses<'_> {
             &[
                 ("view", self.view),
                 ("supervision", supervision),
-                ("image", &self.frame.image),
-                ("depth", &self.frame.depth),
-                ("pixels", &self.frame.pixels),
-                ("depths", &self.frame.depths),
+                ("image", &self.image_buffers.image),
+                ("depth", &self.image_buffers.depth),
+                ("pixels", &self.image_buffers.pixels),
+                ("depths", &self.image_buffers.depths),
             ],
         );
     }
 
     /// Compares the picture with its target: the slopes towards every pixel.
     pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
-        let Self { gpu, frame, status, view, .. } = *self;
+        let Self { gpu, image_buffers, status, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
         let base = [
             ("view", view),
             ("supervision", target.supervision),
             ("status", status),
-            ("image", &frame.image),
+            ("image", &image_buffers.image),
             ("target_image", target.image),
             ("gains", target.gains),
         ];
         if target.ssim {
             let mut buffers = base.to_vec();
-            buffers.push(("slopes", &frame.slopes));
+            buffers.push(("ssim_gradients", &image_buffers.ssim_gradients));
             match &pipelines.ssim {
                 Ssim::Tiles(ssim) => passes.dispatch(gpu, ssim, n_groups, &buffers),
                 Ssim::Strips { means, upstream } => {
                     let n_groups = n_color_strips(self.size_px);
                     passes.dispatch(gpu, means, n_groups, &buffers);
-                    buffers.push(("upstream", &frame.upstream));
+                    buffers.push(("upstream", &image_buffers.upstream));
                     passes.dispatch(gpu, upstream, n_groups, &buffers);
                 }
             }
         }
         let mut buffers = base.to_vec();
         buffers.extend([
-            ("depth", &frame.depth),
+            ("depth", &image_buffers.depth),
             ("target_depth", target.depth),
-            ("slopes", &frame.slopes),
-            ("upstream", &frame.upstream),
-            ("rest", &frame.rest),
-            ("gain_sums", &frame.gain_sums),
+            ("ssim_gradients", &image_buffers.ssim_gradients),
+            ("upstream", &image_buffers.upstream),
+            ("pixel_totals", &image_buffers.pixel_totals),
+            ("gain_sums", &image_buffers.gain_sums),
         ]);
         passes.dispatch(
             gpu,
@@ -249,7 +261,7 @@ impl ViewPasses<'_> {
     }
 
     fn backward_into(&self, passes: &mut Passes, backward: &Pipeline, gradients: &Buffer) {
-        let Self { gpu, scratch, frame, status, view, size_px, .. } = *self;
+        let Self { gpu, scratch, image_buffers, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
             backward,
@@ -260,10 +272,10 @@ impl ViewPasses<'_> {
                 ("bin_starts", &scratch.bin_starts),
                 ("tile_bits", &scratch.tile_bits),
                 ("entries", &scratch.entries),
-                ("drawn", &scratch.drawn),
-                ("upstream", &frame.upstream),
-                ("rest", &frame.rest),
-                ("last", &frame.last),
+                ("projected_splats", &scratch.projected_splats),
+                ("upstream", &image_buffers.upstream),
+                ("pixel_totals", &image_buffers.pixel_totals),
+                ("last", &image_buffers.last),
                 ("gradients", gradients),
             ],
         );
@@ -321,7 +333,7 @@ impl ViewPasses<'_> {
             ("tile_counts", &scratch.tile_counts),
             ("status", status),
             ("error_sums", &splats.error_sums),
-            ("drawn", &scratch.drawn),
+            ("projected_splats", &scratch.projected_splats),
         ]);
         buffers.extend(splats.parameters());
         buffers.extend(splats.all_moments());

@@ -19,34 +19,34 @@
 @group(0) @binding(4) var<storage, read> shapes: array<vec4f>;      // log_scale.xyz, opacity_logit
 @group(0) @binding(5) var<storage, read> sh_dc: array<f32>;         // 3 planes of `capacity`
 @group(0) @binding(6) var<storage, read> sh_rest: array<f32>;       // 3 planes a basis function
-@group(0) @binding(7) var<storage, read_write> drawn: array<Drawn>;
+@group(0) @binding(7) var<storage, read_write> projected_splats: array<ProjectedSplat>;
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
 
 @group(0) @binding(9) var<storage, read_write> status: array<atomic<u32>>;
 
-const UNSEEN = 0xffffffffu;
-var<workgroup> wg_ends: array<vec2u, 256>;
+const INVISIBLE = 0xffffffffu;
+var<workgroup> wg_depth_range: array<vec2u, 256>;
 
 struct ShSums {
     splat_ix: u32,
     color: vec3f,
 }
 
-fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
+fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: vec3f) {
     let at = 3u * k * model.capacity + (*sums).splat_ix;
     (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
 }
 
 // Places and colors a splat; its depth key.
-fn draw(splat_ix: u32) -> u32 {
+fn project(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
     // Written so that a NaN anywhere is not seen.
-    let seen = projection.seen && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
+    let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
-    if !seen { return UNSEEN; }
+    if !visible { return INVISIBLE; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);
@@ -54,32 +54,32 @@ fn draw(splat_ix: u32) -> u32 {
     let half_px = sqrt(max(vec2f(reach) * projection.covariance.xz, vec2f(0.0))) + 0.5;
     let last = projection.mean_px + half_px;
     let first = projection.mean_px - half_px;
-    if any(last < vec2f(0.0)) || any(first > vec2f(view.size_px)) { return UNSEEN; }
+    if any(last < vec2f(0.0)) || any(first > vec2f(view.size_px)) { return INVISIBLE; }
 
     let constant = vec3f(sh_dc[splat_ix], sh_dc[model.capacity + splat_ix], sh_dc[2u * model.capacity + splat_ix]);
     var sums = ShSums(splat_ix, vec3f(0.5) + SH_0 * constant);
     each_sh(&sums, normalize(mean - view.center_in_world.xyz), model.sh_degree);
     let color = max(sums.color, vec3f(0.0));
-    drawn[splat_ix] = Drawn(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(color, 0.0));
+    projected_splats[splat_ix] = ProjectedSplat(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(color, 0.0));
     return bitcast<u32>(projection.point.z); // Positive floats order as their bits do.
 }
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let splat_ix = folded(wg, n_wgs) * 256u + lane;
-    var key = UNSEEN;
+    var key = INVISIBLE;
     if splat_ix < model.n_splats {
-        key = draw(splat_ix);
+        key = project(splat_ix);
         depth_keys[splat_ix] = key;
     }
-    wg_ends[lane] = select(vec2u(key, ~key), vec2u(0u), key == UNSEEN);
+    wg_depth_range[lane] = select(vec2u(key, ~key), vec2u(0u), key == INVISIBLE);
     workgroupBarrier(); // All ends are there.
     for (var stride = 128u; stride > 0u; stride /= 2u) {
-        if lane < stride { wg_ends[lane] = max(wg_ends[lane], wg_ends[lane + stride]); }
+        if lane < stride { wg_depth_range[lane] = max(wg_depth_range[lane], wg_depth_range[lane + stride]); }
         workgroupBarrier(); // This half holds what the other knew.
     }
     if lane == 0u {
-        atomicMax(&status[FURTHEST], wg_ends[0].x);
-        atomicMax(&status[NEAREST], wg_ends[0].y);
+        atomicMax(&status[FURTHEST], wg_depth_range[0].x);
+        atomicMax(&status[NEAREST], wg_depth_range[0].y);
     }
 }

@@ -16,7 +16,7 @@ pub(crate) fn render(
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
 ) -> Result<Picture, Error> {
     match request.projection {
-        Projection::Pinhole { focal_px, principal_px } => draw(&Camera::of_request(request, focal_px, principal_px)),
+        Projection::Pinhole { focal_px, principal_px } => draw(&Camera::from_request(request, focal_px, principal_px)),
         Projection::Equirectangular => all_directions(request, draw),
     }
 }
@@ -31,9 +31,12 @@ fn all_directions(
 ) -> Result<Picture, Error> {
     let [width, height] = request.size_px;
     let edge = (width / 4).max(height / 2).max(1);
-    let face = |turn: Rotation3<f64>| Camera {
+    let face = |rotation: Rotation3<f64>| Camera {
         world_from_camera: request.world_from_camera
-            * Transform::from_parts(nalgebra::Translation3::identity(), UnitQuaternion::from_rotation_matrix(&turn)),
+            * Transform::from_parts(
+                nalgebra::Translation3::identity(),
+                UnitQuaternion::from_rotation_matrix(&rotation),
+            ),
         size_px: [edge; 2],
         focal_px: [f64::from(edge) / 2.0; 2],
         principal_px: [f64::from(edge) / 2.0; 2],
@@ -44,7 +47,7 @@ fn all_directions(
         low_pass_px2: LOW_PASS_PX2,
     };
     let about = |axis, angle| Rotation3::from_axis_angle(&axis, angle);
-    let turns = [
+    let face_rotations = [
         Rotation3::identity(),
         about(Vector3::y_axis(), FRAC_PI_2),
         about(Vector3::y_axis(), PI),
@@ -52,7 +55,7 @@ fn all_directions(
         about(Vector3::x_axis(), FRAC_PI_2),
         about(Vector3::x_axis(), -FRAC_PI_2),
     ];
-    let faces: Vec<Picture> = turns.iter().map(|turn| draw(&face(*turn))).collect::<Result<_, _>>()?;
+    let faces: Vec<Picture> = face_rotations.iter().map(|rotation| draw(&face(*rotation))).collect::<Result<_, _>>()?;
     let n = (width * height) as usize;
     let mut picture = Picture {
         size_px: request.size_px,
@@ -65,21 +68,21 @@ fn all_directions(
             let longitude = 2.0 * PI * (f64::from(x) + 0.5) / f64::from(width) - PI;
             let direction =
                 Vector3::new(latitude.cos() * longitude.sin(), -latitude.sin(), latitude.cos() * longitude.cos());
-            let (face_ix, in_face) = turns
+            let (face_ix, in_face) = face_rotations
                 .iter()
-                .map(|turn| turn.inverse() * direction)
+                .map(|rotation| rotation.inverse() * direction)
                 .enumerate()
                 .max_by(|(_, a), (_, b)| a.z.total_cmp(&b.z))
                 .expect("a cube has six faces");
             let pixel = |axis: usize| {
-                let along = f64::from(edge) / 2.0 * (1.0 + in_face[axis] / in_face.z);
-                (along.max(0.0) as u32).min(edge - 1)
+                let coordinate = f64::from(edge) / 2.0 * (1.0 + in_face[axis] / in_face.z);
+                (coordinate.max(0.0) as u32).min(edge - 1)
             };
             let at = (pixel(1) * edge + pixel(0)) as usize;
-            let seen = &faces[face_ix];
-            picture.rgba_srgb.extend_from_slice(&seen.rgba_srgb[4 * at..4 * at + 4]);
+            let face_picture = &faces[face_ix];
+            picture.rgba_srgb.extend_from_slice(&face_picture.rgba_srgb[4 * at..4 * at + 4]);
             if request.depth {
-                picture.depth_m.push(seen.depth_m[at] / crate::gpu::f32_of(in_face.z));
+                picture.depth_m.push(face_picture.depth_m[at] / crate::gpu::f32_of(in_face.z));
             }
         }
     }

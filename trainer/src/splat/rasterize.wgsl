@@ -16,10 +16,10 @@ var<workgroup> wg_tile: Tile;
 var<workgroup> wg_n_done: atomic<u32>;
 var<workgroup> wg_all_done: u32;
 
-fn blend_in(blend: ptr<function, Blend>, splat: Drawn, dx: Px, dy: f32) {
+fn blend_in(blend: ptr<function, Blend>, splat: ProjectedSplat, dx: Px, dy: f32) {
     let power = power_at(splat.conic, dx, dy);
     let hit = (*blend).live & within_reach(splat.conic, power);
-    *blend = blended(*blend, hit, power, splat.place.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
+    *blend = blended(*blend, hit, power, splat.position.wz, splat.color.rgb, bitcast<u32>(splat.color.w));
 }
 
 fn on_image(tile: Tile, first: vec2u) -> PxB {
@@ -49,10 +49,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             for (var i = 0u; i < n; i++) {
-                let splat = wg_drawn[i];
+                let splat = wg_splats[i];
                 let quarters = wg_quarters[i];
-                let dx = splat.place.x - center_x;
-                let dy = splat.place.y - center_y;
+                let dx = splat.position.x - center_x;
+                let dy = splat.position.y - center_y;
                 if (quarters & 1u) != 0u { blend_in(&a, splat, dx, dy); }
                 if (quarters & 2u) != 0u { blend_in(&b, splat, dx - 8.0, dy); }
                 if (quarters & 4u) != 0u { blend_in(&c, splat, dx, dy - 8.0); }

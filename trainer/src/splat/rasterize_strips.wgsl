@@ -17,7 +17,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let tile = tile_at(folded(wg, n_wgs));
     var next = tile.begin / 32u;
     var unfinished = true;
-    for (var turn = 0u; unfinished; turn++) {
+    for (var round = 0u; unfinished; round++) {
         let queued = queue_entries(lane, next, tile);
         next = queued.y;
         var live_strips = 0u;
@@ -28,22 +28,22 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             let top = f32(tile.corner.y + strip * 2u) + 0.5;
             let on_image = (center_x < Px(f32(view.size_px.x))) & PxB(tile.in_grid && first.y < view.size_px.y);
             var blend = unblended(on_image);
-            if turn > 0u { blend = wg_blends[strip * LANES + lane]; }
+            if round > 0u { blend = wg_blends[strip * LANES + lane]; }
             var any_live = queued.x > 0u && or_of_lanes(select(0u, 1u, any(blend.live))) != 0u;
             for (var part = 0u; part < queued.x && any_live; part += LANES) {
                 let entry = wg_queue[min(part + lane, queued.x - 1u)];
                 let splat_ix = entries[entry].x;
-                let place = drawn[splat_ix].place;
-                let conic = drawn[splat_ix].conic;
-                let color = drawn[splat_ix].color;
+                let position = projected_splats[splat_ix].position;
+                let conic = projected_splats[splat_ix].conic;
+                let color = projected_splats[splat_ix].color;
                 let half = halved(conic);
                 let owned = part + lane < queued.x;
-                var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(place, conic, top)));
+                var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(position, conic, top)));
                 loop {
                     let some = reaching != 0u; // The loop's body runs at least once.
                     let i = firstTrailingBit(reaching) & 7u;
                     reaching &= reaching - 1u;
-                    let at = subgroupShuffle(place, i);
+                    let at = subgroupShuffle(position, i);
                     let shape = subgroupShuffle(half, i);
                     let power = power_at(shape, at.x - center_x, at.y - center_y);
                     let hit = blend.live & within_reach(shape, power) & PxB(some);

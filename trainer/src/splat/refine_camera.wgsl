@@ -9,9 +9,9 @@
 
 #import view
 #import model
-#import camera_terms
+#import camera_params
 #import status
-#import term_step
+#import param_step
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
@@ -19,32 +19,32 @@
 @group(0) @binding(3) var<storage, read> camera_sums: array<vec4f>;
 @group(0) @binding(4) var<storage, read> gain_sums: array<vec4f>;
 @group(0) @binding(5) var<storage, read> status: array<u32>;
-@group(0) @binding(6) var<storage, read_write> terms: array<vec4f>;
+@group(0) @binding(6) var<storage, read_write> params: array<vec4f>;
 @group(0) @binding(7) var<uniform> rule: CameraRule;
 
 override GRADIENTS_ONLY: bool = false;   // Stored as the terms' values, for tests.
 var<workgroup> wg_sums: array<vec4f, 1024>; // [256, 4]
 
-fn slope_of(term: u32) -> f32 {
-    let turn = wg_sums[0].xyz;
-    let shift = wg_sums[1].xyz;
-    if term < SHIFT { return turn[term - TURN]; }
-    if term < DELAY { return shift[term - SHIFT]; }
-    if term == DELAY { return -dot(lens.angular.xyz, turn) - dot(lens.linear.xyz, shift); }
-    if term < PRINCIPAL { return view.focal_px[term - LOG_FOCAL] * vec2f(wg_sums[0].w, wg_sums[1].w)[term - LOG_FOCAL]; }
-    if term < LOG_GAIN { return view.focal_px[term - PRINCIPAL] * wg_sums[2].xy[term - PRINCIPAL]; }
-    return wg_sums[3].xyz[min(term - LOG_GAIN, 2u)];
+fn gradient_of(param: u32) -> f32 {
+    let rotation = wg_sums[0].xyz;
+    let translation = wg_sums[1].xyz;
+    if param < TRANSLATION { return rotation[param - ROTATION]; }
+    if param < TIME_OFFSET { return translation[param - TRANSLATION]; }
+    if param == TIME_OFFSET { return -dot(lens.angular.xyz, rotation) - dot(lens.linear.xyz, translation); }
+    if param < PRINCIPAL { return view.focal_px[param - LOG_FOCAL] * vec2f(wg_sums[0].w, wg_sums[1].w)[param - LOG_FOCAL]; }
+    if param < LOG_GAIN { return view.focal_px[param - PRINCIPAL] * wg_sums[2].xy[param - PRINCIPAL]; }
+    return wg_sums[3].xyz[min(param - LOG_GAIN, 2u)];
 }
 
-fn rate_of(term: u32) -> f32 {
-    if term < SHIFT { return rule.turn_rate; }
-    if term < DELAY { return rule.shift_rate_m; }
-    if term == DELAY { return rule.delay_rate; }
-    if term < LOG_GAIN { return rule.focal_rate; }
+fn rate_of(param: u32) -> f32 {
+    if param < TRANSLATION { return rule.rotation_rate; }
+    if param < TIME_OFFSET { return rule.translation_rate_m; }
+    if param == TIME_OFFSET { return rule.time_offset_rate; }
+    if param < LOG_GAIN { return rule.focal_rate; }
     return rule.gain_rate;
 }
 
-fn finite(x: f32) -> bool {
+fn is_finite(x: f32) -> bool {
     return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
 }
 
@@ -74,19 +74,19 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         wg_sums[2] = total[2];
         wg_sums[3] = total[3];
     }
-    workgroupBarrier(); // The totals are where `slope_of` looks.
-    let term = min(lane, TERMS - 1u);
-    let slope = slope_of(term);
-    let learns = lane < TERMS && status[FAILED] == 0u && finite(slope);
-    let bit = 1u << term;
+    workgroupBarrier(); // The totals are where `gradient_of` looks.
+    let param = min(lane, N_PARAMS - 1u);
+    let gradient = gradient_of(param);
+    let learns = lane < N_PARAMS && status[FAILED] == 0u && is_finite(gradient);
+    let bit = 1u << param;
     if GRADIENTS_ONLY {
-        if learns { terms[lens.camera_terms + term].x = slope; }
+        if learns { params[lens.camera_params + param].x = gradient; }
     } else {
-        if learns && (rule.of_camera & bit) != 0u {
-            terms[lens.camera_terms + term] = stepped(terms[lens.camera_terms + term], slope, rate_of(term), 0.0);
+        if learns && (rule.camera_mask & bit) != 0u {
+            params[lens.camera_params + param] = adam_step(params[lens.camera_params + param], gradient, rate_of(param), 0.0);
         }
-        if learns && (rule.of_image & bit) != 0u {
-            terms[lens.image_terms + term] = stepped(terms[lens.image_terms + term], slope, rate_of(term), rule.image_pull);
+        if learns && (rule.image_mask & bit) != 0u {
+            params[lens.image_params + param] = adam_step(params[lens.image_params + param], gradient, rate_of(param), rule.image_decay);
         }
     }
 }

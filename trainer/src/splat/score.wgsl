@@ -19,11 +19,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let group = folded(wg, n_wgs);
     let n_pixels = view.size_px.x * view.size_px.y;
     let at = min(group * 256u + lane, n_pixels - 1u);
-    let seen = group * 256u + lane < n_pixels && target_image[at] >= 0x01000000u;
+    let visible = group * 256u + lane < n_pixels && target_image[at] >= 0x01000000u;
     for (var color = 0u; color < 3u; color++) {
         let picture = (pixels[at] >> (8u * color)) & 255u;
         let image = (target_image[at] >> (8u * color)) & 255u;
-        wg_sums[lane] = select(vec4u(0u), vec4u(picture * picture, picture * image, image * image, 1u), seen);
+        wg_sums[lane] = select(vec4u(0u), vec4u(picture * picture, picture * image, image * image, 1u), visible);
         workgroupBarrier(); // All have told.
         for (var stride = 128u; stride > 0u; stride /= 2u) {
             if lane < stride { wg_sums[lane] += wg_sums[lane + stride]; }

@@ -29,14 +29,14 @@ const SH_0: f64 = 0.282_094_791_773_878_14;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
     /// Octave of the spacing, and the cell of that size.
-    taken: HashSet<(i32, [i32; 3])>,
+    occupied_cells: HashSet<(i32, [i32; 3])>,
     /// Where the discs lie, in world.
-    places: Vec<Point3<f64>>,
+    positions: Vec<Point3<f64>>,
 }
 
 /// A disc that a depth image asks for.
 struct Disc {
-    place: Point3<f64>,
+    position: Point3<f64>,
     spacing_m: f64,
     normal: Vector3<f64>,
     size_m: [f64; 3],
@@ -47,19 +47,19 @@ struct Disc {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Density {
     /// At most.
-    pub(crate) n_most: f64,
-    /// Pixels of one at least, where there are more than [`ALWAYS`].
-    pub(crate) px_each: f64,
+    pub(crate) max_discs: f64,
+    /// Pixels of one at least, where there are more than [`MIN_DISCS`].
+    pub(crate) px_per_disc: f64,
 }
 
 /// Discs that an image is given however few pixels it has.
-const ALWAYS: f64 = 4000.0;
+const MIN_DISCS: f64 = 4000.0;
 
 impl Density {
     /// Between two of them, whole pixels.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
-        let n = self.n_most.min((n_pixels / self.px_each).max(ALWAYS));
+        let n = self.max_discs.min((n_pixels / self.px_per_disc).max(MIN_DISCS));
         (n_pixels / n).sqrt().round().max(1.0)
     }
 }
@@ -71,13 +71,14 @@ impl Seeder {
     /// The keyframes come in waves: each looks for what no earlier wave has covered, all at once; then they take their
     /// places one after the other, so that the result does not depend on how many processors there are.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
-        const WAVE: usize = 32;
+        const BATCH: usize = 32;
         let mut seeds = Seeds::new();
-        for wave in keyframes.chunks(WAVE) {
-            let asked: Vec<Vec<Disc>> = wave.par_iter().map(|keyframe| self.asked(keyframe, density)).collect();
-            for disc in asked.into_iter().flatten() {
-                if self.take(&disc.place, disc.spacing_m) {
-                    seeds.push(&disc.place, &disc.normal, disc.size_m, SEED_OPACITY, disc.color);
+        for batch in keyframes.chunks(BATCH) {
+            let candidate_discs: Vec<Vec<Disc>> =
+                batch.par_iter().map(|keyframe| self.candidate_discs(keyframe, density)).collect();
+            for disc in candidate_discs.into_iter().flatten() {
+                if self.claim(&disc.position, disc.spacing_m) {
+                    seeds.push(&disc.position, &disc.normal, disc.size_m, SEED_OPACITY, disc.color);
                 }
             }
         }
@@ -85,7 +86,7 @@ impl Seeder {
     }
 
     /// What one keyframe asks for where nobody has taken the place yet.
-    fn asked(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
+    fn candidate_discs(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
         let Some(depth) = &keyframe.depth else { return Vec::new() };
         let mut discs = Vec::new();
         let [width, height] = depth.size_px;
@@ -97,28 +98,28 @@ impl Seeder {
                 if !(z > 0.0 && z <= FAR_M) || x < stride || y < stride || x + stride >= width || y + stride >= height {
                     continue;
                 }
-                let around = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];
-                if around.iter().any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0) {
+                let neighbors = [at(x - stride, y), at(x + stride, y), at(x, y - stride), at(x, y + stride)];
+                if neighbors.iter().any(|near| (near - z).abs() > EDGE_FRAC * z && *near > 0.0) {
                     continue;
                 }
                 let here = depth.point(x, y, z);
                 let spacing_m = f64::from(stride) * z / depth.focal_px[0];
-                let place = depth.world_from_camera * Point3::from(here);
-                if self.is_taken(&place, spacing_m) {
+                let position = depth.world_from_camera * Point3::from(here);
+                if self.is_occupied(&position, spacing_m) {
                     continue;
                 }
-                let Some(color) = color_at(keyframe, &place) else { continue };
+                let Some(color) = color_at(keyframe, &position) else { continue };
                 let filled = |near: f64| if near > 0.0 { near } else { z };
                 let across =
-                    depth.point(x + stride, y, filled(around[1])) - depth.point(x - stride, y, filled(around[0]));
+                    depth.point(x + stride, y, filled(neighbors[1])) - depth.point(x - stride, y, filled(neighbors[0]));
                 let down =
-                    depth.point(x, y + stride, filled(around[3])) - depth.point(x, y - stride, filled(around[2]));
+                    depth.point(x, y + stride, filled(neighbors[3])) - depth.point(x, y - stride, filled(neighbors[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
                 // Seen at a slant the grid is wider apart on the surface.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
                 let size_m =
                     [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
-                discs.push(Disc { place, spacing_m, normal: depth.world_from_camera * normal, size_m, color });
+                discs.push(Disc { position, spacing_m, normal: depth.world_from_camera * normal, size_m, color });
             }
         }
         discs
@@ -131,76 +132,76 @@ impl Seeder {
         let stride = density.stride_px(keyframe.size_px);
         let n_cells = [width, height].map(|px| (px / stride).ceil() as usize);
         let camera_from_world = keyframe.world_from_camera.inverse();
-        let mut seen = InverseDepths::new(n_cells);
-        for place in &self.places {
-            let point = camera_from_world * place;
+        let mut inverse_depths = InverseDepths::new(n_cells);
+        for position in &self.positions {
+            let point = camera_from_world * position;
             let cell = [0, 1].map(|axis| {
                 let px = keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis];
                 (px / stride).floor()
             });
             if point.z > 0.0 && (0..2).all(|axis| cell[axis] >= 0.0 && cell[axis] < n_cells[axis] as f64) {
-                seen.tell([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
+                inverse_depths.set_nearest([cell[0] as usize, cell[1] as usize], 1.0 / point.z);
             }
         }
-        let filled = seen.filled(1.0 / default_m);
+        let filled = inverse_depths.filled(1.0 / default_m);
         for row in 0..n_cells[1] {
             for column in 0..n_cells[0] {
-                if seen.near([column, row]) {
+                if inverse_depths.is_known_nearby([column, row]) {
                     continue;
                 }
                 let px = [(column as f64 + 0.5) * stride, (row as f64 + 0.5) * stride];
                 let z = 1.0 / filled[row * n_cells[0] + column];
                 let ray = [0, 1].map(|axis| (px[axis] - keyframe.principal_px[axis]) / keyframe.focal_px[axis]);
-                let place = keyframe.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z);
-                let Some(color) = color_at(keyframe, &place) else { continue };
+                let position = keyframe.world_from_camera * Point3::from(Vector3::new(ray[0], ray[1], 1.0) * z);
+                let Some(color) = color_at(keyframe, &position) else { continue };
                 let spacing_m = stride * z / keyframe.focal_px[0];
-                if !self.take(&place, spacing_m) {
+                if !self.claim(&position, spacing_m) {
                     continue;
                 }
-                let towards = keyframe.world_from_camera.translation.vector - place.coords;
+                let towards = keyframe.world_from_camera.translation.vector - position.coords;
                 let size = [SPREAD * spacing_m, SPREAD * spacing_m, THICKNESS * spacing_m];
-                seeds.push(&place, &towards.normalize(), size, SEED_OPACITY, color);
+                seeds.push(&position, &towards.normalize(), size, SEED_OPACITY, color);
             }
         }
         seeds.arrays
     }
 
     /// Bytes of a place and of a cell in a checkpoint.
-    pub(crate) const PLACE_BYTES: u64 = 24;
+    pub(crate) const POSITION_BYTES: u64 = 24;
     pub(crate) const CELL_BYTES: u64 = 16;
 
     /// How many places have been given splats; each has its place and its cell.
     pub(crate) fn n_seeds(&self) -> usize {
-        self.places.len()
+        self.positions.len()
     }
 
     /// A copy of what is remembered.
-    pub(crate) fn remembered(&self) -> Remembered {
-        Remembered { places: self.places.clone(), cells: self.taken.iter().copied().collect() }
+    pub(crate) fn snapshot(&self) -> SeedSnapshot {
+        SeedSnapshot { positions: self.positions.clone(), cells: self.occupied_cells.iter().copied().collect() }
     }
 
-    /// What [`Remembered::into_bytes`] gave, or another whole number of places and cells.
-    pub(crate) fn of_bytes(places: &[u8], cells: &[u8]) -> Self {
-        let places = places.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
+    /// What [`SeedSnapshot::into_bytes`] gave, or another whole number of places and cells.
+    pub(crate) fn from_bytes(positions: &[u8], cells: &[u8]) -> Self {
+        let positions = positions.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
         let cells = cells.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes));
-        let (places, cells) = (places.collect::<Vec<_>>(), cells.collect::<Vec<_>>());
+        let (positions, cells) = (positions.collect::<Vec<_>>(), cells.collect::<Vec<_>>());
         Self {
-            taken: cells.as_chunks().0.iter().map(|[octave, x, y, z]| (*octave, [*x, *y, *z])).collect(),
-            places: places.as_chunks().0.iter().map(|[x, y, z]| Point3::new(*x, *y, *z)).collect(),
+            occupied_cells: cells.as_chunks().0.iter().map(|[octave, x, y, z]| (*octave, [*x, *y, *z])).collect(),
+            positions: positions.as_chunks().0.iter().map(|[x, y, z]| Point3::new(*x, *y, *z)).collect(),
         }
     }
 
-    fn is_taken(&self, place: &Point3<f64>, spacing_m: f64) -> bool {
+    fn is_occupied(&self, position: &Point3<f64>, spacing_m: f64) -> bool {
         let octave = octave_of(spacing_m);
-        [octave - 1, octave, octave + 1].iter().any(|octave| self.taken.contains(&cell_of(place, *octave)))
+        [octave - 1, octave, octave + 1].iter().any(|octave| self.occupied_cells.contains(&cell_of(position, *octave)))
     }
 
-    fn take(&mut self, place: &Point3<f64>, spacing_m: f64) -> bool {
-        if self.is_taken(place, spacing_m) {
+    fn claim(&mut self, position: &Point3<f64>, spacing_m: f64) -> bool {
+        if self.is_occupied(position, spacing_m) {
             return false;
         }
-        self.places.push(*place);
-        self.taken.insert(cell_of(place, octave_of(spacing_m)))
+        self.positions.push(*position);
+        self.occupied_cells.insert(cell_of(position, octave_of(spacing_m)))
     }
 }
 
@@ -208,23 +209,24 @@ fn octave_of(spacing_m: f64) -> i32 {
     spacing_m.log2().round() as i32
 }
 
-fn cell_of(place: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
-    (octave, std::array::from_fn(|axis| (place[axis] / 2f64.powi(octave)).floor() as i32))
+fn cell_of(position: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
+    (octave, std::array::from_fn(|axis| (position[axis] / 2f64.powi(octave)).floor() as i32))
 }
 
 /// What a [`Seeder`] remembers, on its way into a checkpoint.
-pub(crate) struct Remembered {
-    places: Vec<Point3<f64>>,
+pub(crate) struct SeedSnapshot {
+    positions: Vec<Point3<f64>>,
     cells: Vec<(i32, [i32; 3])>,
 }
 
-impl Remembered {
+impl SeedSnapshot {
     /// Places in the order they were given splats, x y z as f64; cells in ascending order, octave x y z as i32.
     pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
         self.cells.sort_unstable();
-        let places = self.places.iter().flat_map(|place| [place.x, place.y, place.z]).flat_map(f64::to_le_bytes);
+        let positions =
+            self.positions.iter().flat_map(|position| [position.x, position.y, position.z]).flat_map(f64::to_le_bytes);
         let cells = self.cells.iter().flat_map(|(octave, [x, y, z])| [*octave, *x, *y, *z]).flat_map(i32::to_le_bytes);
-        (places.collect(), cells.collect())
+        (positions.collect(), cells.collect())
     }
 }
 
@@ -240,13 +242,13 @@ impl InverseDepths {
     }
 
     /// The nearest counts.
-    fn tell(&mut self, [column, row]: [usize; 2], per_m: f64) {
+    fn set_nearest(&mut self, [column, row]: [usize; 2], per_m: f64) {
         let known = &mut self.per_m[row * self.n_cells[0] + column];
         *known = known.max(per_m);
     }
 
     /// Whether the cell or one of the eight around it is known.
-    fn near(&self, [column, row]: [usize; 2]) -> bool {
+    fn is_known_nearby(&self, [column, row]: [usize; 2]) -> bool {
         let rows = row.saturating_sub(1)..(row + 2).min(self.n_cells[1]);
         rows.into_iter().any(|row| {
             let columns = column.saturating_sub(1)..(column + 2).min(self.n_cells[0]);
@@ -268,8 +270,8 @@ impl InverseDepths {
             let known: Vec<f64> = square.map(|at| self.per_m[at]).filter(|per_m| *per_m > 0.0).collect();
             *mean = known.iter().sum::<f64>() / known.len().max(1) as f64;
         }
-        let around = coarse.filled(default_per_m);
-        let of_coarse = |ix: usize| around[ix / width / 2 * coarse.n_cells[0] + ix % width / 2];
+        let neighbors = coarse.filled(default_per_m);
+        let of_coarse = |ix: usize| neighbors[ix / width / 2 * coarse.n_cells[0] + ix % width / 2];
         self.per_m.iter().enumerate().map(|(ix, per_m)| if *per_m > 0.0 { *per_m } else { of_coarse(ix) }).collect()
     }
 }
@@ -300,11 +302,11 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
         if rgb[3] == 0 {
             continue;
         }
-        let place = keyframe.world_from_camera * Point3::from(ray * z);
+        let position = keyframe.world_from_camera * Point3::from(ray * z);
         let spacing_px = (f64::from(width) * f64::from(height) * keyframes.len() as f64 / n as f64).sqrt();
         let size = 0.3 * spacing_px * z / keyframe.focal_px[0];
         let color = [0, 1, 2].map(|channel| f64::from(rgb[channel]) / 255.0);
-        seeds.push(&place, &Vector3::z(), [size; 3], RANDOM_OPACITY, color);
+        seeds.push(&position, &Vector3::z(), [size; 3], RANDOM_OPACITY, color);
     }
     seeds.arrays
 }
@@ -312,20 +314,20 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
 /// The point nearest to all optical axes in the sense of least squares, kept in front of the cameras.
 pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
     let mut normal_matrix = Matrix3::identity() * 1e-6;
-    let mut right = Vector3::zeros();
+    let mut rhs = Vector3::zeros();
     for keyframe in keyframes {
         let axis = keyframe.world_from_camera * Vector3::z();
         let camera = keyframe.world_from_camera.translation.vector;
         let across = Matrix3::identity() - axis * axis.transpose();
         normal_matrix += across;
-        right += across * camera;
+        rhs += across * camera;
     }
-    normal_matrix.lu().solve(&right).unwrap_or_else(Vector3::zeros)
+    normal_matrix.lu().solve(&rhs).unwrap_or_else(Vector3::zeros)
 }
 
-/// Color of the keyframe where it sees `place`; `None` outside and where it is masked.
-fn color_at(keyframe: &Keyframe, place: &Point3<f64>) -> Option<[f64; 3]> {
-    let point = keyframe.world_from_camera.inverse() * place;
+/// Color of the keyframe where it sees `position`; `None` outside and where it is masked.
+fn color_at(keyframe: &Keyframe, position: &Point3<f64>) -> Option<[f64; 3]> {
+    let point = keyframe.world_from_camera.inverse() * position;
     if point.z <= 0.0 {
         return None;
     }
@@ -347,12 +349,12 @@ impl Seeds {
         Self { arrays: SplatArrays { sh_degree: 0, ..SplatArrays::default() } }
     }
 
-    fn push(&mut self, place: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
-        let turn = Rotation3::rotation_between(&Vector3::z(), normal)
+    fn push(&mut self, position: &Point3<f64>, normal: &Vector3<f64>, size_m: [f64; 3], opacity: f64, color: [f64; 3]) {
+        let rotation_matrix = Rotation3::rotation_between(&Vector3::z(), normal)
             .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-        let rotation = UnitQuaternion::from_rotation_matrix(&turn);
+        let rotation = UnitQuaternion::from_rotation_matrix(&rotation_matrix);
         let arrays = &mut self.arrays;
-        arrays.means.push(f32s_of(place.coords.into()));
+        arrays.means.push(f32s_of(position.coords.into()));
         arrays.log_scales.push(f32s_of(size_m.map(|size| size.max(1e-7).ln())));
         arrays.rotations_wxyz.push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
         arrays.opacity_logits.push(f32_of((opacity / (1.0 - opacity)).ln()));
@@ -380,10 +382,10 @@ mod tests {
     use kinematics::{Stamp, Transform};
 
     const WALL_M: f64 = 2.0;
-    const DENSE: Density = Density { n_most: 2000.0, px_each: 1.0 };
+    const DENSE: Density = Density { max_discs: 2000.0, px_per_disc: 1.0 };
 
     /// A grey wall ahead; the camera's image is `size_px` wide and high, its axis in the middle.
-    fn sees_wall(size_px: [u32; 2], with_depth: bool) -> Keyframe {
+    fn wall_keyframe(size_px: [u32; 2], with_depth: bool) -> Keyframe {
         let principal_px = size_px.map(|px| f64::from(px) / 2.0);
         let n = (size_px[0] * size_px[1]) as usize;
         let world_from_camera = Transform::identity();
@@ -408,9 +410,9 @@ mod tests {
     }
 
     #[test]
-    fn many_keyframes_at_once_get_what_they_get_one_by_one() {
+    fn batch_and_single_seeding_agree() {
         let keyframes: Vec<Arc<Keyframe>> =
-            (0..40).map(|ix| Arc::new(sees_wall([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true))).collect();
+            (0..40).map(|ix| Arc::new(wall_keyframe([100 + 8 * (ix % 7), 80 + 4 * (ix % 5)], true))).collect();
         let at_once = Seeder::default().discs(&keyframes, DENSE);
         let mut seeder = Seeder::default();
         let one_by_one: Vec<[f32; 3]> =
@@ -420,30 +422,30 @@ mod tests {
     }
 
     #[test]
-    fn a_camera_without_depth_gets_discs_where_the_others_left_it_bare() {
+    fn depthless_camera_seeds_only_uncovered_area() {
         let mut seeder = Seeder::default();
-        let near = sees_wall([100, 80], true);
-        let seen = seeder.discs(&[Arc::new(near)], DENSE);
-        assert!(seen.means.len() > 1000);
-        let wide = sees_wall([200, 80], false);
-        let bare = seeder.discs_without_depth(&wide, Density { n_most: 4000.0, px_each: 1.0 }, 7.0);
+        let near = wall_keyframe([100, 80], true);
+        let discs = seeder.discs(&[Arc::new(near)], DENSE);
+        assert!(discs.means.len() > 1000);
+        let wide = wall_keyframe([200, 80], false);
+        let new_discs = seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0);
         // Half of the wide image is bare, but for a rim of a cell or two.
-        assert!((1500..=2100).contains(&bare.means.len()), "{} discs", bare.means.len());
-        for mean in &bare.means {
+        assert!((1500..=2100).contains(&new_discs.means.len()), "{} discs", new_discs.means.len());
+        for mean in &new_discs.means {
             assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "as far away as the wall around: {mean:?}");
             assert!(f64::from(mean[0]).abs() > 0.9, "outside of what the camera with depth saw: {mean:?}");
         }
         assert!(
-            seeder.discs_without_depth(&wide, Density { n_most: 4000.0, px_each: 1.0 }, 7.0).means.is_empty(),
+            seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0).means.is_empty(),
             "a second look finds nothing bare"
         );
     }
 
     #[test]
-    fn without_any_neighbour_a_disc_lies_at_the_default() {
+    fn discs_without_neighbors_lie_at_the_default_depth() {
         let discs = Seeder::default().discs_without_depth(
-            &sees_wall([40, 40], false),
-            Density { n_most: 100.0, px_each: 1.0 },
+            &wall_keyframe([40, 40], false),
+            Density { max_discs: 100.0, px_per_disc: 1.0 },
             7.0,
         );
         assert_eq!(discs.means.len(), 100);

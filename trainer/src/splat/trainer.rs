@@ -1,26 +1,28 @@
 //! The splat model as a [`Method`]: seeds, steps, growth, pictures.
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
-mod aligning;
+mod alignment_task;
 mod checkpoint;
+mod model_size;
 mod scoring;
-mod size;
 
 use super::arrays::SplatArrays;
-use super::buffers::{Frame, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
-use super::camera_terms::{CameraFix, CameraTerms, PosedLens, TermSet};
+use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
+use super::camera_params::{CalibratedCamera, CameraCorrection, CameraParams, ParamSet};
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
-use super::trials::{CameraChoice, Candidate, Due, Ended, HeldBack, Now, Trial, Trials, Turned};
+use super::trials::{
+    CameraRefinement, Candidate, Due, SecondHalf, SplatTrials, Trial, TrialContext, TrialEnd, ValidationImage,
+};
 use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
-use crate::align::{Aligning, Alignment};
+use crate::align::{Alignment, AlignmentTask};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
 use crate::method::submit_millis;
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Split, ply};
+use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, TrialReport, ply};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -54,7 +56,7 @@ const PX_PER_SEED: f64 = 48.0;
 /// Place of a child within its parent, in standard deviations.
 const CHILD_SPREAD: f32 = 0.5;
 /// Most that opacity and size cost against the color loss.
-const MOST_COST: f64 = 0.1;
+const MAX_COST: f64 = 0.1;
 
 /// 3D Gaussian splats that learn from keyframes.
 #[derive(Debug)]
@@ -65,19 +67,19 @@ pub struct SplatTrainer {
     learn: Learn,
     splats: SplatBuffers,
     scratch: Option<(ScratchSize, Scratch)>,
-    learn_frame: Option<Frame>,
-    draw_frame: Option<Frame>,
+    training_buffers: Option<ImageBuffers>,
+    drawing_buffers: Option<ImageBuffers>,
     learn_status: Buffer,
     draw_status: Buffer,
     draw_view: Buffer,
     rule: Buffer,
     supervision: Buffer,
     plain: Buffer,
-    cameras: CameraTerms,
+    cameras: CameraParams,
     /// Of the saved model this one came from.
-    loaded_fixes: BTreeMap<String, CameraFix>,
-    aligning: Aligning,
-    trials: Trials,
+    saved_corrections: BTreeMap<String, CameraCorrection>,
+    alignment_task: AlignmentTask,
+    trials: SplatTrials,
     passes: Passes,
     seeder: Seeder,
     /// Keyframes whose depth has not been looked at.
@@ -90,19 +92,19 @@ pub struct SplatTrainer {
     /// Maximum bytes of their images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
     /// How often images were requested.
-    images_asked: u64,
+    n_image_requests: u64,
     order: Order,
     scene_size_m: f64,
     has_depth: bool,
     step: u64,
     /// Steps of trials that were taken back.
-    n_taken_back: u64,
+    n_reverted_steps: u64,
     /// Step from which the planned steps count: late keyframes set it forward.
     schedule_start: u64,
-    grown_at: u64,
+    last_growth_step: u64,
     /// Whether the GPU has no memory for more splats.
     is_full: bool,
-    n_poisoned: u64,
+    n_non_finite: u64,
     in_flight: Option<InFlight>,
     idle_since: Instant,
     step_millis: f64,
@@ -114,7 +116,7 @@ pub struct SplatTrainer {
 
 /// The parts of a picture that are read back.
 #[derive(Clone, Copy, Debug)]
-enum Wanted<'a> {
+enum RequestedParts<'a> {
     Nothing,
     Color,
     ColorAndDepth,
@@ -157,11 +159,11 @@ impl Drop for Compiling {
 
 /// Everything that training changes, for restoring it later. When a state is taken, no keyframe waits for its splats.
 #[derive(Debug)]
-pub(crate) struct State {
+pub(crate) struct Snapshot {
     pub(super) splats: SplatBuffers,
-    pub(super) cameras: (TermSet, Buffer),
+    pub(super) cameras: (ParamSet, Buffer),
     pub(super) step: u64,
-    pub(super) grown_at: u64,
+    pub(super) last_growth_step: u64,
     pub(super) seeding: Seeding,
 }
 
@@ -205,8 +207,8 @@ impl SplatTrainer {
             learn,
             splats: SplatBuffers::new(&gpu, 1, options.sh_degree)?,
             scratch: None,
-            learn_frame: None,
-            draw_frame: None,
+            training_buffers: None,
+            drawing_buffers: None,
             learn_status: gpu.storage_with("splat.learn_status", &zeros)?,
             draw_status: gpu.storage_with("splat.draw_status", &zeros)?,
             draw_view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
@@ -218,20 +220,20 @@ impl SplatTrainer {
                     dssim_frac: f32_of(options.dssim_frac),
                     depth_weight: f32_of(options.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
-                    varied_background: f32_of(options.varied_background),
+                    random_background: f32_of(options.random_background),
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
-            cameras: CameraTerms::new(
+            cameras: CameraParams::new(
                 &gpu,
                 match &options.cameras {
-                    CameraChoice::Given(terms) => *terms,
-                    CameraChoice::Try(_) => TermSet::default(),
+                    CameraRefinement::Always(params) => *params,
+                    CameraRefinement::Try(_) => ParamSet::default(),
                 },
             )?,
-            loaded_fixes: BTreeMap::new(),
-            aligning: Aligning::new(&options.align),
-            trials: Trials::new(&options.cameras, options.count),
+            saved_corrections: BTreeMap::new(),
+            alignment_task: AlignmentTask::new(&options.align),
+            trials: SplatTrials::new(&options.cameras, options.count),
             passes: Passes::default(),
             seeder: Seeder::default(),
             pending: Vec::new(),
@@ -243,16 +245,16 @@ impl SplatTrainer {
             coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
             max_image_bytes: if software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
-            images_asked: 0,
+            n_image_requests: 0,
             order: Order::new(options.seed),
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
-            n_taken_back: 0,
+            n_reverted_steps: 0,
             schedule_start: 0,
-            grown_at: 0,
+            last_growth_step: 0,
             is_full: false,
-            n_poisoned: 0,
+            n_non_finite: 0,
             in_flight: None,
             idle_since: Instant::now(),
             step_millis: 0.0,
@@ -272,17 +274,17 @@ impl SplatTrainer {
     }
 
     /// Knows about cameras what a saved model did, see `model.json`.
-    pub fn with_fixes(mut self, folder: &Path) -> Result<Self, Error> {
-        let about = read_about(&folder.join("model.json"))?;
-        self.loaded_fixes = about.cameras;
-        self.aligning = Aligning::Done(about.alignment);
+    pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
+        let metadata = read_metadata(&folder.join("model.json"))?;
+        self.saved_corrections = metadata.cameras;
+        self.alignment_task = AlignmentTask::Done(metadata.alignment);
         Ok(self)
     }
 
     /// The splats as they are now.
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
         self.seed_from_depth()?;
-        self.settle()?;
+        self.finish_in_flight()?;
         self.splats.read(&self.gpu)
     }
 
@@ -292,20 +294,24 @@ impl SplatTrainer {
     }
 
     /// What was learned about each camera; empty where nothing is.
-    pub fn camera_fixes(&mut self) -> Result<BTreeMap<String, CameraFix>, Error> {
-        self.settle()?;
-        let shown = self.trials.instead().map(|state| &state.cameras);
-        let (set, terms) = shown.map_or((self.cameras.set, &self.cameras.terms), |(set, terms)| (*set, terms));
+    pub fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
+        self.finish_in_flight()?;
+        let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
+        let (set, params) = displayed.map_or((self.cameras.set, &self.cameras.params), |(set, params)| (*set, params));
         if !set.any() {
-            return Ok(self.loaded_fixes.clone());
+            return Ok(self.saved_corrections.clone());
         }
-        self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m)
+        self.cameras.corrections(&self.gpu, set, params, self.scene_size_m)
     }
 
     /// What is known about each camera now, with what is being tried; of keyframes that alignment has corrected already.
-    fn learned_fixes(&self) -> Result<Fixes, Error> {
-        let (set, terms) = (self.cameras.set, &self.cameras.terms);
-        if set.any() { self.cameras.fixes(&self.gpu, set, terms, self.scene_size_m) } else { Ok(Fixes::new()) }
+    fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
+        let (set, params) = (self.cameras.set, &self.cameras.params);
+        if set.any() {
+            self.cameras.corrections(&self.gpu, set, params, self.scene_size_m)
+        } else {
+            Ok(CameraCorrections::new())
+        }
     }
 
     #[cfg(test)]
@@ -315,7 +321,7 @@ impl SplatTrainer {
 
     /// Bounds the images on the GPU, as on a software adapter.
     #[cfg(test)]
-    pub(super) fn hold_images(&mut self, max_bytes: u64) {
+    pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
         self.max_image_bytes = max_bytes;
     }
 
@@ -336,13 +342,13 @@ impl SplatTrainer {
     }
 
     #[cfg(test)]
-    pub(super) fn times_learned_from(&self, keyframe: &Keyframe) -> usize {
+    pub(super) fn n_views_of(&self, keyframe: &Keyframe) -> usize {
         self.views.iter().filter(|view| view.keyframe.stamp == keyframe.stamp).count()
     }
 
     /// Gradients that were not finite and were dropped.
-    pub fn n_poisoned(&self) -> u64 {
-        self.n_poisoned
+    pub fn n_non_finite(&self) -> u64 {
+        self.n_non_finite
     }
 
     fn learn(&mut self) -> Result<Arc<LearnPipelines>, Error> {
@@ -365,24 +371,24 @@ impl SplatTrainer {
             return Ok(());
         }
         let n_after = self.splats.n_splats + u32::try_from(n_new).expect("the cap is a u32");
-        let n_new = (self.room_for(n_after)? - self.splats.n_splats) as usize;
+        let n_new = (self.reserve_up_to(n_after)? - self.splats.n_splats) as usize;
         if n_new == 0 {
             return Ok(());
         }
         let kept = if n_new == arrays.n_splats() { arrays.clone() } else { spread_out(arrays, n_new) };
         self.splats.append(&self.gpu, &kept);
-        self.tell_n();
+        self.write_n_splats();
         Ok(())
     }
 
     /// Makes room for this many splats; if the GPU has no memory for them, returns how many there is room for.
-    fn room_for(&mut self, n_splats: u32) -> Result<u32, Error> {
+    fn reserve_up_to(&mut self, n_splats: u32) -> Result<u32, Error> {
         if self.is_full {
             return Ok(n_splats.min(self.splats.capacity));
         }
-        match self.make_room(n_splats) {
+        match self.reserve(n_splats) {
             Ok(()) => Ok(n_splats),
-            Err(error) if error.is_of_memory() && self.splats.n_splats > 0 => {
+            Err(error) if error.is_out_of_memory() && self.splats.n_splats > 0 => {
                 self.is_full = true;
                 log::warn!("the model stops growing at {} splats: {error}", self.splats.n_splats);
                 Ok(n_splats.min(self.splats.capacity))
@@ -391,7 +397,7 @@ impl SplatTrainer {
         }
     }
 
-    fn make_room(&mut self, n_splats: u32) -> Result<(), Error> {
+    fn reserve(&mut self, n_splats: u32) -> Result<(), Error> {
         if n_splats > self.splats.capacity {
             let capacity =
                 n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
@@ -402,29 +408,29 @@ impl SplatTrainer {
                 let n_slots = if have.n_slots > 0 { have.n_slots.max(4 * capacity) } else { 0 };
                 self.ensure_scratch(ScratchSize { n_splats: capacity, n_entries, n_slots, ..have })?;
             }
-            self.splats = self.splats.reshaped(&self.gpu, capacity, self.splats.sh_degree)?;
-            self.passes.forget_bindings();
+            self.splats = self.splats.resized(&self.gpu, capacity, self.splats.sh_degree)?;
+            self.passes.clear_bindings();
         }
         Ok(())
     }
 
-    fn tell_n(&self) {
+    fn write_n_splats(&self) {
         for status in [&self.learn_status, &self.draw_status] {
-            self.tell_n_to(status, self.splats.n_splats);
+            self.write_n_splats_to(status, self.splats.n_splats);
         }
     }
 
-    fn tell_n_to(&self, status: &Buffer, n_splats: u32) {
+    fn write_n_splats_to(&self, status: &Buffer, n_splats: u32) {
         self.gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
     }
 
     /// The splats that people see: while a change is being tried, those without it.
-    fn shown(&self) -> &SplatBuffers {
-        self.trials.instead().map_or(&self.splats, |state| &state.splats)
+    fn displayed(&self) -> &SplatBuffers {
+        self.trials.baseline().map_or(&self.splats, |snapshot| &snapshot.splats)
     }
 
     fn density(&self) -> Density {
-        Density { n_most: self.seeds_per_image, px_each: PX_PER_SEED }
+        Density { max_discs: self.seeds_per_image, px_per_disc: PX_PER_SEED }
     }
 
     /// Gives the keyframes since the last call discs where their depth shows something new.
@@ -436,12 +442,12 @@ impl SplatTrainer {
         self.measure_scene();
         let discs = self.seeder.discs(&pending, self.density());
         self.add(&discs)?;
-        self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.is_bare()));
+        self.unseeded.extend(pending.into_iter().filter(|keyframe| keyframe.lacks_dense_depth()));
         Ok(())
     }
 
     /// Keyframes without depth get discs where those with depth left them bare; without any depth there is a cloud.
-    fn begin_learning(&mut self) -> Result<(), Error> {
+    fn prepare_training(&mut self) -> Result<(), Error> {
         self.seed_from_depth()?;
         for keyframe in std::mem::take(&mut self.unseeded) {
             if self.has_depth {
@@ -451,7 +457,7 @@ impl SplatTrainer {
         }
         if self.cameras.set.any() {
             for view in &mut self.views {
-                view.give_lens(&self.gpu, &mut self.cameras)?;
+                view.assign_lens(&self.gpu, &mut self.cameras)?;
             }
         }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
@@ -470,19 +476,20 @@ impl SplatTrainer {
         let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
         let mut depths: Vec<f64> = self.views.iter().filter_map(|view| view.median_depth_m).collect();
         depths.sort_by(f64::total_cmp);
-        let looks = depths.get(depths.len() / 2).copied().unwrap_or(spread);
-        self.scene_size_m = (1.1 * spread).max(0.5 * looks).max(1e-3);
+        let median_depth_m = depths.get(depths.len() / 2).copied().unwrap_or(spread);
+        self.scene_size_m = (1.1 * spread).max(0.5 * median_depth_m).max(1e-3);
     }
 
     fn write_rule(&self) {
         if self.cameras.set.any() {
             // Where a submit begins depends on the clock, so what is told to it once must not depend on its first step.
             let step = self.step - self.step % GROWTH_PERIOD;
-            let done = step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
-            self.cameras.write_rule(&self.gpu, done, self.scene_size_m);
+            let completed =
+                step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+            self.cameras.write_rule(&self.gpu, completed, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
-        let cost = (self.options.cost_images / self.views.len().max(1) as f64).powi(2).min(MOST_COST);
+        let cost = (self.options.cost_images / self.views.len().max(1) as f64).powi(2).min(MAX_COST);
         let cost = f32_of(cost / f64::from(self.splats.n_splats.max(1)));
         let rule = Rule {
             mean_rate_m: 1.6e-4 * size,
@@ -509,29 +516,30 @@ impl SplatTrainer {
 
     /// Uploads the images that the next `n` steps need and that are not on the GPU.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
-        let mut wanted = self.looked_at(n);
-        let all_there = wanted.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level));
+        let mut requested = self.upcoming_levels(n);
+        let all_there = requested.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level));
         if !all_there && !self.gpu.is_software() {
             // Enough at once for all processors, and for the time of a step not to be that of its images.
-            wanted = self.looked_at(n.max(if self.is_watched { VIEWS_AT_ONCE_WATCHED } else { MAX_STEPS_PER_SUBMIT }));
+            requested =
+                self.upcoming_levels(n.max(if self.is_watched { VIEWS_AT_ONCE_WATCHED } else { MAX_STEPS_PER_SUBMIT }));
         }
-        self.make_levels(&wanted)
+        self.make_levels(&requested)
     }
 
     /// The views and levels of the next `n` steps.
-    fn looked_at(&mut self, n: u64) -> BTreeSet<(usize, usize)> {
-        let mut looked_at = BTreeSet::new();
+    fn upcoming_levels(&mut self, n: u64) -> BTreeSet<(usize, usize)> {
+        let mut upcoming_levels = BTreeSet::new();
         for step in self.step..self.step + n {
             let view_ix = self.order.pick(step, self.views.len());
-            looked_at.insert((view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps))));
+            upcoming_levels.insert((view_ix, self.views[view_ix].clamped(level_at(step, self.coarse_steps))));
         }
-        looked_at
+        upcoming_levels
     }
 
     /// Uploads these levels of views unless they are on the GPU, using all processors; other images may be removed for them.
-    fn make_levels(&mut self, wanted: &BTreeSet<(usize, usize)>) -> Result<(), Error> {
+    fn make_levels(&mut self, requested: &BTreeSet<(usize, usize)>) -> Result<(), Error> {
         let missing: Vec<(usize, usize)> =
-            wanted.iter().copied().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
+            requested.iter().copied().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
         if !missing.is_empty() {
             let made: Vec<LevelImages> = missing
                 .par_iter()
@@ -539,7 +547,7 @@ impl SplatTrainer {
                 .collect();
             let new_bytes = made.iter().map(LevelImages::bytes).sum();
             let keep = Keep {
-                needed: wanted,
+                needed: requested,
                 coarsest: level_at(self.step, self.coarse_steps),
                 max_bytes: self.max_image_bytes.saturating_sub(new_bytes),
             };
@@ -553,12 +561,12 @@ impl SplatTrainer {
                 self.views[view_ix].upload(&self.gpu, level, images, reused)?;
             }
             if !dropped.is_empty() {
-                self.passes.forget_bindings();
+                self.passes.clear_bindings();
             }
         }
-        self.images_asked += 1;
-        for (view_ix, level) in wanted {
-            self.views[*view_ix].touch(*level, self.images_asked);
+        self.n_image_requests += 1;
+        for (view_ix, level) in requested {
+            self.views[*view_ix].mark_used(*level, self.n_image_requests);
         }
         Ok(())
     }
@@ -609,7 +617,7 @@ impl SplatTrainer {
     fn make_space(&mut self, view_ix: usize, level_ix: usize) -> Result<(), Error> {
         let size_px = self.views[view_ix].size_at(level_ix);
         self.make_scratch(size_px, true)?;
-        ensure_frame(&self.gpu, &mut self.learn_frame, &mut self.passes, size_px, true)
+        ensure_image_buffers(&self.gpu, &mut self.training_buffers, &mut self.passes, size_px, true)
     }
 
     /// A view and level that are ready, with its camera as it is learned now; lists what that takes.
@@ -619,9 +627,9 @@ impl SplatTrainer {
         learn: &LearnPipelines,
         (view_ix, level_ix): (usize, usize),
     ) -> Result<LearnedView<'_>, Error> {
-        let (lens, level) = self.views[view_ix].made(level_ix)?;
+        let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
         let lens = lens.filter(|_| self.cameras.set.any());
-        let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.learn_frame) else {
+        let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
             return Err(Error::DeviceLost);
         };
         if let Some(lens) = lens {
@@ -631,7 +639,7 @@ impl SplatTrainer {
             gpu: &self.gpu,
             splats: &self.splats,
             scratch,
-            frame,
+            image_buffers,
             status: &self.learn_status,
             view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px: level.size_px,
@@ -641,7 +649,7 @@ impl SplatTrainer {
 
     /// Makes sure that a view of this size can be drawn, or learned from.
     fn make_scratch(&mut self, size_px: [u32; 2], learn: bool) -> Result<(), Error> {
-        let n_splats = self.splats.capacity.max(self.shown().capacity);
+        let n_splats = self.splats.capacity.max(self.displayed().capacity);
         let n_entries = (2 * n_splats).max(1 << 14);
         let n_slots = if learn { 2 * n_entries } else { 0 };
         self.ensure_scratch(ScratchSize { n_splats, n_entries, n_slots, n_bins: n_bins(size_px) })
@@ -666,7 +674,7 @@ impl SplatTrainer {
             n_bins: need.n_bins.max(have.n_bins),
         };
         self.passes.submit(&self.gpu); // What is listed holds the old buffers.
-        self.passes.forget_bindings();
+        self.passes.clear_bindings();
         let had = self.scratch.take().map(|(size, _)| size);
         let made = Scratch::new(&self.gpu, &self.draw, size);
         if made.is_err()
@@ -679,7 +687,7 @@ impl SplatTrainer {
     }
 
     /// Gives a failed submit larger buffers; true when there was a failure.
-    fn mend(&mut self, counters: &[u32]) -> Result<bool, Error> {
+    fn grow_scratch(&mut self, counters: &[u32]) -> Result<bool, Error> {
         if counters[status::FAILED] == 0 {
             return Ok(false);
         }
@@ -696,16 +704,16 @@ impl SplatTrainer {
     }
 
     /// Waits for the submit in flight and takes note of what it did; says whether a buffer was too small for it.
-    fn settle(&mut self) -> Result<bool, Error> {
+    fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
-        let done = Instant::now();
+        let completed = Instant::now();
         let began = in_flight.since.max(self.idle_since); // The submit before was still running when this one was sent.
-        self.idle_since = done;
-        let millis = (done - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
+        self.idle_since = completed;
+        let millis = (completed - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
-        self.note_poisoned(counters[status::N_POISONED].into());
-        let failed = self.mend(&counters)?;
+        self.log_non_finite(counters[status::N_NON_FINITE].into());
+        let failed = self.grow_scratch(&counters)?;
         if failed {
             self.step = u64::from(counters[status::STEP]);
             self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
@@ -714,15 +722,15 @@ impl SplatTrainer {
     }
 
     /// Takes note of gradients that were not finite; says so at first, and whenever there are twice as many.
-    fn note_poisoned(&mut self, n_poisoned: u64) {
-        if n_poisoned.checked_ilog2() > self.n_poisoned.checked_ilog2() {
-            log::warn!("{n_poisoned} gradients of splats were not finite so far and were dropped");
+    fn log_non_finite(&mut self, n_non_finite: u64) {
+        if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
+            log::warn!("{n_non_finite} gradients of splats were not finite so far and were dropped");
         }
-        self.n_poisoned = n_poisoned;
+        self.n_non_finite = n_non_finite;
     }
 
     /// Step from which there are no more splats.
-    fn last_growth(&self) -> u64 {
+    fn growth_end(&self) -> u64 {
         let end = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
         end.next_multiple_of(GROWTH_PERIOD) // Where a submit ends.
     }
@@ -730,17 +738,17 @@ impl SplatTrainer {
     /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
     fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
         let due = self.step >= GROWTH_START
-            && self.step < self.last_growth()
+            && self.step < self.growth_end()
             && self.step.is_multiple_of(GROWTH_PERIOD)
-            && self.grown_at != self.step;
+            && self.last_growth_step != self.step;
         if !due {
             return Ok(());
         }
-        self.settle()?;
+        self.finish_in_flight()?;
         if !self.step.is_multiple_of(GROWTH_PERIOD) {
             return Ok(()); // The submit had failed; the change is due again when its steps are done.
         }
-        self.grown_at = self.step;
+        self.last_growth_step = self.step;
         let n_before = self.splats.n_splats;
         let more = if self.trials.may_grow() && !self.is_full {
             (f64::from(n_before) * self.options.growth_frac).ceil() as u32
@@ -748,7 +756,7 @@ impl SplatTrainer {
             0
         };
         let n_after = (n_before + more).min(self.options.cap()).max(n_before);
-        let n_after = self.room_for(n_after)?.max(n_before);
+        let n_after = self.reserve_up_to(n_after)?.max(n_before);
         let growth = Growth {
             n_before,
             n_after,
@@ -756,11 +764,11 @@ impl SplatTrainer {
             capacity: self.splats.capacity,
             n_sh_rest: n_sh_rest(self.splats.sh_degree),
             child_spread: CHILD_SPREAD,
-            least_opacity: 0.005,
+            min_opacity: 0.005,
             unused: 0.0,
         };
         let buffers = match self.growth_buffers(&growth) {
-            Err(error) if error.is_of_memory() => {
+            Err(error) if error.is_out_of_memory() => {
                 if !std::mem::replace(&mut self.is_full, true) {
                     log::warn!("the model stops growing at {n_before} splats: {error}");
                 }
@@ -770,9 +778,9 @@ impl SplatTrainer {
         };
         passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
         self.passes.submit(&self.gpu);
-        self.passes.forget_bindings();
-        self.splats.set_n(&self.gpu, n_after);
-        self.tell_n();
+        self.passes.clear_bindings();
+        self.splats.set_n_splats(&self.gpu, n_after);
+        self.write_n_splats();
         Ok(())
     }
 
@@ -788,12 +796,12 @@ impl SplatTrainer {
         })
     }
 
-    fn state(&self) -> Result<State, Error> {
-        Ok(State {
-            splats: self.splats.reshaped(&self.gpu, self.splats.capacity, self.splats.sh_degree)?,
+    fn snapshot(&self) -> Result<Snapshot, Error> {
+        Ok(Snapshot {
+            splats: self.splats.resized(&self.gpu, self.splats.capacity, self.splats.sh_degree)?,
             cameras: (self.cameras.set, self.cameras.copy(&self.gpu)?),
             step: self.step,
-            grown_at: self.grown_at,
+            last_growth_step: self.last_growth_step,
             seeding: Seeding {
                 seeder: self.seeder.clone(),
                 scene_size_m: self.scene_size_m,
@@ -803,25 +811,25 @@ impl SplatTrainer {
         })
     }
 
-    fn go_back(&mut self, state: State) -> Result<(), Error> {
-        self.passes.forget_bindings();
-        self.n_taken_back = self.n_taken_back.wrapping_add(self.step).wrapping_sub(state.step);
-        (self.splats, self.step, self.grown_at) = (state.splats, state.step, state.grown_at);
-        self.cameras.go_back(&self.gpu, state.cameras)?;
-        let Seeding { seeder, scene_size_m, has_depth, schedule_start } = state.seeding;
+    fn restore_snapshot(&mut self, snapshot: Snapshot) -> Result<(), Error> {
+        self.passes.clear_bindings();
+        self.n_reverted_steps = self.n_reverted_steps.wrapping_add(self.step).wrapping_sub(snapshot.step);
+        (self.splats, self.step, self.last_growth_step) = (snapshot.splats, snapshot.step, snapshot.last_growth_step);
+        self.cameras.restore_snapshot(&self.gpu, snapshot.cameras)?;
+        let Seeding { seeder, scene_size_m, has_depth, schedule_start } = snapshot.seeding;
         (self.seeder, self.scene_size_m, self.has_depth) = (seeder, scene_size_m, has_depth);
         self.schedule_start = schedule_start;
-        self.tell_n();
+        self.write_n_splats();
         let step = u32::try_from(self.step).unwrap_or(u32::MAX);
         self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
         Ok(())
     }
 
-    fn now(&self) -> Now {
-        Now {
+    fn trial_context(&self) -> TrialContext {
+        TrialContext {
             step: self.step,
             n_splats: self.splats.n_splats,
-            is_mature: self.step >= self.last_growth(),
+            is_mature: self.step >= self.growth_end(),
             sh_degree: self.splats.sh_degree,
         }
     }
@@ -829,87 +837,89 @@ impl SplatTrainer {
     /// Begins, turns and ends trials. What follows from the end of one is done at the same step: when the next submit
     /// ends is a matter of time.
     fn try_when_due(&mut self) -> Result<(), Error> {
-        while self.trials.due(self.now()) != Due::Nothing {
-            self.settle()?; // Steps may turn out to be lost.
-            match self.trials.due(self.now()) {
+        while self.trials.due(self.trial_context()) != Due::Nothing {
+            self.finish_in_flight()?; // Steps may turn out to be lost.
+            match self.trials.due(self.trial_context()) {
                 Due::Nothing => {}
-                Due::Begin(candidate) => match self.state() {
-                    Ok(state) => self.trials.begin(candidate, state, self.views.len()),
+                Due::Begin(candidate) => match self.snapshot() {
+                    Ok(snapshot) => self.trials.begin(candidate, snapshot, self.views.len()),
                     Err(error) => self.end_trials_without_memory(error)?,
                 },
-                Due::Turn => self.turn_trial()?,
+                Due::BeginSecondHalf => self.start_second_half()?,
                 Due::Arrival => {
                     if let Some(keyframe) = self.trials.next_arrival() {
-                        self.welcome(keyframe)?;
-                        self.begin_learning()?;
+                        self.add_keyframe(keyframe)?;
+                        self.prepare_training()?;
                     }
                 }
                 Due::Gains => self.try_gains()?,
                 Due::End => {
-                    let with_db = self.score_held_back()?;
-                    if let Some(ended) = self.trials.end(&with_db) {
-                        self.end_trial(ended)?;
-                        self.begin_learning()?;
+                    let variant_db = self.score_validation()?;
+                    if let Some(finished) = self.trials.end(&variant_db) {
+                        self.end_trial(finished)?;
+                        self.prepare_training()?;
                     }
                 }
-                Due::Join => self.join_held_back()?,
+                Due::ReleaseValidation => self.release_validation()?,
             }
         }
         Ok(())
     }
 
-    fn join_held_back(&mut self) -> Result<(), Error> {
-        for keyframe in self.trials.settle() {
-            self.learn_from(keyframe)?;
+    fn release_validation(&mut self) -> Result<(), Error> {
+        for keyframe in self.trials.finish() {
+            self.add_view(keyframe)?;
         }
-        self.begin_learning()
+        self.prepare_training()
     }
 
     /// Trials need copies of the model. If there is no memory for them, training continues without trials.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
-        if !error.is_of_memory() {
+        if !error.is_out_of_memory() {
             return Err(error);
         }
         log::warn!("no further trials of model changes: {error}");
-        self.join_held_back()
+        self.release_validation()
     }
 
     /// Goes back to where a trial began, with the change.
-    fn turn_trial(&mut self) -> Result<(), Error> {
-        let without_db = self.score_held_back()?;
-        let state = match self.state() {
-            Ok(state) => state,
+    fn start_second_half(&mut self) -> Result<(), Error> {
+        let baseline_db = self.score_validation()?;
+        let snapshot = match self.snapshot() {
+            Ok(snapshot) => snapshot,
             Err(error) => return self.end_trials_without_memory(error),
         };
-        let Some(Turned { from, candidate, arrived }) = self.trials.turn(state, without_db) else { return Ok(()) };
-        self.go_back(from)?;
+        let Some(SecondHalf { from, candidate, arrived }) = self.trials.begin_second_half(snapshot, baseline_db) else {
+            return Ok(());
+        };
+        self.restore_snapshot(from)?;
         self.views.retain(|view| !arrived.iter().any(|keyframe| Arc::ptr_eq(keyframe, &view.keyframe)));
         match candidate {
-            Candidate::Cameras(terms) => self.cameras.learn_also(terms),
-            Candidate::Halved { to, .. } => self.keep_most(to)?,
+            Candidate::Cameras(params) => self.cameras.enable(params),
+            Candidate::Halved { to, .. } => self.keep_most_contributing(to)?,
             Candidate::ShDegree { to, .. } => self.lower_degree(to)?,
         }
-        self.begin_learning()
+        self.prepare_training()
     }
 
     /// Restores the state without the change if the change is rejected, then adds the keyframes that arrived meanwhile.
-    fn end_trial(&mut self, Ended { restored, seeded, deferred }: Ended) -> Result<(), Error> {
-        if let Some(state) = restored {
-            self.go_back(state)?;
+    fn end_trial(&mut self, TrialEnd { restored, seeded, deferred }: TrialEnd) -> Result<(), Error> {
+        if let Some(snapshot) = restored {
+            self.restore_snapshot(snapshot)?;
             self.views.extend(seeded.into_iter().map(TrainView::new));
         }
-        deferred.into_iter().try_for_each(|keyframe| self.welcome(keyframe))
+        deferred.into_iter().try_for_each(|keyframe| self.add_keyframe(keyframe))
     }
 
     /// Starts training on a keyframe that arrives now.
-    fn welcome(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+    fn add_keyframe(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // At least half of the schedule is ahead of a late keyframe: learning rates are still large enough, and growth continues.
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
-        self.learn_from(keyframe)
+        self.add_view(keyframe)
     }
 
-    fn learn_from(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.settle()?;
+    fn add_view(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        self.finish_in_flight()?;
         self.has_depth |= keyframe.depth.is_some();
         self.pending.push(keyframe.clone());
         self.views.push(TrainView::new(keyframe));
@@ -918,18 +928,18 @@ impl SplatTrainer {
 
     /// How the trials of what the model needs ended so far.
     pub fn trials(&self) -> &[Trial] {
-        &self.trials.ended
+        &self.trials.finished
     }
 
     /// Draws one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
-        let wanted = if depth { Wanted::ColorAndDepth } else { Wanted::Color };
-        self.draw_reading(camera, background_srgb, true, wanted, |parts| Picture::of_parts(camera.size_px, parts))
+        let requested = if depth { RequestedParts::ColorAndDepth } else { RequestedParts::Color };
+        self.draw_reading(camera, background_srgb, true, requested, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
     /// Draws one pinhole view into the frame for pictures, of the splats that people see or of those that learn.
-    fn draw_into_frame(&mut self, camera: &Camera, background_srgb: [f32; 3], shown: bool) -> Result<(), Error> {
-        self.draw_reading(camera, background_srgb, shown, Wanted::Nothing, |_| ())
+    fn draw_into_buffers(&mut self, camera: &Camera, background_srgb: [f32; 3], displayed: bool) -> Result<(), Error> {
+        self.draw_reading(camera, background_srgb, displayed, RequestedParts::Nothing, |_| ())
     }
 
     /// Draws one pinhole view into the frame for pictures and passes the bytes of the wanted parts to `take`. The same read
@@ -938,8 +948,8 @@ impl SplatTrainer {
         &mut self,
         camera: &Camera,
         background_srgb: [f32; 3],
-        shown: bool,
-        wanted: Wanted<'_>,
+        displayed: bool,
+        requested: RequestedParts<'_>,
         take: impl Fn(&[&[u8]]) -> R,
     ) -> Result<R, Error> {
         let size_px = camera.size_px;
@@ -949,25 +959,27 @@ impl SplatTrainer {
         self.gpu.write(&self.plain, 0, bytemuck::bytes_of(&background));
         loop {
             self.make_scratch(size_px, false)?;
-            ensure_frame(&self.gpu, &mut self.draw_frame, &mut self.passes, size_px, false)?;
+            ensure_image_buffers(&self.gpu, &mut self.drawing_buffers, &mut self.passes, size_px, false)?;
             let mut list = std::mem::take(&mut self.passes);
-            let (Some((_, scratch)), Some(frame)) = (&self.scratch, &self.draw_frame) else {
+            let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.drawing_buffers) else {
                 return Err(Error::DeviceLost);
             };
-            let splats = if shown { self.shown() } else { &self.splats };
-            self.tell_n_to(&self.draw_status, splats.n_splats);
+            let splats = if displayed { self.displayed() } else { &self.splats };
+            self.write_n_splats_to(&self.draw_status, splats.n_splats);
             let (gpu, status, view) = (&self.gpu, &self.draw_status, &self.draw_view);
-            let passes = ViewPasses { gpu, splats, scratch, frame, status, view, size_px };
+            let passes = ViewPasses { gpu, splats, scratch, image_buffers, status, view, size_px };
             passes.draw(&mut list, &self.draw);
             passes.finish(&mut list, &self.draw, &self.plain);
             let mut read = vec![(status, 4 * status::LEN)];
-            match wanted {
-                Wanted::Nothing => {}
-                Wanted::Color => read.extend(Picture::buffers(size_px, &frame.pixels, None)),
-                Wanted::ColorAndDepth => read.extend(Picture::buffers(size_px, &frame.pixels, Some(&frame.depths))),
-                Wanted::Comparison { score, image } => {
-                    let n_groups = scoring::compare(gpu, &mut list, score, (view, frame), size_px, image);
-                    read.push((&frame.products, scoring::PRODUCTS_BYTES * n_groups as usize));
+            match requested {
+                RequestedParts::Nothing => {}
+                RequestedParts::Color => read.extend(Picture::buffers(size_px, &image_buffers.pixels, None)),
+                RequestedParts::ColorAndDepth => {
+                    read.extend(Picture::buffers(size_px, &image_buffers.pixels, Some(&image_buffers.depths)))
+                }
+                RequestedParts::Comparison { score, image } => {
+                    let n_groups = scoring::compare(gpu, &mut list, score, (view, image_buffers), size_px, image);
+                    read.push((&image_buffers.products, scoring::PRODUCTS_BYTES * n_groups as usize));
                 }
             }
             let read = list.submit_reading(&self.gpu, &read);
@@ -980,7 +992,7 @@ impl SplatTrainer {
             if let Some(taken) = taken {
                 return Ok(taken);
             }
-            if !self.mend(&counters)? {
+            if !self.grow_scratch(&counters)? {
                 return Err(Error::DeviceLost);
             }
             self.gpu.write(&self.draw_status, 4 * status::FAILED as u64, &[0; 12]);
@@ -990,7 +1002,7 @@ impl SplatTrainer {
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.settle()?; // The step at which it comes must be true.
+        self.finish_in_flight()?; // The step at which it comes must be true.
         if keyframe.split == Split::Test {
             return Ok(());
         }
@@ -1002,26 +1014,26 @@ impl Method for SplatTrainer {
             );
             return Ok(());
         }
-        let keyframe = self.aligning.corrected(&keyframe);
-        if keyframe.split == Split::Selection && self.trials.hold_back() {
-            self.trials.held_back.push(HeldBack { keyframe, image: None });
+        let keyframe = self.alignment_task.corrected(&keyframe);
+        if keyframe.split == Split::Validation && self.trials.holds_validation() {
+            self.trials.validation.push(ValidationImage { keyframe, image: None });
             return Ok(());
         }
         // Both halves of a trial train on the same keyframes at the same steps.
-        if self.trials.defers(&keyframe, self.step) {
+        if self.trials.defer_arrival(&keyframe, self.step) {
             return Ok(());
         }
-        self.welcome(keyframe)
+        self.add_keyframe(keyframe)
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.settle()?; // The step at which it goes must be true.
+        self.finish_in_flight()?; // The step at which it goes must be true.
         self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
-        let is_it = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
-        self.trials.remove(is_it);
-        self.pending.retain(|keyframe| !is_it(keyframe));
-        self.unseeded.retain(|keyframe| !is_it(keyframe));
-        self.passes.forget_bindings();
+        let is_removed = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
+        self.trials.remove(is_removed);
+        self.pending.retain(|keyframe| !is_removed(keyframe));
+        self.unseeded.retain(|keyframe| !is_removed(keyframe));
+        self.passes.clear_bindings();
         Ok(())
     }
 
@@ -1029,7 +1041,7 @@ impl Method for SplatTrainer {
         if self.views.is_empty() {
             return Ok(0);
         }
-        self.begin_learning()?;
+        self.prepare_training()?;
         if self.splats.n_splats == 0 {
             return Ok(0);
         }
@@ -1037,13 +1049,13 @@ impl Method for SplatTrainer {
         self.align_when_due()?;
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
-        let most_millis = submit_millis(self.is_watched);
-        let by_time = if self.step_millis > 0.0 { (most_millis / self.step_millis) as u64 } else { 1 };
-        let to_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
-        let asked = n;
+        let max_millis = submit_millis(self.is_watched);
+        let by_time = if self.step_millis > 0.0 { (max_millis / self.step_millis) as u64 } else { 1 };
+        let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
+        let n_requested = n;
         let n = n
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
-            .min(to_change)
+            .min(to_next_change)
             .min(self.trials.steps_left(self.step))
             .min(self.steps_to_alignment());
         self.splats.set_active_degree(&self.gpu, u32::try_from(self.step / SH_PERIOD).unwrap_or(3).min(3));
@@ -1055,12 +1067,12 @@ impl Method for SplatTrainer {
         }
         let status = self.passes.submit_reading(&self.gpu, &[(&self.learn_status, 4 * status::LEN)]);
         self.step += n;
-        let failed = self.settle()?; // The submit before; this one runs meanwhile.
+        let failed = self.finish_in_flight()?; // The submit before; this one runs meanwhile.
         if !failed {
             self.in_flight = Some(InFlight { status, n_steps: n, since });
         } // Else this one found the failure too and did nothing: its steps are to be done, not to be waited for.
-        if n == asked {
-            self.settle()?; // The caller stops here: the count must be true.
+        if n == n_requested {
+            self.finish_in_flight()?; // The caller stops here: the count must be true.
         }
         Ok(n)
     }
@@ -1073,9 +1085,9 @@ impl Method for SplatTrainer {
         "splat"
     }
 
-    fn n_taken(&mut self) -> Result<u64, Error> {
-        self.settle()?;
-        Ok(self.step.wrapping_add(self.n_taken_back))
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
+        self.finish_in_flight()?;
+        Ok(self.step.wrapping_add(self.n_reverted_steps))
     }
 
     fn seed(&mut self) -> Result<(), Error> {
@@ -1087,8 +1099,8 @@ impl Method for SplatTrainer {
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        self.settle()?;
-        self.begin_learning()?;
+        self.finish_in_flight()?;
+        self.prepare_training()?;
         let learn = self.learn()?;
         self.write_rule();
         self.record_step(&learn, self.step)?;
@@ -1109,52 +1121,52 @@ impl Method for SplatTrainer {
     fn psnr(&mut self, request: &RenderRequest, keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         self.seed_from_depth()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
-        self.psnr_of_view(&Camera::of_request(request, focal_px, principal_px), request.background_srgb, keyframe)
+        self.psnr_of_view(&Camera::from_request(request, focal_px, principal_px), request.background_srgb, keyframe)
     }
 
-    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        let learned = self.camera_fixes()?;
-        Ok(self.aligning.posed_lens(keyframe, learned.get(keyframe.camera.as_ref())))
+    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
+        let learned = self.camera_corrections()?;
+        Ok(self.alignment_task.calibrated_camera(keyframe, learned.get(keyframe.camera.as_ref())))
     }
 
     fn alignment(&self) -> Option<&Alignment> {
-        self.aligning.result()
+        self.alignment_task.result()
     }
 
     fn progress(&self) -> Progress {
         Progress {
             step: self.step,
-            primitives: self.shown().n_splats.into(),
-            bytes: self.shown().bytes(),
+            primitives: self.displayed().n_splats.into(),
+            bytes: self.displayed().bytes(),
             step_millis: self.step_millis,
         }
     }
 
-    fn report(&self) -> Vec<Part> {
-        self.trials.ended.iter().map(Trial::part).collect()
+    fn report(&self) -> Vec<TrialReport> {
+        self.trials.finished.iter().map(Trial::part).collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
-        self.settle()?;
-        if let Some(ended) = self.trials.give_up() {
+        self.finish_in_flight()?;
+        if let Some(finished) = self.trials.cancel() {
             log::info!("training ends before what is being tried could be judged: saved without it");
-            self.end_trial(ended)?;
+            self.end_trial(finished)?;
         }
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
         ply::write(&folder.join("splats.ply"), &arrays)?;
-        let about = serde_json::json!({
+        let metadata = serde_json::json!({
             "method": "splat",
             "steps": self.step,
             "splats": arrays.n_splats(),
             "sh_degree": arrays.sh_degree,
             "seed": self.options.seed,
             "trials": self.report(),
-            "alignment": self.aligning.result(),
-            "cameras": self.camera_fixes()?,
+            "alignment": self.alignment_task.result(),
+            "cameras": self.camera_corrections()?,
         });
         let path = folder.join("model.json");
-        std::fs::write(&path, format!("{about:#}\n")).map_err(|source| Error::Write { path, source })
+        std::fs::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
     }
 
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
@@ -1163,45 +1175,51 @@ impl Method for SplatTrainer {
 }
 
 /// What was learned about cameras, by name.
-type Fixes = BTreeMap<String, CameraFix>;
+type CameraCorrections = BTreeMap<String, CameraCorrection>;
 
-/// The camera of a keyframe as it is, where the input has it as [`PosedLens::of`].
-fn fixed(fixes: &Fixes, keyframe: &Keyframe) -> PosedLens {
-    fixes.get(keyframe.camera.as_ref()).map_or_else(|| PosedLens::of(keyframe), |fix| fix.apply(keyframe))
+/// The camera of a keyframe as it is, where the input has it as [`CalibratedCamera::of`].
+fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> CalibratedCamera {
+    corrections
+        .get(keyframe.camera.as_ref())
+        .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
 }
 
 /// What a saved model knows about cameras.
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
-pub(crate) struct About {
-    pub(crate) cameras: BTreeMap<String, CameraFix>,
+pub(crate) struct ModelMetadata {
+    pub(crate) cameras: BTreeMap<String, CameraCorrection>,
     pub(crate) alignment: Option<Alignment>,
 }
 
 /// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.
-pub(crate) fn read_about(path: &Path) -> Result<About, Error> {
-    let refused = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
+pub(crate) fn read_metadata(path: &Path) -> Result<ModelMetadata, Error> {
+    let invalid_file = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
     match std::fs::read(path) {
-        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| refused(error.to_string())),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(About::default()),
-        Err(error) => Err(refused(error.to_string())),
+        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| invalid_file(error.to_string())),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ModelMetadata::default()),
+        Err(error) => Err(invalid_file(error.to_string())),
     }
 }
 
-fn ensure_frame(
+fn ensure_image_buffers(
     gpu: &Gpu,
-    frame: &mut Option<Frame>,
+    image_buffers: &mut Option<ImageBuffers>,
     passes: &mut Passes,
     size_px: [u32; 2],
     learned: bool,
 ) -> Result<(), Error> {
     let (n_pixels, n_tiles) = (size_px[0] * size_px[1], n_tiles(size_px));
-    if frame.as_ref().is_none_or(|frame| frame.n_pixels < n_pixels || frame.n_tiles < n_tiles) {
-        let have = frame.as_ref().map_or((0, 0), |frame| (frame.n_pixels, frame.n_tiles));
+    if image_buffers
+        .as_ref()
+        .is_none_or(|image_buffers| image_buffers.n_pixels < n_pixels || image_buffers.n_tiles < n_tiles)
+    {
+        let have =
+            image_buffers.as_ref().map_or((0, 0), |image_buffers| (image_buffers.n_pixels, image_buffers.n_tiles));
         passes.submit(gpu);
-        passes.forget_bindings();
-        *frame = None;
-        *frame = Some(Frame::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
+        passes.clear_bindings();
+        *image_buffers = None;
+        *image_buffers = Some(ImageBuffers::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
     }
     Ok(())
 }

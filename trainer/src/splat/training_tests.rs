@@ -2,7 +2,7 @@
 
 use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
-use super::{CameraChoice, SplatOptions, SplatTrainer, TermSet};
+use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions, f32s_of};
 use crate::{DepthMap, Keyframe, Method, Projection, RenderRequest, Split};
@@ -20,8 +20,8 @@ fn scene() -> SplatArrays {
     for ix in 0..N_DISCS {
         // Evenly spread (Vogel 1979), facing the middle.
         let height = 1.0 - (2 * ix + 1) as f64 / N_DISCS as f64;
-        let (turn, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
-        let out = Vector3::new(radius * turn.cos(), height, radius * turn.sin());
+        let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
+        let out = Vector3::new(radius * angle.cos(), height, radius * angle.sin());
         let facing =
             nalgebra::UnitQuaternion::rotation_between(&Vector3::z(), &out).expect("no disc lies opposite to z");
         arrays.means[ix] = f32s_of((6.0 * out).into());
@@ -51,7 +51,7 @@ pub(super) fn request(world_from_camera: Transform) -> RenderRequest {
         far_m: 100.0,
         crop: None,
         background_srgb: [0.0; 3],
-        light_of: None,
+        appearance_of: None,
         depth: true,
     }
 }
@@ -143,7 +143,7 @@ pub(super) fn test_psnr(trainer: &mut SplatTrainer, keyframes: &[Arc<Keyframe>])
 }
 
 #[test]
-fn learns_unseen_views_and_gives_the_same_bits_twice() {
+fn training_predicts_test_views_and_is_reproducible() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let run = |seed| {
@@ -164,14 +164,14 @@ fn learns_unseen_views_and_gives_the_same_bits_twice() {
 
 /// On a software adapter, images are removed from the GPU: memory stays bounded however many keyframes there are.
 #[test]
-fn a_bound_on_images_holds_and_changes_no_bit() {
+fn image_memory_limit_holds_and_changes_no_bit() {
     const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 20, true);
     let n_train = keyframes.iter().filter(|keyframe| keyframe.split == Split::Train).count() as u64;
     let run = |max_bytes: u64, train: fn(&mut SplatTrainer, u64)| {
         let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
-        trainer.hold_images(max_bytes);
+        trainer.limit_image_bytes(max_bytes);
         for keyframe in &keyframes {
             trainer.push(keyframe.clone()).unwrap();
         }
@@ -199,7 +199,7 @@ fn a_bound_on_images_holds_and_changes_no_bit() {
 }
 
 #[test]
-fn learns_without_depth_from_a_random_start() {
+fn trains_without_depth_from_random_points() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, false);
     let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
@@ -216,7 +216,7 @@ fn learns_without_depth_from_a_random_start() {
 /// A live scan may be longer than the plan: what comes late is still given splats.
 /// Depth as a scanner has it: a band of coarse cells.
 #[test]
-fn what_a_band_of_depth_leaves_bare_is_seeded_from_it() {
+fn area_outside_a_depth_band_is_seeded_from_it() {
     const SHARE: u32 = 4;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let with_band = |keyframe: Arc<Keyframe>| {
@@ -257,7 +257,7 @@ fn what_a_band_of_depth_leaves_bare_is_seeded_from_it() {
 }
 
 #[test]
-fn a_late_keyframe_lets_the_model_grow_again() {
+fn late_keyframe_resumes_growth() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let mut trainer = SplatTrainer::new(gpu, SplatOptions { max_splats: 8_000, ..options() }).unwrap();
@@ -276,8 +276,8 @@ fn a_late_keyframe_lets_the_model_grow_again() {
 }
 
 /// Learns from many images, with the lens to be tried.
-fn trying_a_lens(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
-    let cameras = CameraChoice::Try(vec![TermSet { lens: true, ..TermSet::default() }]);
+fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
+    let cameras = CameraRefinement::Try(vec![ParamSet { lens: true, ..ParamSet::default() }]);
     let options = SplatOptions { cameras, max_splats, n_planned_steps: 1500, ..options() };
     let mut trainer = SplatTrainer::new(gpu, options).unwrap();
     for keyframe in keyframes {
@@ -288,35 +288,38 @@ fn trying_a_lens(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) ->
 
 /// A focal length off by 10 % is found out on the held-back images.
 #[test]
-fn a_wrong_lens_is_found_out() {
-    const OFF: f64 = 1.1;
+fn wrong_lens_is_corrected_by_trial() {
+    const FOCAL_ERROR: f64 = 1.1;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let right = n_keyframes(&gpu, 60, true);
-    let wrong = right.iter().map(|keyframe| {
-        let focal_px = keyframe.focal_px.map(|focal| OFF * focal);
+    let true_keyframes = n_keyframes(&gpu, 60, true);
+    let miscalibrated = true_keyframes.iter().map(|keyframe| {
+        let focal_px = keyframe.focal_px.map(|focal| FOCAL_ERROR * focal);
         Arc::new(Keyframe { focal_px, ..keyframe.as_ref().clone() })
     });
-    let wrong: Vec<_> = wrong.collect();
-    let mut trainer = trying_a_lens(&wrong, gpu, 2000);
+    let miscalibrated: Vec<_> = miscalibrated.collect();
+    let mut trainer = trainer_with_lens_trial(&miscalibrated, gpu, 2000);
     train(&mut trainer, 900);
-    let found = trainer.posed_lens(&wrong[0]).unwrap().focal_px;
-    assert!(trainer.trials()[0].kept, "{:?}, focal length {found:?}", trainer.trials());
+    let found_focal_px = trainer.calibrated_camera(&miscalibrated[0]).unwrap().focal_px;
+    assert!(trainer.trials()[0].kept, "{:?}, focal length {found_focal_px:?}", trainer.trials());
     // The cameras turn about the vertical axis only, which tells the horizontal focal length; 400 steps go half the way.
-    assert!((found[0] / FOCAL_PX - 1.0).abs() < 0.6 * (OFF - 1.0), "{found:?} instead of {FOCAL_PX}");
+    assert!(
+        (found_focal_px[0] / FOCAL_PX - 1.0).abs() < 0.6 * (FOCAL_ERROR - 1.0),
+        "{found_focal_px:?} instead of {FOCAL_PX}"
+    );
 }
 
 #[test]
-fn what_is_being_tried_is_not_saved_and_tried_again() {
+fn running_trial_is_not_saved_and_is_repeated() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 36, true);
-    let mut trainer = trying_a_lens(&keyframes, gpu, 300);
+    let mut trainer = trainer_with_lens_trial(&keyframes, gpu, 300);
     train(&mut trainer, 750);
     trainer.step(40).unwrap();
     assert!(trainer.progress().step < 750, "a lens is being tried");
-    assert!(trainer.camera_fixes().unwrap().is_empty(), "what is being tried is not told");
+    assert!(trainer.camera_corrections().unwrap().is_empty(), "what is being tried is not told");
     let folder = tempfile::tempdir().unwrap();
     trainer.save(folder.path()).unwrap();
-    assert!(trainer.camera_fixes().unwrap().is_empty(), "nothing is decided yet, so nothing is saved");
+    assert!(trainer.camera_corrections().unwrap().is_empty(), "nothing is decided yet, so nothing is saved");
     assert_eq!((trainer.progress().step, trainer.trials().len()), (750, 0));
     train(&mut trainer, 260);
     assert_eq!(trainer.trials().len(), 1);
@@ -324,7 +327,7 @@ fn what_is_being_tried_is_not_saved_and_tried_again() {
 
 /// Black splats look like no splats before a black background, but they hide what is behind them and have a depth.
 #[test]
-fn black_things_stay_solid() {
+fn black_objects_stay_opaque() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let mut trainer = SplatTrainer::new(gpu.clone(), options()).unwrap();
     let keyframes = keyframes(&gpu, true);
@@ -334,8 +337,9 @@ fn black_things_stay_solid() {
     }
     train(&mut trainer, 250);
     let picture = trainer.render(&request(keyframes[0].world_from_camera)).unwrap();
-    let wanted = &keyframes[0].depth.as_ref().unwrap().depth_m;
-    let solid = wanted.iter().zip(picture.rgba_srgb.chunks_exact(4)).filter(|(wanted_m, _)| **wanted_m > 0.0);
+    let expected_depth_m = &keyframes[0].depth.as_ref().unwrap().depth_m;
+    let solid =
+        expected_depth_m.iter().zip(picture.rgba_srgb.chunks_exact(4)).filter(|(expected_m, _)| **expected_m > 0.0);
     let coverage: Vec<f64> = solid.map(|(_, pixel)| f64::from(pixel[3]) / 255.0).collect();
     let mean = coverage.iter().sum::<f64>() / coverage.len() as f64;
     // Measured 0.89; with a background that stays black 0.003.
@@ -343,7 +347,7 @@ fn black_things_stay_solid() {
 }
 
 #[test]
-fn a_cap_in_bytes_holds() {
+fn byte_limit_holds() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let base = options();
@@ -381,7 +385,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
 }
 
 #[test]
-fn all_directions_agree_with_the_pinhole_view() {
+fn equirectangular_agrees_with_pinhole() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let mut trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &scene()).unwrap();
     let around = trainer
@@ -410,25 +414,25 @@ fn all_directions_agree_with_the_pinhole_view() {
 
 /// How many steps fit into a submit is measured, so it must not matter; also where cameras are learned.
 #[test]
-fn the_length_of_submits_changes_no_bit() {
+fn submit_length_changes_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
-    let mount = TermSet { mount: true, delay: true, ..TermSet::default() };
+    let params = ParamSet { params: true, time_offset: true, ..ParamSet::default() };
     let learned = |train: fn(&mut SplatTrainer, u64)| {
-        let options = SplatOptions { cameras: CameraChoice::Given(mount), ..options() };
+        let options = SplatOptions { cameras: CameraRefinement::Always(params), ..options() };
         let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
         for keyframe in &keyframes {
             trainer.push(keyframe.clone()).unwrap();
         }
         train(&mut trainer, 130);
-        (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
+        (trainer.arrays().unwrap(), trainer.camera_corrections().unwrap())
     };
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
 /// Viewers change no bit either: submits are shorter then, and images are uploaded in smaller batches.
 #[test]
-fn submits_are_short_while_somebody_looks_and_no_bit_differs() {
+fn viewers_shorten_submits_and_change_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let learned = |watched: bool| {
@@ -442,12 +446,12 @@ fn submits_are_short_while_somebody_looks_and_no_bit_differs() {
             trainer.assume_step_millis(1.0);
             assert_eq!(trainer.step(100).unwrap(), if watched { 4 } else { 20 });
             if watched {
-                let seen = RenderRequest { depth: false, ..request(keyframes[0].world_from_camera) };
-                assert!(trainer.render(&seen).unwrap().depth_m.is_empty());
+                let render_request = RenderRequest { depth: false, ..request(keyframes[0].world_from_camera) };
+                assert!(trainer.render(&render_request).unwrap().depth_m.is_empty());
             }
         }
-        let left = 160 - trainer.progress().step;
-        train(&mut trainer, left);
+        let n_left = 160 - trainer.progress().step;
+        train(&mut trainer, n_left);
         trainer.arrays().unwrap()
     };
     assert!(learned(true) == learned(false));
@@ -455,21 +459,21 @@ fn submits_are_short_while_somebody_looks_and_no_bit_differs() {
 
 /// Nor where a trial ends, and held-back images join in.
 #[test]
-fn the_length_of_submits_changes_no_bit_of_a_trial() {
+fn submit_length_changes_no_bit_of_a_trial() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 36, true);
     let learned = |train: fn(&mut SplatTrainer, u64)| {
-        let mut trainer = trying_a_lens(&keyframes, gpu.clone(), 300);
+        let mut trainer = trainer_with_lens_trial(&keyframes, gpu.clone(), 300);
         train(&mut trainer, 790);
-        assert_eq!((trainer.trials().len(), trainer.n_taken().unwrap()), (1, 790 + 250));
-        (trainer.arrays().unwrap(), trainer.camera_fixes().unwrap())
+        assert_eq!((trainer.trials().len(), trainer.n_total_steps().unwrap()), (1, 790 + 250));
+        (trainer.arrays().unwrap(), trainer.camera_corrections().unwrap())
     };
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
 /// A submit whose intersections found no room is done again, and the one sent behind it is not counted twice.
 #[test]
-fn a_buffer_that_was_too_small_changes_no_bit() {
+fn buffer_overflow_changes_no_bit() {
     const N_STEPS: u64 = 90;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, false);
@@ -482,7 +486,7 @@ fn a_buffer_that_was_too_small_changes_no_bit() {
         }
         train(&mut trainer, N_STEPS);
         // Rates and noise go by the GPU's own count.
-        (trainer.n_taken().unwrap(), trainer.n_steps_on_gpu(), trainer.arrays().unwrap())
+        (trainer.n_total_steps().unwrap(), trainer.n_steps_on_gpu(), trainer.arrays().unwrap())
     };
     let (one_by_one, together) = (learned(train_one_by_one), learned(train_in_long_submits));
     assert_eq!((one_by_one.0, one_by_one.1), (N_STEPS, N_STEPS));

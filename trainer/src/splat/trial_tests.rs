@@ -1,8 +1,8 @@
 //! Trials while keyframes arrive and leave: both halves see the same data, no seed is lost, and a checkpoint holds the whole trial.
 
-use super::learning::{n_keyframes, options};
+use super::training_tests::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
-use super::{CameraChoice, SplatOptions, SplatTrainer, TermSet, Trial};
+use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer, Trial};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
 use crate::{Keyframe, Method, Split};
@@ -12,10 +12,10 @@ use std::sync::Arc;
 const HALF: u64 = 250;
 const END: u64 = TRIAL_START + 2 * HALF;
 
-fn trying(gpu: &Arc<Gpu>, candidate: TermSet) -> SplatTrainer {
+fn trainer_with_candidate(gpu: &Arc<Gpu>, candidate: ParamSet) -> SplatTrainer {
     // The splat count changes only when seeds are added.
     let options = SplatOptions {
-        cameras: CameraChoice::Try(vec![candidate]),
+        cameras: CameraRefinement::Try(vec![candidate]),
         growth_frac: 0.0,
         n_planned_steps: 1500,
         max_splats: 20_000,
@@ -30,30 +30,30 @@ fn with_split(keyframe: &Arc<Keyframe>, split: Split) -> Arc<Keyframe> {
 }
 
 /// Trains up to a total number of updates, including those of trials.
-fn train_to(trainer: &mut SplatTrainer, n_taken: u64) {
-    while trainer.n_taken().unwrap() < n_taken {
-        let left = n_taken - trainer.n_taken().unwrap();
-        trainer.step(left.min(7)).unwrap();
+fn train_to(trainer: &mut SplatTrainer, n_total_steps: u64) {
+    while trainer.n_total_steps().unwrap() < n_total_steps {
+        let n_left = n_total_steps - trainer.n_total_steps().unwrap();
+        trainer.step(n_left.min(7)).unwrap();
     }
 }
 
-fn lens() -> TermSet {
-    TermSet { lens: true, ..TermSet::default() }
+fn lens() -> ParamSet {
+    ParamSet { lens: true, ..ParamSet::default() }
 }
 
 const N_EARLY: usize = 30;
 
 /// Keyframes all around the scene; every fourth one is a selection keyframe.
 fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
-    let split = |ix: usize| if ix.is_multiple_of(4) { Split::Selection } else { Split::Train };
+    let split = |ix: usize| if ix.is_multiple_of(4) { Split::Validation } else { Split::Train };
     n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
 }
 
 /// Keyframes arrive before the trial, in its first half and in its second half; returns after the end of the trial.
-fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: TermSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
+fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let (early, late) = keyframes.split_at(N_EARLY);
     let (first_half, second_half) = late.split_at(8);
-    let mut trainer = trying(gpu, candidate);
+    let mut trainer = trainer_with_candidate(gpu, candidate);
     early.iter().for_each(|keyframe| trainer.push(keyframe.clone()).unwrap());
     for (begin, arriving) in [(TRIAL_START, first_half), (TRIAL_START + HALF, second_half)] {
         for (ix, keyframe) in arriving.iter().enumerate() {
@@ -65,51 +65,51 @@ fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: TermSet, keyframes: &[Arc<Keyf
     trainer
 }
 
-fn assert_no_seed_is_lost(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
+fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
     assert_eq!(trainer.progress().primitives, trainer.n_seeds() as u64, "splats against places that count as seeded");
     for keyframe in keyframes.iter().filter(|keyframe| keyframe.split == Split::Train) {
-        assert_eq!(trainer.times_learned_from(keyframe), 1, "{:?}", keyframe.stamp);
+        assert_eq!(trainer.n_views_of(keyframe), 1, "{:?}", keyframe.stamp);
     }
     assert!(trainer.n_seeds() > 500, "{}", trainer.n_seeds());
 }
 
 #[test]
-fn a_change_without_effect_scores_the_same_while_keyframes_arrive() {
+fn no_op_trial_scores_equal_while_keyframes_arrive() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = around(&gpu);
-    let trainer = trial_with_arrivals(&gpu, TermSet::NONE, &keyframes);
+    let trainer = trial_with_arrivals(&gpu, ParamSet::NONE, &keyframes);
     let [Trial { gain_db, standard_error_db, n_images, kept, .. }] = trainer.trials() else {
         panic!("{:?}", trainer.trials())
     };
     assert_eq!((*gain_db, *standard_error_db, *kept), (0.0, 0.0, false));
     assert_eq!(*n_images, N_EARLY.div_ceil(4), "those held when the trial began");
-    assert_no_seed_is_lost(&trainer, &keyframes);
+    assert_all_seeds_kept(&trainer, &keyframes);
 }
 
 #[test]
-fn a_change_that_is_kept_keeps_the_seeds_of_keyframes_that_arrived_meanwhile() {
+fn accepted_trial_keeps_seeds_of_arrived_keyframes() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let wrong: Vec<_> = around(&gpu)
+    let miscalibrated: Vec<_> = around(&gpu)
         .iter()
         .map(|keyframe| {
             let focal_px = keyframe.focal_px.map(|focal| 1.1 * focal);
             Arc::new(Keyframe { focal_px, ..keyframe.as_ref().clone() })
         })
         .collect();
-    let trainer = trial_with_arrivals(&gpu, lens(), &wrong);
+    let trainer = trial_with_arrivals(&gpu, lens(), &miscalibrated);
     assert!(trainer.trials().len() == 1 && trainer.trials()[0].kept, "{:?}", trainer.trials());
-    assert_no_seed_is_lost(&trainer, &wrong);
+    assert_all_seeds_kept(&trainer, &miscalibrated);
 }
 
 #[test]
-fn both_scores_of_a_trial_are_of_the_same_images() {
+fn both_halves_score_the_same_images() {
     const N_FIRST: usize = 20;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 60, true);
     let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
     let selection: Vec<_> =
-        (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Selection)).collect();
-    let mut trainer = trying(&gpu, TermSet::NONE);
+        (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Validation)).collect();
+    let mut trainer = trainer_with_candidate(&gpu, ParamSet::NONE);
     let (early, late) = selection.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
     // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.
@@ -131,14 +131,14 @@ fn both_scores_of_a_trial_are_of_the_same_images() {
 }
 
 #[test]
-fn stopping_in_either_half_of_a_trial_changes_no_bit() {
+fn resuming_in_either_trial_half_is_bit_exact() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 42, true);
     // Times at which keyframes arrive, and at which training stops and resumes, in total updates.
     let arrivals: Vec<u64> = (0..42).map(|ix| if ix < 36 { 0 } else { TRIAL_START - 60 + 120 * (ix - 35) }).collect();
     let stops = [TRIAL_START - 10, TRIAL_START + 70, TRIAL_START + HALF + 30, TRIAL_START + HALF + 140, END + 20];
     let run = |stops: &[u64]| {
-        let mut trainer = trying(&gpu, lens());
+        let mut trainer = trainer_with_candidate(&gpu, lens());
         let mut n_taken_before = 0; // A checkpoint does not count updates that a trial reverted.
         let mut n_pushed = 0;
         let times: std::collections::BTreeSet<u64> = arrivals.iter().chain(stops).copied().chain([END + 40]).collect();
@@ -150,27 +150,27 @@ fn stopping_in_either_half_of_a_trial_changes_no_bit() {
             }
             if stops.contains(&time) {
                 let checkpoint = trainer.checkpoint().unwrap().finish().unwrap();
-                let bytes_of_other = checkpoint.arrays.iter().filter(|array| array.name.starts_with("other_")).count();
+                let n_other_arrays = checkpoint.arrays.iter().filter(|array| array.name.starts_with("other_")).count();
                 let is_in_trial = (TRIAL_START..END).contains(&time);
-                assert_eq!(bytes_of_other > 0, is_in_trial, "at {time}");
-                let rest;
-                (trainer, rest) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();
-                rest.into_iter().for_each(|keyframe| trainer.push(keyframe).unwrap());
-                n_taken_before = time - trainer.n_taken().unwrap();
+                assert_eq!(n_other_arrays > 0, is_in_trial, "at {time}");
+                let untrained;
+                (trainer, untrained) = SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes[..n_pushed]).unwrap();
+                untrained.into_iter().for_each(|keyframe| trainer.push(keyframe).unwrap());
+                n_taken_before = time - trainer.n_total_steps().unwrap();
             }
         }
         let trials = trainer.trials().to_vec();
         assert_eq!(trials.len(), 1);
-        (trials, taken(&mut trainer))
+        (trials, checkpoint_of(&mut trainer))
     };
-    let (whole, parts) = (run(&[]), run(&stops));
-    assert_eq!(whole.0, parts.0);
-    assert_eq!(whole.1.state, parts.1.state);
-    for (one, other) in whole.1.arrays.iter().zip(&parts.1.arrays) {
+    let (uninterrupted, interrupted) = (run(&[]), run(&stops));
+    assert_eq!(uninterrupted.0, interrupted.0);
+    assert_eq!(uninterrupted.1.state, interrupted.1.state);
+    for (one, other) in uninterrupted.1.arrays.iter().zip(&interrupted.1.arrays) {
         assert!(one == other, "{} differ", one.name);
     }
 }
 
-fn taken(trainer: &mut SplatTrainer) -> Checkpoint {
+fn checkpoint_of(trainer: &mut SplatTrainer) -> Checkpoint {
     trainer.checkpoint().unwrap().finish().unwrap()
 }

@@ -56,7 +56,7 @@ struct Rule {
 @group(0) @binding(13) var<storage, read_write> sh_rest_moments: array<f32>;     // second, shared
 @group(0) @binding(14) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(15) var<storage, read_write> error_sums: array<f32>;        // since the last change of the splat count
-@group(0) @binding(16) var<storage, read> drawn: array<Drawn>;
+@group(0) @binding(16) var<storage, read> projected_splats: array<ProjectedSplat>;
 
 override GRADIENTS_ONLY: bool = false;
 const PI = 3.14159265358979;
@@ -76,32 +76,32 @@ fn adam1(moment: ptr<function, vec2f>, gradient: f32) -> f32 {
     return (*moment).x * correction.x / (sqrt((*moment).y * correction.y) + rule.epsilon);
 }
 
-fn finite(x: vec4f) -> bool {
+fn is_finite(x: vec4f) -> bool {
     return all((bitcast<vec4u>(x) & vec4u(0x7f800000u)) != vec4u(0x7f800000u));
 }
 
 struct ShSums {
     splat_ix: u32,
     v_color: vec3f,
-    pull: vec3f,       // per value of the basis function
+    rest_step: vec3f,       // per value of the basis function
     v_direction: vec3f,
 }
 
-fn sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, slope: vec3f) {
+fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: vec3f) {
     let at = 3u * k * model.capacity + (*sums).splat_ix;
     let rest = vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
-    (*sums).v_direction += slope * dot((*sums).v_color, rest);
-    var moved = rest - basis * (*sums).pull;
-    if GRADIENTS_ONLY { moved = basis * (*sums).v_color; }
-    sh_rest[at] = moved.x;
-    sh_rest[at + model.capacity] = moved.y;
-    sh_rest[at + 2u * model.capacity] = moved.z;
+    (*sums).v_direction += basis_gradient * dot((*sums).v_color, rest);
+    var updated = rest - basis * (*sums).rest_step;
+    if GRADIENTS_ONLY { updated = basis * (*sums).v_color; }
+    sh_rest[at] = updated.x;
+    sh_rest[at + model.capacity] = updated.y;
+    sh_rest[at + 2u * model.capacity] = updated.z;
 }
 
 // The slope towards a small motion of the camera, of what one splat tells.
 struct CameraGradient {
-    turn: vec3f,
-    shift: vec3f,
+    rotation: vec3f,
+    translation: vec3f,
     focal: vec2f,
     principal: vec2f,
 }
@@ -131,7 +131,7 @@ fn learn(splat_ix: u32) -> CameraGradient {
     var v_mean = vec3f(0.0);
     var v_log_scale = vec3f(0.0);
     var v_rotation = vec4f(0.0);
-    let v_opacity_logit = sum.place.w * opacity * (1.0 - opacity);
+    let v_opacity_logit = sum.position.w * opacity * (1.0 - opacity);
     if n_touched != 0u {
         // Conic to covariance: the inverse's derivative is -M G M.
         let a = p.covariance.z / p.determinant;
@@ -169,44 +169,44 @@ fn learn(splat_ix: u32) -> CameraGradient {
         let z = p.point.z;
         let f = view.focal_px;
         let ratio = -vec2f(p.jacobian_x.z, p.jacobian_y.z) * z / f; // clamped x/z, y/z
-        var v_point = vec3f(sum.place.xy * f / z, sum.place.z - dot(sum.place.xy * f, p.point.xy) / (z * z));
+        var v_point = vec3f(sum.position.xy * f / z, sum.position.z - dot(sum.position.xy * f, p.point.xy) / (z * z));
         v_point.x -= p.unclamped.x * v_jacobian_x.z * f.x / (z * z);
         v_point.y -= p.unclamped.y * v_jacobian_y.z * f.y / (z * z);
         v_point.z += -v_jacobian_x.x * f.x / (z * z) - v_jacobian_y.y * f.y / (z * z)
             + v_jacobian_x.z * f.x * ratio.x * (1.0 + p.unclamped.x) / (z * z)
             + v_jacobian_y.z * f.y * ratio.y * (1.0 + p.unclamped.y) / (z * z);
-        let v_still = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
-        let still = camera_from_world(view, mean);
-        camera.shift = v_still;
-        camera.turn = cross(still, v_still);
+        let v_mid_exposure = v_point + p.tau * cross(view.shutter_angular.xyz, v_point);
+        let point_mid_exposure = camera_from_world(view, mean);
+        camera.translation = v_mid_exposure;
+        camera.rotation = cross(point_mid_exposure, v_mid_exposure);
         let unturned = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
         let spin = p.tau * view.shutter_angular.xyz;
-        camera.turn += p.scale.x * cross(unturned[0], v_axis_0 + cross(spin, v_axis_0));
-        camera.turn += p.scale.y * cross(unturned[1], v_axis_1 + cross(spin, v_axis_1));
-        camera.turn += p.scale.z * cross(unturned[2], v_axis_2 + cross(spin, v_axis_2));
-        camera.principal = sum.place.xy;
-        camera.focal = sum.place.xy * p.point.xy / z + vec2f(dot(v_jacobian_x, p.jacobian_x), dot(v_jacobian_y, p.jacobian_y)) / f;
-        v_mean = view.camera_row_0.xyz * v_still.x + view.camera_row_1.xyz * v_still.y + view.camera_row_2.xyz * v_still.z;
+        camera.rotation += p.scale.x * cross(unturned[0], v_axis_0 + cross(spin, v_axis_0));
+        camera.rotation += p.scale.y * cross(unturned[1], v_axis_1 + cross(spin, v_axis_1));
+        camera.rotation += p.scale.z * cross(unturned[2], v_axis_2 + cross(spin, v_axis_2));
+        camera.principal = sum.position.xy;
+        camera.focal = sum.position.xy * p.point.xy / z + vec2f(dot(v_jacobian_x, p.jacobian_x), dot(v_jacobian_y, p.jacobian_y)) / f;
+        v_mean = view.camera_row_0.xyz * v_mid_exposure.x + view.camera_row_1.xyz * v_mid_exposure.y + view.camera_row_2.xyz * v_mid_exposure.z;
     }
 
-    let v_color = select(vec3f(0.0), sum.color.rgb, drawn[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors end at 0.
-    if !GRADIENTS_ONLY && (!finite(vec4f(v_mean, v_opacity_logit)) || !finite(v_rotation) || !finite(vec4f(v_log_scale, sum.conic.w)) || !finite(vec4f(v_color, 0.0))) {
-        atomicAdd(&status[N_POISONED], 1u);
+    let v_color = select(vec3f(0.0), sum.color.rgb, projected_splats[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors end at 0.
+    if !GRADIENTS_ONLY && (!is_finite(vec4f(v_mean, v_opacity_logit)) || !is_finite(v_rotation) || !is_finite(vec4f(v_log_scale, sum.conic.w)) || !is_finite(vec4f(v_color, 0.0))) {
+        atomicAdd(&status[N_NON_FINITE], 1u);
         return CameraGradient();
     }
     let step = f32(atomicLoad(&status[STEP]));
     correction = 1.0 / (1.0 - pow(rule.betas, vec2f(step + 1.0)));
 
     let mean_square = mix(dot(v_color, v_color) / (12.0 * PI), sh_rest_moments[splat_ix], rule.betas.y);
-    let pull = rule.sh_rest_rate * v_color / (sqrt(mean_square * correction.y) + rule.epsilon);
+    let rest_step = rule.sh_rest_rate * v_color / (sqrt(mean_square * correction.y) + rule.epsilon);
     let to_splat = mean - view.center_in_world.xyz;
     let distance = max(length(to_splat), 1e-6);
     let direction = to_splat / distance;
-    var sh = ShSums(splat_ix, v_color, pull, vec3f(0.0));
+    var sh = ShSums(splat_ix, v_color, rest_step, vec3f(0.0));
     each_sh(&sh, direction, model.sh_degree);
     let v_moved = (sh.v_direction - direction * dot(direction, sh.v_direction)) / distance;
     v_mean += v_moved;
-    camera.shift += vec3f(dot(view.camera_row_0.xyz, v_moved), dot(view.camera_row_1.xyz, v_moved), dot(view.camera_row_2.xyz, v_moved));
+    camera.translation += vec3f(dot(view.camera_row_0.xyz, v_moved), dot(view.camera_row_1.xyz, v_moved), dot(view.camera_row_2.xyz, v_moved));
 
     let capacity = model.capacity;
     if GRADIENTS_ONLY {
@@ -218,25 +218,25 @@ fn learn(splat_ix: u32) -> CameraGradient {
         return camera;
     }
     sh_rest_moments[splat_ix] = mean_square;
-    let done = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
-    let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, done);
+    let progress = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
+    let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, progress);
     // The costs double as the model gets able to fit what a single image shows.
-    let cost_gradient = (1.0 + done) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
+    let cost_gradient = (1.0 + progress) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
 
     // Noise moves splats that hardly show, so that they find a place where they are of use.
-    let loose = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
+    let noise_weight = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
     let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
     let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));
-    let jitter = rule.noise * mean_rate * loose * stretched;
+    let jitter = rule.noise * mean_rate * noise_weight * stretched;
 
     means[splat_ix] = vec4f(mean - mean_rate * mean_step.xyz + jitter, 0.0);
-    let turned = rotation - rule.rotation_rate * rotation_step;
-    rotations[splat_ix] = turned / max(length(turned), 1e-12);
-    let shaped = shape - vec4f(vec3f(rule.log_scale_rate), rule.opacity_rate) * shape_step;
-    shapes[splat_ix] = vec4f(clamp(shaped.xyz, vec3f(rule.log_scale_range.x), vec3f(rule.log_scale_range.y)), clamp(shaped.w, -12.0, 12.0));
+    let rotated = rotation - rule.rotation_rate * rotation_step;
+    rotations[splat_ix] = rotated / max(length(rotated), 1e-12);
+    let updated_shape = shape - vec4f(vec3f(rule.log_scale_rate), rule.opacity_rate) * shape_step;
+    shapes[splat_ix] = vec4f(clamp(updated_shape.xyz, vec3f(rule.log_scale_range.x), vec3f(rule.log_scale_range.y)), clamp(updated_shape.w, -12.0, 12.0));
     for (var channel = 0u; channel < 3u; channel++) {
         let at = channel * capacity + splat_ix;
         var moment = sh_dc_moments[at];

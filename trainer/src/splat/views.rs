@@ -4,7 +4,7 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
-use super::camera_terms::{CameraTerms, PosedLens};
+use super::camera_params::{CalibratedCamera, CameraParams};
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::gpu::{Buffer, Gpu, f32_of};
 use crate::{Error, Keyframe};
@@ -132,7 +132,7 @@ impl TrainView {
     }
 
     /// Takes part in what is learned about cameras.
-    pub(crate) fn give_lens(&mut self, gpu: &Gpu, cameras: &mut CameraTerms) -> Result<(), Error> {
+    pub(crate) fn assign_lens(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
         if self.lens.is_none() {
             self.lens = Some(cameras.lens(gpu, &self.keyframe)?);
         }
@@ -140,7 +140,7 @@ impl TrainView {
     }
 
     /// The lens, where it has one, and a level that was made.
-    pub(crate) fn made(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
+    pub(crate) fn ready_level(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
         Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or(Error::DeviceLost)?))
     }
 
@@ -166,7 +166,7 @@ impl TrainView {
     }
 
     /// Records that a level is needed at time `now`, a counter.
-    pub(crate) fn touch(&mut self, level: usize, now: u64) {
+    pub(crate) fn mark_used(&mut self, level: usize, now: u64) {
         if let Some(level) = &mut self.levels[level] {
             level.used_at = now;
         }
@@ -221,8 +221,8 @@ impl LevelImages {
     pub(crate) fn new(keyframe: &Keyframe, level: usize) -> Self {
         let camera = camera_of(keyframe).at_level(level as u32);
         let (image, depth_m) = (
-            shrunk_image(keyframe, camera.size_px, level as u32),
-            shrunk_depth(keyframe, camera.size_px, level as u32),
+            downscaled_image(keyframe, camera.size_px, level as u32),
+            downscaled_depth(keyframe, camera.size_px, level as u32),
         );
         Self { camera, image, depth_m }
     }
@@ -253,7 +253,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
         size_px: keyframe.size_px,
         focal_px: keyframe.focal_px,
         principal_px: keyframe.principal_px,
-        shutter: PosedLens::of(keyframe).shutter,
+        shutter: CalibratedCamera::of(keyframe).shutter,
         near_m: NEAR_M,
         far_m: FAR_M,
         crop: None,
@@ -262,36 +262,37 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
 }
 
 /// Means over squares of pixels; masked where any of them is.
-fn shrunk_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]> {
+fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]> {
     if level == 0 {
         return keyframe.rgba_srgb.clone();
     }
     let width = keyframe.size_px[0] as usize;
     let edge = 1usize << level;
-    let mut shrunk = Vec::with_capacity(4 * (size_px[0] * size_px[1]) as usize);
+    let mut downscaled = Vec::with_capacity(4 * (size_px[0] * size_px[1]) as usize);
     for y in 0..size_px[1] as usize {
         for x in 0..size_px[0] as usize {
             let mut sums = [0u32; 3];
-            let mut seen = true;
+            let mut is_visible = true;
             for row in y * edge..(y + 1) * edge {
                 for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
-                    seen &= pixel[3] > 0;
+                    is_visible &= pixel[3] > 0;
                     for (sum, value) in sums.iter_mut().zip(pixel) {
                         *sum += u32::from(*value);
                     }
                 }
             }
             let area = (edge * edge) as u32;
-            shrunk.extend(sums.map(|sum| u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")));
-            shrunk.push(if seen { 255 } else { 0 });
+            downscaled
+                .extend(sums.map(|sum| u8::try_from((sum + area / 2) / area).expect("a mean of bytes is a byte")));
+            downscaled.push(if is_visible { 255 } else { 0 });
         }
     }
-    shrunk.into()
+    downscaled.into()
 }
 
 /// Takes the value in the middle of each square, because averages would invent surfaces between near and far. Empty for a
 /// keyframe without depth.
-fn shrunk_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
+fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
     if full.is_empty() || level == 0 {
         return full;
@@ -317,7 +318,7 @@ pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
     }
     let color_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
     let [width, height] = keyframe.size_px;
-    let mut carried = vec![0.0f32; (width * height) as usize];
+    let mut reprojected = vec![0.0f32; (width * height) as usize];
     for (ix, z) in depth.depth_m.iter().enumerate().filter(|(_, z)| **z > 0.0) {
         let (x, y) = ((ix as u32 % depth.size_px[0]), (ix as u32 / depth.size_px[0]));
         let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
@@ -330,11 +331,11 @@ pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
         if pixel[0] < 0.0 || pixel[1] < 0.0 || pixel[0] >= f64::from(width) || pixel[1] >= f64::from(height) {
             continue;
         }
-        let place = &mut carried[pixel[1] as usize * width as usize + pixel[0] as usize];
-        let nearer = f32_of(point.z);
-        if *place == 0.0 || nearer < *place {
-            *place = nearer;
+        let nearest_m = &mut reprojected[pixel[1] as usize * width as usize + pixel[0] as usize];
+        let depth_m = f32_of(point.z);
+        if *nearest_m == 0.0 || depth_m < *nearest_m {
+            *nearest_m = depth_m;
         }
     }
-    carried.into()
+    reprojected.into()
 }

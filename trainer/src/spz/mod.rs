@@ -10,7 +10,7 @@
 mod quantize;
 
 use crate::splat::arrays::SplatArrays;
-use crate::{Error, whole_file};
+use crate::{Error, atomic_file};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -21,15 +21,15 @@ const MAGIC: [u8; 4] = *b"NGSP";
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 const HEADER_BYTES: usize = 16;
 /// Oldest version that is read: the one before held its means as 16-bit floats.
-const OLDEST: u32 = 2;
+const MIN_VERSION: u32 = 2;
 /// Newest version that is read, and the one that is written. Later ones are not gzip streams.
-const NEWEST: u32 = 3;
+const MAX_VERSION: u32 = 3;
 /// Bit of the header's flags: more follows the splats.
 const HAS_EXTENSIONS: u8 = 2;
 /// More splats than this are taken for a damaged header.
-const MOST_SPLATS: u32 = 100_000_000;
+const MAX_SPLATS: u32 = 100_000_000;
 /// Most bits behind the point of a mean: steps of 15 micrometres.
-const MOST_FRACTIONAL_BITS: u8 = 16;
+const MAX_FRACTIONAL_BITS: u8 = 16;
 /// Signs of the higher color coefficients when y and z change theirs: negative where the function is odd in them.
 const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
@@ -43,10 +43,10 @@ pub fn read(path: &Path) -> Result<SplatArrays, Error> {
 ///
 /// Values past what the format holds end at its bounds, except means, which are refused beyond 8388 km.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
-    let plain = plain_bytes(&splats.clone().checked()?)?;
-    whole_file::write(path, |file| {
+    let uncompressed = uncompressed_bytes(&splats.clone().checked()?)?;
+    atomic_file::write(path, |file| {
         let mut gzip = GzEncoder::new(file, Compression::default());
-        gzip.write_all(&plain)?;
+        gzip.write_all(&uncompressed)?;
         gzip.finish().map(drop)
     })
 }
@@ -69,8 +69,8 @@ impl Header {
         let (version, n_splats, [sh_degree, fractional_bits, flags, _]) =
             (word(4), word(8), [bytes[12], bytes[13], bytes[14], bytes[15]]);
         check_version(version)?;
-        if n_splats > MOST_SPLATS {
-            return Err(format!("the header speaks of {n_splats} splats, at most {MOST_SPLATS} are read"));
+        if n_splats > MAX_SPLATS {
+            return Err(format!("the header speaks of {n_splats} splats, at most {MAX_SPLATS} are read"));
         }
         if sh_degree > 3 {
             return Err(format!("colour degree {sh_degree}, at most 3"));
@@ -97,8 +97,8 @@ impl Header {
 
 fn check_version(version: u32) -> Result<(), String> {
     match version {
-        OLDEST..=NEWEST => Ok(()),
-        _ => Err(format!("version {version} of the format, only {OLDEST} and {NEWEST} are read")),
+        MIN_VERSION..=MAX_VERSION => Ok(()),
+        _ => Err(format!("version {version} of the format, only {MIN_VERSION} and {MAX_VERSION} are read")),
     }
 }
 
@@ -113,16 +113,16 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     }
     let mut gzip = GzDecoder::new(bytes);
     let mut header = [0; HEADER_BYTES];
-    gzip.read_exact(&mut header).map_err(|error| damage(&error))?;
+    gzip.read_exact(&mut header).map_err(|error| read_error(&error))?;
     let header = Header::parse(header)?;
     let mut body = Vec::new();
-    gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| damage(&error))?;
+    gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| read_error(&error))?;
     if (body.len() as u64) < header.n_body_bytes() {
         let (n_splats, n_bytes) = (header.n_splats, header.n_body_bytes());
         return Err(format!("cut off: its {n_splats} splats take {n_bytes} bytes, there are {}", body.len()));
     }
     // Reading to the end checks the sum of the stream, too.
-    let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| damage(&error))?;
+    let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| read_error(&error))?;
     if n_more > 0 && header.flags & HAS_EXTENSIONS == 0 {
         return Err(format!("{n_more} bytes follow the last splat"));
     }
@@ -132,7 +132,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     }
 }
 
-fn damage(error: &std::io::Error) -> String {
+fn read_error(error: &std::io::Error) -> String {
     match error.kind() {
         ErrorKind::UnexpectedEof => "cut off".to_owned(),
         _ => format!("damaged ({error})"),
@@ -187,16 +187,16 @@ fn flipped([x, y, z]: [f32; 3]) -> [f32; 3] {
 }
 
 /// Header and splats before they are packed.
-fn plain_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
-    let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MOST_SPLATS).ok_or_else(|| {
-        Error::SplatArrays(format!("{} of them, .spz is written of at most {MOST_SPLATS}", splats.n_splats()))
+fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
+    let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MAX_SPLATS).ok_or_else(|| {
+        Error::SplatArrays(format!("{} of them, .spz is written of at most {MAX_SPLATS}", splats.n_splats()))
     })?;
     let fractional_bits = fractional_bits(&splats.means)?;
     let mut bytes = MAGIC.to_vec();
-    bytes.extend([NEWEST, n_splats].map(u32::to_le_bytes).as_flattened());
+    bytes.extend([MAX_VERSION, n_splats].map(u32::to_le_bytes).as_flattened());
     bytes.extend([u8::try_from(splats.sh_degree).expect("checked to be at most 3"), fractional_bits, 0, 0]);
     for mean in &splats.means {
-        bytes.extend(flipped(*mean).map(|metres| quantize::fixed_from_mean(metres, fractional_bits)).as_flattened());
+        bytes.extend(flipped(*mean).map(|meters| quantize::fixed_from_mean(meters, fractional_bits)).as_flattened());
     }
     bytes.extend(splats.opacity_logits.iter().map(|logit| quantize::byte_from_opacity_logit(*logit)));
     let n_coefficients = splats.n_coefficients();
@@ -220,10 +220,13 @@ fn plain_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
 
 /// As many bits behind the point as leave room for the mean that is furthest out.
 fn fractional_bits(means: &[[f32; 3]]) -> Result<u8, Error> {
-    let furthest_m = means.as_flattened().iter().map(|metres| f64::from(metres.abs())).fold(0.0, f64::max);
-    let fits = |bits: &u8| furthest_m * f64::from(1_u32 << bits) <= f64::from(quantize::MOST_FIXED);
-    (0..=MOST_FRACTIONAL_BITS).rev().find(fits).ok_or_else(|| {
-        Error::SplatArrays(format!("a mean lies {furthest_m:.0} m out, .spz holds at most {} m", quantize::MOST_FIXED))
+    let max_coordinate_m = means.as_flattened().iter().map(|meters| f64::from(meters.abs())).fold(0.0, f64::max);
+    let fits = |bits: &u8| max_coordinate_m * f64::from(1_u32 << bits) <= f64::from(quantize::MAX_FIXED);
+    (0..=MAX_FRACTIONAL_BITS).rev().find(fits).ok_or_else(|| {
+        Error::SplatArrays(format!(
+            "a mean lies {max_coordinate_m:.0} m out, .spz holds at most {} m",
+            quantize::MAX_FIXED
+        ))
     })
 }
 

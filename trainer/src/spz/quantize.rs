@@ -4,19 +4,19 @@
 use std::f64::consts::FRAC_1_SQRT_2;
 
 /// Largest magnitude of a mean: a signed number of 24 bits.
-pub(super) const MOST_FIXED: i32 = (1 << 23) - 1;
+pub(super) const MAX_FIXED: i32 = (1 << 23) - 1;
 /// Constant colors, which are mostly small, get the whole range of a byte by this factor.
 const COLOR_SCALE: f64 = 0.15;
 /// Largest magnitude of a component of a rotation: 9 bits.
-const MOST_COMPONENT: u32 = (1 << 9) - 1;
+const MAX_COMPONENT: u32 = (1 << 9) - 1;
 
 fn byte(value: f64) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-pub(super) fn fixed_from_mean(metres: f32, fractional_bits: u8) -> [u8; 3] {
-    let fixed = (f64::from(metres) * f64::from(1_u32 << fractional_bits)).round();
-    let [low, middle, high, _] = (fixed.clamp(-f64::from(MOST_FIXED), f64::from(MOST_FIXED)) as i32).to_le_bytes();
+pub(super) fn fixed_from_mean(meters: f32, fractional_bits: u8) -> [u8; 3] {
+    let fixed = (f64::from(meters) * f64::from(1_u32 << fractional_bits)).round();
+    let [low, middle, high, _] = (fixed.clamp(-f64::from(MAX_FIXED), f64::from(MAX_FIXED)) as i32).to_le_bytes();
     [low, middle, high]
 }
 
@@ -76,7 +76,7 @@ pub(super) fn smallest_from_rotation(xyzw: [f32; 4]) -> [u8; 4] {
     let mut bits = largest_ix as u32;
     for part in (0..4).filter(|ix| *ix != largest_ix).map(|ix| xyzw[ix]) {
         let share = (part / length / FRAC_1_SQRT_2).abs().min(1.0);
-        let magnitude = (share * f64::from(MOST_COMPONENT)).round() as u32;
+        let magnitude = (share * f64::from(MAX_COMPONENT)).round() as u32;
         let negative = u32::from((part < 0.0) != (xyzw[largest_ix] < 0.0));
         bits = bits << 10 | negative << 9 | magnitude;
     }
@@ -88,7 +88,7 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     let largest_ix = (bits >> 30) as usize;
     let mut xyzw = [0.0; 4];
     for ix in (0..4).rev().filter(|ix| *ix != largest_ix) {
-        let magnitude = f64::from(bits & MOST_COMPONENT) / f64::from(MOST_COMPONENT) * FRAC_1_SQRT_2;
+        let magnitude = f64::from(bits & MAX_COMPONENT) / f64::from(MAX_COMPONENT) * FRAC_1_SQRT_2;
         xyzw[ix] = if bits >> 9 & 1 == 0 { magnitude } else { -magnitude };
         bits >>= 10;
     }

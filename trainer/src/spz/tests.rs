@@ -13,19 +13,19 @@ fn cloud_of_degree(n_splats: usize, sh_degree: u32) -> SplatArrays {
     SplatArrays { sh, sh_degree, ..cloud }
 }
 
-fn packed(plain: &[u8]) -> Vec<u8> {
+fn packed(uncompressed: &[u8]) -> Vec<u8> {
     let mut gzip = GzEncoder::new(Vec::new(), Compression::default());
-    gzip.write_all(plain).unwrap();
+    gzip.write_all(uncompressed).unwrap();
     gzip.finish().unwrap()
 }
 
-fn turn(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
+fn quaternion(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
     let [w, x, y, z] = wxyz.map(f64::from);
     UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
 }
 
 /// Largest difference of two lists.
-fn furthest(what: &str, got: &[f32], expected: &[f32], bound: f32) {
+fn assert_max_difference(what: &str, got: &[f32], expected: &[f32], bound: f32) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let worst = got.iter().zip(expected).map(|(got, expected)| (got - expected).abs()).fold(0.0, f32::max);
     assert!(worst <= bound * 1.0001, "{what}: {worst} off, at most {bound}");
@@ -33,37 +33,61 @@ fn furthest(what: &str, got: &[f32], expected: &[f32], bound: f32) {
 }
 
 #[test]
-fn every_value_survives_within_its_step() {
+fn every_value_round_trips_within_its_step() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.spz");
     for sh_degree in 0..=3 {
         let mut cloud = cloud_of_degree(3000, sh_degree);
         cloud.means[7] = [-100.0, 60.0, 0.0];
         write(&path, &cloud).unwrap();
-        let again = read(&path).unwrap();
-        assert_eq!(again.sh_degree, sh_degree);
-        furthest("means", again.means.as_flattened(), cloud.means.as_flattened(), 0.5 / 65536.0);
-        furthest("log scales", again.log_scales.as_flattened(), cloud.log_scales.as_flattened(), 0.5 / 16.0);
+        let decoded = read(&path).unwrap();
+        assert_eq!(decoded.sh_degree, sh_degree);
+        assert_max_difference("means", decoded.means.as_flattened(), cloud.means.as_flattened(), 0.5 / 65536.0);
+        assert_max_difference(
+            "log scales",
+            decoded.log_scales.as_flattened(),
+            cloud.log_scales.as_flattened(),
+            0.5 / 16.0,
+        );
         let opacity = |logits: &[f32]| logits.iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect::<Vec<_>>();
-        furthest("opacities", &opacity(&again.opacity_logits), &opacity(&cloud.opacity_logits), 0.5 / 255.0);
-        let turns = again.rotations_wxyz.iter().zip(&cloud.rotations_wxyz);
-        let worst_rad = turns.map(|(a, b)| turn(*a).angle_to(&turn(*b))).fold(0.0, f64::max);
+        assert_max_difference(
+            "opacities",
+            &opacity(&decoded.opacity_logits),
+            &opacity(&cloud.opacity_logits),
+            0.5 / 255.0,
+        );
+        let rotation_pairs = decoded.rotations_wxyz.iter().zip(&cloud.rotations_wxyz);
+        let worst_rad = rotation_pairs.map(|(a, b)| quaternion(*a).angle_to(&quaternion(*b))).fold(0.0, f64::max);
         assert!(worst_rad < 0.26_f64.to_radians(), "rotations: {} degrees", worst_rad.to_degrees());
         let coefficients = |cloud: &SplatArrays, functions: std::ops::Range<usize>| -> Vec<f32> {
             let of_splat = cloud.sh.chunks_exact(cloud.n_coefficients());
             of_splat.flat_map(|of| of[functions.clone()].as_flattened().to_vec()).collect()
         };
-        furthest("constant", &coefficients(&again, 0..1), &coefficients(&cloud, 0..1), 0.5 / (255.0 * 0.15));
+        assert_max_difference(
+            "constant",
+            &coefficients(&decoded, 0..1),
+            &coefficients(&cloud, 0..1),
+            0.5 / (255.0 * 0.15),
+        );
         for degree in 1..=sh_degree {
             let functions = (degree * degree) as usize..((degree + 1) * (degree + 1)) as usize;
             let expected = coefficients(&cloud, functions.clone());
-            furthest(&format!("degree {degree}"), &coefficients(&again, functions), &expected, 0.5 / 128.0);
+            assert_max_difference(
+                &format!("degree {degree}"),
+                &coefficients(&decoded, functions),
+                &expected,
+                0.5 / 128.0,
+            );
         }
         // What was rounded once stays as it is, except rotations whose two largest components are nearly the same.
-        write(&path, &again).unwrap();
-        let twice = read(&path).unwrap();
-        assert!(twice.means == again.means && twice.log_scales == again.log_scales && twice.sh == again.sh);
-        assert!(twice.opacity_logits == again.opacity_logits);
+        write(&path, &decoded).unwrap();
+        let decoded_twice = read(&path).unwrap();
+        assert!(
+            decoded_twice.means == decoded.means
+                && decoded_twice.log_scales == decoded.log_scales
+                && decoded_twice.sh == decoded.sh
+        );
+        assert!(decoded_twice.opacity_logits == decoded.opacity_logits);
     }
     write(&path, &SplatArrays::default()).unwrap();
     assert_eq!(read(&path).unwrap().n_splats(), 0);
@@ -72,7 +96,7 @@ fn every_value_survives_within_its_step() {
 
 /// Every byte of a file of one splat, worked out by hand from the description of the format.
 #[test]
-fn a_file_of_one_splat_has_the_bytes_of_the_format() {
+fn one_splat_file_has_the_specified_bytes() {
     let splat = SplatArrays {
         means: vec![[1.0, -2.0, 3.0]],
         log_scales: vec![[-10.0, -3.0, 5.9375]],
@@ -95,29 +119,29 @@ fn a_file_of_one_splat_has_the_bytes_of_the_format() {
         128, 0, 255,                                                 // -z: 128, - 128, + 128 past the upper end
         144, 128, 128,                                               // x: 128 + 16
     ];
-    assert_eq!(plain_bytes(&splat).unwrap(), expected);
-    let again = from_bytes(&packed(&expected)).unwrap().checked().unwrap();
-    assert_eq!((again.means[0], again.log_scales[0]), (splat.means[0], splat.log_scales[0]));
-    assert!(turn(again.rotations_wxyz[0]).angle_to(&turn(splat.rotations_wxyz[0])) < 1e-3);
-    assert_eq!(again.sh[1..], [[0.25, 0.5, -0.5], [0.0, 1.0, -0.992_187_5], [0.125, 0.0, 0.0]]);
+    assert_eq!(uncompressed_bytes(&splat).unwrap(), expected);
+    let decoded = from_bytes(&packed(&expected)).unwrap().checked().unwrap();
+    assert_eq!((decoded.means[0], decoded.log_scales[0]), (splat.means[0], splat.log_scales[0]));
+    assert!(quaternion(decoded.rotations_wxyz[0]).angle_to(&quaternion(splat.rotations_wxyz[0])) < 1e-3);
+    assert_eq!(decoded.sh[1..], [[0.25, 0.5, -0.5], [0.0, 1.0, -0.992_187_5], [0.125, 0.0, 0.0]]);
 
     let mut older = expected.to_vec();
     older[4] = 2;
     older.splice(32..36, [128, 38, 128]); // x and z about 0, y: 127.5 (1 - 1/sqrt(2)).
-    let again = from_bytes(&packed(&older)).unwrap().checked().unwrap();
-    assert!(turn(again.rotations_wxyz[0]).angle_to(&turn(splat.rotations_wxyz[0])).to_degrees() < 1.5);
+    let decoded = from_bytes(&packed(&older)).unwrap().checked().unwrap();
+    assert!(quaternion(decoded.rotations_wxyz[0]).angle_to(&quaternion(splat.rotations_wxyz[0])).to_degrees() < 1.5);
 }
 
 /// Colors seen along a direction are those of the turned splat seen along the turned direction.
 #[test]
-fn colors_turn_with_the_axes() {
+fn colors_follow_the_axis_flip() {
     let coefficients: Vec<[f64; 3]> = synthetic_cloud(1, 5).sh.iter().map(|rgb| rgb.map(f64::from)).collect();
-    let mut turned = coefficients.clone();
-    for (rgb, sign) in turned[1..].iter_mut().zip(SH_SIGNS) {
+    let mut flipped_coefficients = coefficients.clone();
+    for (rgb, sign) in flipped_coefficients[1..].iter_mut().zip(SH_SIGNS) {
         *rgb = rgb.map(|value| f64::from(sign) * value);
     }
     for offset in [Vector3::new(0.3, -0.5, 0.8), Vector3::new(-0.9, 0.2, 0.1), Vector3::new(0.1, 0.7, -0.6)] {
-        let there = sh::color(&turned, &Vector3::new(offset.x, -offset.y, -offset.z));
+        let there = sh::color(&flipped_coefficients, &Vector3::new(offset.x, -offset.y, -offset.z));
         for (here, there) in sh::color(&coefficients, &offset).iter().zip(there) {
             assert!((here - there).abs() < 1e-12);
         }
@@ -125,40 +149,40 @@ fn colors_turn_with_the_axes() {
 }
 
 #[test]
-fn broken_files_are_refused_with_the_reason() {
-    let plain = plain_bytes(&cloud_of_degree(5, 2)).unwrap();
-    let whole = packed(&plain);
+fn broken_files_are_rejected_with_the_reason() {
+    let uncompressed = uncompressed_bytes(&cloud_of_degree(5, 2)).unwrap();
+    let whole = packed(&uncompressed);
     assert!(from_bytes(&whole).is_ok());
-    let complaint = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
-    let changed = |at: usize, to: u8| {
-        let mut plain = plain.clone();
-        plain[at] = to;
-        complaint(&packed(&plain))
+    let error_of = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
+    let error_with_byte = |at: usize, to: u8| {
+        let mut uncompressed = uncompressed.clone();
+        uncompressed[at] = to;
+        error_of(&packed(&uncompressed))
     };
-    assert_eq!(complaint(b"ply\n"), "it does not begin as a gzip stream");
-    assert_eq!(complaint(b""), "it does not begin as a gzip stream");
-    assert_eq!(complaint(b"NGSP\x04\0\0\0rest"), "version 4 of the format, only 2 and 3 are read");
-    assert!(complaint(&plain).contains("gzip"));
-    assert_eq!(changed(0, b'X'), "what is packed in it does not begin with \"NGSP\"");
-    assert_eq!(changed(4, 1), "version 1 of the format, only 2 and 3 are read");
-    assert_eq!(changed(8, 6), "cut off: its 6 splats take 264 bytes, there are 220");
-    assert_eq!(changed(8, 4), "44 bytes follow the last splat");
-    assert!(changed(11, 255).contains("4278190085 splats, at most 100000000"));
-    assert!(changed(11, 5).contains("cut off: its 83886085 splats"));
-    assert_eq!(changed(12, 4), "colour degree 4, at most 3");
-    assert!(changed(12, 3).contains("cut off"));
-    assert!(changed(13, 32).contains("32 fractional bits"));
-    assert_eq!(complaint(&packed(&plain[..7])), "cut off");
+    assert_eq!(error_of(b"ply\n"), "it does not begin as a gzip stream");
+    assert_eq!(error_of(b""), "it does not begin as a gzip stream");
+    assert_eq!(error_of(b"NGSP\x04\0\0\0rest"), "version 4 of the format, only 2 and 3 are read");
+    assert!(error_of(&uncompressed).contains("gzip"));
+    assert_eq!(error_with_byte(0, b'X'), "what is packed in it does not begin with \"NGSP\"");
+    assert_eq!(error_with_byte(4, 1), "version 1 of the format, only 2 and 3 are read");
+    assert_eq!(error_with_byte(8, 6), "cut off: its 6 splats take 264 bytes, there are 220");
+    assert_eq!(error_with_byte(8, 4), "44 bytes follow the last splat");
+    assert!(error_with_byte(11, 255).contains("4278190085 splats, at most 100000000"));
+    assert!(error_with_byte(11, 5).contains("cut off: its 83886085 splats"));
+    assert_eq!(error_with_byte(12, 4), "colour degree 4, at most 3");
+    assert!(error_with_byte(12, 3).contains("cut off"));
+    assert!(error_with_byte(13, 32).contains("32 fractional bits"));
+    assert_eq!(error_of(&packed(&uncompressed[..7])), "cut off");
     for length in 2..whole.len() {
-        assert!(complaint(&whole[..length]).contains("cut off"), "{length} of {} bytes", whole.len());
+        assert!(error_of(&whole[..length]).contains("cut off"), "{length} of {} bytes", whole.len());
     }
-    assert_eq!(complaint(&[&whole[..], b"tail"].concat()), "4 bytes follow the gzip stream");
+    assert_eq!(error_of(&[&whole[..], b"tail"].concat()), "4 bytes follow the gzip stream");
     let mut damaged = whole.clone();
     let sum_at = damaged.len() - 8;
     damaged[sum_at] ^= 1;
-    assert!(complaint(&damaged).starts_with("damaged ("));
-    let mut extended = [&plain[..], b"what other programs add"].concat();
-    assert_eq!(complaint(&packed(&extended)), "23 bytes follow the last splat");
+    assert!(error_of(&damaged).starts_with("damaged ("));
+    let mut extended = [&uncompressed[..], b"what other programs add"].concat();
+    assert_eq!(error_of(&packed(&extended)), "23 bytes follow the last splat");
     extended[14] = HAS_EXTENSIONS;
     assert!(from_bytes(&packed(&extended)).is_ok());
 }
@@ -167,17 +191,17 @@ fn broken_files_are_refused_with_the_reason() {
 fn any_bytes_decode_to_finite_splats() {
     for version in [2, 3] {
         for value in [0, 1, 127, 128, 255] {
-            let mut plain = plain_bytes(&cloud_of_degree(3, 3)).unwrap();
-            plain[HEADER_BYTES..].fill(value);
-            plain[4] = version;
-            plain.truncate(HEADER_BYTES + 3 * if version == 2 { 64 } else { 65 });
-            from_bytes(&packed(&plain)).unwrap().checked().unwrap();
+            let mut uncompressed = uncompressed_bytes(&cloud_of_degree(3, 3)).unwrap();
+            uncompressed[HEADER_BYTES..].fill(value);
+            uncompressed[4] = version;
+            uncompressed.truncate(HEADER_BYTES + 3 * if version == 2 { 64 } else { 65 });
+            from_bytes(&packed(&uncompressed)).unwrap().checked().unwrap();
         }
     }
 }
 
 #[test]
-fn what_cannot_be_written_is_told() {
+fn unwritable_values_are_reported() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.spz");
     let mut cloud = cloud_of_degree(3, 0);
@@ -198,7 +222,7 @@ fn files_of_another_program_are_read() {
     for name in ["minimal-v2.spz", "minimal-v3.spz"] {
         let splats = read(&folder.join(name)).unwrap();
         assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");
-        assert!(splats.means.as_flattened().iter().all(|metres| [0.0, 1.0, -1.0].contains(metres)), "{name}");
+        assert!(splats.means.as_flattened().iter().all(|meters| [0.0, 1.0, -1.0].contains(meters)), "{name}");
         assert!(splats.log_scales.as_flattened().iter().all(|scale| (scale - 0.1_f32.ln()).abs() < 0.04), "{name}");
         assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all unturned");
     }

@@ -9,11 +9,11 @@
 #import field
 #import field_status
 #import field_insert
-#import depth_frame
+#import depth_view
 #import folded
 
 @group(0) @binding(0) var<uniform> field: Field;
-@group(0) @binding(1) var<uniform> frame: DepthFrame;
+@group(0) @binding(1) var<uniform> depth_view: DepthView;
 @group(0) @binding(2) var<storage, read> readings: array<vec2f>;
 @group(0) @binding(3) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(4) var<storage, read_write> keys: array<atomic<u32>>;
@@ -23,7 +23,7 @@
 const MAX_BLOCKS_PER_RAY = 64;
 const MAX_TRIES = 64u;
 
-fn ask_for(block: vec3i) {
+fn request_block(block: vec3i) {
     let chunk = block >> vec3u(3u);
     if !chunk_in_range(chunk) {
         atomicAdd(&status[N_OUTSIDE], 1u);
@@ -38,7 +38,7 @@ fn ask_for(block: vec3i) {
     let at = (row - 1u) * BLOCK_VOXELS + voxel_in_block(block);
     for (var i = 0u; i < MAX_TRIES; i++) {
         if atomicLoad(&entries[at]) != NO_BLOCK { return; }
-        if atomicCompareExchangeWeak(&entries[at], NO_BLOCK, BLOCK_WANTED).exchanged {
+        if atomicCompareExchangeWeak(&entries[at], NO_BLOCK, BLOCK_REQUESTED).exchanged {
             let slot = atomicAdd(&status[N_BLOCKS], 1u);
             if slot < field.n_block_slots {
                 coords[slot] = vec4i(block, 0);
@@ -55,16 +55,16 @@ override WG_SIZE = 64u;
 @compute @workgroup_size(WG_SIZE)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs) * WG_SIZE + lane;
-    if at >= frame.depth_size_px.x * frame.depth_size_px.y { return; } // Allowed here: no barrier below.
+    if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // Allowed here: no barrier below.
     if atomicLoad(&status[STOPPED]) != 0u { return; } // A frame before this one is to be done again first.
     let depth_m = readings[at].x;
     if !(depth_m > 0.0) { return; }
-    let pixel = vec2u(at % frame.depth_size_px.x, at / frame.depth_size_px.x);
-    let ray = ray_of(frame, vec2f(pixel) + 0.5);
+    let pixel = vec2u(at % depth_view.depth_size_px.x, at / depth_view.depth_size_px.x);
+    let ray = ray_of(depth_view, vec2f(pixel) + 0.5);
     let band_m = truncation_at(field, depth_m) / length(ray);
     let block_m = 8.0 * field.voxel_m;
-    let begin = field_from_depth(frame, ray * max(depth_m - band_m, 0.0)) / block_m;
-    let end = field_from_depth(frame, ray * (depth_m + band_m)) / block_m;
+    let begin = field_from_depth(depth_view, ray * max(depth_m - band_m, 0.0)) / block_m;
+    let end = field_from_depth(depth_view, ray * (depth_m + band_m)) / block_m;
     var block = vec3i(floor(begin));
     let last = vec3i(floor(end));
     let toward = sign(last - block);
@@ -75,7 +75,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let between = select(vec3f(2.0), abs(1.0 / along), toward != vec3i(0));
     let left = abs(last - block);
     let n_steps = min(left.x + left.y + left.z, MAX_BLOCKS_PER_RAY);
-    ask_for(block);
+    request_block(block);
     for (var i = 0; i < n_steps; i++) {
         let open = block != last;
         let x = select(3.0, reached.x, open.x);
@@ -91,6 +91,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             block.z += toward.z;
             reached.z += between.z;
         }
-        ask_for(block);
+        request_block(block);
     }
 }

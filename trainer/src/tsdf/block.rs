@@ -11,10 +11,10 @@ pub const N_VOXELS: usize = 512;
 pub const WEIGHT_ONE: f64 = 256.0;
 
 /// Place of a block in blocks, or of a voxel in voxels, from the field's anchor along the world's axes.
-pub type Place = [i32; 3];
+pub type GridCoord = [i32; 3];
 
 /// Blocks in order of their places.
-pub type Blocks = BTreeMap<Place, Block>;
+pub type Blocks = BTreeMap<GridCoord, Block>;
 
 /// The voxels of one block as the GPU has them, x fastest.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -27,12 +27,12 @@ pub struct Block {
 
 impl Block {
     /// Voxels that nobody has seen.
-    pub fn unseen() -> Self {
+    pub fn unobserved() -> Self {
         Self { geometry: vec![0; N_VOXELS], colors: vec![[0; 2]; N_VOXELS] }
     }
 
     /// Whether anything was seen of it.
-    pub fn is_seen(&self) -> bool {
+    pub fn is_observed(&self) -> bool {
         self.geometry.iter().any(|word| word >> 16 != 0)
     }
 
@@ -55,12 +55,12 @@ pub fn stored_distance(word: u32) -> f64 {
 }
 
 /// Place of a voxel within its block's arrays.
-pub fn voxel_ix(voxel: Place) -> usize {
+pub fn voxel_ix(voxel: GridCoord) -> usize {
     let [x, y, z] = voxel.map(|along| along.rem_euclid(BLOCK_EDGE) as usize);
     z * 64 + y * 8 + x
 }
 
 /// The block of a voxel.
-pub fn block_of(voxel: Place) -> Place {
+pub fn block_of(voxel: GridCoord) -> GridCoord {
     voxel.map(|along| along.div_euclid(BLOCK_EDGE))
 }

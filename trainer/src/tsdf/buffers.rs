@@ -1,7 +1,7 @@
 //! The field's memory: a pool of blocks, and the table that finds them.
 
-use super::block::{Block, Blocks, N_VOXELS, Place};
-use super::chosen::Lattice;
+use super::block::{Block, Blocks, GridCoord, N_VOXELS};
+use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
 use super::params::{Field, status};
 use super::passes;
@@ -14,7 +14,7 @@ pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
 /// Bytes of a chunk: a key and the slots of its blocks.
 pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 /// Blocks gathered at once.
-const GATHERED: usize = 2048;
+const GATHER_BATCH: usize = 2048;
 
 /// Sizes of the pool and the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -40,15 +40,15 @@ pub(crate) struct FieldBuffers {
 }
 
 /// Most blocks that the adapter can bind.
-pub(crate) fn most_blocks(gpu: &Gpu) -> u32 {
+pub(crate) fn max_blocks(gpu: &Gpu) -> u32 {
     u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
 }
 
 impl FieldBuffers {
     /// An empty field.
-    pub(crate) fn new(gpu: &Gpu, lattice: &Lattice, capacity: Capacity) -> Result<Self, Error> {
+    pub(crate) fn new(gpu: &Gpu, voxel_grid: &VoxelGrid, capacity: Capacity) -> Result<Self, Error> {
         let n = u64::from(capacity.n_blocks);
-        let field = Field::new(lattice, capacity.n_chunks, capacity.n_blocks);
+        let field = Field::new(voxel_grid, capacity.n_chunks, capacity.n_blocks);
         Ok(Self {
             capacity,
             field: gpu.uniform_with("tsdf.field", &field),
@@ -82,13 +82,13 @@ impl FieldBuffers {
         &self,
         gpu: &Gpu,
         pipelines: &Pipelines,
-        lattice: &Lattice,
+        voxel_grid: &VoxelGrid,
         mut capacity: Capacity,
     ) -> Result<Self, Error> {
         let n = self.n_blocks(gpu)?;
         let mut counters = self.counters(gpu)?;
         loop {
-            let resized = Self::new(gpu, lattice, capacity)?;
+            let resized = Self::new(gpu, voxel_grid, capacity)?;
             for (from, to, bytes) in [
                 (&self.coords, &resized.coords, 16),
                 (&self.geometry, &resized.geometry, 4 * 512),
@@ -100,7 +100,7 @@ impl FieldBuffers {
                 }
             }
             counters[status::N_BLOCKS] = n;
-            forget_failure(&mut counters);
+            clear_failure(&mut counters);
             gpu.write(&resized.status, 0, bytemuck::cast_slice(&counters));
             if resized.index(gpu, pipelines, n)? {
                 return Ok(resized);
@@ -121,16 +121,16 @@ impl FieldBuffers {
     pub(crate) fn with_blocks(
         gpu: &Gpu,
         pipelines: &Pipelines,
-        lattice: &Lattice,
+        voxel_grid: &VoxelGrid,
         blocks: &Blocks,
         mut capacity: Capacity,
     ) -> Result<Self, Error> {
         let n = u32::try_from(blocks.len()).unwrap_or(u32::MAX);
         capacity.n_blocks = capacity.n_blocks.max(n);
         loop {
-            let field = Self::new(gpu, lattice, capacity)?;
-            for (slot, (place, block)) in (0..).zip(blocks) {
-                field.write_block(gpu, slot, *place, block);
+            let field = Self::new(gpu, voxel_grid, capacity)?;
+            for (slot, (block_coord, block)) in (0..).zip(blocks) {
+                field.write_block(gpu, slot, *block_coord, block);
             }
             gpu.write(&field.status, 0, bytemuck::bytes_of(&n));
             if field.index(gpu, pipelines, n)? {
@@ -140,15 +140,15 @@ impl FieldBuffers {
         }
     }
 
-    fn write_block(&self, gpu: &Gpu, slot: u64, place: Place, block: &Block) {
-        let [x, y, z] = place;
+    fn write_block(&self, gpu: &Gpu, slot: u64, block_coord: GridCoord, block: &Block) {
+        let [x, y, z] = block_coord;
         gpu.write(&self.coords, 16 * slot, bytemuck::cast_slice(&[x, y, z, 0]));
         gpu.write(&self.geometry, 4 * 512 * slot, bytemuck::cast_slice(&block.geometry));
         gpu.write(&self.colors, 8 * 512 * slot, bytemuck::cast_slice(&block.colors));
     }
 
     /// Places of the blocks, by slot.
-    pub(crate) fn places(&self, gpu: &Gpu) -> Result<Vec<Place>, Error> {
+    pub(crate) fn block_coords(&self, gpu: &Gpu) -> Result<Vec<GridCoord>, Error> {
         let n = self.n_blocks(gpu)? as usize;
         let coords: Vec<[i32; 4]> = gpu.read(&self.coords, n)?;
         Ok(coords.into_iter().map(|[x, y, z, _]| [x, y, z]).collect())
@@ -157,7 +157,7 @@ impl FieldBuffers {
     /// The blocks of some slots.
     pub(crate) fn read(&self, gpu: &Gpu, pipelines: &Pipelines, slots: &[u32]) -> Result<Vec<Block>, Error> {
         let mut blocks = Vec::with_capacity(slots.len());
-        for part in slots.chunks(GATHERED) {
+        for part in slots.chunks(GATHER_BATCH) {
             let n = part.len();
             let listed = gpu.storage_with("tsdf.listed", bytemuck::cast_slice(part))?;
             let geometry = gpu.storage("tsdf.gathered_geometry", (4 * N_VOXELS * n) as u64)?;
@@ -179,54 +179,62 @@ impl FieldBuffers {
 
     /// All blocks.
     pub(crate) fn read_all(&self, gpu: &Gpu, pipelines: &Pipelines) -> Result<Blocks, Error> {
-        let places = self.places(gpu)?;
-        let slots: Vec<u32> = (0..).take(places.len()).collect();
-        Ok(places.into_iter().zip(self.read(gpu, pipelines, &slots)?).collect())
+        let block_coords = self.block_coords(gpu)?;
+        let slots: Vec<u32> = (0..).take(block_coords.len()).collect();
+        Ok(block_coords.into_iter().zip(self.read(gpu, pipelines, &slots)?).collect())
     }
 
     /// Places of the blocks that changed since the last call.
-    pub(crate) fn take_changed(&self, gpu: &Gpu) -> Result<Vec<Place>, Error> {
-        let places = self.places(gpu)?;
-        let changed: Vec<u32> = gpu.read(&self.changed, places.len())?;
-        self.forget_changed(gpu);
-        Ok(places.into_iter().zip(changed).filter(|(_, flag)| *flag != 0).map(|(place, _)| place).collect())
+    pub(crate) fn take_changed(&self, gpu: &Gpu) -> Result<Vec<GridCoord>, Error> {
+        let block_coords = self.block_coords(gpu)?;
+        let changed: Vec<u32> = gpu.read(&self.changed, block_coords.len())?;
+        self.clear_changed(gpu);
+        Ok(block_coords
+            .into_iter()
+            .zip(changed)
+            .filter(|(_, flag)| *flag != 0)
+            .map(|(block_coord, _)| block_coord)
+            .collect())
     }
 
     /// Says that nothing changed.
-    pub(crate) fn forget_changed(&self, gpu: &Gpu) {
+    pub(crate) fn clear_changed(&self, gpu: &Gpu) {
         gpu.clear(&self.changed, 0, self.changed.bytes());
     }
 
     /// Says that these blocks changed, and no others.
-    pub(crate) fn mark_changed(&self, gpu: &Gpu, changed: &BTreeSet<Place>) -> Result<(), Error> {
-        let flags: Vec<u32> = self.places(gpu)?.iter().map(|place| u32::from(changed.contains(place))).collect();
+    pub(crate) fn set_changed(&self, gpu: &Gpu, changed: &BTreeSet<GridCoord>) -> Result<(), Error> {
+        let flags: Vec<u32> =
+            self.block_coords(gpu)?.iter().map(|block_coord| u32::from(changed.contains(block_coord))).collect();
         gpu.write(&self.changed, 0, bytemuck::cast_slice(&flags));
         Ok(())
     }
 
-    /// Takes the blocks of `leaving` (slots, in order) out of the pool and puts `coming` in, which must
+    /// Takes the blocks of `evicted` (slots, in order) out of the pool and puts `added` in, which must
     /// fit. Nothing may be in flight, and no changes untold.
-    pub(crate) fn exchange(
+    pub(crate) fn swap_blocks(
         &mut self,
         gpu: &Gpu,
         pipelines: &Pipelines,
-        leaving: &[u32],
-        coming: &Blocks,
+        evicted: &[u32],
+        added: &Blocks,
     ) -> Result<(), Error> {
         let n_before = self.n_blocks(gpu)?;
-        let places = self.places(gpu)?;
-        let n_after = n_before as usize - leaving.len() + coming.len();
-        let gone: BTreeSet<u32> = leaving.iter().copied().collect();
+        let block_coords = self.block_coords(gpu)?;
+        let n_after = n_before as usize - evicted.len() + added.len();
+        let gone: BTreeSet<u32> = evicted.iter().copied().collect();
         // What lies past the new end moves into the holes; then those that come fill the rest.
         let end = u32::try_from(n_after).unwrap_or(u32::MAX);
-        let movers: Vec<u32> = (end.min(n_before)..n_before).filter(|slot| !gone.contains(slot)).collect();
-        let moved = self.read(gpu, pipelines, &movers)?;
-        let moved = movers.iter().map(|slot| places[*slot as usize]).zip(moved);
-        let holes = gone.iter().copied().filter(|slot| *slot < end).chain(n_before..end);
-        let incoming =
-            moved.collect::<Vec<_>>().into_iter().chain(coming.iter().map(|(place, block)| (*place, block.clone())));
-        for (slot, (place, block)) in holes.zip(incoming) {
-            self.write_block(gpu, slot.into(), place, &block);
+        let moved_slots: Vec<u32> = (end.min(n_before)..n_before).filter(|slot| !gone.contains(slot)).collect();
+        let moved = self.read(gpu, pipelines, &moved_slots)?;
+        let moved = moved_slots.iter().map(|slot| block_coords[*slot as usize]).zip(moved);
+        let free_slots = gone.iter().copied().filter(|slot| *slot < end).chain(n_before..end);
+        let incoming = moved
+            .collect::<Vec<_>>()
+            .into_iter()
+            .chain(added.iter().map(|(block_coord, block)| (*block_coord, block.clone())));
+        for (slot, (block_coord, block)) in free_slots.zip(incoming) {
+            self.write_block(gpu, slot.into(), block_coord, &block);
         }
         if end < n_before {
             let (from, n) = (u64::from(end), u64::from(n_before - end));
@@ -242,7 +250,7 @@ impl FieldBuffers {
         gpu.clear(&self.entries, 0, self.entries.bytes());
         let mut counters = self.counters(gpu)?;
         counters[status::N_BLOCKS] = n;
-        forget_failure(&mut counters);
+        clear_failure(&mut counters);
         gpu.write(&self.status, 0, bytemuck::cast_slice(&counters));
         // There were as many chunks before, or more; only a clash of their places could fill the table up.
         if self.index(gpu, pipelines, n)? {
@@ -257,7 +265,7 @@ impl FieldBuffers {
 }
 
 /// Clears what a failed frame left, bounds and the number of chunks: they are counted anew.
-fn forget_failure(counters: &mut [u32]) {
+fn clear_failure(counters: &mut [u32]) {
     for ix in [status::FAILED, status::TABLE_FULL, status::STOPPED] {
         counters[ix] = 0;
     }

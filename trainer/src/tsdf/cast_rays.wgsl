@@ -28,36 +28,36 @@ struct Backdrop {
 @group(0) @binding(9) var<storage, read_write> depths: array<f32>;
 
 const MAX_STEPS = 4096u;
-const N_REFINE = 8u;
-const CLOSE = 1e-3;           // voxels
+const N_BISECTIONS = 8u;
+const CONVERGED_VOXELS = 1e-3;           // voxels
 const UNKNOWN = 1e9;
 
 // Of the chunk and block looked up last.
-var<private> known_chunk: vec3i;
-var<private> known_row: u32;
-var<private> known_block: vec3i;
-var<private> known_slot: u32;
+var<private> cached_chunk: vec3i;
+var<private> cached_row: u32;
+var<private> cached_block: vec3i;
+var<private> cached_slot: u32;
 
 // The row plus one; 0 where there is none.
 fn row_of(chunk: vec3i) -> u32 {
-    if any(chunk != known_chunk) {
-        known_chunk = chunk;
-        known_row = find_row(chunk);
+    if any(chunk != cached_chunk) {
+        cached_chunk = chunk;
+        cached_row = find_row(chunk);
     }
-    return known_row;
+    return cached_row;
 }
 
 // The slot plus one; 0 where there is none.
 fn slot_of(block: vec3i) -> u32 {
-    if any(block != known_block) {
-        known_block = block;
-        known_slot = slot_in_row(row_of(block >> vec3u(3u)), block);
+    if any(block != cached_block) {
+        cached_block = block;
+        cached_slot = slot_in_row(row_of(block >> vec3u(3u)), block);
     }
-    return known_slot;
+    return cached_slot;
 }
 
 // Place of a voxel in the pool plus one; 0 where it has none.
-fn place_of(voxel: vec3i) -> u32 {
+fn pool_ix_of(voxel: vec3i) -> u32 {
     let slot = slot_of(voxel >> vec3u(3u));
     if slot == 0u { return 0u; }
     return (slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel) + 1u;
@@ -71,18 +71,18 @@ fn distance_at(point: vec3f) -> f32 {
     let is_inside = all((voxel & vec3i(7)) < vec3i(7)); // All eight in one block.
     var at = 0u;
     if is_inside {
-        at = place_of(voxel);
+        at = pool_ix_of(voxel);
         if at == 0u { return UNKNOWN; }
     }
     var sum = 0.0;
     for (var i = 0u; i < 8u; i++) {
         let offset = vec3u(i & 1u, (i >> 1u) & 1u, i >> 2u);
-        var place = at + offset.x + 8u * offset.y + 64u * offset.z;
+        var pool_ix = at + offset.x + 8u * offset.y + 64u * offset.z;
         if !is_inside {
-            place = place_of(voxel + vec3i(offset));
-            if place == 0u { return UNKNOWN; }
+            pool_ix = pool_ix_of(voxel + vec3i(offset));
+            if pool_ix == 0u { return UNKNOWN; }
         }
-        let word = geometry[place - 1u];
+        let word = geometry[pool_ix - 1u];
         if stored_weight(word) == 0u { return UNKNOWN; }
         let part = select(1.0 - share, share, offset == vec3u(1u));
         sum += part.x * part.y * part.z * stored_distance(word);
@@ -97,9 +97,9 @@ fn color_at(point: vec3f) -> vec3f {
     var sum = vec4f(0.0);
     for (var i = 0; i < 8; i++) {
         let offset = vec3i(i & 1, (i >> 1u) & 1, i >> 2u);
-        let place = place_of(vec3i(corner) + offset);
-        if place == 0u { continue; }
-        let word = colors[place - 1u];
+        let pool_ix = pool_ix_of(vec3i(corner) + offset);
+        if pool_ix == 0u { continue; }
+        let word = colors[pool_ix - 1u];
         if (word.y >> 16u) == 0u { continue; }
         let part = select(1.0 - share, share, offset == vec3i(1));
         let rgb = vec3f(vec3u(word.x & 0xffffu, word.x >> 16u, word.y & 0xffffu)) / 65535.0;
@@ -116,21 +116,21 @@ struct Ray {
 }
 
 fn ray_of(pixel: vec2u) -> Ray {
-    let seen = ray_of_pixel(pixel);
+    let pixel_ray = ray_of_pixel(pixel);
     var low = vec3f(0.0);
     var high = vec3f(0.0);
     for (var axis = 0u; axis < 3u; axis++) {
         low[axis] = f32(BOUNDS_BIAS - i32(status[BOUNDS_LOW + axis])) * 64.0;
         high[axis] = f32(i32(status[BOUNDS_HIGH + axis]) - BOUNDS_BIAS + 1) * 64.0;
     }
-    let origin = seen.origin / field.voxel_m;
-    let along = seen.along / field.voxel_m;
-    let range = within_box(seen.range, origin, along, low, high);
+    let origin = pixel_ray.origin / field.voxel_m;
+    let along = pixel_ray.along / field.voxel_m;
+    let range = within_box(pixel_ray.range, origin, along, low, high);
     return Ray(origin, along, range.x, range.y);
 }
 
 // Depth at which the ray leaves the box of `size` voxels that begins at `corner`.
-fn leaves(ray: Ray, corner: vec3i, size: i32) -> f32 {
+fn exit_depth_m(ray: Ray, corner: vec3i, size: i32) -> f32 {
     return within_box(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
 }
 
@@ -139,12 +139,12 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
     var low = vec2f(outside_m, outside_distance);
     var high = vec2f(inside_m, inside_distance);
     var at_m = inside_m;
-    for (var i = 0u; i < N_REFINE; i++) {
+    for (var i = 0u; i < N_BISECTIONS; i++) {
         let even = (high.x - low.x) * speed > 0.5;
         at_m = select(low.x + (high.x - low.x) * low.y / (low.y - high.y), 0.5 * (low.x + high.x), even);
         let here = distance_at(ray.origin + ray.along * at_m);
         if here == UNKNOWN { return UNKNOWN; }
-        if abs(here) < CLOSE { break; }
+        if abs(here) < CONVERGED_VOXELS { break; }
         if here >= 0.0 { low = vec2f(at_m, here); } else { high = vec2f(at_m, here); }
     }
     return at_m;
@@ -155,7 +155,7 @@ fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;
     var outside = vec2f(-1.0, 0.0); // Depth and distance of the last place known to be outside; depth -1: none.
-    var careful_m = -1.0; // Up to this depth steps are short: a long one passed a place that nobody saw.
+    var short_steps_until_m = -1.0; // Up to this depth steps are short: a long one passed a place that nobody saw.
     for (var i = 0u; i < MAX_STEPS; i++) {
         if !(at_m < ray.end_m) { break; }
         let point = ray.origin + ray.along * at_m;
@@ -166,34 +166,34 @@ fn march(ray: Ray) -> f32 {
             let is_empty = row_of(chunk) == 0u;
             let edge = select(8, 64, is_empty);
             let corner = select((voxel >> vec3u(3u)) * 8, chunk * 64, is_empty);
-            at_m = max(at_m, leaves(ray, corner, edge)) + 0.01 / speed;
+            at_m = max(at_m, exit_depth_m(ray, corner, edge)) + 0.01 / speed;
             outside.x = -1.0;
             continue;
         }
         let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
         let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
-        let is_careful = at_m < careful_m;
+        let takes_short_steps = at_m < short_steps_until_m;
         if stored_weight(word) == 0u { // One of the eight around, so they say nothing either.
-            at_m += select(1.0, 0.25, is_careful) / speed;
+            at_m += select(1.0, 0.25, takes_short_steps) / speed;
             continue;
         }
-        if nearest > 1.5 && !is_careful {
+        if nearest > 1.5 && !takes_short_steps {
             outside = vec2f(at_m, nearest);
             at_m += 0.8 * nearest / speed;
             continue;
         }
         let here = distance_at(point);
         if here == UNKNOWN {
-            at_m += select(0.5, 0.25, is_careful) / speed;
+            at_m += select(0.5, 0.25, takes_short_steps) / speed;
         } else if here >= 0.0 {
             outside = vec2f(at_m, here);
-            at_m += select(max(0.8 * here, 0.25), 0.25, is_careful) / speed;
+            at_m += select(max(0.8 * here, 0.25), 0.25, takes_short_steps) / speed;
         } else {
             if outside.x >= 0.0 {
                 let found = crossing(ray, outside.x, at_m, outside.y, here, speed);
                 if found != UNKNOWN { return found; }
-                if !is_careful {
-                    careful_m = at_m + 0.5 / speed;
+                if !takes_short_steps {
+                    short_steps_until_m = at_m + 0.5 / speed;
                     at_m = outside.x;
                     outside.x = -1.0;
                     continue;
@@ -212,8 +212,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n_columns = (view.size_px.x + 7u) / 8u;
     let pixel = vec2u(ix % n_columns, ix / n_columns) * 8u + lane.xy;
     if any(pixel >= view.size_px) { return; } // Allowed here: no barrier below.
-    known_chunk = vec3i(0x7fffffff);
-    known_block = vec3i(0x7fffffff);
+    cached_chunk = vec3i(0x7fffffff);
+    cached_block = vec3i(0x7fffffff);
     let ray = ray_of(pixel);
     var depth_m = UNKNOWN;
     if status[BOUNDS_HIGH] != 0u { depth_m = march(ray); }

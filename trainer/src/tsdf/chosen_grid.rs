@@ -12,14 +12,14 @@ const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
 /// Voxels of the least truncation.
 const TRUNCATION_VOXELS: f64 = 4.0;
 /// How many times the least truncation noise may make of it.
-const MOST_TRUNCATION: f64 = 4.0;
+const MAX_TRUNCATION_FACTOR: f64 = 4.0;
 /// Of `max_bytes` the field may take for what one image shows when voxels are chosen: the scene goes on beyond it.
-const SHARE_OF_ONE_IMAGE: f64 = 0.1;
+const ONE_IMAGE_FRAC: f64 = 0.1;
 
 /// A field's voxels, settled.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Lattice {
+pub struct VoxelGrid {
     /// Edge of a voxel, metres.
     pub voxel_m: f64,
     /// Least truncation, metres.
@@ -36,7 +36,7 @@ pub struct Lattice {
     pub anchor_m: [f64; 3],
 }
 
-impl Lattice {
+impl VoxelGrid {
     /// Settles what the options leave open by the first depth image; `None` where that shows nothing.
     ///
     /// A voxel is as wide as a pixel at the median depth, no less than the noise there, and wide enough that what
@@ -45,27 +45,27 @@ impl Lattice {
     /// tells whole steps that is 0.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
     pub fn choose(options: &TsdfOptions, depth: &DepthMap) -> Option<Self> {
-        let mut depths: Vec<f64> = believed(options, depth).map(|(_, z)| z).collect();
-        let n_believed = depths.len();
+        let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();
+        let n_valid = depths.len();
         let median_m = quantile(&mut depths, 5)?;
-        let noise_per_m2 = usable(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
+        let noise_per_m2 = positive(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
         let by_noise_m = noise_per_m2 * median_m * median_m;
         // A surface of n pixels has n (px / voxel)^2 voxels, and its band about as many blocks as a 16th of them.
-        let area_m2 = n_believed as f64 * px_m * px_m;
+        let area_m2 = n_valid as f64 * px_m * px_m;
         let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {
-            let n_blocks = SHARE_OF_ONE_IMAGE * bytes as f64 / super::buffers::BYTES_PER_BLOCK as f64;
+            let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / super::buffers::BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });
-        let chosen = px_m.max(by_noise_m).max(by_bytes_m).clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
-        let voxel_m = usable(options.voxel_m).unwrap_or_else(|| (chosen * 2e3).ceil() / 2e3);
-        let truncation_m = usable(options.truncation_m).unwrap_or(TRUNCATION_VOXELS * voxel_m).max(2.0 * voxel_m);
+        let chosen_grid = px_m.max(by_noise_m).max(by_bytes_m).clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);
+        let voxel_m = positive(options.voxel_m).unwrap_or_else(|| (chosen_grid * 2e3).ceil() / 2e3);
+        let truncation_m = positive(options.truncation_m).unwrap_or(TRUNCATION_VOXELS * voxel_m).max(2.0 * voxel_m);
         let chunk_m = 64.0 * voxel_m;
         let anchor = depth.world_from_camera.translation.vector.map(|along| (along / chunk_m).round() * chunk_m);
-        let lattice = Self {
+        let voxel_grid = Self {
             voxel_m,
             truncation_m,
-            scale_m: MOST_TRUNCATION * truncation_m,
+            scale_m: MAX_TRUNCATION_FACTOR * truncation_m,
             noise_per_m2,
             max_depth_m: options.max_depth_m,
             max_weight: (options.max_weight * WEIGHT_ONE).clamp(1.0, 65_535.0) as u32,
@@ -77,7 +77,7 @@ impl Lattice {
             1e3 * truncation_m,
             1e3 * noise_per_m2
         );
-        Some(lattice)
+        Some(voxel_grid)
     }
 
     /// Metres from the anchor along the world's axes.
@@ -87,12 +87,12 @@ impl Lattice {
     }
 }
 
-fn usable(given: Option<f64>) -> Option<f64> {
+fn positive(given: Option<f64>) -> Option<f64> {
     given.filter(|value| value.is_finite() && *value > 0.0)
 }
 
 /// Index and depth of the pixels that may be believed.
-fn believed<'a>(options: &'a TsdfOptions, depth: &'a DepthMap) -> impl Iterator<Item = (usize, f64)> + 'a {
+fn valid_depths<'a>(options: &'a TsdfOptions, depth: &'a DepthMap) -> impl Iterator<Item = (usize, f64)> + 'a {
     let depths = depth.depth_m.iter().map(|z| f64::from(*z)).enumerate();
     depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
 }
@@ -101,11 +101,11 @@ fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     let width = depth.size_px[0] as usize;
     let at =
         |ix: usize| depth.depth_m.get(ix).map(|z| f64::from(*z)).filter(|z| *z > 0.01 && *z <= options.max_depth_m);
-    let mut bends: Vec<f64> = believed(options, depth)
+    let mut second_differences: Vec<f64> = valid_depths(options, depth)
         .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
         .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))
         .collect();
-    quantile(&mut bends, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
+    quantile(&mut second_differences, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
 }
 
 /// The value that so many tenths lie below.

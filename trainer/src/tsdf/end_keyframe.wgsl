@@ -9,6 +9,6 @@
 
 @compute @workgroup_size(1)
 fn main() {
-    if status[FAILED] == 0u { status[N_FRAMES] += 1u; } else { status[STOPPED] = 1u; }
+    if status[FAILED] == 0u { status[N_FUSED] += 1u; } else { status[STOPPED] = 1u; }
     status[N_VISIBLE] = 0u;
 }

@@ -8,11 +8,11 @@
 
 #import field
 #import field_status
-#import depth_frame
+#import depth_view
 #import folded
 
 @group(0) @binding(0) var<uniform> field: Field;
-@group(0) @binding(1) var<uniform> frame: DepthFrame;
+@group(0) @binding(1) var<uniform> depth_view: DepthView;
 @group(0) @binding(2) var<storage, read> coords: array<vec4i>;
 @group(0) @binding(3) var<storage, read_write> status: array<atomic<u32>>;
 @group(0) @binding(4) var<storage, read_write> visible: array<u32>;
@@ -23,11 +23,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let slot = folded(wg, n_wgs) * WG_SIZE + lane;
     if atomicLoad(&status[FAILED]) != 0u { return; } // Allowed here: no barrier below.
     if slot >= min(atomicLoad(&status[N_BLOCKS]), field.n_block_slots) { return; }
-    let center = depth_from_field(frame, (vec3f(coords[slot].xyz) + 0.5) * (8.0 * field.voxel_m));
+    let center = depth_from_field(depth_view, (vec3f(coords[slot].xyz) + 0.5) * (8.0 * field.voxel_m));
     let radius_m = 7.0 * field.voxel_m; // Half the diagonal of a block is 6.93 voxels.
-    let focal = frame.depth_focal_px;
-    let principal = frame.depth_principal_px;
-    let rest = vec2f(frame.depth_size_px) - principal;
+    let focal = depth_view.depth_focal_px;
+    let principal = depth_view.depth_principal_px;
+    let rest = vec2f(depth_view.depth_size_px) - principal;
     let low = focal * center.xy + principal * center.z >= -radius_m * sqrt(focal * focal + principal * principal);
     let high = rest * center.z - focal * center.xy >= -radius_m * sqrt(focal * focal + rest * rest);
     let near = center.z >= -radius_m;

@@ -15,11 +15,11 @@
 
 #import field
 #import field_status
-#import depth_frame
+#import depth_view
 #import folded
 
 @group(0) @binding(0) var<uniform> field: Field;
-@group(0) @binding(1) var<uniform> frame: DepthFrame;
+@group(0) @binding(1) var<uniform> depth_view: DepthView;
 @group(0) @binding(2) var<storage, read> readings: array<vec2f>;
 @group(0) @binding(3) var<storage, read> image: array<u32>;
 @group(0) @binding(4) var<storage, read> coords: array<vec4i>;
@@ -30,7 +30,7 @@
 @group(0) @binding(9) var<storage, read_write> changed: array<atomic<u32>>;
 
 // Least cosine between ray and normal that distances are shortened by: normals of steeper surfaces are mostly noise.
-const MIN_TURNED = 0.3;
+const MIN_RAY_DOT_NORMAL = 0.3;
 // One look through a solid voxel takes back as many looks at it: where what lies behind is one truncation away, and where it is
 // two away or more. What is nearer may be no more than a wrong pose.
 const CARVING_NEAR = 1.0;
@@ -39,52 +39,52 @@ const CARVING_FAR = 4.0;
 const COLOR_VOXELS = 2.0;
 
 fn reading_at(pixel: vec2i) -> vec2f {
-    let inside = clamp(pixel, vec2i(0), vec2i(frame.depth_size_px) - 1);
-    return readings[u32(inside.y) * frame.depth_size_px.x + u32(inside.x)];
+    let inside = clamp(pixel, vec2i(0), vec2i(depth_view.depth_size_px) - 1);
+    return readings[u32(inside.y) * depth_view.depth_size_px.x + u32(inside.x)];
 }
 
 // Between four readings where all are believed, else the nearest one.
-fn reading_near(place_px: vec2f) -> vec2f {
-    let corner = floor(place_px - 0.5);
-    let share = place_px - 0.5 - corner;
+fn reading_near(position_px: vec2f) -> vec2f {
+    let corner = floor(position_px - 0.5);
+    let share = position_px - 0.5 - corner;
     let base = vec2i(corner);
     let a = reading_at(base);
     let b = reading_at(base + vec2i(1, 0));
     let c = reading_at(base + vec2i(0, 1));
     let d = reading_at(base + vec2i(1, 1));
-    let all_believed = min(min(a.x, b.x), min(c.x, d.x)) > 0.0;
+    let all_valid = min(min(a.x, b.x), min(c.x, d.x)) > 0.0;
     let between = mix(mix(a, b, share.x), mix(c, d, share.x), share.y);
     let nearest = select(select(a, b, share.x >= 0.5), select(c, d, share.x >= 0.5), share.y >= 0.5);
-    return select(nearest, between, all_believed);
+    return select(nearest, between, all_valid);
 }
 
 fn pixel_at(pixel: vec2i) -> vec4f {
-    let inside = clamp(pixel, vec2i(0), vec2i(frame.color_size_px) - 1);
-    return unpack4x8unorm(image[u32(inside.y) * frame.color_size_px.x + u32(inside.x)]);
+    let inside = clamp(pixel, vec2i(0), vec2i(depth_view.color_size_px) - 1);
+    return unpack4x8unorm(image[u32(inside.y) * depth_view.color_size_px.x + u32(inside.x)]);
 }
 
 // Color at a point, between four pixels; alpha is less than 1 where it falls outside the image or on a mask.
 fn color_near(point_in_field: vec3f) -> vec4f {
-    let point = color_from_field(frame, point_in_field);
-    let place_px = frame.color_focal_px * point.xy / point.z + frame.color_principal_px;
-    let inside = point.z > 0.0 && all(place_px >= vec2f(0.0)) && all(place_px < vec2f(frame.color_size_px));
+    let point = color_from_field(depth_view, point_in_field);
+    let position_px = depth_view.color_focal_px * point.xy / point.z + depth_view.color_principal_px;
+    let inside = point.z > 0.0 && all(position_px >= vec2f(0.0)) && all(position_px < vec2f(depth_view.color_size_px));
     if !inside { return vec4f(0.0); }
-    let corner = floor(place_px - 0.5);
-    let share = place_px - 0.5 - corner;
+    let corner = floor(position_px - 0.5);
+    let share = position_px - 0.5 - corner;
     let base = vec2i(corner);
     let top = mix(pixel_at(base), pixel_at(base + vec2i(1, 0)), share.x);
     let bottom = mix(pixel_at(base + vec2i(0, 1)), pixel_at(base + vec2i(1, 1)), share.x);
     return mix(top, bottom, share.y);
 }
 
-fn fuse_color(at: u32, point_in_field: vec3f, gained: u32) {
-    let seen = color_near(point_in_field);
-    if !(seen.a > 0.999) { return; }
+fn fuse_color(at: u32, point_in_field: vec3f, weight_gain: u32) {
+    let observed = color_near(point_in_field);
+    if !(observed.a > 0.999) { return; }
     let old = colors[at];
     let weight = old.y >> 16u;
-    let had = vec3f(vec3u(old.x & 0xffffu, old.x >> 16u, old.y & 0xffffu)) / 65535.0;
-    let sum = weight + gained;
-    let now = (had * f32(weight) + seen.rgb * f32(gained)) / f32(sum);
+    let previous = vec3f(vec3u(old.x & 0xffffu, old.x >> 16u, old.y & 0xffffu)) / 65535.0;
+    let sum = weight + weight_gain;
+    let now = (previous * f32(weight) + observed.rgb * f32(weight_gain)) / f32(sum);
     let rgb = vec3u(floor(clamp(now, vec3f(0.0), vec3f(1.0)) * 65535.0 + 0.5));
     colors[at] = vec2u(rgb.x | (rgb.y << 16u), rgb.z | (min(sum, field.max_weight) << 16u));
 }
@@ -98,22 +98,22 @@ struct Fused {
 const UNCHANGED = Fused(false, 0u);
 
 fn fuse(at: u32, point_in_field: vec3f) -> Fused {
-    let point = depth_from_field(frame, point_in_field);
-    let place_px = frame.depth_focal_px * point.xy / point.z + frame.depth_principal_px;
-    let inside = point.z > 0.0 && all(place_px >= vec2f(0.0)) && all(place_px < vec2f(frame.depth_size_px));
+    let point = depth_from_field(depth_view, point_in_field);
+    let position_px = depth_view.depth_focal_px * point.xy / point.z + depth_view.depth_principal_px;
+    let inside = point.z > 0.0 && all(position_px >= vec2f(0.0)) && all(position_px < vec2f(depth_view.depth_size_px));
     if !inside { return UNCHANGED; }
-    let reading = reading_near(place_px);
+    let reading = reading_near(position_px);
     if !(reading.x > 0.0) { return UNCHANGED; }
-    let distance_m = (reading.x - point.z) * max(reading.y, MIN_TURNED);
+    let distance_m = (reading.x - point.z) * max(reading.y, MIN_RAY_DOT_NORMAL);
     let truncation_m = truncation_at(field, reading.x);
-    let ray_m = length(ray_of(frame, place_px));
+    let ray_m = length(ray_of(depth_view, position_px));
     // Along the ray, not the normal: past the rim of a thing a ray soon leaves it again.
     let behind_m = (point.z - reading.x) * ray_m;
     if !(behind_m <= truncation_m) { return UNCHANGED; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
-    let behind = clamp((truncation_m - behind_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
+    let falloff = clamp((truncation_m - behind_m) / (truncation_m - field.voxel_m), 0.0, 1.0);
     let cosine = reading.y / ray_m;
-    let gain = nearness * cosine * cosine * behind;
+    let gain_frac = nearness * cosine * cosine * falloff;
     let old = geometry[at];
     let weight = stored_weight(old);
     if distance_m > truncation_m {
@@ -121,16 +121,16 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
         // matter of where the voxel is, not of what lies behind it.
         if weight == 0u || stored_distance(old) >= 0.0 { return UNCHANGED; }
         let carving = mix(CARVING_NEAR, CARVING_FAR, min(distance_m / truncation_m - 1.0, 1.0));
-        let lost = u32(max(floor(carving * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
-        geometry[at] = select(old - (lost << 16u), 0u, lost >= weight);
+        let weight_loss = u32(max(floor(carving * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
+        geometry[at] = select(old - (weight_loss << 16u), 0u, weight_loss >= weight);
         return Fused(true, 0u);
     }
-    let gained = u32(clamp(floor(WEIGHT_ONE * gain + 0.5), 1.0, WEIGHT_ONE));
-    let sum = weight + gained;
-    let mean = (stored_distance(old) * f32(weight) + distance_m / field.scale_m * f32(gained)) / f32(sum);
+    let weight_gain = u32(clamp(floor(WEIGHT_ONE * gain_frac + 0.5), 1.0, WEIGHT_ONE));
+    let sum = weight + weight_gain;
+    let mean = (stored_distance(old) * f32(weight) + distance_m / field.scale_m * f32(weight_gain)) / f32(sum);
     let stored = i32(floor(clamp(mean, -1.0, 1.0) * 32767.0 + 0.5));
     geometry[at] = (u32(stored) & 0xffffu) | (min(sum, field.max_weight) << 16u);
-    return Fused(true, select(0u, gained, abs(distance_m) <= COLOR_VOXELS * field.voxel_m));
+    return Fused(true, select(0u, weight_gain, abs(distance_m) <= COLOR_VOXELS * field.voxel_m));
 }
 
 fn center_of(first: vec3i, z: u32) -> vec3f {
@@ -147,14 +147,14 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let begin = slot * BLOCK_VOXELS + lane;
         let first = coords[slot].xyz * 8 + vec3i(vec3u(lane & 7u, lane >> 3u, 0u));
         var any_changed = false;
-        var due = 0u;         // Bit z: the color of this voxel is due,
+        var stale = 0u;         // Bit z: the color of this voxel is due,
         var gains = vec2u(0u); // and byte z is the weight it gains, less one.
         var z = 0u;
         loop {
             let fused = fuse(begin + z * 64u, center_of(first, z));
             any_changed = any_changed || fused.changed;
             if fused.color_gain != 0u {
-                due |= 1u << z;
+                stale |= 1u << z;
                 let byte = (fused.color_gain - 1u) << (8u * (z & 3u));
                 gains |= select(vec2u(byte, 0u), vec2u(0u, byte), z >= 4u);
             }
@@ -164,14 +164,14 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             }
         }
         loop {
-            if due != 0u {
-                let z = firstTrailingBit(due);
+            if stale != 0u {
+                let z = firstTrailingBit(stale);
                 let byte = select(gains.x, gains.y, z >= 4u) >> (8u * (z & 3u));
                 fuse_color(begin + z * 64u, center_of(first, z), (byte & 255u) + 1u);
             }
             continuing {
-                due &= due - 1u;
-                break if due == 0u;
+                stale &= stale - 1u;
+                break if stale == 0u;
             }
         }
         if any_changed { atomicStore(&changed[slot], 1u); }

@@ -19,7 +19,7 @@ const SHARED: &[Source] = &[
     source!("folded"),
     source!("mesh_work"),
     source!("scan"),
-    source!("depth_frame"),
+    source!("depth_view"),
 ];
 
 macro_rules! kernel {
@@ -35,10 +35,10 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("index_blocks"),
     kernel!("find_visible"),
     kernel!("integrate"),
-    kernel!("end_frame"),
+    kernel!("end_keyframe"),
     kernel!("gather_blocks"),
     kernel!("cast_rays"),
-    kernel!("list_due"),
+    kernel!("list_stale"),
     kernel!("march_cubes"),
 ];
 
@@ -50,10 +50,10 @@ pub(crate) struct Pipelines {
     pub(crate) index_blocks: Pipeline,
     pub(crate) find_visible: Pipeline,
     pub(crate) integrate: Pipeline,
-    pub(crate) end_frame: Pipeline,
+    pub(crate) end_keyframe: Pipeline,
     pub(crate) gather_blocks: Pipeline,
     pub(crate) cast_rays: Pipeline,
-    pub(crate) list_due: Pipeline,
+    pub(crate) list_stale: Pipeline,
     pub(crate) march_cubes: Pipeline,
 }
 
@@ -65,10 +65,10 @@ impl Pipelines {
             index_blocks: Pipeline::new(gpu, kernel!("index_blocks"), &[])?,
             find_visible: Pipeline::new(gpu, kernel!("find_visible"), &[])?,
             integrate: Pipeline::new(gpu, kernel!("integrate"), &[])?,
-            end_frame: Pipeline::new(gpu, kernel!("end_frame"), &[])?,
+            end_keyframe: Pipeline::new(gpu, kernel!("end_keyframe"), &[])?,
             gather_blocks: Pipeline::new(gpu, kernel!("gather_blocks"), &[])?,
             cast_rays: Pipeline::new(gpu, kernel!("cast_rays"), &[])?,
-            list_due: Pipeline::new(gpu, kernel!("list_due"), &[])?,
+            list_stale: Pipeline::new(gpu, kernel!("list_stale"), &[])?,
             march_cubes: Pipeline::new(gpu, kernel!("march_cubes"), &[])?,
         })
     }
@@ -78,7 +78,7 @@ impl Pipelines {
 mod tests {
     use crate::gpu::{reflect, resolve};
     use crate::splat::View;
-    use crate::tsdf::params::{Backdrop, DepthFrame, Field, MeshPart, MeshPiece, MeshVertex};
+    use crate::tsdf::params::{Backdrop, BlockMeshRange, DepthView, Field, MeshBatch, MeshVertex};
 
     /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
     fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
@@ -111,7 +111,7 @@ mod tests {
             [voxel_m, truncation_m, scale_m, noise_per_m2, max_depth_m, max_weight, n_chunk_slots, n_block_slots]
         );
         assert_layout!(
-            DepthFrame,
+            DepthView,
             [
                 depth_row_0,
                 depth_row_1,
@@ -131,8 +131,8 @@ mod tests {
             ]
         );
         assert_layout!(Backdrop, [srgb]);
-        assert_layout!(MeshPiece, [first, n_most]);
-        assert_layout!(MeshPart, [place, first_vertex, n_vertices, first_triangle, n_triangles]);
+        assert_layout!(MeshBatch, [first, max_blocks]);
+        assert_layout!(BlockMeshRange, [block_coord, first_vertex, n_vertices, first_triangle, n_triangles]);
         assert_layout!(MeshVertex, [position_m, edge, normal, color]);
         assert_eq!(layout_in_wgsl("View").1, size_of::<View>());
     }

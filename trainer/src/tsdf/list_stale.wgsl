@@ -17,8 +17,8 @@
 @group(0) @binding(3) var<storage, read> changed: array<u32>;
 @group(0) @binding(4) var<storage, read> keys: array<u32>;
 @group(0) @binding(5) var<storage, read> entries: array<u32>;
-@group(0) @binding(6) var<storage, read_write> is_due: array<atomic<u32>>;
-@group(0) @binding(7) var<storage, read_write> due: array<atomic<u32>>;
+@group(0) @binding(6) var<storage, read_write> is_stale: array<atomic<u32>>;
+@group(0) @binding(7) var<storage, read_write> stale: array<atomic<u32>>;
 
 @compute @workgroup_size(32)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -27,8 +27,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if changed[at] == 0u { return; }
     let slot = find_slot(coords[at].xyz + around(lane));
     if slot == 0u { return; }
-    if atomicExchange(&is_due[slot - 1u], 1u) == 0u {
-        let ix = atomicAdd(&due[0], 1u);
-        atomicStore(&due[1u + ix], slot - 1u);
+    if atomicExchange(&is_stale[slot - 1u], 1u) == 0u {
+        let ix = atomicAdd(&stale[0], 1u);
+        atomicStore(&stale[1u + ix], slot - 1u);
     }
 }

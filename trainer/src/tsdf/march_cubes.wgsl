@@ -4,7 +4,7 @@
 // groups    one per block; 256 threads, two cubes each
 // reads     field, piece, coords, keys, entries, geometry, colors, due [1 + n_due] (how many, then slots),
 //           cases [256 * 6] (how many triangles, then each one's edges, five bits each: corner, axis)
-// writes    room (how much is needed), parts [n_most], vertices, triangles [3 each] (counterclockwise as seen from
+// writes    needed (how much is needed), parts [n_most], vertices, triangles [3 each] (counterclockwise as seen from
 //           outside; indices into `vertices`). Where a block's triangles go is a matter of luck, their order is not;
 //           a block that finds no room writes none.
 // twin      tsdf/reference/march.rs
@@ -17,16 +17,16 @@
 #import scan
 
 @group(0) @binding(0) var<uniform> field: Field;
-@group(0) @binding(1) var<uniform> piece: MeshPiece;
+@group(0) @binding(1) var<uniform> batch: MeshBatch;
 @group(0) @binding(2) var<storage, read> coords: array<vec4i>;
 @group(0) @binding(3) var<storage, read> keys: array<u32>;
 @group(0) @binding(4) var<storage, read> entries: array<u32>;
 @group(0) @binding(5) var<storage, read> geometry: array<u32>;
 @group(0) @binding(6) var<storage, read> colors: array<vec2u>;
 @group(0) @binding(7) var<storage, read> cases: array<u32>;
-@group(0) @binding(8) var<storage, read> due: array<u32>;
-@group(0) @binding(9) var<storage, read_write> room: array<atomic<u32>>;
-@group(0) @binding(10) var<storage, read_write> parts: array<MeshPart>;
+@group(0) @binding(8) var<storage, read> stale: array<u32>;
+@group(0) @binding(9) var<storage, read_write> needed: array<atomic<u32>>;
+@group(0) @binding(10) var<storage, read_write> parts: array<BlockMeshRange>;
 @group(0) @binding(11) var<storage, read_write> vertices: array<MeshVertex>;
 @group(0) @binding(12) var<storage, read_write> triangles: array<u32>;
 
@@ -38,7 +38,7 @@ const CUBE_EDGES = 2187u;
 const EDGE_STEPS = vec3u(3u, 27u, 243u);
 const USED_WORDS = 69u;
 const CASE_WORDS = 6u;
-const GREY = vec3f(0.5);
+const GRAY = vec3f(0.5);
 
 var<workgroup> wg_slots: array<u32, 27>;           // plus one, of the blocks around
 var<workgroup> wg_words: array<u32, TILE_VOXELS>;
@@ -60,13 +60,13 @@ fn tile_ix(voxel: vec3u) -> u32 {
 fn case_of(cube: vec3u) -> u32 {
     let first = tile_ix(cube);
     var inside = 0u;
-    var is_seen = true;
+    var is_observed = true;
     for (var corner = 0u; corner < 8u; corner++) {
         let word = wg_words[first + dot(corner_of(corner), TILE_STEPS)];
-        is_seen = is_seen && stored_weight(word) != 0u;
+        is_observed = is_observed && stored_weight(word) != 0u;
         inside |= ((word >> 15u) & 1u) << corner; // The distance's sign.
     }
-    return select(0u, inside, is_seen);
+    return select(0u, inside, is_observed);
 }
 
 // Number of a triangle's edge among those of all the block's cubes.
@@ -109,7 +109,7 @@ fn write_triangles(cube_ix: u32, begin: u32) -> u32 {
 }
 
 // Change of the distance along an axis, from both sides where both were seen.
-fn slope_along(at: u32, step: u32) -> f32 {
+fn gradient_along(at: u32, step: u32) -> f32 {
     let low = wg_words[at - step];
     let here = wg_words[at];
     let high = wg_words[at + step];
@@ -119,21 +119,21 @@ fn slope_along(at: u32, step: u32) -> f32 {
     return select(difference, 0.5 * difference, has_low && has_high);
 }
 
-fn slope_at(at: u32) -> vec3f {
-    return vec3f(slope_along(at, TILE_STEPS.x), slope_along(at, TILE_STEPS.y), slope_along(at, TILE_STEPS.z));
+fn gradient_at(at: u32) -> vec3f {
+    return vec3f(gradient_along(at, TILE_STEPS.x), gradient_along(at, TILE_STEPS.y), gradient_along(at, TILE_STEPS.z));
 }
 
 // Place of a voxel in the pool plus one, given from the block before this one; 0 where it has none.
-fn place_of(voxel: vec3u) -> u32 {
+fn pool_ix_of(voxel: vec3u) -> u32 {
     let slot = wg_slots[dot(voxel >> vec3u(3u), vec3u(1u, 3u, 9u))];
     return select(0u, (slot - 1u) * BLOCK_VOXELS + voxel_in_block(vec3i(voxel)) + 1u, slot != 0u);
 }
 
 // Red, green, blue and 1; all 0 where the voxel has none.
 fn color_at(voxel: vec3u) -> vec4f {
-    let place = place_of(voxel + 8u);
-    if place == 0u { return vec4f(0.0); }
-    let both = colors[place - 1u];
+    let pool_ix = pool_ix_of(voxel + 8u);
+    if pool_ix == 0u { return vec4f(0.0); }
+    let both = colors[pool_ix - 1u];
     let rgb = vec3f(vec3u(both.x & 0xffffu, both.x >> 16u, both.y & 0xffffu)) / 65535.0;
     return select(vec4f(0.0), vec4f(rgb, 1.0), (both.y >> 16u) != 0u);
 }
@@ -141,8 +141,8 @@ fn color_at(voxel: vec3u) -> vec4f {
 // Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit vectors", section 3.
 fn octahedral(normal: vec3f) -> u32 {
     let flat = normal.xy / (abs(normal.x) + abs(normal.y) + abs(normal.z));
-    let turned = (1.0 - abs(flat.yx)) * select(vec2f(-1.0), vec2f(1.0), flat >= vec2f(0.0));
-    return pack2x16snorm(select(flat, turned, normal.z < 0.0));
+    let folded_xy = (1.0 - abs(flat.yx)) * select(vec2f(-1.0), vec2f(1.0), flat >= vec2f(0.0));
+    return pack2x16snorm(select(flat, folded_xy, normal.z < 0.0));
 }
 
 fn vertex_of(block: vec3i, edge: u32) -> MeshVertex {
@@ -154,53 +154,53 @@ fn vertex_of(block: vec3i, edge: u32) -> MeshVertex {
     let here = stored_distance(wg_words[from_ix]);
     let there = stored_distance(wg_words[to_ix]);
     let share = here / (here - there);
-    let place_m = (vec3f(8 * block + vec3i(voxel)) + 0.5 + share * vec3f(along)) * field.voxel_m;
-    let slope = mix(slope_at(from_ix), slope_at(to_ix), share);
-    let steepness = length(slope);
-    let normal = select(vec3f(along) * sign(there - here), slope / steepness, steepness > 1e-12);
+    let position_m = (vec3f(8 * block + vec3i(voxel)) + 0.5 + share * vec3f(along)) * field.voxel_m;
+    let gradient = mix(gradient_at(from_ix), gradient_at(to_ix), share);
+    let gradient_norm = length(gradient);
+    let normal = select(vec3f(along) * sign(there - here), gradient / gradient_norm, gradient_norm > 1e-12);
     let near = color_at(voxel);
     let far = color_at(voxel + along);
     // That of the one that has a color, where not both do.
-    let only = select(vec4f(GREY, 1.0), near + far, near.a + far.a > 0.0);
+    let only = select(vec4f(GRAY, 1.0), near + far, near.a + far.a > 0.0);
     let rgba = select(only, mix(near, far, share), near.a * far.a > 0.0);
-    return MeshVertex(array(place_m.x, place_m.y, place_m.z), edge, octahedral(normal), pack4x8unorm(rgba));
+    return MeshVertex(array(position_m.x, position_m.y, position_m.z), edge, octahedral(normal), pack4x8unorm(rgba));
 }
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let ix = folded(wg, n_wgs);
-    if ix >= piece.n_most || piece.first + ix >= due[0] { return; } // The whole group.
-    let block = coords[due[1u + piece.first + ix]].xyz;
+    if ix >= batch.max_blocks || batch.first + ix >= stale[0] { return; } // The whole group.
+    let block = coords[stale[1u + batch.first + ix]].xyz;
     if lane < 27u { wg_slots[lane] = find_slot(block + around(lane)); }
     if lane < USED_WORDS { atomicStore(&wg_used[lane], 0u); }
     workgroupBarrier(); // Slots are known before voxels are looked for.
     for (var at = lane; at < TILE_VOXELS; at += 256u) {
-        let place = place_of(vec3u(at % 11u, at / 11u % 11u, at / 121u) + 7u);
+        let pool_ix = pool_ix_of(vec3u(at % 11u, at / 11u % 11u, at / 121u) + 7u);
         var word = 0u;
-        if place != 0u { word = geometry[place - 1u]; }
+        if pool_ix != 0u { word = geometry[pool_ix - 1u]; }
         wg_words[at] = word;
     }
     workgroupBarrier(); // All voxels are there, and no edge is marked.
     let n_triangles = mark_edges(2u * lane) + mark_edges(2u * lane + 1u);
     workgroupBarrier(); // All edges are marked.
-    var used = 0u;
-    if lane < USED_WORDS { used = atomicLoad(&wg_used[lane]); }
-    let n_vertices = countOneBits(used);
+    var used_bits = 0u;
+    if lane < USED_WORDS { used_bits = atomicLoad(&wg_used[lane]); }
+    let n_vertices = countOneBits(used_bits);
     var both = 0u; // Both sums in one word: a block has at most 2187 vertices and 2560 triangles.
     let before = exclusive_scan(lane, n_vertices | (n_triangles << 16u), &both);
     let n = vec2u(both & 0xffffu, both >> 16u);
     if lane < USED_WORDS {
         var at = before & 0xffffu;
         wg_before[lane] = at;
-        for (var left = used; left != 0u; left &= left - 1u) {
+        for (var left = used_bits; left != 0u; left &= left - 1u) {
             wg_edges[at] = 32u * lane + firstTrailingBit(left);
             at++;
         }
     }
     if lane == 0u {
-        let begin = vec2u(atomicAdd(&room[N_VERTICES], n.x), atomicAdd(&room[N_TRIANGLES], n.y));
+        let begin = vec2u(atomicAdd(&needed[N_VERTICES], n.x), atomicAdd(&needed[N_TRIANGLES], n.y));
         wg_begin = begin;
-        parts[ix] = MeshPart(array(block.x, block.y, block.z), begin.x, n.x, begin.y, n.y);
+        parts[ix] = BlockMeshRange(array(block.x, block.y, block.z), begin.x, n.x, begin.y, n.y);
     }
     workgroupBarrier(); // The block's room and the list of its edges are known.
     let begin = wg_begin;

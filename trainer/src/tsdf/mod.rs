@@ -4,7 +4,7 @@
 
 pub mod block;
 mod buffers;
-mod chosen;
+mod chosen_grid;
 pub mod kernels;
 mod marching;
 pub mod mesh;
@@ -19,6 +19,6 @@ mod against_twin;
 #[cfg(test)]
 mod tests;
 
-pub use chosen::Lattice;
+pub use chosen_grid::VoxelGrid;
 pub use model::TsdfModel;
 pub use options::TsdfOptions;

@@ -5,22 +5,22 @@ mod checkpoint;
 mod meshing;
 mod saving;
 
-use super::block::{Blocks, Place};
+use super::block::{Blocks, GridCoord};
 use super::buffers::{self, Capacity, FieldBuffers};
-use super::chosen::Lattice;
+use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
 use super::marching::MeshBuffers;
 use super::mesh::Mesher;
 use super::options::TsdfOptions;
-use super::params::{DepthFrame, status};
-use super::passes::{self, Canvas, FrameSlot};
+use super::params::{DepthView, status};
+use super::passes::{self, Canvas, KeyframeSlot};
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
 use crate::method::submit_millis;
-use crate::seen::Seen;
-use crate::splat::{Camera, PosedLens, projections};
-use crate::{Error, Keyframe, Method, Part, Picture, Progress, Projection, RenderRequest, Renewable, Split};
+use crate::seen::KeyframeSignature;
+use crate::splat::{CalibratedCamera, Camera, projections};
+use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Restartable, Split, TrialReport};
 use kinematics::Stamp;
 use std::collections::{BTreeSet, VecDeque};
 use std::path::Path;
@@ -28,14 +28,14 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// Most keyframes of a submit: their images lie on the GPU at once.
-const FRAMES_PER_SUBMIT: usize = 4;
+const KEYFRAMES_PER_SUBMIT: usize = 4;
 /// Room at the start.
-const FIRST_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
+const INITIAL_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
 /// Fewer blocks show no scene: voxels are chosen so that one image takes a tenth of them.
-const FEWEST_BLOCKS: u32 = 256;
+const MIN_BLOCKS: u32 = 256;
 /// The table at the start, and the fewest blocks.
-pub(super) const LEAST_BYTES: u64 =
-    FIRST_CAPACITY.n_chunks as u64 * buffers::BYTES_PER_CHUNK + FEWEST_BLOCKS as u64 * buffers::BYTES_PER_BLOCK;
+pub(super) const MIN_BYTES: u64 =
+    INITIAL_CAPACITY.n_chunks as u64 * buffers::BYTES_PER_CHUNK + MIN_BLOCKS as u64 * buffers::BYTES_PER_BLOCK;
 
 /// A colored distance field built from keyframes with depth.
 ///
@@ -45,28 +45,28 @@ pub struct TsdfModel {
     gpu: Arc<Gpu>,
     options: TsdfOptions,
     pipelines: Pipelines,
-    lattice: Option<Lattice>,
+    voxel_grid: Option<VoxelGrid>,
     field: Option<FieldBuffers>,
-    slots: Vec<FrameSlot>,
+    slots: Vec<KeyframeSlot>,
     canvas: Option<Canvas>,
     passes: Passes,
     /// Not known to be fused, in order; the first of them may be in flight.
     pending: VecDeque<Arc<Keyframe>>,
-    fused: Vec<Seen>,
+    fused: Vec<KeyframeSignature>,
     /// Keyframes that a loaded state waits for; nobody may bring them.
-    to_match: Vec<Seen>,
+    unmatched: Vec<KeyframeSignature>,
     in_flight: Option<InFlight>,
     /// Blocks that found no room on the GPU.
-    waiting: Blocks,
+    host_blocks: Blocks,
     /// Blocks that changed since the mesh was made, besides those that the GPU has flags for.
-    due: BTreeSet<Place>,
+    stale: BTreeSet<GridCoord>,
     mesher: Mesher,
     mesh_buffers: Option<MeshBuffers>,
     n_resident: u32,
-    n_refused: u64,
+    n_skipped: u64,
     n_outside: u32,
     /// Frames the GPU had counted when it was last asked.
-    n_on_gpu: u32,
+    n_fused_on_gpu: u32,
     step: u64,
     step_millis: f64,
     /// Whether pictures are requested.
@@ -76,7 +76,7 @@ pub struct TsdfModel {
 #[derive(Debug)]
 struct InFlight {
     status: PendingRead,
-    n_frames: usize,
+    n_keyframes: usize,
     since: Instant,
 }
 
@@ -84,34 +84,34 @@ impl TsdfModel {
     /// An empty model; refused where it may not even have the memory of the smallest.
     pub fn new(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
         match options.max_bytes {
-            Some(max_bytes) if max_bytes < LEAST_BYTES => {
-                Err(Error::BudgetTooSmall { model: "distance field", max_bytes, least_bytes: LEAST_BYTES })
+            Some(max_bytes) if max_bytes < MIN_BYTES => {
+                Err(Error::BudgetTooSmall { model: "distance field", max_bytes, min_bytes: MIN_BYTES })
             }
-            _ => Self::within_any_budget(gpu, options),
+            _ => Self::without_budget_check(gpu, options),
         }
     }
 
     /// An empty model; where it may have less memory than the smallest it leaves out what it finds no room for.
-    pub(super) fn within_any_budget(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
+    pub(super) fn without_budget_check(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
         Ok(Self {
             pipelines: Pipelines::new(&gpu)?,
-            lattice: None,
+            voxel_grid: None,
             field: None,
             slots: Vec::new(),
             canvas: None,
             passes: Passes::default(),
             pending: VecDeque::new(),
             fused: Vec::new(),
-            to_match: Vec::new(),
+            unmatched: Vec::new(),
             in_flight: None,
-            waiting: Blocks::new(),
-            due: BTreeSet::new(),
+            host_blocks: Blocks::new(),
+            stale: BTreeSet::new(),
             mesher: Mesher::default(),
             mesh_buffers: None,
             n_resident: 0,
-            n_refused: 0,
+            n_skipped: 0,
             n_outside: 0,
-            n_on_gpu: 0,
+            n_fused_on_gpu: 0,
             step: 0,
             step_millis: 0.0,
             is_watched: false,
@@ -126,13 +126,13 @@ impl TsdfModel {
     }
 
     /// How finely the scene is divided; `None` before the first depth.
-    pub fn lattice(&self) -> Option<&Lattice> {
-        self.lattice.as_ref()
+    pub fn voxel_grid(&self) -> Option<&VoxelGrid> {
+        self.voxel_grid.as_ref()
     }
 
     /// Keyframes that showed more at once than the memory allowed holds; they were left out.
-    pub fn n_refused(&self) -> u64 {
-        self.n_refused
+    pub fn n_skipped(&self) -> u64 {
+        self.n_skipped
     }
 
     /// Readings whose surface lay further out than blocks have places for.
@@ -141,14 +141,14 @@ impl TsdfModel {
     }
 
     /// Blocks that wait in host memory.
-    pub fn n_waiting(&self) -> usize {
-        self.waiting.len()
+    pub fn n_host_blocks(&self) -> usize {
+        self.host_blocks.len()
     }
 
     /// All blocks, in order of their places.
     pub fn blocks(&mut self) -> Result<Blocks, Error> {
-        self.settle()?;
-        let mut blocks = self.waiting.clone();
+        self.finish_in_flight()?;
+        let mut blocks = self.host_blocks.clone();
         if let Some(field) = &self.field {
             blocks.extend(field.read_all(&self.gpu, &self.pipelines)?);
         }
@@ -156,38 +156,39 @@ impl TsdfModel {
     }
 
     /// Most blocks the GPU may hold beside the table that finds them.
-    fn most_blocks(&self) -> u32 {
-        self.most_blocks_beside(self.field.as_ref().map_or(FIRST_CAPACITY, |field| field.capacity).n_chunks)
+    fn max_blocks(&self) -> u32 {
+        self.max_blocks_with_table(self.field.as_ref().map_or(INITIAL_CAPACITY, |field| field.capacity).n_chunks)
     }
 
-    fn most_blocks_beside(&self, n_chunks: u32) -> u32 {
+    fn max_blocks_with_table(&self, n_chunks: u32) -> u32 {
         let table_bytes = u64::from(n_chunks) * buffers::BYTES_PER_CHUNK;
-        let of_blocks = |bytes: u64| bytes.saturating_sub(table_bytes) / buffers::BYTES_PER_BLOCK;
-        let by_bytes = self.options.max_bytes.map_or(u64::MAX, of_blocks);
-        buffers::most_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+        let n_blocks_in = |bytes: u64| bytes.saturating_sub(table_bytes) / buffers::BYTES_PER_BLOCK;
+        let by_bytes = self.options.max_bytes.map_or(u64::MAX, n_blocks_in);
+        buffers::max_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 
     /// Settles voxels by the first depth image that shows something; those before it are done with. False where none does.
     fn begin(&mut self) -> Result<bool, Error> {
         // What one binding holds is a limit as good as any.
-        let max_bytes = Some(u64::from(self.most_blocks()) * buffers::BYTES_PER_BLOCK);
+        let max_bytes = Some(u64::from(self.max_blocks()) * buffers::BYTES_PER_BLOCK);
         let options = TsdfOptions { max_bytes, ..self.options.clone() };
-        while self.lattice.is_none() {
+        while self.voxel_grid.is_none() {
             let Some(first) = self.pending.front() else { return Ok(false) };
-            let chosen = first.depth.as_ref().and_then(|depth| Lattice::choose(&options, depth));
-            if let Some(lattice) = chosen {
-                let n_blocks = FIRST_CAPACITY.n_blocks.min(self.most_blocks());
-                self.field = Some(FieldBuffers::new(&self.gpu, &lattice, Capacity { n_blocks, ..FIRST_CAPACITY })?);
-                self.lattice = Some(lattice);
+            let chosen_grid = first.depth.as_ref().and_then(|depth| VoxelGrid::choose(&options, depth));
+            if let Some(voxel_grid) = chosen_grid {
+                let n_blocks = INITIAL_CAPACITY.n_blocks.min(self.max_blocks());
+                self.field =
+                    Some(FieldBuffers::new(&self.gpu, &voxel_grid, Capacity { n_blocks, ..INITIAL_CAPACITY })?);
+                self.voxel_grid = Some(voxel_grid);
             } else {
-                self.pass_over();
+                self.skip_first();
             }
         }
         Ok(!self.pending.is_empty())
     }
 
     /// Fuses one keyframe where none was: then there is something to show. No more than that, or looking would count as learning.
-    fn fuse_first(&mut self) -> Result<(), Error> {
+    fn fuse_one(&mut self) -> Result<(), Error> {
         while self.step == 0 && !self.pending.is_empty() {
             self.step(1)?;
         }
@@ -195,37 +196,39 @@ impl TsdfModel {
     }
 
     /// Number of keyframes in a submit that stays within the time limit.
-    fn frames_per_submit(&self) -> usize {
+    fn keyframes_per_submit(&self) -> usize {
         if !self.is_watched || self.step_millis == 0.0 {
-            return FRAMES_PER_SUBMIT;
+            return KEYFRAMES_PER_SUBMIT;
         }
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-        let n = (submit_millis(true) / self.step_millis).clamp(1.0, FRAMES_PER_SUBMIT as f64) as usize;
+        let n = (submit_millis(true) / self.step_millis).clamp(1.0, KEYFRAMES_PER_SUBMIT as f64) as usize;
         n
     }
 
     /// Takes the first pending keyframe for done.
-    fn pass_over(&mut self) {
+    fn skip_first(&mut self) {
         if let Some(keyframe) = self.pending.pop_front() {
-            self.fused.push(Seen::of(&keyframe));
+            self.fused.push(KeyframeSignature::of(&keyframe));
             self.step += 1;
         }
     }
 
     /// Lists the passes of a pending keyframe.
     fn record(&mut self, pending_ix: usize, slot_ix: usize) -> Result<(), Error> {
-        let (Some(lattice), Some(keyframe)) = (&self.lattice, self.pending.get(pending_ix)) else { return Ok(()) };
-        let Some(frame) = DepthFrame::of(keyframe, lattice) else { return Ok(()) };
-        let [n_depth, n_color] =
-            [frame.depth_size_px, frame.color_size_px].map(|[width, height]| u64::from(width) * u64::from(height));
+        let (Some(voxel_grid), Some(keyframe)) = (&self.voxel_grid, self.pending.get(pending_ix)) else {
+            return Ok(());
+        };
+        let Some(depth_view) = DepthView::of(keyframe, voxel_grid) else { return Ok(()) };
+        let [n_depth, n_color] = [depth_view.depth_size_px, depth_view.color_size_px]
+            .map(|[width, height]| u64::from(width) * u64::from(height));
         if self.slots.get(slot_ix).is_none_or(|slot| !slot.holds(n_depth, n_color)) {
-            self.passes.forget_bindings();
-            let slot = FrameSlot::new(&self.gpu, n_depth, n_color)?;
+            self.passes.clear_bindings();
+            let slot = KeyframeSlot::new(&self.gpu, n_depth, n_color)?;
             self.slots.truncate(slot_ix);
             self.slots.push(slot);
         }
         let slot = &mut self.slots[slot_ix];
-        slot.upload(&self.gpu, keyframe, &frame);
+        slot.upload(&self.gpu, keyframe, &depth_view);
         if let Some(field) = &self.field {
             passes::fuse(&self.gpu, &mut self.passes, &self.pipelines, field, slot);
         }
@@ -233,49 +236,50 @@ impl TsdfModel {
     }
 
     /// Waits for the submit in flight and takes note of what it did; says whether something found no room.
-    fn settle(&mut self) -> Result<bool, Error> {
+    fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
-        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_frames.max(1) as f64;
+        let millis = in_flight.since.elapsed().as_secs_f64() * 1e3 / in_flight.n_keyframes.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
-        self.take_note(&counters)
+        self.apply_counters(&counters)
     }
 
     /// Counts what was fused; makes room where there was none and says so.
-    fn take_note(&mut self, counters: &[u32]) -> Result<bool, Error> {
-        for _ in 0..counters[status::N_FRAMES].wrapping_sub(self.n_on_gpu) {
-            self.pass_over();
+    fn apply_counters(&mut self, counters: &[u32]) -> Result<bool, Error> {
+        for _ in 0..counters[status::N_FUSED].wrapping_sub(self.n_fused_on_gpu) {
+            self.skip_first();
         }
-        self.n_on_gpu = counters[status::N_FRAMES];
+        self.n_fused_on_gpu = counters[status::N_FUSED];
         self.n_outside = counters[status::N_OUTSIDE];
         self.n_resident = counters[status::N_BLOCKS];
         let failed = counters[status::STOPPED] != 0;
         if failed {
-            self.make_room(counters)?;
+            self.grow(counters)?;
             self.n_resident = self.field.as_ref().map_or(Ok(0), |field| field.n_blocks(&self.gpu))?;
         }
         Ok(failed)
     }
 
     /// Gives a field that was too small more room, on the GPU or by sending blocks to wait.
-    fn make_room(&mut self, counters: &[u32]) -> Result<(), Error> {
-        let (Some(lattice), Some(field)) = (&self.lattice, &self.field) else { return Ok(()) };
+    fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
+        let (Some(voxel_grid), Some(field)) = (&self.voxel_grid, &self.field) else { return Ok(()) };
         let mut capacity = field.capacity;
         if counters[status::TABLE_FULL] != 0 {
             capacity.n_chunks *= 2;
         }
-        let (need, most) = (counters[status::N_BLOCKS], self.most_blocks_beside(capacity.n_chunks));
-        if need > capacity.n_blocks {
-            let wanted = need.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
-            capacity.n_blocks = wanted.min(most).max(capacity.n_blocks);
+        let (n_blocks_needed, n_blocks_allowed) =
+            (counters[status::N_BLOCKS], self.max_blocks_with_table(capacity.n_chunks));
+        if n_blocks_needed > capacity.n_blocks {
+            let n_blocks_wanted = n_blocks_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
+            capacity.n_blocks = n_blocks_wanted.min(n_blocks_allowed).max(capacity.n_blocks);
         }
         if capacity != field.capacity {
             log::debug!("tsdf: room for {capacity:?}");
-            let resized = field.resized(&self.gpu, &self.pipelines, lattice, capacity)?;
-            self.passes.forget_bindings();
+            let resized = field.resized(&self.gpu, &self.pipelines, voxel_grid, capacity)?;
+            self.passes.clear_bindings();
             self.field = Some(resized);
         }
-        if need > most { self.send_away(need - most) } else { Ok(()) }
+        if n_blocks_needed > n_blocks_allowed { self.evict(n_blocks_needed - n_blocks_allowed) } else { Ok(()) }
     }
 
     /// Draws one pinhole view.
@@ -288,41 +292,41 @@ impl TsdfModel {
             &self.gpu,
             &Picture::buffers(camera.size_px, &canvas.pixels, depth.then_some(&canvas.depths)),
         );
-        read.finish_with(&self.gpu, |parts| Picture::of_parts(camera.size_px, parts))
+        read.finish_with(&self.gpu, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
     /// GPU time of a pinhole picture, milliseconds, without bringing it to the host; `None` where the adapter tells none.
     pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
-        self.settle()?;
+        self.finish_in_flight()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
-        if !self.record_picture(&Camera::of_request(request, focal_px, principal_px), request.background_srgb)? {
+        if !self.record_picture(&Camera::from_request(request, focal_px, principal_px), request.background_srgb)? {
             return Ok(None);
         }
-        self.passes.submit_spanned(&self.gpu)
+        self.passes.submit_timed_total(&self.gpu)
     }
 
     /// Lists what a picture takes; false where there is nothing to draw.
     fn record_picture(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<bool, Error> {
         let [width, height] = camera.size_px;
         let n = u64::from(width) * u64::from(height);
-        let Some(lattice) = self.lattice.clone().filter(|_| self.field.is_some()) else { return Ok(false) };
-        let in_field = in_field(camera, &lattice);
-        self.bring_for(&in_field)?;
+        let Some(voxel_grid) = self.voxel_grid.clone().filter(|_| self.field.is_some()) else { return Ok(false) };
+        let in_field = in_field(camera, &voxel_grid);
+        self.load_visible(&in_field)?;
         if self.canvas.as_ref().is_none_or(|canvas| canvas.n_pixels < n) {
-            self.passes.forget_bindings();
+            self.passes.clear_bindings();
             self.canvas = None;
             self.canvas = Some(Canvas::new(&self.gpu, n)?);
         }
         let (Some(field), Some(canvas)) = (&self.field, &self.canvas) else { return Err(Error::DeviceLost) };
-        canvas.aim(&self.gpu, &in_field.view(), background_srgb);
+        canvas.set_view(&self.gpu, &in_field.view(), background_srgb);
         passes::draw(&self.gpu, &mut self.passes, &self.pipelines, field, canvas, camera.size_px);
         Ok(true)
     }
 }
 
 /// The camera, and what it is cropped to, in the field's frame.
-fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
-    let field_from_world = lattice.field_from_world();
+fn in_field(camera: &Camera, voxel_grid: &VoxelGrid) -> Camera {
+    let field_from_world = voxel_grid.field_from_world();
     let mut camera = camera.clone();
     camera.world_from_camera = field_from_world * camera.world_from_camera;
     if let Some(crop) = &mut camera.crop {
@@ -331,9 +335,9 @@ fn in_field(camera: &Camera, lattice: &Lattice) -> Camera {
     camera
 }
 
-impl Renewable for TsdfModel {
-    fn begin_anew(&mut self) -> Result<(), Error> {
-        self.settle()?;
+impl Restartable for TsdfModel {
+    fn restart(&mut self) -> Result<(), Error> {
+        self.finish_in_flight()?;
         *self = Self { is_watched: self.is_watched, ..Self::new(self.gpu.clone(), self.options.clone())? };
         Ok(())
     }
@@ -352,7 +356,7 @@ impl Method for TsdfModel {
     /// A keyframe that was not fused yet is forgotten. What was fused stays: sums do not tell who gave what; it fades as
     /// others look at the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.settle()?;
+        self.finish_in_flight()?;
         self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
         Ok(())
     }
@@ -360,35 +364,35 @@ impl Method for TsdfModel {
     fn step(&mut self, n: u64) -> Result<u64, Error> {
         let before = self.step;
         if !self.begin()? {
-            self.settle()?;
+            self.finish_in_flight()?;
             return Ok(self.step - before);
         }
-        if !self.waiting.is_empty() {
-            self.settle()?;
-            return self.step_within_budget(n);
+        if !self.host_blocks.is_empty() {
+            self.finish_in_flight()?;
+            return self.step_with_host_blocks(n);
         }
-        let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_frames);
+        let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_keyframes);
         let n_left = (self.pending.len() - n_in_flight.min(self.pending.len())) as u64;
         let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not know of those in flight.
-        let n_frames = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(self.frames_per_submit());
-        if n_frames == 0 {
-            self.settle()?;
+        let n_keyframes = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(self.keyframes_per_submit());
+        if n_keyframes == 0 {
+            self.finish_in_flight()?;
             return Ok(self.step - before);
         }
         let since = Instant::now();
-        for ix in 0..n_frames {
+        for ix in 0..n_keyframes {
             self.record(n_in_flight + ix, ix)?;
         }
         let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
         let status = self.passes.submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
-        let failed = self.settle()?; // The submit before; this one runs meanwhile.
+        let failed = self.finish_in_flight()?; // The submit before; this one runs meanwhile.
         if !failed {
-            self.in_flight = Some(InFlight { status, n_frames, since });
+            self.in_flight = Some(InFlight { status, n_keyframes, since });
         } // Else this one found the failure too and did nothing.
-        if n_frames as u64 == n_asked || n_frames as u64 == n_left {
-            self.settle()?; // The caller stops here: the count must be true.
+        if n_keyframes as u64 == n_asked || n_keyframes as u64 == n_left {
+            self.finish_in_flight()?; // The caller stops here: the count must be true.
         }
-        Ok(n_frames as u64)
+        Ok(n_keyframes as u64)
     }
 
     fn is_idle(&self) -> bool {
@@ -399,14 +403,14 @@ impl Method for TsdfModel {
         "block"
     }
 
-    fn n_taken(&mut self) -> Result<u64, Error> {
-        self.settle()?;
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
+        self.finish_in_flight()?;
         Ok(self.step)
     }
 
     fn seed(&mut self) -> Result<(), Error> {
-        self.settle()?;
-        self.fuse_first()
+        self.finish_in_flight()?;
+        self.fuse_one()
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
@@ -414,8 +418,8 @@ impl Method for TsdfModel {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        self.settle()?;
-        self.fuse_first()?;
+        self.finish_in_flight()?;
+        self.fuse_one()?;
         projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
     }
 
@@ -423,12 +427,12 @@ impl Method for TsdfModel {
         self.is_watched = watched;
     }
 
-    fn posed_lens(&mut self, keyframe: &Keyframe) -> Result<PosedLens, Error> {
-        Ok(PosedLens::of(keyframe))
+    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
+        Ok(CalibratedCamera::of(keyframe))
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
-        self.settle()?;
+        self.finish_in_flight()?;
         if !self.begin()? {
             return Ok(Vec::new());
         }
@@ -436,7 +440,7 @@ impl Method for TsdfModel {
         let timings = self.passes.submit_timed(&self.gpu)?;
         let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
         let counters = field.counters(&self.gpu)?;
-        self.take_note(&counters)?;
+        self.apply_counters(&counters)?;
         Ok(timings)
     }
 
@@ -447,13 +451,13 @@ impl Method for TsdfModel {
     fn progress(&self) -> Progress {
         Progress {
             step: self.step,
-            primitives: u64::from(self.n_resident) + self.waiting.len() as u64,
+            primitives: u64::from(self.n_resident) + self.host_blocks.len() as u64,
             bytes: self.field.as_ref().map_or(0, |field| field.bytes(self.n_resident.into())),
             step_millis: self.step_millis,
         }
     }
 
-    fn report(&self) -> Vec<Part> {
+    fn report(&self) -> Vec<TrialReport> {
         Vec::new()
     }
 

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TsdfOptions {
-    /// Edge of a voxel, metres; `None`: from the first depth image, see [`super::Lattice::choose`].
+    /// Edge of a voxel, metres; `None`: from the first depth image, see [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
     /// Least distance from a surface that is kept, metres; `None`: four voxels.
     pub truncation_m: Option<f64>,

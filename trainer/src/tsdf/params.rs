@@ -1,9 +1,9 @@
 //! Small structs the kernels read, with the layouts of their WGSL twins.
 
-use super::chosen::Lattice;
+use super::chosen_grid::VoxelGrid;
 use crate::Keyframe;
 use crate::gpu::{f32_of, f32s_of};
-use crate::splat::PosedLens;
+use crate::splat::CalibratedCamera;
 use kinematics::Transform;
 
 /// `Field` of `shared/field.wgsl`.
@@ -21,24 +21,24 @@ pub(crate) struct Field {
 }
 
 impl Field {
-    pub(crate) fn new(lattice: &Lattice, n_chunk_slots: u32, n_block_slots: u32) -> Self {
+    pub(crate) fn new(voxel_grid: &VoxelGrid, n_chunk_slots: u32, n_block_slots: u32) -> Self {
         Self {
-            voxel_m: f32_of(lattice.voxel_m),
-            truncation_m: f32_of(lattice.truncation_m),
-            scale_m: f32_of(lattice.scale_m),
-            noise_per_m2: f32_of(lattice.noise_per_m2),
-            max_depth_m: f32_of(lattice.max_depth_m),
-            max_weight: lattice.max_weight,
+            voxel_m: f32_of(voxel_grid.voxel_m),
+            truncation_m: f32_of(voxel_grid.truncation_m),
+            scale_m: f32_of(voxel_grid.scale_m),
+            noise_per_m2: f32_of(voxel_grid.noise_per_m2),
+            max_depth_m: f32_of(voxel_grid.max_depth_m),
+            max_weight: voxel_grid.max_weight,
             n_chunk_slots,
             n_block_slots,
         }
     }
 }
 
-/// `DepthFrame` of `shared/depth_frame.wgsl`.
+/// `DepthView` of `shared/depth_view.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct DepthFrame {
+pub(crate) struct DepthView {
     pub(crate) depth_row_0: [f32; 4],
     pub(crate) depth_row_1: [f32; 4],
     pub(crate) depth_row_2: [f32; 4],
@@ -56,12 +56,12 @@ pub(crate) struct DepthFrame {
     pub(crate) color_size_px: [u32; 2],
 }
 
-impl DepthFrame {
+impl DepthView {
     /// `None` where the keyframe has no depth.
-    pub(crate) fn of(keyframe: &Keyframe, lattice: &Lattice) -> Option<Self> {
+    pub(crate) fn of(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
-        let field_from_depth = lattice.field_from_world() * depth.world_from_camera;
-        let field_from_color = lattice.field_from_world() * PosedLens::of(keyframe).world_from_camera;
+        let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
+        let field_from_color = voxel_grid.field_from_world() * CalibratedCamera::of(keyframe).world_from_camera;
         let to_depth = rows_of(&field_from_depth.inverse());
         let from_depth = rows_of(&field_from_depth);
         let to_color = rows_of(&field_from_color.inverse());
@@ -98,19 +98,19 @@ pub(crate) struct Backdrop {
     pub(crate) srgb: [f32; 4],
 }
 
-/// `MeshPiece` of `shared/mesh_work.wgsl`.
+/// `MeshBatch` of `shared/mesh_work.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct MeshPiece {
+pub(crate) struct MeshBatch {
     pub(crate) first: u32,
-    pub(crate) n_most: u32,
+    pub(crate) max_blocks: u32,
 }
 
-/// `MeshPart` of `shared/mesh_work.wgsl`.
+/// `BlockMeshRange` of `shared/mesh_work.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
-pub(crate) struct MeshPart {
-    pub(crate) place: [i32; 3],
+pub(crate) struct BlockMeshRange {
+    pub(crate) block_coord: [i32; 3],
     pub(crate) first_vertex: u32,
     pub(crate) n_vertices: u32,
     pub(crate) first_triangle: u32,
@@ -132,7 +132,7 @@ pub(crate) mod status {
     pub(crate) const N_BLOCKS: usize = 0;
     pub(crate) const FAILED: usize = 2;
     pub(crate) const TABLE_FULL: usize = 3;
-    pub(crate) const N_FRAMES: usize = 4;
+    pub(crate) const N_FUSED: usize = 4;
     pub(crate) const N_OUTSIDE: usize = 5;
     pub(crate) const BOUNDS: usize = 6;
     pub(crate) const STOPPED: usize = 13;

@@ -3,7 +3,7 @@
 use super::buffers::FieldBuffers;
 use super::kernels::Pipelines;
 use super::marching::MeshBuffers;
-use super::params::{Backdrop, DepthFrame};
+use super::params::{Backdrop, DepthView};
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::splat::View;
 use crate::{Error, Keyframe};
@@ -13,19 +13,19 @@ const MAX_INTEGRATE_GROUPS: u32 = 8192;
 
 /// One keyframe on the GPU, and what is made of its depth.
 #[derive(Debug)]
-pub(crate) struct FrameSlot {
-    frame: Buffer,
+pub(crate) struct KeyframeSlot {
+    depth_view: Buffer,
     depth: Buffer,
     image: Buffer,
     readings: Buffer,
     n_pixels: u64,
 }
 
-impl FrameSlot {
+impl KeyframeSlot {
     /// Room for images like these.
     pub(crate) fn new(gpu: &Gpu, n_depth_pixels: u64, n_color_pixels: u64) -> Result<Self, Error> {
         Ok(Self {
-            frame: gpu.uniform_with("tsdf.frame", &<DepthFrame as bytemuck::Zeroable>::zeroed()),
+            depth_view: gpu.uniform_with("tsdf.depth_view", &<DepthView as bytemuck::Zeroable>::zeroed()),
             depth: gpu.storage("tsdf.depth", 4 * n_depth_pixels)?,
             image: gpu.storage("tsdf.image", 4 * n_color_pixels)?,
             readings: gpu.storage("tsdf.readings", 8 * n_depth_pixels)?,
@@ -39,9 +39,9 @@ impl FrameSlot {
     }
 
     /// Takes a keyframe's images; they must fit.
-    pub(crate) fn upload(&mut self, gpu: &Gpu, keyframe: &Keyframe, frame: &DepthFrame) {
+    pub(crate) fn upload(&mut self, gpu: &Gpu, keyframe: &Keyframe, depth_view: &DepthView) {
         let Some(depth) = &keyframe.depth else { return };
-        gpu.write(&self.frame, 0, bytemuck::bytes_of(frame));
+        gpu.write(&self.depth_view, 0, bytemuck::bytes_of(depth_view));
         gpu.write(&self.depth, 0, bytemuck::cast_slice(&depth.depth_m));
         gpu.write(&self.image, 0, &keyframe.rgba_srgb);
         self.n_pixels = depth.depth_m.len() as u64;
@@ -54,15 +54,15 @@ impl FrameSlot {
 }
 
 /// Fuses a frame.
-pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, slot: &FrameSlot) {
+pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, slot: &KeyframeSlot) {
     let FieldBuffers { capacity, field, status, keys, entries, coords, geometry, colors, changed, visible } = buffers;
-    let FrameSlot { frame, depth, image, readings, n_pixels } = slot;
+    let KeyframeSlot { depth_view, depth, image, readings, n_pixels } = slot;
     let n_groups = n_pixels.div_ceil(64);
     list.dispatch(
         gpu,
         &pipelines.readings,
         n_groups,
-        &[("field", field), ("frame", frame), ("depth", depth), ("readings", readings)],
+        &[("field", field), ("depth_view", depth_view), ("depth", depth), ("readings", readings)],
     );
     list.dispatch(
         gpu,
@@ -70,7 +70,7 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
         n_groups,
         &[
             ("field", field),
-            ("frame", frame),
+            ("depth_view", depth_view),
             ("readings", readings),
             ("status", status),
             ("keys", keys),
@@ -82,7 +82,7 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
         gpu,
         &pipelines.find_visible,
         u64::from(capacity.n_blocks).div_ceil(64),
-        &[("field", field), ("frame", frame), ("coords", coords), ("status", status), ("visible", visible)],
+        &[("field", field), ("depth_view", depth_view), ("coords", coords), ("status", status), ("visible", visible)],
     );
     list.dispatch(
         gpu,
@@ -90,7 +90,7 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
         capacity.n_blocks.min(MAX_INTEGRATE_GROUPS).into(),
         &[
             ("field", field),
-            ("frame", frame),
+            ("depth_view", depth_view),
             ("readings", readings),
             ("image", image),
             ("coords", coords),
@@ -101,7 +101,7 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
             ("changed", changed),
         ],
     );
-    list.dispatch(gpu, &pipelines.end_frame, 1, &[("status", status)]);
+    list.dispatch(gpu, &pipelines.end_keyframe, 1, &[("status", status)]);
 }
 
 /// Enters the first `n` blocks into the empty table.
@@ -140,7 +140,7 @@ pub(crate) fn gather(
 }
 
 /// Lists the blocks whose triangles may be others than before.
-pub(crate) fn list_due(
+pub(crate) fn list_stale(
     gpu: &Gpu,
     list: &mut Passes,
     pipelines: &Pipelines,
@@ -148,11 +148,11 @@ pub(crate) fn list_due(
     mesh: &MeshBuffers,
 ) {
     let FieldBuffers { capacity, field, status, keys, entries, coords, changed, .. } = buffers;
-    list.clear(&mesh.is_due);
-    list.clear_range(&mesh.due, 0..4);
+    list.clear(&mesh.is_stale);
+    list.clear_range(&mesh.stale, 0..4);
     list.dispatch(
         gpu,
-        &pipelines.list_due,
+        &pipelines.list_stale,
         capacity.n_blocks.into(),
         &[
             ("field", field),
@@ -161,8 +161,8 @@ pub(crate) fn list_due(
             ("changed", changed),
             ("keys", keys),
             ("entries", entries),
-            ("is_due", &mesh.is_due),
-            ("due", &mesh.due),
+            ("is_stale", &mesh.is_stale),
+            ("stale", &mesh.stale),
         ],
     );
 }
@@ -174,18 +174,18 @@ pub(crate) fn march(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers
     list.dispatch(
         gpu,
         &pipelines.march_cubes,
-        capacity.n_blocks.min(mesh.room.n_blocks).into(),
+        capacity.n_blocks.min(mesh.mesh_capacity.n_blocks).into(),
         &[
             ("field", field),
-            ("piece", &mesh.piece),
+            ("batch", &mesh.batch),
             ("coords", coords),
             ("keys", keys),
             ("entries", entries),
             ("geometry", geometry),
             ("colors", colors),
             ("cases", &mesh.cases),
-            ("due", &mesh.due),
-            ("room", &mesh.needed),
+            ("stale", &mesh.stale),
+            ("needed", &mesh.needed),
             ("parts", &mesh.parts),
             ("vertices", &mesh.vertices),
             ("triangles", &mesh.triangles),
@@ -214,7 +214,7 @@ impl Canvas {
         })
     }
 
-    pub(crate) fn aim(&self, gpu: &Gpu, view: &View, background_srgb: [f32; 3]) {
+    pub(crate) fn set_view(&self, gpu: &Gpu, view: &View, background_srgb: [f32; 3]) {
         let [red, green, blue] = background_srgb;
         gpu.write(&self.view, 0, bytemuck::bytes_of(view));
         gpu.write(&self.backdrop, 0, bytemuck::bytes_of(&Backdrop { srgb: [red, green, blue, 0.0] }));

@@ -4,7 +4,7 @@
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::test_scenes::{self as scenes, SIZE_PX, Shape};
+use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
 use crate::{Aabb, Error, Keyframe, Method, Picture, Projection, RenderRequest};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
@@ -14,7 +14,7 @@ fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
-fn started(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+fn model_with(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     let mut model = TsdfModel::new(gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -29,16 +29,16 @@ pub(super) fn fuse_all(model: &mut TsdfModel) {
     }
 }
 
-fn fused(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
-    let mut model = started(options, keyframes);
+fn fused_model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+    let mut model = model_with(options, keyframes);
     fuse_all(&mut model);
     model
 }
 
-const AT: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
+const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 
 fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
-    scenes::ring(&[scenes::ball(AT), scenes::floor()], AT, n)
+    scenes::ring(&[scenes::ball(BALL_CENTER), scenes::floor()], BALL_CENTER, n)
 }
 
 fn same(one: &Picture, other: &Picture) -> bool {
@@ -51,9 +51,9 @@ fn view_of(keyframe: &Keyframe) -> Transform {
 }
 
 #[test]
-fn a_drawn_view_is_what_the_camera_saw() {
+fn rendered_view_matches_input_depth() {
     let keyframes = ball_on_floor(6);
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     let depth = keyframes[2].depth.as_ref().unwrap();
     let picture = model.render(&scenes::request(view_of(&keyframes[2]))).unwrap();
     let errors: Vec<f64> = picture
@@ -73,22 +73,23 @@ fn a_drawn_view_is_what_the_camera_saw() {
 }
 
 #[test]
-fn what_moved_away_is_carved() {
+fn removed_object_is_carved() {
     let mut keyframes = ball_on_floor(4);
-    let mut without = scenes::ring(&[scenes::floor()], AT, 4);
-    for (ix, keyframe) in without.iter_mut().enumerate() {
+    let mut without_ball = scenes::ring(&[scenes::floor()], BALL_CENTER, 4);
+    for (ix, keyframe) in without_ball.iter_mut().enumerate() {
         Arc::make_mut(keyframe).stamp = Stamp(100 + i64::try_from(ix).unwrap());
     }
     let near_ball = |model: &mut TsdfModel| {
         let mesh = model.mesh().unwrap();
         let origin = Vector3::from(mesh.origin_m);
-        let places = mesh.positions_m.iter().map(|place| Point3::from(Vector3::from(place.map(f64::from)) + origin));
-        places.filter(|place| (place - AT).norm() < 0.33 && place.z > -0.2).count()
+        let positions =
+            mesh.positions_m.iter().map(|position| Point3::from(Vector3::from(position.map(f64::from)) + origin));
+        positions.filter(|position| (position - BALL_CENTER).norm() < 0.33 && position.z > -0.2).count()
     };
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     let n_before = near_ball(&mut model);
-    keyframes.extend(without);
-    let mut model = fused(scenes::options(), &keyframes);
+    keyframes.extend(without_ball);
+    let mut model = fused_model(scenes::options(), &keyframes);
     let n_after = near_ball(&mut model);
     assert!(n_before > 500 && n_after * 50 < n_before, "{n_after} of {n_before} vertices of the ball are left");
     // The floor is still there.
@@ -98,58 +99,59 @@ fn what_moved_away_is_carved() {
 
 /// Looks past where a thing was until its mesh is gone, after `n_with` looks at it: of its upper part, and of the part that is
 /// nearer to the floor than five voxels.
-fn looks_until_gone(n_with: usize) -> [usize; 2] {
-    const MOST: usize = 200;
-    let [with, without] =
-        [&[scenes::ball(AT), scenes::floor()][..], &[scenes::floor()]].map(|shapes| scenes::ring(shapes, AT, 4));
+fn n_views_until_removed(n_with: usize) -> [usize; 2] {
+    const MAX_LOOKS: usize = 200;
+    let [with_ball, without_ball] = [&[scenes::ball(BALL_CENTER), scenes::floor()][..], &[scenes::floor()]]
+        .map(|shapes| scenes::ring(shapes, BALL_CENTER, 4));
     let mut n_pushed = 0;
     let mut model = TsdfModel::new(gpu(), scenes::options()).unwrap();
-    let mut look = |model: &mut TsdfModel, views: &[Arc<Keyframe>]| {
+    let mut add_view = |model: &mut TsdfModel, views: &[Arc<Keyframe>]| {
         let mut keyframe = views[n_pushed % views.len()].clone();
         Arc::make_mut(&mut keyframe).stamp = Stamp(i64::try_from(n_pushed).unwrap());
         n_pushed += 1;
         model.push(keyframe).unwrap();
         fuse_all(model);
     };
-    let left = |model: &mut TsdfModel| {
+    let n_left = |model: &mut TsdfModel| {
         let mesh = model.mesh().unwrap();
         let origin = Vector3::from(mesh.origin_m);
-        let places = mesh.positions_m.iter().map(|place| Point3::from(Vector3::from(place.map(f64::from)) + origin));
-        let of_ball = places.filter(|place| (place - AT).norm() < 0.33 && place.z > -0.28);
-        let (upper, lower): (Vec<_>, Vec<_>) = of_ball.partition(|place| place.z > -0.2);
+        let positions =
+            mesh.positions_m.iter().map(|position| Point3::from(Vector3::from(position.map(f64::from)) + origin));
+        let ball_vertices = positions.filter(|position| (position - BALL_CENTER).norm() < 0.33 && position.z > -0.28);
+        let (upper, lower): (Vec<_>, Vec<_>) = ball_vertices.partition(|position| position.z > -0.2);
         [upper.len(), lower.len()]
     };
     for _ in 0..n_with {
-        look(&mut model, &with);
+        add_view(&mut model, &with_ball);
     }
-    let before = left(&mut model);
-    let mut gone = [MOST; 2];
-    for n in 1..=MOST {
-        look(&mut model, &without);
-        let now = left(&mut model);
+    let before = n_left(&mut model);
+    let mut n_views = [MAX_LOOKS; 2];
+    for n in 1..=MAX_LOOKS {
+        add_view(&mut model, &without_ball);
+        let now = n_left(&mut model);
         for part in 0..2 {
             if 50 * now[part] <= before[part] {
-                gone[part] = gone[part].min(n);
+                n_views[part] = n_views[part].min(n);
             }
         }
-        if gone.iter().all(|n| *n < MOST) {
+        if n_views.iter().all(|n| *n < MAX_LOOKS) {
             break;
         }
     }
-    gone
+    n_views
 }
 
 #[test]
-fn what_moved_away_is_gone_after_fewer_looks_than_it_had() {
+fn removed_object_fades_faster_than_it_was_built() {
     // Measured 2, 7 and 17 looks; the lower part, which new distances overwrite, is gone at once.
-    for (n_with, most) in [(8, 3), (32, 9), (100, 20)] {
-        let gone = looks_until_gone(n_with);
-        assert!(gone.iter().all(|n| *n <= most), "{n_with} looks at it, gone after {gone:?}");
+    for (n_with, max_views) in [(8, 3), (32, 9), (100, 20)] {
+        let n_views = n_views_until_removed(n_with);
+        assert!(n_views.iter().all(|n| *n <= max_views), "{n_with} looks at it, gone after {n_views:?}");
     }
 }
 
 #[test]
-fn without_depth_there_is_nothing_and_nothing_breaks() {
+fn keyframes_without_depth_are_ignored() {
     let mut model = TsdfModel::new(gpu(), TsdfOptions::default()).unwrap();
     let request = scenes::request(Transform::identity());
     let check = |model: &mut TsdfModel| {
@@ -161,9 +163,9 @@ fn without_depth_there_is_nothing_and_nothing_breaks() {
         assert!(model.profile_step().unwrap().is_empty());
     };
     check(&mut model);
-    let mut bare = (*ball_on_floor(1)[0]).clone();
-    bare.depth = None;
-    model.push(Arc::new(bare)).unwrap();
+    let mut without_depth_keyframe = (*ball_on_floor(1)[0]).clone();
+    without_depth_keyframe.depth = None;
+    model.push(Arc::new(without_depth_keyframe)).unwrap();
     check(&mut model);
     let folder = tempfile::tempdir().unwrap();
     model.save(folder.path()).unwrap();
@@ -171,21 +173,21 @@ fn without_depth_there_is_nothing_and_nothing_breaks() {
 }
 
 #[test]
-fn a_camera_inside_a_wall_sees_what_lies_before_it() {
+fn back_faces_are_not_drawn() {
     let keyframes = ball_on_floor(4);
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     // Just under the floor's surface, looking up and along: the floor's back is not drawn.
-    let eye = Point3::new(AT.x, AT.y - 0.5, -0.33);
-    let picture = model.render(&scenes::request(scenes::looking(eye, eye + Vector3::new(0.0, 0.3, 1.0)))).unwrap();
+    let eye = Point3::new(BALL_CENTER.x, BALL_CENTER.y - 0.5, -0.33);
+    let picture = model.render(&scenes::request(scenes::look_at(eye, eye + Vector3::new(0.0, 0.3, 1.0)))).unwrap();
     let nearest = picture.depth_m.iter().copied().filter(|depth| *depth > 0.0).fold(f32::INFINITY, f32::min);
     assert!(nearest > 0.05, "{nearest}");
     // Looking down from inside there is nothing at all.
-    let down = scenes::looking(eye, eye - Vector3::new(0.0, 0.3, 1.0));
+    let down = scenes::look_at(eye, eye - Vector3::new(0.0, 0.3, 1.0));
     assert!(model.render(&scenes::request(down)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
 }
 
 #[test]
-fn a_wide_scene_far_from_the_origin_is_as_exact_as_a_near_one() {
+fn precision_does_not_depend_on_distance_from_origin() {
     let origin = Vector3::new(4.1e5, -2.3e5, 80.0);
     let mut keyframes = Vec::new();
     let mut balls = Vec::new();
@@ -197,23 +199,23 @@ fn a_wide_scene_far_from_the_origin_is_as_exact_as_a_near_one() {
             keyframes.push(keyframe);
         }
     }
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     assert_eq!(model.n_outside(), 0);
     let mesh = model.mesh().unwrap();
     let far = Vector3::from(mesh.origin_m);
     let mut n = [0; 5];
-    for place in &mesh.positions_m {
-        let place = Point3::from(Vector3::from(place.map(f64::from)) + far);
+    for position in &mesh.positions_m {
+        let position = Point3::from(Vector3::from(position.map(f64::from)) + far);
         let (ix, at) = balls
             .iter()
             .enumerate()
-            .min_by(|(_, a), (_, b)| (place - **a).norm().total_cmp(&(place - **b).norm()))
+            .min_by(|(_, a), (_, b)| (position - **a).norm().total_cmp(&(position - **b).norm()))
             .unwrap();
         n[ix] += 1;
         assert!(
-            scenes::ball(*at).distance_m(&place).abs() < 0.015,
+            scenes::ball(*at).distance_m(&position).abs() < 0.015,
             "ball {ix}: {}",
-            scenes::ball(*at).distance_m(&place)
+            scenes::ball(*at).distance_m(&position)
         );
     }
     assert!(n.iter().all(|n| *n > 300), "{n:?}");
@@ -225,11 +227,11 @@ fn a_wide_scene_far_from_the_origin_is_as_exact_as_a_near_one() {
 }
 
 #[test]
-fn the_same_keyframes_give_the_same_bits_however_they_come() {
+fn fusion_is_deterministic() {
     let keyframes = ball_on_floor(7);
-    let mut whole = fused(scenes::options(), &keyframes);
-    let mut again = fused(scenes::options(), &keyframes);
-    let mut one_by_one = started(scenes::options(), &keyframes);
+    let mut whole = fused_model(scenes::options(), &keyframes);
+    let mut again = fused_model(scenes::options(), &keyframes);
+    let mut one_by_one = model_with(scenes::options(), &keyframes);
     while one_by_one.progress().step < 7 {
         one_by_one.step(1).unwrap();
     }
@@ -242,33 +244,33 @@ fn the_same_keyframes_give_the_same_bits_however_they_come() {
 }
 
 #[test]
-fn looking_fuses_no_more_than_one_keyframe() {
+fn rendering_fuses_at_most_one_keyframe() {
     // So fine that the first frame finds no room at first.
-    let mut model = started(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
+    let mut model = model_with(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
     model.step(2).unwrap();
     model.render(&scenes::request(view_of(&ball_on_floor(1)[0]))).unwrap();
     assert!((1..=2).contains(&model.progress().step), "{:?}", model.progress());
 }
 
 #[test]
-fn no_more_keyframes_are_fused_than_were_asked_for() {
-    for n_wanted in [1, 5, 7, 9] {
-        let mut model = started(scenes::options(), &ball_on_floor(14));
-        while model.progress().step < n_wanted {
-            model.step(n_wanted - model.progress().step).unwrap();
+fn step_fuses_exactly_the_requested_keyframes() {
+    for n_requested in [1, 5, 7, 9] {
+        let mut model = model_with(scenes::options(), &ball_on_floor(14));
+        while model.progress().step < n_requested {
+            model.step(n_requested - model.progress().step).unwrap();
         }
-        assert_eq!((model.progress().step, model.n_taken().unwrap()), (n_wanted, n_wanted));
+        assert_eq!((model.progress().step, model.n_total_steps().unwrap()), (n_requested, n_requested));
     }
 }
 
 #[test]
-fn a_small_pool_grows_and_changes_nothing() {
+fn growing_pool_keeps_results() {
     // Voxels so fine that the pool and the table begin too small.
     let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };
     let keyframes = ball_on_floor(3);
-    let mut grown = fused(fine.clone(), &keyframes);
+    let mut grown = fused_model(fine.clone(), &keyframes);
     assert!(grown.progress().primitives > 4096, "{:?}", grown.progress());
-    let mut one_by_one = started(fine, &keyframes);
+    let mut one_by_one = model_with(fine, &keyframes);
     while one_by_one.progress().step < 3 {
         one_by_one.step(1).unwrap();
     }
@@ -276,59 +278,59 @@ fn a_small_pool_grows_and_changes_nothing() {
 }
 
 #[test]
-fn half_the_memory_loses_nothing() {
+fn swapping_to_host_memory_is_lossless() {
     // Two places, each seen twice in turn: only one of them finds room at a time.
     let far = Point3::new(8.0, 0.0, 0.1);
-    let shapes = [scenes::ball(AT), scenes::ball(far)];
+    let shapes = [scenes::ball(BALL_CENTER), scenes::ball(far)];
     let options = || TsdfOptions { max_depth_m: 3.0, ..scenes::options() };
     let mut keyframes = Vec::new();
-    for (from, at) in [(0, AT), (0, far), (2, AT), (2, far)] {
+    for (from, at) in [(0, BALL_CENTER), (0, far), (2, BALL_CENTER), (2, far)] {
         for keyframe in &scenes::ring(&shapes, at, 4)[from..from + 2] {
             let mut keyframe = keyframe.clone();
             Arc::make_mut(&mut keyframe).stamp = Stamp(i64::try_from(keyframes.len()).unwrap());
             keyframes.push(keyframe);
         }
     }
-    let mut plenty = fused(options(), &keyframes);
-    let n_all = plenty.progress().primitives;
-    let within = |max_bytes| {
+    let mut unlimited = fused_model(options(), &keyframes);
+    let n_all = unlimited.progress().primitives;
+    let model_with_budget = |max_bytes| {
         let options = TsdfOptions { max_bytes: Some(max_bytes), ..options() };
-        let mut model = TsdfModel::within_any_budget(gpu(), options).unwrap();
+        let mut model = TsdfModel::without_budget_check(gpu(), options).unwrap();
         keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
         fuse_all(&mut model);
         model
     };
-    let table_bytes = plenty.progress().bytes - super::buffers::BYTES_PER_BLOCK * n_all;
-    let mut scarce = within(table_bytes + super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
-    assert_eq!(scarce.n_refused(), 0);
-    assert!(scarce.n_waiting() > 0);
-    assert!(scarce.blocks().unwrap() == plenty.blocks().unwrap());
+    let table_bytes = unlimited.progress().bytes - super::buffers::BYTES_PER_BLOCK * n_all;
+    let mut limited = model_with_budget(table_bytes + super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
+    assert_eq!(limited.n_skipped(), 0);
+    assert!(limited.n_host_blocks() > 0);
+    assert!(limited.blocks().unwrap() == unlimited.blocks().unwrap());
     for keyframe in [&keyframes[0], &keyframes[2], &keyframes[5]] {
         let request = RenderRequest { far_m: 3.0, ..scenes::request(view_of(keyframe)) };
-        assert!(same(&scarce.render(&request).unwrap(), &plenty.render(&request).unwrap()));
+        assert!(same(&limited.render(&request).unwrap(), &unlimited.render(&request).unwrap()));
     }
-    assert!(scarce.mesh().unwrap() == plenty.mesh().unwrap());
+    assert!(limited.mesh().unwrap() == unlimited.mesh().unwrap());
     // Less than one image needs: it is left out, and said so.
-    let mut tiny = within(20_000);
-    assert_eq!((tiny.n_refused(), tiny.progress().step), (8, 8));
-    assert!(tiny.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
+    let mut too_small = model_with_budget(20_000);
+    assert_eq!((too_small.n_skipped(), too_small.progress().step), (8, 8));
+    assert!(too_small.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
 }
 
 #[test]
-fn a_budget_holds_all_that_is_told_or_is_refused_with_the_least() {
-    let least = super::model::LEAST_BYTES;
+fn memory_budget_is_kept_or_refused() {
+    let min_bytes = super::model::MIN_BYTES;
     let of = |max_bytes| TsdfOptions { max_bytes: Some(max_bytes), ..TsdfOptions::default() };
-    let told = TsdfModel::new(gpu(), of(least - 1)).unwrap_err().to_string();
-    assert!(told.contains(&least.to_string()) && told.contains("distance field"), "{told}");
-    let small = fused(of(least), &ball_on_floor(4));
-    assert_eq!(small.n_refused(), 0);
-    assert!((least / 2..=least).contains(&small.progress().bytes), "{:?}", small.progress());
+    let message = TsdfModel::new(gpu(), of(min_bytes - 1)).unwrap_err().to_string();
+    assert!(message.contains(&min_bytes.to_string()) && message.contains("distance field"), "{message}");
+    let small = fused_model(of(min_bytes), &ball_on_floor(4));
+    assert_eq!(small.n_skipped(), 0);
+    assert!((min_bytes / 2..=min_bytes).contains(&small.progress().bytes), "{:?}", small.progress());
 }
 
 #[test]
-fn a_saved_model_draws_the_same_bits() {
+fn saved_model_renders_identically() {
     let keyframes = ball_on_floor(4);
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     let folder = tempfile::tempdir().unwrap();
     assert!(!TsdfModel::is_saved_in(folder.path()));
     model.save(folder.path()).unwrap();
@@ -350,38 +352,38 @@ fn a_saved_model_draws_the_same_bits() {
     assert!(matches!(TsdfModel::load(gpu(), folder.path()), Err(Error::Checkpoint { .. })));
 }
 
-fn taken(model: &mut TsdfModel) -> Checkpoint {
+fn checkpoint_of(model: &mut TsdfModel) -> Checkpoint {
     model.checkpoint().unwrap().finish().unwrap()
 }
 
 #[test]
-fn stopping_and_going_on_changes_no_bit() {
+fn resume_is_bit_exact() {
     let keyframes = ball_on_floor(6);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("training.ckpt");
-    let mut whole = fused(scenes::options(), &keyframes);
-    let mut parts = started(scenes::options(), &keyframes[..5]);
+    let mut whole = fused_model(scenes::options(), &keyframes);
+    let mut parts = model_with(scenes::options(), &keyframes[..5]);
     for stop in [0, 2, 5] {
         while parts.progress().step < stop {
-            let left = stop - parts.progress().step;
-            parts.step(left).unwrap();
+            let n_left = stop - parts.progress().step;
+            parts.step(n_left).unwrap();
         }
-        let before = taken(&mut parts);
+        let before = checkpoint_of(&mut parts);
         before.write(&path).unwrap();
         let rest;
         (parts, rest) = TsdfModel::resume(gpu(), &Checkpoint::read(&path).unwrap(), &keyframes).unwrap();
         assert_eq!(rest.len(), 1);
         assert_eq!(rest[0].stamp, keyframes[5].stamp);
-        assert!(taken(&mut parts) == before);
+        assert!(checkpoint_of(&mut parts) == before);
     }
     parts.push(keyframes[5].clone()).unwrap();
     fuse_all(&mut parts);
-    assert!(taken(&mut parts) == taken(&mut whole));
+    assert!(checkpoint_of(&mut parts) == checkpoint_of(&mut whole));
     assert!(parts.mesh().unwrap() == whole.mesh().unwrap());
     let refused = |checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]| {
         TsdfModel::resume(gpu(), checkpoint, keyframes).map(drop).unwrap_err().to_string()
     };
-    let checkpoint = taken(&mut parts);
+    let checkpoint = checkpoint_of(&mut parts);
     assert!(refused(&checkpoint, &keyframes[1..]).contains("image 0 of camera \"test\" is not there"));
     let broken = |change: &dyn Fn(&mut Checkpoint)| {
         let mut other = checkpoint.clone();
@@ -390,19 +392,19 @@ fn stopping_and_going_on_changes_no_bit() {
     };
     assert!(broken(&|other| other.method = "splat".into()).contains("\"splat\""));
     assert!(broken(&|other| other.state["n_blocks"] = 1.into()).contains("\"places\" has"));
-    assert!(broken(&|other| other.state["lattice"]["voxel_m"] = (-1.0).into()).contains("no field"));
+    assert!(broken(&|other| other.state["voxel_grid"]["voxel_m"] = (-1.0).into()).contains("no field"));
     assert!(broken(&|other| other.state["future"] = 1.into()).contains("unknown field"));
 }
 
 #[test]
-fn crops_and_ranges_cut_the_picture() {
+fn crop_and_depth_range_limit_the_picture() {
     let keyframes = ball_on_floor(4);
-    let mut model = fused(scenes::options(), &keyframes);
+    let mut model = fused_model(scenes::options(), &keyframes);
     let mut request = scenes::request(view_of(&keyframes[0]));
     let whole = model.render(&request).unwrap();
     let corner: Vector3<f64> = Vector3::repeat(0.31);
     request.crop = Some(Aabb {
-        world_from_box: Transform::translation(AT.x, AT.y, AT.z + 0.1),
+        world_from_box: Transform::translation(BALL_CENTER.x, BALL_CENTER.y, BALL_CENTER.z + 0.1),
         min_m: (-corner).into(),
         max_m: corner.into(),
     });
@@ -425,29 +427,29 @@ fn crops_and_ranges_cut_the_picture() {
 }
 
 #[test]
-fn what_was_not_fused_can_be_removed_and_bad_arrays_are_refused() {
+fn unfused_keyframes_are_removable_and_bad_sizes_rejected() {
     let keyframes = ball_on_floor(2);
-    let mut model = started(scenes::options(), &keyframes);
+    let mut model = model_with(scenes::options(), &keyframes);
     model.remove("test", keyframes[1].stamp).unwrap();
     fuse_all(&mut model);
     assert_eq!(model.progress().step, 1);
-    assert!(model.blocks().unwrap() == fused(scenes::options(), &keyframes[..1]).blocks().unwrap());
+    assert!(model.blocks().unwrap() == fused_model(scenes::options(), &keyframes[..1]).blocks().unwrap());
     let mut short = (*keyframes[0]).clone();
     short.depth.as_mut().unwrap().depth_m = vec![1.0; 3].into();
-    assert!(matches!(model.push(Arc::new(short)), Err(Error::DepthSize { rendered: 3, .. })));
+    assert!(matches!(model.push(Arc::new(short)), Err(Error::DepthSizeMismatch { rendered: 3, .. })));
     let mut short = (*keyframes[0]).clone();
     short.rgba_srgb = vec![0; 3].into();
     assert!(matches!(model.push(Arc::new(short)), Err(Error::PictureBytes { .. })));
 }
 
 #[test]
-fn voxels_follow_the_pixels_and_the_noise() {
-    let wall = Shape::Plane { normal: Vector3::z(), offset_m: 0.0 };
-    let exact = scenes::keyframe(0, &[wall], scenes::looking(Point3::new(0.0, 0.0, 2.0), Point3::origin()));
+fn voxel_size_follows_pixel_size_and_noise() {
+    let wall = TestShape::Plane { normal: Vector3::z(), offset_m: 0.0 };
+    let exact = scenes::keyframe(0, &[wall], scenes::look_at(Point3::new(0.0, 0.0, 2.0), Point3::origin()));
     let depth = exact.depth.clone().unwrap();
-    let chosen = super::Lattice::choose(&TsdfOptions::default(), &depth).unwrap();
-    assert!((chosen.voxel_m - 2.0 / 89.0).abs() < 1e-3, "{chosen:?}");
-    assert!(chosen.noise_per_m2 < 1e-6);
+    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), &depth).unwrap();
+    assert!((chosen_grid.voxel_m - 2.0 / 89.0).abs() < 1e-3, "{chosen_grid:?}");
+    assert!(chosen_grid.noise_per_m2 < 1e-6);
     let mut noisy = depth.clone();
     let mut state = 1_u64;
     let mut uniform = || {
@@ -458,45 +460,46 @@ fn voxels_follow_the_pixels_and_the_noise() {
         noisy.depth_m.iter().map(|z| z + 0.08 * (0..4).map(|_| uniform()).sum::<f32>()).collect::<Vec<_>>().into();
     // The sum of four uniform numbers has a deviation of 1 / sqrt(3).
     let expected = 0.08 / 3.0f64.sqrt() / 4.0;
-    let chosen = super::Lattice::choose(&TsdfOptions::default(), &noisy).unwrap();
-    assert!((chosen.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen:?}, expected {expected}");
+    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), &noisy).unwrap();
+    assert!((chosen_grid.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen_grid:?}, expected {expected}");
     assert!(
-        (chosen.voxel_m / (4.0 * expected) - 1.0).abs() < 0.1 && chosen.truncation_m >= 4.0 * chosen.voxel_m - 1e-9,
-        "{chosen:?}"
+        (chosen_grid.voxel_m / (4.0 * expected) - 1.0).abs() < 0.1
+            && chosen_grid.truncation_m >= 4.0 * chosen_grid.voxel_m - 1e-9,
+        "{chosen_grid:?}"
     );
     assert_eq!(depth.depth_m.len(), (SIZE_PX[0] * SIZE_PX[1]) as usize);
 }
 
-/// What a frame of 640x480 costs: `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`.
+/// What a frame of 640x480 costs: `cargo test --release -p trainer --lib measure_640x480_keyframe -- --ignored --nocapture`.
 #[test]
 #[ignore = "a measurement"]
-fn frame_of_640x480() {
+fn measure_640x480_keyframe() {
     let shapes = [
-        Shape::Sphere { center_m: Point3::new(0.0, 0.0, 0.3), radius_m: 0.3 },
-        Shape::Plane { normal: Vector3::z(), offset_m: 0.0 },
-        Shape::Plane { normal: Vector3::new(0.0, -1.0, 0.0), offset_m: -1.5 },
+        TestShape::Sphere { center_m: Point3::new(0.0, 0.0, 0.3), radius_m: 0.3 },
+        TestShape::Plane { normal: Vector3::z(), offset_m: 0.0 },
+        TestShape::Plane { normal: Vector3::new(0.0, -1.0, 0.0), offset_m: -1.5 },
     ];
     let options = || TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
     let gpu = gpu();
     eprintln!("{}", gpu.describe());
     let mut model = TsdfModel::new(gpu, options()).unwrap();
-    let frame = |ix: i64| {
+    let keyframe_at = |ix: i64| {
         let turn = 0.02 * ix as f64 - 1.57;
         let eye = Point3::new(1.6 * turn.cos(), 1.6 * turn.sin(), 0.9);
-        Arc::new(scenes::large_keyframe(ix, &shapes, scenes::looking(eye, Point3::new(0.0, 0.3, 0.3))))
+        Arc::new(scenes::large_keyframe(ix, &shapes, scenes::look_at(eye, Point3::new(0.0, 0.3, 0.3))))
     };
     for ix in 0..8 {
-        model.push(frame(ix)).unwrap();
+        model.push(keyframe_at(ix)).unwrap();
     }
     fuse_all(&mut model);
     for ix in 8..12 {
-        model.push(frame(ix)).unwrap();
+        model.push(keyframe_at(ix)).unwrap();
         let timings = model.profile_step().unwrap();
         let sum: f64 = timings.iter().map(|timing| timing.millis).sum();
         eprintln!("{:?} {sum:.2} ms", timings.iter().map(|timing| (timing.name, timing.millis)).collect::<Vec<_>>());
     }
     eprintln!("{:?}", model.progress());
-    let request = scenes::request(scenes::looking(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)));
+    let request = scenes::request(scenes::look_at(Point3::new(0.1, -1.6, 0.9), Point3::new(0.0, 0.3, 0.3)));
     let focal_px = [525.0; 2];
     let projection = Projection::Pinhole { focal_px, principal_px: [320.0, 240.0] };
     let request = RenderRequest { size_px: [640, 480], projection, ..request };
@@ -507,7 +510,7 @@ fn frame_of_640x480() {
     let mesh = model.mesh().unwrap();
     eprintln!("mesh: {} triangles, {:.1} ms of wall time", mesh.triangles.len(), begin.elapsed().as_secs_f64() * 1e3);
     for ix in 12..16 {
-        model.push(frame(ix)).unwrap();
+        model.push(keyframe_at(ix)).unwrap();
         fuse_all(&mut model);
         let timings = model.profile_mesh().unwrap();
         let sum: f64 = timings.iter().map(|timing| timing.millis).sum();

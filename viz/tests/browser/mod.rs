@@ -9,7 +9,7 @@ use std::time::Duration;
 use tungstenite::{Message, WebSocket};
 
 /// Far more than a browser needs on two busy cores.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A running browser with one page.
 pub(crate) struct Browser {
@@ -52,7 +52,7 @@ impl Browser {
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
         let host = address.trim_start_matches("ws://").split('/').next().expect("a host");
         let stream = TcpStream::connect(host).expect("chromium listens");
-        stream.set_read_timeout(Some(PATIENCE)).expect("a timeout");
+        stream.set_read_timeout(Some(TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(&address, stream).expect("a WebSocket");
         let mut browser = Self { process, socket, session: String::new(), n_calls: 0 };
         let target = browser.call("Target.createTarget", json!({"url": "about:blank"}));

@@ -24,22 +24,22 @@ pub(crate) enum Received {
 impl Client {
     pub(crate) fn connect(address: SocketAddr) -> Self {
         let stream = TcpStream::connect(address).expect("the server listens");
-        stream.set_read_timeout(Some(super::PATIENCE)).expect("a timeout");
+        stream.set_read_timeout(Some(super::TIMEOUT)).expect("a timeout");
         let (socket, _) = tungstenite::client(format!("ws://{address}/ws"), stream).expect("a WebSocket");
         Self { socket }
     }
 
-    pub(crate) fn say(&mut self, message: &Value) {
-        self.say_raw(Message::text(message.to_string()));
+    pub(crate) fn send_json(&mut self, message: &Value) {
+        self.send_raw(Message::text(message.to_string()));
     }
 
-    pub(crate) fn say_raw(&mut self, message: Message) {
+    pub(crate) fn send_raw(&mut self, message: Message) {
         self.socket.send(message).expect("sent");
     }
 
     /// Waits until the server has read all that was said so far.
     pub(crate) fn settle(&mut self) {
-        self.say_raw(Message::text("settle?"));
+        self.send_raw(Message::text("settle?"));
         self.text_of("error");
     }
 
@@ -66,7 +66,7 @@ impl Client {
 
     /// The next text message of a type.
     pub(crate) fn text_of(&mut self, kind: &str) -> Value {
-        self.until(|received| match received {
+        self.receive_until(|received| match received {
             Received::Text(value) if value["type"] == kind => Some(value),
             Received::End => panic!("the connection ended before a {kind:?} came"),
             _ => None,
@@ -75,7 +75,7 @@ impl Client {
 
     /// The next binary message of a type.
     pub(crate) fn binary_of(&mut self, kind: &str) -> (Value, Vec<u8>) {
-        self.until(|received| match received {
+        self.receive_until(|received| match received {
             Received::Binary(header, payload) if header["type"] == kind => Some((header, payload)),
             Received::Text(value) if value["type"] == "error" => panic!("{value}"),
             Received::End => panic!("the connection ended before a {kind:?} came"),
@@ -83,10 +83,10 @@ impl Client {
         })
     }
 
-    fn until<T>(&mut self, mut wanted: impl FnMut(Received) -> Option<T>) -> T {
-        let deadline = Instant::now() + super::PATIENCE + Duration::from_secs(1);
+    fn receive_until<T>(&mut self, mut matcher: impl FnMut(Received) -> Option<T>) -> T {
+        let deadline = Instant::now() + super::TIMEOUT + Duration::from_secs(1);
         while Instant::now() < deadline {
-            if let Some(found) = wanted(self.receive()) {
+            if let Some(found) = matcher(self.receive()) {
                 return found;
             }
         }

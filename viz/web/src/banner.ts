@@ -3,12 +3,12 @@
 import { timeText } from "./chart";
 import type { ConnectionState } from "./connection";
 import { element } from "./element";
-import type { Ended } from "./protocol";
+import type { RunResult } from "./protocol";
 
 export class Banner {
   private connection: ConnectionState = "connecting";
   private connectionText = "";
-  private ended: Ended | null = null;
+  private ended: RunResult | null = null;
 
   setConnection(state: ConnectionState, text: string): void {
     this.connection = state;
@@ -21,7 +21,7 @@ export class Banner {
     return this.ended !== null;
   }
 
-  setEnded(ended: Ended | null): void {
+  setRunResult(ended: RunResult | null): void {
     this.ended = ended;
     this.show();
   }
@@ -30,7 +30,7 @@ export class Banner {
     const isBroken = this.connection === "silent" || this.connection === "lost";
     // Once a run has ended, a stopped server is expected.
     const { ended, isFinished } = this;
-    const text = ended ? endedText(ended) : isBroken ? capitalized(this.connectionText) : "";
+    const text = ended ? runResultText(ended) : isBroken ? capitalized(this.connectionText) : "";
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
     banner.dataset.kind = isFinished ? "finished" : this.connection;
@@ -38,7 +38,7 @@ export class Banner {
   }
 }
 
-function endedText(ended: Ended): string {
+function runResultText(ended: RunResult): string {
   const saved = ended.folder === null ? "no model was saved" : `model saved in ${ended.folder}`;
   const scores = ended.scores === "" ? "" : `, ${ended.scores}`;
   return `Finished after ${timeText(ended.seconds)}: ${saved}${scores}`;

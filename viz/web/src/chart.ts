@@ -68,8 +68,8 @@ export class Chart {
     context.lineWidth = 1.75;
     context.lineJoin = "round";
     line(context, path);
-    const marked = this.nearest(x) ?? this.points.length - 1;
-    this.mark(context, path[marked]!, this.points[marked]!, color);
+    const selected = this.nearest(x) ?? this.points.length - 1;
+    this.mark(context, path[selected]!, this.points[selected]!, color);
   }
 
   /** Index of the point under the pointer. */
@@ -116,8 +116,8 @@ function line(context: CanvasRenderingContext2D, points: readonly (readonly [num
 function spanOf(values: number[]): [number, number] {
   const min = Math.min(...values);
   const max = Math.max(...values);
-  const air = Math.max(0.06 * (max - min), (MIN_SPAN_DB - (max - min)) / 2, 0.1);
-  return [min - air, max + air];
+  const padding = Math.max(0.06 * (max - min), (MIN_SPAN_DB - (max - min)) / 2, 0.1);
+  return [min - padding, max + padding];
 }
 
 /** Round numbers between two values, about `n` of them. */

@@ -31,7 +31,7 @@ export class Connection {
   private socket: WebSocket | null = null;
   private goodbye = "";
   private state: ConnectionState = "connecting";
-  private heardAt = performance.now();
+  private receivedAt = performance.now();
   private pingedAt = -Infinity;
   private checkedAt = performance.now();
   private lostAt = 0;
@@ -65,15 +65,15 @@ export class Connection {
       if (socket === this.socket) this.receive(event.data as string | ArrayBuffer);
     };
     socket.onclose = () => {
-      if (socket === this.socket) this.lose();
+      if (socket === this.socket) this.disconnect();
     };
     this.socket = socket;
-    this.heardAt = performance.now();
+    this.receivedAt = performance.now();
     this.clock.forget();
   }
 
   /** Abandons the socket; a new one is opened after a pause. */
-  private lose(): void {
+  private disconnect(): void {
     const socket = this.socket;
     this.socket = null;
     socket?.close();
@@ -95,10 +95,10 @@ export class Connection {
       else this.report();
       return;
     }
-    const silence = now - this.heardAt;
+    const silence = now - this.receivedAt;
     const isTrying = this.state === "lost" || this.state === "connecting";
     if (silence > (isTrying ? ATTEMPT_MILLIS : GIVE_UP_MILLIS)) {
-      this.lose();
+      this.disconnect();
     } else if (this.state === "lost") {
       this.report();
     } else if (silence > SILENT_MILLIS) {
@@ -117,7 +117,7 @@ export class Connection {
     const seconds = (since: number): string => `${Math.max(1, Math.round((performance.now() - since) / 1000))} s`;
     switch (this.state) {
       case "silent":
-        this.events.state("silent", `no data from the server for ${seconds(this.heardAt)}`);
+        this.events.state("silent", `no data from the server for ${seconds(this.receivedAt)}`);
         break;
       case "lost": {
         const why = this.goodbye || "connection lost";
@@ -130,7 +130,7 @@ export class Connection {
   }
 
   private receive(data: string | ArrayBuffer): void {
-    this.heardAt = performance.now();
+    this.receivedAt = performance.now();
     if (this.state === "silent") {
       this.state = "open";
       this.report();
@@ -146,7 +146,7 @@ export class Connection {
         this.goodbye = "";
         if (message.protocol !== PROTOCOL_VERSION) {
           this.goodbye = "this page and the server have different versions, reload the page";
-          this.lose();
+          this.disconnect();
           return;
         }
         this.nRetries = 0;
@@ -154,10 +154,10 @@ export class Connection {
         this.report();
         break;
       case "heartbeat":
-        this.clock.heard(message.clock_millis);
+        this.clock.observeMessage(message.clock_millis);
         break;
       case "pong":
-        this.clock.answered(message.t, message.clock_millis);
+        this.clock.observePong(message.t, message.clock_millis);
         break;
       case "goodbye":
         this.goodbye = message.reason;

@@ -8,7 +8,7 @@ import { ModelSwitch } from "./model_switch";
 import { BACKGROUND, OrbitView } from "./orbit_view";
 import type { BinaryHeader, LiveImageHeader, PictureHeader, Status, TextMessage } from "./protocol";
 import { Readouts } from "./readouts";
-import { RenderAsker } from "./render_asker";
+import { RenderScheduler } from "./render_scheduler";
 
 let stages = [0.1, 0.5, 1];
 let latestStatus: Status | null = null;
@@ -17,7 +17,7 @@ let liveCamera: LiveImageHeader | null = null;
 
 const readouts = new Readouts();
 const banner = new Banner();
-const view = new OrbitView(element("canvas", HTMLCanvasElement), () => asker.moved());
+const view = new OrbitView(element("canvas", HTMLCanvasElement), () => scheduler.moved());
 const connection = new Connection(`ws://${location.host}/ws`, {
   state(state, text) {
     const shown = element("connection");
@@ -32,7 +32,7 @@ const connection = new Connection(`ws://${location.host}/ws`, {
     if (state === "open" && !wasOpen) {
       view.picture.forget();
       liveImages.forget();
-      asker.restart();
+      scheduler.restart();
     }
     if (shown.dataset.state !== before) view.changed();
   },
@@ -41,10 +41,10 @@ const connection = new Connection(`ws://${location.host}/ws`, {
 });
 const liveImages = new LiveImages(() => connection.clock);
 const models = new ModelSwitch(() => {
-  asker.restart();
+  scheduler.restart();
   if (latestStatus) showStatus(latestStatus);
 });
-const asker = new RenderAsker(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
+const scheduler = new RenderScheduler(connection, () => view.view(), () => stages, BACKGROUND, () => models.method);
 
 function receiveText(message: TextMessage): void {
   switch (message.type) {
@@ -55,7 +55,7 @@ function receiveText(message: TextMessage): void {
       latestStatus = message;
       models.list(message);
       showStatus(message);
-      banner.setEnded(message.ended);
+      banner.setRunResult(message.ended);
       break;
     case "scene":
       view.setScene(message);
@@ -65,7 +65,7 @@ function receiveText(message: TextMessage): void {
       view.changed();
       break;
     case "error":
-      asker.failed(message.id);
+      scheduler.failed(message.id);
       element("notice").textContent = message.message;
       break;
     case "heartbeat":
@@ -78,7 +78,7 @@ function receiveText(message: TextMessage): void {
 function showStatus(status: Status): void {
   const model = models.shown(status);
   readouts.show(status, model);
-  if (model.step !== latestStep) asker.learned();
+  if (model.step !== latestStep) scheduler.modelChanged();
   latestStep = model.step;
 }
 
@@ -97,7 +97,7 @@ function receiveBinary(header: BinaryHeader, payload: Uint8Array<ArrayBuffer>): 
 }
 
 async function showPicture(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): Promise<void> {
-  const millis = asker.answered(header);
+  const millis = scheduler.answered(header);
   if (!(await view.picture.show(header, payload, view.emptyDepth))) return;
   view.changed();
   element("notice").textContent = "";
@@ -138,7 +138,7 @@ toggle("toggle-keyframes", "k", (isOn) => (view.overlays.showsKeyframes = isOn))
 toggle("toggle-occlude", "o", (isOn) => (view.picture.occludes = isOn));
 
 function frame(): void {
-  asker.tick();
+  scheduler.tick();
   view.draw();
   requestAnimationFrame(frame);
 }

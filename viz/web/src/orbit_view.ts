@@ -6,7 +6,7 @@ import { pinholeOfThreeCamera, poseOfThreeCamera, worldFromCamera } from "./conv
 import { Overlays } from "./overlays";
 import { PictureLayer } from "./picture_layer";
 import type { Scene } from "./protocol";
-import type { View } from "./render_asker";
+import type { View } from "./render_scheduler";
 
 const VERTICAL_FOV_DEGREES = 50;
 /** Larger windows are drawn at this width and stretched. */
@@ -22,7 +22,7 @@ export class OrbitView {
   private readonly renderer: THREE.WebGLRenderer;
   private readonly controls: OrbitControls;
   private scene: Scene | null = null;
-  private isSteered = false;
+  private hasUserMoved = false;
   private isStale = true;
 
   constructor(private readonly canvas: HTMLCanvasElement, onMove: () => void) {
@@ -39,7 +39,7 @@ export class OrbitView {
       this.isStale = true;
       onMove();
     });
-    this.controls.addEventListener("start", () => (this.isSteered = true));
+    this.controls.addEventListener("start", () => (this.hasUserMoved = true));
     this.world.add(this.picture.mesh, this.overlays.root);
     new ResizeObserver(() => {
       this.fit();
@@ -60,7 +60,7 @@ export class OrbitView {
     this.camera.updateProjectionMatrix();
     this.controls.minDistance = 2 * this.camera.near;
     this.controls.maxDistance = 12 * scene.radius_m;
-    if (!this.isSteered) this.reset();
+    if (!this.hasUserMoved) this.reset();
   }
 
   /** Back to the scene's first view. */

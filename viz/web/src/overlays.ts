@@ -60,14 +60,14 @@ export class Overlays {
   /** Draws a camera at its current pose; returns whether the pose changed. */
   setLiveCamera(camera: PosedCamera): boolean {
     let drawn = this.live.get(camera.camera);
-    const place = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
-    if (drawn?.name === place) return false;
+    const poseKey = [...camera.world_from_camera, ...camera.focal_px, this.frustumDepth].join();
+    if (drawn?.name === poseKey) return false;
     if (!drawn) {
       drawn = lines(LIVE_COLOR, 1);
       this.live.set(camera.camera, drawn);
       this.cameras.add(drawn);
     }
-    drawn.name = place;
+    drawn.name = poseKey;
     setLines(drawn, frustum(camera, 1.6 * this.frustumDepth));
     return true;
   }

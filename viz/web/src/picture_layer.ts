@@ -131,7 +131,7 @@ function unpackDepth(header: PictureHeader, payload: Uint8Array<ArrayBuffer>): T
   // The parts are packed without padding; a copy gives them the alignment that typed arrays need.
   const bytes = payload.slice(part.offset, part.offset + part.bytes).buffer;
   const counts = part.format === "f32" ? new Float32Array(bytes) : new Uint16Array(bytes);
-  const depth = Float32Array.from(counts, (count) => count * part.metres_per_count);
+  const depth = Float32Array.from(counts, (count) => count * part.meters_per_count);
   return depthTexture(depth, part.size_px[0], part.size_px[1]);
 }
 

@@ -1,7 +1,7 @@
 // The messages of docs/reference/protocol.md, version 2.
 
 /** Version this page was written for. */
-export const PROTOCOL_VERSION = 2;
+export const PROTOCOL_VERSION = 3;
 
 export interface Pinhole {
   kind: "pinhole";
@@ -39,11 +39,11 @@ export interface Status extends ModelStatus {
   refused: Record<string, number>;
   others: ModelStatus[];
   notes: string[];
-  ended: Ended | null;
+  ended: RunResult | null;
 }
 
 /** Result of a run that has ended. */
-export interface Ended {
+export interface RunResult {
   folder: string | null;
   scores: string;
   seconds: number;
@@ -112,7 +112,7 @@ export interface PictureHeader {
   depth: {
     format: "u16_half" | "f32";
     size_px: [number, number];
-    metres_per_count: number;
+    meters_per_count: number;
     offset: number;
     bytes: number;
   } | null;

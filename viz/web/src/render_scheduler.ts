@@ -23,11 +23,11 @@ const REFRESH_SHARE = 0.25;
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
 /** An answer that does not come within this time is not waited for, while moving and at rest. */
-const PATIENCE_MILLIS = { moving: 3000, resting: 30_000 };
+const TIMEOUT_MILLIS = { moving: 3000, resting: 30_000 };
 
-export class RenderAsker {
+export class RenderScheduler {
   private id = 0;
-  private askedAt = 0;
+  private requestedAt = 0;
   private finishedAt = 0;
   private lastMillis = 0;
   private movedAt = -Infinity;
@@ -35,8 +35,8 @@ export class RenderAsker {
   /** Scale of the newest picture of the moving view; what comes after it is not coarser. */
   private movingScale = 0;
   private isWaiting = false;
-  private isRested = false;
-  private hasNews = false;
+  private isResting = false;
+  private hasUpdate = false;
 
   constructor(
     private readonly connection: Connection,
@@ -50,29 +50,29 @@ export class RenderAsker {
   moved(): void {
     this.movedAt = performance.now();
     // A full picture of the old view is not waited for: the next request replaces it.
-    if (this.isRested) this.isWaiting = false;
-    this.isRested = false;
+    if (this.isResting) this.isWaiting = false;
+    this.isResting = false;
   }
 
   /** The model has changed. */
-  learned(): void {
-    this.hasNews = true;
+  modelChanged(): void {
+    this.hasUpdate = true;
   }
 
   /** Nothing asked before will be answered. */
   restart(): void {
     this.isWaiting = false;
-    this.isRested = false;
+    this.isResting = false;
   }
 
   /** A picture came; says how long after it was asked for, milliseconds. */
   answered(header: PictureHeader): number {
-    const millis = performance.now() - this.askedAt;
+    const millis = performance.now() - this.requestedAt;
     if (header.id !== this.id || !header.last) return millis;
     this.isWaiting = false;
     this.finishedAt = performance.now();
     this.lastMillis = millis;
-    if (!this.isRested) {
+    if (!this.isResting) {
       this.movingScale = header.scale;
       this.adapt(millis);
     }
@@ -88,26 +88,26 @@ export class RenderAsker {
   tick(): void {
     if (!this.connection.isOpen) return;
     const now = performance.now();
-    const patience = this.isRested ? PATIENCE_MILLIS.resting : PATIENCE_MILLIS.moving;
-    if (now - this.askedAt > patience) this.isWaiting = false;
-    if (!this.isRested && now - this.movedAt > REST_MILLIS) {
-      this.isRested = true;
+    const timeout = this.isResting ? TIMEOUT_MILLIS.resting : TIMEOUT_MILLIS.moving;
+    if (now - this.requestedAt > timeout) this.isWaiting = false;
+    if (!this.isResting && now - this.movedAt > REST_MILLIS) {
+      this.isResting = true;
       const finer = this.stages().filter((scale) => scale > this.movingScale);
       this.movingScale = 0;
-      this.ask(finer.length > 0 ? finer : [1]); // Replaces whatever is on its way.
-    } else if (!this.isRested && !this.isWaiting) {
-      this.ask([MOVING_SCALES[this.movingIx]!]);
-    } else if (this.isRested && !this.isWaiting && this.hasNews) {
+      this.request(finer.length > 0 ? finer : [1]); // Replaces whatever is on its way.
+    } else if (!this.isResting && !this.isWaiting) {
+      this.request([MOVING_SCALES[this.movingIx]!]);
+    } else if (this.isResting && !this.isWaiting && this.hasUpdate) {
       const pause = Math.max(REFRESH_MILLIS, this.lastMillis * (1 / REFRESH_SHARE - 1));
-      if (now - this.finishedAt > pause) this.ask([1]);
+      if (now - this.finishedAt > pause) this.request([1]);
     }
   }
 
-  private ask(stages: number[]): void {
+  private request(stages: number[]): void {
     this.id += 1;
-    this.askedAt = performance.now();
+    this.requestedAt = performance.now();
     this.isWaiting = true;
-    this.hasNews = false;
+    this.hasUpdate = false;
     const message: RenderMessage = {
       type: "render",
       id: this.id,

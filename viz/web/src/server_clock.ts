@@ -1,21 +1,21 @@
 // Estimates the server's clock. The estimate errs so that no age is understated.
 
 /** Samples are used for this long, because clocks drift apart. */
-const SAMPLE_LIFE_MILLIS = 30_000;
+const MAX_SAMPLE_AGE_MILLIS = 30_000;
 
 export class ServerClock {
   /** When each ping was sent, and by how much the server's clock was ahead of that time when the server answered. */
   private samples: { sentAt: number; ahead: number }[] = [];
 
   /** Adds the answer to a ping. The server read its clock after the ping was sent, so it is ahead by at most this much. */
-  answered(sentAt: number, clockMillis: number): void {
-    const oldest = performance.now() - SAMPLE_LIFE_MILLIS;
+  observePong(sentAt: number, clockMillis: number): void {
+    const oldest = performance.now() - MAX_SAMPLE_AGE_MILLIS;
     this.samples = this.samples.filter((sample) => sample.sentAt > oldest);
     this.samples.push({ sentAt, ahead: clockMillis - sentAt });
   }
 
   /** Checks samples against the time in any message. The server read its clock before now, so it is ahead by at least this much. */
-  heard(clockMillis: number): void {
+  observeMessage(clockMillis: number): void {
     const ahead = clockMillis - performance.now();
     // Smaller samples were taken before one of the computers was suspended.
     this.samples = this.samples.filter((sample) => sample.ahead >= ahead);

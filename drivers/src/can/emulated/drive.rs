@@ -1,15 +1,15 @@
 //! A CiA 402 drive with a cyclic synchronous position mode.
 
-use super::shaft::Work;
-use super::{Played, State};
+use super::shaft::Actuation;
+use super::{EmulatedMotor, State};
 use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT, Direction, Node, NodeState, Object, Pdo};
-use crate::wire::can::cia402::{self, Order, Units};
+use crate::wire::can::cia402::{self, StateCommand, Units};
 use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame, Id};
 use std::time::Duration;
 
 /// What [`cia402::SUPPORTED_MODES`] tells: profile position and the three cyclic modes.
-const MODES: u32 = 0b11_1000_0001;
+const SUPPORTED_MODES_MASK: u32 = 0b11_1000_0001;
 
 /// The place of an object among the settings.
 fn number(index: u16, subindex: u8) -> u32 {
@@ -17,34 +17,34 @@ fn number(index: u16, subindex: u8) -> u32 {
 }
 
 /// What a controlword orders; `None` where its bits mean nothing. Source: CiA 402-2, table of the controlword.
-fn order_of(controlword: u16, before: u16) -> Option<Order> {
+fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     if controlword & !before & 0x80 != 0 {
-        return Some(Order::ResetFault);
+        return Some(StateCommand::ResetFault);
     }
     match controlword & 0x8F {
-        word if word & 0x82 == 0 => Some(Order::DisableVoltage),
-        word if word & 0x86 == 0x02 => Some(Order::QuickStop),
-        word if word & 0x87 == 0x06 => Some(Order::Shutdown),
-        0x07 => Some(Order::SwitchOn),
-        0x0F => Some(Order::EnableOperation),
+        word if word & 0x82 == 0 => Some(StateCommand::DisableVoltage),
+        word if word & 0x86 == 0x02 => Some(StateCommand::QuickStop),
+        word if word & 0x87 == 0x06 => Some(StateCommand::Shutdown),
+        0x07 => Some(StateCommand::SwitchOn),
+        0x0F => Some(StateCommand::EnableOperation),
         _ => None,
     }
 }
 
-impl Played {
+impl EmulatedMotor {
     fn object(&self, object: Object) -> Option<u32> {
         self.setting(number(object.index, object.subindex))
     }
 
-    pub(super) fn take_as_drive(&mut self, frame: &Frame, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
+    pub(super) fn handle_drive(&mut self, frame: &Frame, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
         if frame.is_remote() || frame.id().is_extended() {
             return Ok(Vec::new());
         }
         let sdo = 0x600 + u32::from(node.number());
-        let watched = self.object(CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
+        let watched_node = self.object(CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
         match (frame.id().value(), frame.data()) {
-            (0, &[order, to]) if to == 0 || to == node.number() => {
-                self.node_state = match order {
+            (0, &[state_command, to]) if to == 0 || to == node.number() => {
+                self.node_state = match state_command {
                     0x01 => NodeState::Operational,
                     0x02 => NodeState::Stopped,
                     0x80 => NodeState::PreOperational,
@@ -53,13 +53,13 @@ impl Played {
                 Ok(Vec::new())
             }
             (0x80, &[]) if self.node_state == NodeState::Operational => self.synchronous(node, units),
-            (id, &[_]) if watched > 0 && id == 0x700 + watched => {
-                self.feed();
+            (id, &[_]) if watched_node > 0 && id == 0x700 + watched_node => {
+                self.reset_watchdog();
                 Ok(Vec::new())
             }
             (id, &[low, high, a, b, c, d]) if id == Pdo::First.id(Direction::Receive, node).value() => {
-                if self.node_state == NodeState::Operational && self.takes_targets(node) {
-                    self.waiting = Some((u16::from_le_bytes([low, high]), i32::from_le_bytes([a, b, c, d])));
+                if self.node_state == NodeState::Operational && self.accepts_targets(node) {
+                    self.pending_command = Some((u16::from_le_bytes([low, high]), i32::from_le_bytes([a, b, c, d])));
                 }
                 Ok(Vec::new())
             }
@@ -71,12 +71,12 @@ impl Played {
                         let is_timeout = index == CONSUMER_HEARTBEAT.index;
                         self.set(number(index, subindex), value, is_timeout);
                         if index == cia402::CONTROLWORD.index {
-                            self.order(u16::from_le_bytes([a, b]), None);
+                            self.state_command(u16::from_le_bytes([a, b]), None);
                         }
                         [0x60, low, high, subindex, 0, 0, 0, 0]
                     }
                     2 => {
-                        let [a, b, c, d] = self.told(index, subindex).to_le_bytes();
+                        let [a, b, c, d] = self.reply(index, subindex).to_le_bytes();
                         [0x43, low, high, subindex, a, b, c, d]
                     }
                     _ => return Ok(Vec::new()),
@@ -88,13 +88,13 @@ impl Played {
     }
 
     /// What an object holds.
-    fn told(&self, index: u16, subindex: u8) -> u32 {
-        let is = |object: Object| object.index == index;
-        if is(cia402::STATUSWORD) {
+    fn reply(&self, index: u16, subindex: u8) -> u32 {
+        let is_object = |object: Object| object.index == index;
+        if is_object(cia402::STATUSWORD) {
             self.drive_state.statusword().into()
-        } else if is(cia402::SUPPORTED_MODES) {
-            MODES
-        } else if is(cia402::MODE_DISPLAY) {
+        } else if is_object(cia402::SUPPORTED_MODES) {
+            SUPPORTED_MODES_MASK
+        } else if is_object(cia402::MODE_DISPLAY) {
             self.object(cia402::MODE).unwrap_or(0)
         } else {
             self.setting(number(index, subindex)).unwrap_or(0)
@@ -102,7 +102,7 @@ impl Played {
     }
 
     /// Whether its first PDO brings controlword and target at every SYNC.
-    fn takes_targets(&self, node: Node) -> bool {
+    fn accepts_targets(&self, node: Node) -> bool {
         let mapped = [cia402::CONTROLWORD, cia402::TARGET_POSITION].map(|object| Some(object.mapped()));
         let places = [1, 2].map(|place| self.object(Pdo::First.mapping(Direction::Receive, place)));
         self.is_on(Pdo::First, Direction::Receive, node) && places == mapped
@@ -114,48 +114,48 @@ impl Played {
     }
 
     /// Takes an order, and a target where it obeys in cyclic position mode.
-    fn order(&mut self, controlword: u16, target: Option<Command>) {
-        if let Some(order) = order_of(controlword, self.last_controlword) {
-            self.go_to(self.drive_state.after(order));
+    fn state_command(&mut self, controlword: u16, target: Option<Command>) {
+        if let Some(state_command) = decode_controlword(controlword, self.last_controlword) {
+            self.change_state(self.drive_state.after(state_command));
         }
         self.last_controlword = controlword;
         let is_cyclic = self.object(cia402::MODE) == Some(cia402::Mode::CyclicPosition as u32);
-        if let Some(target) = target.filter(|_| is_cyclic && self.state() == State::Obeys) {
-            self.work = Work::Follow(target);
+        if let Some(target) = target.filter(|_| is_cyclic && self.state() == State::Enabled) {
+            self.actuation = Actuation::Follow(target);
             self.target = Some(target);
         }
     }
 
-    fn go_to(&mut self, state: cia402::State) {
+    fn change_state(&mut self, state: cia402::State) {
         if state == self.drive_state {
             return;
         }
         self.drive_state = state;
-        self.work = match state {
+        self.actuation = match state {
             cia402::State::OperationEnabled => {
                 let position_rad = self.shaft.motion.position_rad;
-                Work::Follow(Command { position_rad, ..Command::default() })
+                Actuation::Follow(Command { position_rad, ..Command::default() })
             }
             cia402::State::QuickStopActive => match self.object(cia402::QUICK_STOP_OPTION) {
-                Some(5..=7) => Work::Stop,
+                Some(5..=7) => Actuation::Stop,
                 _ => {
                     self.drive_state = cia402::State::SwitchOnDisabled;
-                    Work::Free
+                    Actuation::Free
                 }
             },
-            _ => Work::Free,
+            _ => Actuation::Free,
         };
     }
 
     /// No heartbeat came for too long: what it does where it obeys.
-    pub(super) fn lose_as_drive(&mut self) {
-        if self.state() != State::Obeys {
+    pub(super) fn time_out_drive(&mut self) {
+        if self.state() != State::Enabled {
             return;
         }
         match self.object(cia402::ABORT_CONNECTION) {
-            Some(1) => self.go_to(cia402::State::Fault),
-            Some(2) => self.go_to(cia402::State::SwitchOnDisabled),
-            Some(3) => self.go_to(cia402::State::QuickStopActive),
+            Some(1) => self.change_state(cia402::State::Fault),
+            Some(2) => self.change_state(cia402::State::SwitchOnDisabled),
+            Some(3) => self.change_state(cia402::State::QuickStopActive),
             _ => {}
         }
     }
@@ -171,9 +171,9 @@ impl Played {
 
     /// What waited takes effect; PDOs go out as they were mapped, where they were switched on for every SYNC.
     fn synchronous(&mut self, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
-        if let Some((controlword, target)) = self.waiting.take() {
+        if let Some((controlword, target)) = self.pending_command.take() {
             let position_rad = units.rad_from_raw(target);
-            self.order(controlword, Some(Command { position_rad, ..Command::default() }));
+            self.state_command(controlword, Some(Command { position_rad, ..Command::default() }));
         }
         let mut sent = Vec::new();
         for pdo in [Pdo::First, Pdo::Second] {

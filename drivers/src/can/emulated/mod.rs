@@ -18,7 +18,7 @@ use crate::wire::can::canopen::NodeState;
 use crate::wire::can::mit::{Command, Limits, Motion};
 use crate::wire::can::{CanError, Frame, cia402};
 use kinematics::Stamp;
-use shaft::{Shaft, Work};
+use shaft::{Actuation, Shaft};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -35,27 +35,27 @@ pub enum State {
     /// Nothing: it turns as it is pushed.
     Free,
     /// What it was commanded last.
-    Obeys,
+    Enabled,
     /// It stopped by itself, or by a quick stop, and keeps its place.
-    Held,
+    Holding,
 }
 
 /// A motor.
 #[derive(Debug)]
-pub struct Played {
+pub struct EmulatedMotor {
     family: Family,
     limits: Limits,
     shaft: Shaft,
-    work: Work,
+    actuation: Actuation,
     now: Option<Stamp>,
     /// Time up to which its shaft has turned by itself.
-    turned_until: Option<Stamp>,
+    simulated_until: Option<Stamp>,
     /// Registers, parameters, endpoints or objects that were set, by number.
     settings: BTreeMap<u32, u32>,
     ignores_timeout: bool,
     /// When its watchdog was quieted last, and when it acted.
-    fed_at: Option<Stamp>,
-    lost_at: Option<Stamp>,
+    watchdog_reset_at: Option<Stamp>,
+    timed_out_at: Option<Stamp>,
     /// What is wrong, as the family counts it.
     faults: u32,
     target: Option<Command>,
@@ -66,11 +66,11 @@ pub struct Played {
     node_state: NodeState,
     drive_state: cia402::State,
     /// Of a drive: the controlword and the target that take effect at the next SYNC.
-    waiting: Option<(u16, i32)>,
+    pending_command: Option<(u16, i32)>,
     last_controlword: u16,
 }
 
-impl Played {
+impl EmulatedMotor {
     /// A motor at rest at 0, switched off. `limits`: what a Damiao motor's registers tell; the others' follow from their models.
     pub fn new(family: Family, limits: Limits) -> Self {
         let limits = match family {
@@ -82,13 +82,13 @@ impl Played {
             family,
             limits,
             shaft: Shaft::at_rest(),
-            work: Work::Free,
+            actuation: Actuation::Free,
             now: None,
-            turned_until: None,
+            simulated_until: None,
             settings: BTreeMap::new(),
             ignores_timeout: false,
-            fed_at: None,
-            lost_at: None,
+            watchdog_reset_at: None,
+            timed_out_at: None,
             faults: 0,
             target: None,
             reports: matches!(family, Family::Odrive { .. }),
@@ -96,7 +96,7 @@ impl Played {
             last_heartbeat: None,
             node_state: NodeState::PreOperational,
             drive_state: cia402::State::SwitchOnDisabled,
-            waiting: None,
+            pending_command: None,
             last_controlword: 0,
         }
     }
@@ -104,7 +104,7 @@ impl Played {
     /// What its shaft does; from there on it goes as its drive has it, unless it is set again.
     pub fn set_motion(&mut self, motion: Motion) {
         self.shaft.motion = motion;
-        self.turned_until = None;
+        self.simulated_until = None;
     }
 
     /// What its shaft does.
@@ -114,10 +114,10 @@ impl Played {
 
     /// What it does with its shaft.
     pub fn state(&self) -> State {
-        match self.work {
-            Work::Free => State::Free,
-            Work::Mit(_) | Work::Follow(_) => State::Obeys,
-            Work::Stop => State::Held,
+        match self.actuation {
+            Actuation::Free => State::Free,
+            Actuation::Mit(_) | Actuation::Follow(_) => State::Enabled,
+            Actuation::Stop => State::Holding,
         }
     }
 
@@ -127,13 +127,13 @@ impl Played {
     }
 
     /// When something quieted its watchdog last.
-    pub fn fed_at(&self) -> Option<Stamp> {
-        self.fed_at
+    pub fn watchdog_reset_at(&self) -> Option<Stamp> {
+        self.watchdog_reset_at
     }
 
     /// When its watchdog stopped it last.
-    pub fn lost_at(&self) -> Option<Stamp> {
-        self.lost_at
+    pub fn timed_out_at(&self) -> Option<Stamp> {
+        self.timed_out_at
     }
 
     /// From now on it takes no timeout, without saying so: older firmware does that.
@@ -143,7 +143,7 @@ impl Played {
 
     /// Something breaks: it lets go, and tells a fault.
     pub fn fail(&mut self) {
-        self.work = Work::Free;
+        self.actuation = Actuation::Free;
         match self.family {
             Family::Damiao { .. } => self.faults = damiao::OVERLOAD,
             Family::Robstride { .. } => self.faults = robstride::OVERLOAD,
@@ -154,26 +154,27 @@ impl Played {
     }
 
     /// What it sends because of a frame; nothing where that is not for it. What its protocol cannot say is an error. A frame comes at the
-    /// time of the last [`Played::report`].
+    /// time of the last [`EmulatedMotor::report`].
     pub fn take(&mut self, frame: &Frame) -> Result<Vec<Frame>, CanError> {
         match self.family {
-            Family::Damiao { motor, feedback } => self.take_as_damiao(frame, motor, feedback),
-            Family::Robstride { motor, .. } => self.take_as_robstride(frame, motor),
-            Family::TMotor { motor, .. } => self.take_as_tmotor(frame, motor),
-            Family::Odrive { node } => self.take_as_odrive(frame, node),
-            Family::Cia402 { node, units } => self.take_as_drive(frame, node, units),
+            Family::Damiao { motor, feedback } => self.handle_damiao(frame, motor, feedback),
+            Family::Robstride { motor, .. } => self.handle_robstride(frame, motor),
+            Family::TMotor { motor, .. } => self.handle_tmotor(frame, motor),
+            Family::Odrive { node } => self.handle_odrive(frame, node),
+            Family::Cia402 { node, units } => self.handle_drive(frame, node, units),
         }
     }
 
     /// Lets time pass until now: its shaft turns, its watchdog looks; and gives what it sends unasked.
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.now = Some(now);
-        if let Some(before) = self.turned_until.replace(now) {
-            self.shaft.advance(now.secs_since(before), &self.work, &self.limits);
+        if let Some(before) = self.simulated_until.replace(now) {
+            self.shaft.advance(now.secs_since(before), &self.actuation, &self.limits);
         }
-        let is_lost = |fed: Stamp| self.timeout().is_some_and(|timeout| now.duration_since(fed) > timeout);
-        if self.fed_at.is_some_and(is_lost) {
-            self.lose(now);
+        let has_timed_out =
+            |reset_at: Stamp| self.timeout().is_some_and(|timeout| now.duration_since(reset_at) > timeout);
+        if self.watchdog_reset_at.is_some_and(has_timed_out) {
+            self.time_out(now);
         }
         let mut sent = Vec::new();
         if self.reports && is_due(&mut self.last_report, now, REPORT) {
@@ -206,31 +207,31 @@ impl Played {
     }
 
     /// Nothing came for too long.
-    fn lose(&mut self, now: Stamp) {
-        self.fed_at = None;
-        if self.state() == State::Obeys {
-            self.lost_at = Some(now);
+    fn time_out(&mut self, now: Stamp) {
+        self.watchdog_reset_at = None;
+        if self.state() == State::Enabled {
+            self.timed_out_at = Some(now);
         }
         match self.family {
-            Family::Damiao { .. } if self.state() == State::Obeys => self.faults = damiao::LOST,
+            Family::Damiao { .. } if self.state() == State::Enabled => self.faults = damiao::COMMUNICATION_LOST,
             Family::Odrive { .. } => self.faults |= crate::wire::can::odrive::WATCHDOG_TIMER_EXPIRED,
-            Family::Cia402 { .. } => return self.lose_as_drive(),
+            Family::Cia402 { .. } => return self.time_out_drive(),
             _ => {}
         }
-        self.work = Work::Free;
+        self.actuation = Actuation::Free;
     }
 
     /// Its watchdog is quiet from now on.
-    fn feed(&mut self) {
-        self.fed_at = self.now;
+    fn reset_watchdog(&mut self) {
+        self.watchdog_reset_at = self.now;
     }
 
     /// Obeys a command of MIT mode, where it obeys.
     fn obey(&mut self, command: Command) {
-        if self.state() == State::Obeys {
-            self.work = Work::Mit(command);
+        if self.state() == State::Enabled {
+            self.actuation = Actuation::Mit(command);
             self.target = Some(command);
-            self.feed();
+            self.reset_watchdog();
         }
     }
 
@@ -247,14 +248,14 @@ impl Played {
 
     /// Takes hold of the shaft where it is.
     fn switch_on(&mut self) {
-        self.work = Work::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
-        self.feed();
+        self.actuation = Actuation::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
+        self.reset_watchdog();
     }
 }
 
 /// Whether so long has passed since the last time, which is then now.
-fn is_due(last: &mut Option<Stamp>, now: Stamp, every: Duration) -> bool {
-    let due = last.is_none_or(|last| now.duration_since(last) >= every);
+fn is_due(last: &mut Option<Stamp>, now: Stamp, interval: Duration) -> bool {
+    let due = last.is_none_or(|last| now.duration_since(last) >= interval);
     if due {
         *last = Some(now);
     }
@@ -272,72 +273,76 @@ mod tests {
     const MILLIS: i64 = 1_000_000;
 
     /// Lets time pass, and gives it frames at the end.
-    fn give(motor: &mut Played, at_millis: i64, frames: &[Result<Frame, CanError>]) {
+    fn advance_and_send(motor: &mut EmulatedMotor, at_millis: i64, frames: &[Result<Frame, CanError>]) {
         motor.report(Stamp(at_millis * MILLIS)).expect("it fits");
         for frame in frames {
             motor.take(frame.as_ref().expect("a frame")).expect("it fits");
         }
     }
 
-    fn is_lost_between(motor: &mut Played, fed_millis: i64, timeout_millis: i64) {
-        give(motor, fed_millis + timeout_millis, &[]);
-        assert_eq!((motor.state(), motor.lost_at()), (State::Obeys, None), "not yet");
-        give(motor, fed_millis + timeout_millis + 1, &[]);
-        assert_ne!(motor.state(), State::Obeys);
-        assert_eq!(motor.lost_at(), Some(Stamp((fed_millis + timeout_millis + 1) * MILLIS)));
+    fn assert_times_out_between(motor: &mut EmulatedMotor, fed_millis: i64, timeout_millis: i64) {
+        advance_and_send(motor, fed_millis + timeout_millis, &[]);
+        assert_eq!((motor.state(), motor.timed_out_at()), (State::Enabled, None), "not yet");
+        advance_and_send(motor, fed_millis + timeout_millis + 1, &[]);
+        assert_ne!(motor.state(), State::Enabled);
+        assert_eq!(motor.timed_out_at(), Some(Stamp((fed_millis + timeout_millis + 1) * MILLIS)));
     }
 
     #[test]
-    fn a_damiao_motor_lets_go_after_its_timeout_and_obeys_only_when_its_error_is_cleared() {
-        let mut motor = Played::new(Family::Damiao { motor: 1, feedback: 0x11 }, LIMITS);
+    fn damiao_times_out_and_needs_error_cleared() {
+        let mut motor = EmulatedMotor::new(Family::Damiao { motor: 1, feedback: 0x11 }, LIMITS);
         let write = |register, value| {
-            let access = dm::Access::Write(register, dm::Value::Whole(value));
+            let access = dm::Access::Write(register, dm::Value::Integer(value));
             dm::encode_register(&dm::RegisterMessage { motor: 1, access }, None)
         };
         let command = Command { position_rad: 0.5, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
         let set_up = [write(dm::Register::Timeout, 2000), write(dm::Register::ControlMode, dm::MIT_MODE)];
-        give(&mut motor, 0, &set_up);
-        give(&mut motor, 1, &[dm::encode_command(1, &command, &LIMITS)]);
+        advance_and_send(&mut motor, 0, &set_up);
+        advance_and_send(&mut motor, 1, &[dm::encode_command(1, &command, &LIMITS)]);
         assert_eq!((motor.state(), motor.target()), (State::Free, None), "it is off");
-        let enable = || dm::encode_order(1, dm::Order::Enable);
-        give(&mut motor, 2, &[enable(), dm::encode_command(1, &command, &LIMITS)]);
-        give(&mut motor, 10, &[dm::encode_command(1, &command, &LIMITS)]);
+        let enable = || dm::encode_state_command(1, dm::StateCommand::Enable);
+        advance_and_send(&mut motor, 2, &[enable(), dm::encode_command(1, &command, &LIMITS)]);
+        advance_and_send(&mut motor, 10, &[dm::encode_command(1, &command, &LIMITS)]);
         assert!(motor.motion().position_rad > 0.0);
-        is_lost_between(&mut motor, 10, 100);
-        give(&mut motor, 200, &[enable()]);
+        assert_times_out_between(&mut motor, 10, 100);
+        advance_and_send(&mut motor, 200, &[enable()]);
         assert_eq!(motor.state(), State::Free, "its error stands");
-        give(&mut motor, 201, &[dm::encode_order(1, dm::Order::ClearError), enable()]);
-        assert_eq!(motor.state(), State::Obeys);
+        advance_and_send(&mut motor, 201, &[dm::encode_state_command(1, dm::StateCommand::ClearError), enable()]);
+        assert_eq!(motor.state(), State::Enabled);
     }
 
     #[test]
-    fn a_robstride_motor_lets_go_unless_its_timeout_was_not_taken() {
+    fn robstride_times_out_unless_timeout_ignored() {
         let model = rs::Model::Rs02;
         for ignores in [false, true] {
-            let mut motor = Played::new(Family::Robstride { motor: 3, model }, LIMITS);
+            let mut motor = EmulatedMotor::new(Family::Robstride { motor: 3, model }, LIMITS);
             if ignores {
                 motor.ignore_timeout();
             }
-            let say = |request| rs::encode_request(ROBSTRIDE_HOST, 3, &request, &model.limits());
+            let encode = |request| rs::encode_request(ROBSTRIDE_HOST, 3, &request, &model.limits());
             let timeout = rs::timeout(0.05).expect("in range");
-            give(&mut motor, 0, &[say(rs::Request::Write(rs::Parameter::Timeout, timeout)), say(rs::Request::Enable)]);
+            advance_and_send(
+                &mut motor,
+                0,
+                &[encode(rs::Request::Write(rs::Parameter::Timeout, timeout)), encode(rs::Request::Enable)],
+            );
             match ignores {
-                false => is_lost_between(&mut motor, 0, 50),
-                true => give(&mut motor, 5000, &[]),
+                false => assert_times_out_between(&mut motor, 0, 50),
+                true => advance_and_send(&mut motor, 5000, &[]),
             }
-            assert_eq!(motor.state() == State::Obeys, ignores);
+            assert_eq!(motor.state() == State::Enabled, ignores);
         }
     }
 
     #[test]
-    fn a_drive_stays_where_a_quick_stop_brought_it_when_the_heartbeat_ends() {
+    fn drive_quick_stops_and_holds_on_heartbeat_loss() {
         let (node, host) = (Node::new(5).expect("a node"), Node::new(127).expect("a node"));
         let units = cia402::Units { counts_per_turn: 65_536.0, rated_torque_nm: 1.0 };
-        let mut motor = Played::new(Family::Cia402 { node, units }, LIMITS);
+        let mut motor = EmulatedMotor::new(Family::Cia402 { node, units }, LIMITS);
         let write = |object, value| canopen::encode_write(node, object, value);
         let (direction, pdo) = (Direction::Receive, Pdo::First);
         let id = pdo.id(direction, node);
-        give(
+        advance_and_send(
             &mut motor,
             0,
             &[
@@ -355,14 +360,14 @@ mod tests {
         for (at_millis, controlword) in [(1, 0x06), (2, 0x07), (3, 0x0F), (50, 0x0F)] {
             let target = Frame::classic(id, &[controlword, 0, 0, 0x40, 0, 0]);
             let heartbeat = canopen::encode_heartbeat(host, NodeState::Operational);
-            give(&mut motor, at_millis, &[target, Ok(heartbeat), Ok(canopen::encode_sync())]);
+            advance_and_send(&mut motor, at_millis, &[target, Ok(heartbeat), Ok(canopen::encode_sync())]);
         }
-        assert_eq!(motor.state(), State::Obeys);
-        is_lost_between(&mut motor, 50, 100);
-        assert_eq!(motor.state(), State::Held);
-        give(&mut motor, 2000, &[]);
-        let held = motor.motion();
-        give(&mut motor, 3000, &[Frame::classic(Id::standard(0x705).expect("11 bits"), &[5])]);
-        assert_eq!((motor.motion(), motor.motion().velocity_rad_s), (held, 0.0));
+        assert_eq!(motor.state(), State::Enabled);
+        assert_times_out_between(&mut motor, 50, 100);
+        assert_eq!(motor.state(), State::Holding);
+        advance_and_send(&mut motor, 2000, &[]);
+        let held_motion = motor.motion();
+        advance_and_send(&mut motor, 3000, &[Frame::classic(Id::standard(0x705).expect("11 bits"), &[5])]);
+        assert_eq!((motor.motion(), motor.motion().velocity_rad_s), (held_motion, 0.0));
     }
 }

@@ -1,7 +1,7 @@
 //! An `ODrive` axis. It follows positions with a loop of its own, and its watchdog looks also while it is idle.
 
-use super::shaft::Work;
-use super::{Played, State};
+use super::shaft::Actuation;
+use super::{EmulatedMotor, State};
 use crate::wire::can::mit::{Command, Motion};
 use crate::wire::can::odrive::{self, Answer, Code, Endpoints, Node};
 use crate::wire::can::{CanError, Frame};
@@ -26,41 +26,45 @@ pub fn endpoints() -> Endpoints {
     }
 }
 
-impl Played {
-    pub(super) fn take_as_odrive(&mut self, frame: &Frame, node: Node) -> Result<Vec<Frame>, CanError> {
+impl EmulatedMotor {
+    pub(super) fn handle_odrive(&mut self, frame: &Frame, node: Node) -> Result<Vec<Frame>, CanError> {
         let id = frame.id();
         if id.is_extended() || id.value() >> 5 != u32::from(node.number()) {
             return Ok(Vec::new());
         }
-        let is = |code: Code| id.value() & 0x1F == code as u32;
+        let is_object = |code: Code| id.value() & 0x1F == code as u32;
         if frame.is_remote() {
             let version = Answer::Version { hardware: HARDWARE, firmware: FIRMWARE };
-            return if is(Code::Version) { Ok(vec![odrive::encode_answer(node, &version)?]) } else { Ok(Vec::new()) };
+            return if is_object(Code::Version) {
+                Ok(vec![odrive::encode_answer(node, &version)?])
+            } else {
+                Ok(Vec::new())
+            };
         }
-        if is(Code::SetState) {
+        if is_object(Code::SetState) {
             match frame.data() {
-                [1, 0, 0, 0] => self.work = Work::Free,
+                [1, 0, 0, 0] => self.actuation = Actuation::Free,
                 [8, 0, 0, 0] if self.faults == 0 => {
                     // It begins with where it is, whatever was asked for before.
                     let position_rad = self.shaft.motion.position_rad;
-                    self.work = Work::Follow(Command { position_rad, ..Command::default() });
+                    self.actuation = Actuation::Follow(Command { position_rad, ..Command::default() });
                 }
                 _ => {}
             }
-        } else if is(Code::ClearErrors) {
+        } else if is_object(Code::ClearErrors) {
             self.faults = 0;
-        } else if is(Code::SetPosition) {
+        } else if is_object(Code::SetPosition) {
             let &[a, b, c, d, e, f, ..] = frame.data() else { return Ok(Vec::new()) };
             let command = Command {
                 position_rad: f64::from(f32::from_le_bytes([a, b, c, d])) * TAU,
                 velocity_rad_s: f64::from(i16::from_le_bytes([e, f])) * 1e-3 * TAU,
                 ..Command::default()
             };
-            if self.state() == State::Obeys {
-                self.work = Work::Follow(command);
+            if self.state() == State::Enabled {
+                self.actuation = Actuation::Follow(command);
                 self.target = Some(command);
             }
-        } else if is(Code::EndpointRequest) {
+        } else if is_object(Code::EndpointRequest) {
             let &[operation, low, high, _, a, b, c, d] = frame.data() else { return Ok(Vec::new()) };
             let number = u16::from_le_bytes([low, high]);
             if operation == 1 {
@@ -71,7 +75,7 @@ impl Played {
             }
         }
         // Whatever comes to it quiets its watchdog.
-        self.feed();
+        self.reset_watchdog();
         Ok(Vec::new())
     }
 
@@ -88,8 +92,8 @@ impl Played {
 
     pub(super) fn odrive_heartbeat(&self, node: Node) -> Result<Frame, CanError> {
         let state = match self.state() {
-            State::Obeys => odrive::State::ClosedLoopControl,
-            State::Free | State::Held => odrive::State::Idle,
+            State::Enabled => odrive::State::ClosedLoopControl,
+            State::Free | State::Holding => odrive::State::Idle,
         };
         odrive::encode_answer(node, &Answer::Heartbeat { errors: self.faults, state })
     }

@@ -1,7 +1,7 @@
 //! A Robstride motor.
 
-use super::shaft::Work;
-use super::{CELSIUS, Played, State};
+use super::shaft::Actuation;
+use super::{CELSIUS, EmulatedMotor, State};
 use crate::can::ROBSTRIDE_HOST;
 use crate::wire::can::robstride::{self, Faults, Mode, Parameter};
 use crate::wire::can::{CanError, Frame, Id};
@@ -11,8 +11,8 @@ pub(super) const OVERLOAD: u32 = Faults::OVERLOAD as u32;
 /// Counts of its timeout a second.
 const TICKS_HZ: f64 = 20_000.0;
 
-impl Played {
-    pub(super) fn take_as_robstride(&mut self, frame: &Frame, motor: u8) -> Result<Vec<Frame>, CanError> {
+impl EmulatedMotor {
+    pub(super) fn handle_robstride(&mut self, frame: &Frame, motor: u8) -> Result<Vec<Frame>, CanError> {
         let id = frame.id();
         let [kind, _, host, to] = id.value().to_be_bytes();
         let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return Ok(Vec::new()) };
@@ -30,7 +30,7 @@ impl Played {
             }
             3 if self.faults == 0 => self.switch_on(),
             4 => {
-                self.work = Work::Free;
+                self.actuation = Actuation::Free;
                 if low == 1 {
                     self.faults = 0;
                 }
@@ -58,15 +58,15 @@ impl Played {
         Some(Duration::from_secs_f64(f64::from(ticks) / TICKS_HZ))
     }
 
-    pub(super) fn robstride_feedback(&self, motor: u8, is_unasked: bool) -> Result<Frame, CanError> {
-        let told = robstride::Feedback {
+    pub(super) fn robstride_feedback(&self, motor: u8, is_unsolicited: bool) -> Result<Frame, CanError> {
+        let reply = robstride::Feedback {
             motor,
-            is_unasked,
-            mode: if self.state() == State::Obeys { Mode::Run } else { Mode::Reset },
+            is_unsolicited,
+            mode: if self.state() == State::Enabled { Mode::Run } else { Mode::Reset },
             faults: Faults(self.faults.to_le_bytes()[0]),
             motion: self.shaft.motion,
             winding_celsius: CELSIUS.into(),
         };
-        robstride::encode_feedback(ROBSTRIDE_HOST, &told, &self.limits)
+        robstride::encode_feedback(ROBSTRIDE_HOST, &reply, &self.limits)
     }
 }

@@ -18,7 +18,7 @@ const MAX_SECS: f64 = 1.0;
 
 /// What a drive does with its shaft.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Work {
+pub(super) enum Actuation {
     /// Nothing.
     Free,
     /// The law of MIT mode.
@@ -41,40 +41,43 @@ impl Shaft {
     }
 
     /// Lets time pass.
-    pub(super) fn advance(&mut self, secs: f64, work: &Work, limits: &Limits) {
-        let mut left = secs.clamp(0.0, MAX_SECS);
-        while left > 0.0 {
-            let step = left.min(STEP_SECS);
-            self.step(step, work, limits);
-            left -= step;
+    pub(super) fn advance(&mut self, secs: f64, actuation: &Actuation, limits: &Limits) {
+        let mut remaining = secs.clamp(0.0, MAX_SECS);
+        while remaining > 0.0 {
+            let step = remaining.min(STEP_SECS);
+            self.step(step, actuation, limits);
+            remaining -= step;
         }
     }
 
-    fn step(&mut self, secs: f64, work: &Work, limits: &Limits) {
+    fn step(&mut self, secs: f64, actuation: &Actuation, limits: &Limits) {
         let Motion { position_rad, velocity_rad_s, .. } = self.motion;
-        let torque_nm = match work {
-            Work::Free => 0.0,
-            Work::Mit(command) => {
+        let torque_nm = match actuation {
+            Actuation::Free => 0.0,
+            Actuation::Mit(command) => {
                 let torque = command.kp_nm_rad * (command.position_rad - position_rad)
                     + command.kd_nm_s_rad * (command.velocity_rad_s - velocity_rad_s)
                     + command.torque_nm;
                 torque.clamp(-limits.torque_nm, limits.torque_nm)
             }
-            Work::Follow(command) => {
-                let wanted = command.velocity_rad_s + FOLLOWING_HZ * (command.position_rad - position_rad);
-                return self.turn(wanted.clamp(-MAX_FOLLOWING_RAD_S, MAX_FOLLOWING_RAD_S), secs);
+            Actuation::Follow(command) => {
+                let target_velocity = command.velocity_rad_s + FOLLOWING_HZ * (command.position_rad - position_rad);
+                return self.rotate(target_velocity.clamp(-MAX_FOLLOWING_RAD_S, MAX_FOLLOWING_RAD_S), secs);
             }
-            Work::Stop => {
-                let slower = QUICK_STOP_RAD_S2 * secs;
-                return self.turn(velocity_rad_s - velocity_rad_s.clamp(-slower, slower), secs);
+            Actuation::Stop => {
+                let max_deceleration_step = QUICK_STOP_RAD_S2 * secs;
+                return self.rotate(
+                    velocity_rad_s - velocity_rad_s.clamp(-max_deceleration_step, max_deceleration_step),
+                    secs,
+                );
             }
         };
         let acceleration = (torque_nm - FRICTION_NM_S_RAD * velocity_rad_s) / INERTIA_KG_M2;
-        self.turn(velocity_rad_s + acceleration * secs, secs);
+        self.rotate(velocity_rad_s + acceleration * secs, secs);
         self.motion.torque_nm = torque_nm;
     }
 
-    fn turn(&mut self, velocity_rad_s: f64, secs: f64) {
+    fn rotate(&mut self, velocity_rad_s: f64, secs: f64) {
         let position_rad = self.motion.position_rad + velocity_rad_s * secs;
         self.motion = Motion { position_rad, velocity_rad_s, torque_nm: 0.0 };
     }
@@ -87,23 +90,23 @@ mod tests {
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
     #[test]
-    fn it_goes_where_its_drive_has_it_and_rests_there() {
+    fn shaft_reaches_target_and_rests() {
         let command = Command { position_rad: 0.7, kp_nm_rad: 30.0, kd_nm_s_rad: 1.5, ..Command::default() };
-        for work in [Work::Mit(command), Work::Follow(command)] {
+        for actuation in [Actuation::Mit(command), Actuation::Follow(command)] {
             let mut shaft = Shaft::at_rest();
             for _ in 0..1500 {
-                shaft.advance(2e-3, &work, &LIMITS);
+                shaft.advance(2e-3, &actuation, &LIMITS);
             }
-            assert!((shaft.motion.position_rad - 0.7).abs() < 1e-6, "{work:?} {:?}", shaft.motion);
+            assert!((shaft.motion.position_rad - 0.7).abs() < 1e-6, "{actuation:?} {:?}", shaft.motion);
         }
     }
 
     #[test]
-    fn a_free_shaft_coasts_and_one_that_stops_rests_soon() {
+    fn free_shaft_coasts_and_stopping_shaft_rests() {
         let moving = Shaft { motion: Motion { position_rad: 0.0, velocity_rad_s: 3.0, torque_nm: 0.0 } };
         let (mut free, mut stopped) = (moving, moving);
-        free.advance(0.2, &Work::Free, &LIMITS);
-        stopped.advance(0.2, &Work::Stop, &LIMITS);
+        free.advance(0.2, &Actuation::Free, &LIMITS);
+        stopped.advance(0.2, &Actuation::Stop, &LIMITS);
         assert!(free.motion.position_rad > 0.3 && free.motion.velocity_rad_s > 1.0, "{:?}", free.motion);
         // Half of 3 rad/s for a tenth of a second.
         assert!((stopped.motion.position_rad - 0.15).abs() < 1e-3, "{:?}", stopped.motion);

@@ -1,15 +1,15 @@
 //! State datagrams from anyone.
 
-use super::{Line, MAX_STATE_BYTES, Waiting, decode};
-use crate::hostile::take;
+use super::{MAX_STATE_BYTES, StateQueue, StateReader, decode};
+use crate::fuzz::take;
 use franka::FciVersion;
 use kinematics::Stamp;
 use std::time::Duration;
 
 /// When the first datagram arrives.
-const BEGAN: Stamp = Stamp(1_000_000_000_000);
+const START_TIME: Stamp = Stamp(1_000_000_000_000);
 /// No joint of these arms is further from zero, rad.
-const MOST_RAD: f64 = 10.0;
+const MAX_RAD: f64 = 10.0;
 
 /// Datagrams one behind the other, a millisecond apart, each with its length before it in two bytes, little-endian; read as
 /// both versions of FCI, as they are and filled up to the length of a state.
@@ -17,69 +17,69 @@ const MOST_RAD: f64 = 10.0;
 /// What an arm would be told of them grows in time, and its joints are angles.
 pub fn states(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
-        told(version, bytes);
+        decode_positions(version, bytes);
     }
 }
 
 /// Angles of all joints that an arm would tell of the datagrams, see [`states`].
-pub(crate) fn told(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec<f64>> {
-    let mut line = Line::new("it".to_owned(), version, None);
-    let mut waiting = Waiting::default();
-    let mut at = BEGAN;
+pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec<f64>> {
+    let mut reader = StateReader::new("it".to_owned(), version, None);
+    let mut state_queue = StateQueue::default();
+    let mut at = START_TIME;
     while !bytes.is_empty() {
         let n_bytes = usize::from(u16::from_le_bytes(take(&mut bytes))).min(MAX_STATE_BYTES).min(bytes.len());
         let (datagram, rest) = bytes.split_at(n_bytes);
         bytes = rest;
-        let mut whole = datagram.to_vec();
-        whole.resize(super::super::state::n_bytes(version), 0);
-        for datagram in [datagram, &whole] {
+        let mut padded = datagram.to_vec();
+        padded.resize(super::super::state::n_bytes(version), 0);
+        for datagram in [datagram, &padded] {
             at += Duration::from_millis(1);
             if let Some(numbered) = decode(version, datagram) {
-                line.take(&mut waiting, &numbered, at);
-                line.tell_mode(&numbered.state);
+                reader.take(&mut state_queue, &numbered, at);
+                reader.log_mode(&numbered.state);
                 let _ = super::pose(&numbered.state.O_T_EE);
             }
         }
     }
     let mut newest = None;
-    for state in &waiting.queue {
+    for state in &state_queue.queue {
         assert!(newest.is_none_or(|newest| state.stamp > newest) && state.stamp <= at, "{newest:?}, then {state:?}");
         newest = Some(state.stamp);
-        assert!(state.position.iter().all(|angle| angle.abs() <= MOST_RAD), "{state:?}");
+        assert!(state.position.iter().all(|angle| angle.abs() <= MAX_RAD), "{state:?}");
         assert!(state.velocity.iter().chain(&state.effort).all(|number| number.is_finite()), "{state:?}");
     }
-    let _ = waiting.statistics.to_string();
-    waiting.queue.into_iter().map(|state| state.position).collect()
+    let _ = state_queue.statistics.to_string();
+    state_queue.queue.into_iter().map(|state| state.position).collect()
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::franka::played::hostile::tests::state_datagrams;
-    use crate::hostile::Random;
+    use crate::franka::emulated::fuzz::tests::state_datagrams;
+    use crate::fuzz::Random;
 
     pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
     /// Datagrams as [`states`] takes them.
-    pub(crate) fn with_lengths(datagrams: &[Vec<u8>]) -> Vec<u8> {
+    pub(crate) fn with_length_prefixes(datagrams: &[Vec<u8>]) -> Vec<u8> {
         let length = |datagram: &[u8]| u16::try_from(datagram.len()).unwrap().to_le_bytes();
         datagrams.iter().flat_map(|datagram| [&length(datagram)[..], datagram].concat()).collect()
     }
 
     #[test]
-    fn states_cut_doubled_or_out_of_order_move_no_joint() {
+    fn corrupted_states_move_no_joint() {
         for version in VERSIONS {
             let datagrams = state_datagrams(version, 8);
-            let told_whole = told(version, &with_lengths(&datagrams));
-            assert_eq!(told_whole.len(), 8, "{version:?}");
+            let expected = decode_positions(version, &with_length_prefixes(&datagrams));
+            assert_eq!(expected.len(), 8, "{version:?}");
             let doubled: Vec<_> = datagrams.iter().flat_map(|one| [one.clone(), one.clone()]).collect();
-            assert_eq!(told(version, &with_lengths(&doubled)), told_whole, "the second is no news");
+            assert_eq!(decode_positions(version, &with_length_prefixes(&doubled)), expected, "the second is no news");
             let mut random = Random(3);
             for _ in 0..20 {
                 let mut shuffled = datagrams.clone();
                 random.shuffle(&mut shuffled);
-                let read = told(version, &with_lengths(&shuffled));
-                assert!(read.iter().all(|positions| told_whole.contains(positions)), "{read:?}");
+                let read = decode_positions(version, &with_length_prefixes(&shuffled));
+                assert!(read.iter().all(|positions| expected.contains(positions)), "{read:?}");
             }
             for n_bytes in [0, 1, 8, 100, datagrams[0].len() - 1] {
                 assert!(decode(version, &datagrams[0][..n_bytes]).is_none(), "{n_bytes} bytes");

@@ -1,7 +1,7 @@
 //! What a motion may ask of the joints.
 
 use super::super::N_JOINTS;
-use super::Wanted;
+use super::CommandedJoints;
 
 /// Seconds from command to command.
 pub(super) const STEP_SECS: f64 = 1e-3;
@@ -20,15 +20,15 @@ pub struct Limits {
     /// And its rate, rad/s³.
     pub jerk_rad_s3: [f64; N_JOINTS],
     /// How a joint must be slower towards the end of its range; without, it may be fast everywhere.
-    pub braking: Option<[Braking; N_JOINTS]>,
+    pub braking: Option<[BrakingLimit; N_JOINTS]>,
 }
 
 /// Near the end of its range a joint must be slow enough to stop with `deceleration_rad_s2`:
-/// `velocity <= sqrt(2 * deceleration * way left) - margin`.
+/// `velocity <= sqrt(2 * deceleration * way remaining) - margin`.
 ///
 /// Source: libfranka 0.21.2, `joint_velocity_limits.h`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Braking {
+pub struct BrakingLimit {
     /// Deceleration that is counted with, rad/s².
     pub deceleration_rad_s2: f64,
     /// Taken off the rate, rad/s.
@@ -79,7 +79,7 @@ impl Limits {
 
     /// The FR3's. Source: `franka_description` and `rate_limiting.h` of libfranka 0.21.2.
     pub fn fr3() -> Self {
-        let braking = |(deceleration_rad_s2, margin_rad_s)| Braking { deceleration_rad_s2, margin_rad_s };
+        let braking = |(deceleration_rad_s2, margin_rad_s)| BrakingLimit { deceleration_rad_s2, margin_rad_s };
         let braking =
             [(6.0, 0.3), (2.585, 0.2), (3.5, 0.2), (4.0, 0.3), (17.0, 0.35), (5.5, 0.35), (17.0, 0.35)].map(braking);
         Self {
@@ -101,36 +101,36 @@ impl Limits {
 
     /// Least and greatest rate of a joint at an angle, rad/s.
     fn velocity_range(&self, ix: usize, position_rad: f64) -> [f64; 2] {
-        let [least, greatest] = self.position_rad[ix];
-        let most = self.velocity_rad_s[ix];
+        let [min, max] = self.position_rad[ix];
+        let max_rate = self.velocity_rad_s[ix];
         let towards = |left_rad: f64| match &self.braking {
             Some(braking) => {
-                let Braking { deceleration_rad_s2, margin_rad_s } = braking[ix];
-                ((2.0 * deceleration_rad_s2 * left_rad.max(0.0)).sqrt() - margin_rad_s).clamp(0.0, most)
+                let BrakingLimit { deceleration_rad_s2, margin_rad_s } = braking[ix];
+                ((2.0 * deceleration_rad_s2 * left_rad.max(0.0)).sqrt() - margin_rad_s).clamp(0.0, max_rate)
             }
-            None => most,
+            None => max_rate,
         };
-        [-towards(position_rad - least), towards(greatest - position_rad)]
+        [-towards(position_rad - min), towards(max - position_rad)]
     }
 
     /// Checks a step from where joints were wanted to where they are wanted now.
-    pub(super) fn check(&self, before: &Wanted, now: &Wanted) -> Result<(), Violation> {
-        let over = |number: f64, most: f64| number.is_nan() || number.abs() > most + ROUNDING;
+    pub(super) fn check(&self, before: &CommandedJoints, now: &CommandedJoints) -> Result<(), Violation> {
+        let exceeds = |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {
             let (position, velocity) = (now.position_rad[ix], now.velocity_rad_s[ix]);
-            let [least, greatest] = self.position_rad[ix];
-            if !(least..=greatest).contains(&position) {
+            let [min, max] = self.position_rad[ix];
+            if !(min..=max).contains(&position) {
                 return Err(Violation::Position);
             }
-            let [slowest, fastest] = self.velocity_range(ix, before.position_rad[ix]);
-            if !(slowest - ROUNDING..=fastest + ROUNDING).contains(&velocity) {
+            let [min_velocity, max_velocity] = self.velocity_range(ix, before.position_rad[ix]);
+            if !(min_velocity - ROUNDING..=max_velocity + ROUNDING).contains(&velocity) {
                 return Err(Violation::Velocity);
             }
-            if over(now.acceleration_rad_s2[ix], self.acceleration_rad_s2[ix]) {
+            if exceeds(now.acceleration_rad_s2[ix], self.acceleration_rad_s2[ix]) {
                 return Err(Violation::Acceleration);
             }
             let jerk = (now.acceleration_rad_s2[ix] - before.acceleration_rad_s2[ix]) / STEP_SECS;
-            if over(jerk, self.jerk_rad_s3[ix]) {
+            if exceeds(jerk, self.jerk_rad_s3[ix]) {
                 return Err(Violation::Jerk);
             }
         }
@@ -143,61 +143,74 @@ mod tests {
     use super::*;
 
     /// At rest in the middle of all ranges, where an FR3 may be as fast as anywhere; one joint changed.
-    fn with(limits: &Limits, ix: usize, change: impl Fn(&mut Wanted, usize)) -> Wanted {
-        let position_rad = limits.position_rad.map(|[least, greatest]| 0.5 * (least + greatest));
-        let mut wanted = Wanted { position_rad, is_moving: true, ..Wanted::default() };
-        change(&mut wanted, ix);
-        wanted
+    fn commanded_with(limits: &Limits, ix: usize, change: impl Fn(&mut CommandedJoints, usize)) -> CommandedJoints {
+        let position_rad = limits.position_rad.map(|[min, max]| 0.5 * (min + max));
+        let mut commanded = CommandedJoints { position_rad, is_moving: true, ..CommandedJoints::default() };
+        change(&mut commanded, ix);
+        commanded
     }
 
     #[test]
-    fn each_limit_of_each_joint_is_kept_from_both_sides() {
+    fn joint_limits_are_enforced_in_both_directions() {
         let mut wrong = Vec::new();
         for limits in [Limits::panda(), Limits::fr3()] {
-            let mut expect = |expected, before: Wanted, now: Wanted| {
+            let mut expect = |expected, before: CommandedJoints, now: CommandedJoints| {
                 if limits.check(&before, &now) != expected {
                     wrong.push((expected, before, now));
                 }
             };
-            let rest = with(&limits, 0, |_, _| {});
+            let rest = commanded_with(&limits, 0, |_, _| {});
             for ix in 0..N_JOINTS {
                 for frac in [0.999, 1.001, -0.999, -1.001_f64] {
-                    let holds = |violation| if frac.abs() < 1.0 { Ok(()) } else { Err(violation) };
-                    let of = |most: [f64; N_JOINTS]| frac * most[ix];
-                    let fast = with(&limits, ix, |wanted, ix| wanted.velocity_rad_s[ix] = of(limits.velocity_rad_s));
-                    expect(holds(Violation::Velocity), fast, fast);
-                    let brisk =
-                        with(&limits, ix, |wanted, ix| wanted.acceleration_rad_s2[ix] = of(limits.acceleration_rad_s2));
-                    expect(holds(Violation::Acceleration), brisk, brisk);
+                    let expected_at = |violation| if frac.abs() < 1.0 { Ok(()) } else { Err(violation) };
+                    let of = |max_rate: [f64; N_JOINTS]| frac * max_rate[ix];
+                    let fast = commanded_with(&limits, ix, |commanded, ix| {
+                        commanded.velocity_rad_s[ix] = of(limits.velocity_rad_s)
+                    });
+                    expect(expected_at(Violation::Velocity), fast, fast);
+                    let accelerating = commanded_with(&limits, ix, |commanded, ix| {
+                        commanded.acceleration_rad_s2[ix] = of(limits.acceleration_rad_s2)
+                    });
+                    expect(expected_at(Violation::Acceleration), accelerating, accelerating);
                     let step = of(limits.jerk_rad_s3) * STEP_SECS;
-                    let [from, to] = [-0.5, 0.5]
-                        .map(|share| with(&limits, ix, |wanted, ix| wanted.acceleration_rad_s2[ix] = share * step));
-                    expect(holds(Violation::Jerk), from, to);
-                    let [least, greatest] = limits.position_rad[ix];
-                    let (middle, half) = (0.5 * (least + greatest), 0.5 * (greatest - least));
-                    let far = with(&limits, ix, |wanted, ix| wanted.position_rad[ix] = middle + frac * half);
-                    expect(holds(Violation::Position), rest, far);
+                    let [from, to] = [-0.5, 0.5].map(|share| {
+                        commanded_with(&limits, ix, |commanded, ix| commanded.acceleration_rad_s2[ix] = share * step)
+                    });
+                    expect(expected_at(Violation::Jerk), from, to);
+                    let [min, max] = limits.position_rad[ix];
+                    let (middle, half) = (0.5 * (min + max), 0.5 * (max - min));
+                    let far =
+                        commanded_with(&limits, ix, |commanded, ix| commanded.position_rad[ix] = middle + frac * half);
+                    expect(expected_at(Violation::Position), rest, far);
                 }
             }
-            expect(Err(Violation::Position), rest, with(&limits, 2, |wanted, ix| wanted.position_rad[ix] = f64::NAN));
-            expect(Err(Violation::Velocity), rest, with(&limits, 2, |wanted, ix| wanted.velocity_rad_s[ix] = f64::NAN));
+            expect(
+                Err(Violation::Position),
+                rest,
+                commanded_with(&limits, 2, |commanded, ix| commanded.position_rad[ix] = f64::NAN),
+            );
+            expect(
+                Err(Violation::Velocity),
+                rest,
+                commanded_with(&limits, 2, |commanded, ix| commanded.velocity_rad_s[ix] = f64::NAN),
+            );
             expect(
                 Err(Violation::Acceleration),
                 rest,
-                with(&limits, 2, |wanted, ix| wanted.acceleration_rad_s2[ix] = f64::NAN),
+                commanded_with(&limits, 2, |commanded, ix| commanded.acceleration_rad_s2[ix] = f64::NAN),
             );
         }
         assert!(wrong.is_empty(), "{wrong:#?}");
     }
 
     #[test]
-    fn an_fr3_is_slower_towards_the_end_of_its_range() {
+    fn fr3_speed_limit_drops_near_range_end() {
         let limits = Limits::fr3();
         let at = |position_rad: f64, velocity_rad_s: f64| {
-            let wanted = with(&limits, 1, |wanted, ix| {
-                (wanted.position_rad[ix], wanted.velocity_rad_s[ix]) = (position_rad, velocity_rad_s);
+            let commanded = commanded_with(&limits, 1, |commanded, ix| {
+                (commanded.position_rad[ix], commanded.velocity_rad_s[ix]) = (position_rad, velocity_rad_s);
             });
-            limits.check(&wanted, &wanted)
+            limits.check(&commanded, &commanded)
         };
         // sqrt(2 * 2.585 * 0.1) - 0.2 = 0.519
         assert_eq!(at(1.6918, 0.51), Ok(()));

@@ -15,7 +15,7 @@ pub(super) enum Request {
     Recover,
     Model,
     Library,
-    Wall,
+    CartesianLimit,
     Set(Setting),
 }
 
@@ -64,7 +64,7 @@ impl Request {
                 v5::Command::Connect => Self::Connect,
                 v5::Command::Move => Self::Move,
                 v5::Command::StopMove => Self::Stop,
-                v5::Command::GetCartesianLimit => Self::Wall,
+                v5::Command::GetCartesianLimit => Self::CartesianLimit,
                 v5::Command::SetCollisionBehavior => Self::Set(Setting::Collision),
                 v5::Command::SetJointImpedance => Self::Set(Setting::JointImpedance),
                 v5::Command::SetCartesianImpedance => Self::Set(Setting::CartesianImpedance),

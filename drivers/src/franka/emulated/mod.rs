@@ -16,9 +16,9 @@ mod server;
 mod state;
 
 pub use limits::Limits;
-pub use server::PlayedRobot;
+pub use server::EmulatedRobot;
 #[cfg(any(test, fuzzing))]
-pub(crate) use server::hostile;
+pub(crate) use server::fuzz;
 
 use super::N_JOINTS;
 use franka::FciVersion;
@@ -55,7 +55,7 @@ pub struct Joints {
 
 /// Where a client wants the joints to be at one instant; where they were last wanted while no motion runs.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Wanted {
+pub struct CommandedJoints {
     /// Angles, rad.
     pub position_rad: [f64; N_JOINTS],
     /// Their rates, rad/s.
@@ -67,4 +67,4 @@ pub struct Wanted {
 }
 
 /// Who says where the joints are: asked once for each millisecond, in order, with where they are wanted.
-pub type Owner = Box<dyn FnMut(Stamp, &Wanted) -> Joints + Send>;
+pub type JointSimulator = Box<dyn FnMut(Stamp, &CommandedJoints) -> Joints + Send>;

@@ -6,7 +6,7 @@ use std::fmt::Write;
 /// Each joint's place after the one before it: x, y, z in metres, and the turn about x in quarter turns.
 ///
 /// Source: `franka_description`; the FR3 has the Panda's lengths.
-const PLACES: [(f64, f64, f64, f64); 7] = [
+const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
     (0.0, 0.0, 0.333, 0.0),
     (0.0, 0.0, 0.0, -1.0),
     (0.0, -0.316, 0.0, 1.0),
@@ -19,7 +19,7 @@ const PLACES: [(f64, f64, f64, f64); 7] = [
 /// A URDF of the joints with the limits that clients look for; no bodies.
 pub(super) fn urdf(limits: &Limits) -> String {
     let mut text = String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
-    for (ix, (x, y, z, quarters)) in PLACES.into_iter().enumerate() {
+    for (ix, (x, y, z, quarters)) in JOINT_ORIGINS.into_iter().enumerate() {
         let n = ix + 1;
         let [lower, upper] = limits.position_rad[ix];
         let velocity = limits.velocity_rad_s[ix];
@@ -51,16 +51,16 @@ mod tests {
     use kinematics::Chain;
 
     #[test]
-    fn the_description_is_of_a_panda_and_has_the_limits() {
+    fn description_matches_panda_with_limits() {
         let text = urdf(&Limits::fr3());
         let ours = Chain::from_urdf(&text, "fr3_link0", "fr3_link8").unwrap();
         let panda = include_str!("../../../../kinematics/tests/data/panda.urdf");
         let panda = Chain::from_urdf(panda, "link0", "link8").unwrap();
         let q = [0.3, -0.7, 0.2, -2.1, 0.4, 1.9, -0.8];
-        let off = ours.forward(&q).unwrap().inverse() * panda.forward(&q).unwrap();
-        assert!(off.translation.vector.norm() < 1e-9 && off.rotation.angle() < 1e-9, "{off}");
+        let error = ours.forward(&q).unwrap().inverse() * panda.forward(&q).unwrap();
+        assert!(error.translation.vector.norm() < 1e-9 && error.rotation.angle() < 1e-9, "{error}");
         // What a client makes of it lies just inside of what is checked here.
-        let theirs = JointVelocityLimitsConfig::from_urdf(&text).unwrap().upper_limits(&q);
-        assert!((theirs[1] - 2.62).abs() < 1e-2, "{theirs:?}");
+        let parsed_limits = JointVelocityLimitsConfig::from_urdf(&text).unwrap().upper_limits(&q);
+        assert!((parsed_limits[1] - 2.62).abs() < 1e-2, "{parsed_limits:?}");
     }
 }

@@ -4,7 +4,7 @@ use super::super::N_JOINTS;
 use super::super::state::pose;
 use super::limits::{STEP_SECS, Violation};
 use super::message::{Command, Reply, Request, Setting};
-use super::{Joints, RobotConfig, Wanted, model};
+use super::{CommandedJoints, Joints, RobotConfig, model};
 use franka::wire::f64s_to_f64;
 use franka::wire::robot::{v5, v10};
 use franka::{Errors, FciVersion, MoveStatus};
@@ -18,11 +18,11 @@ const MAX_MISSED: u32 = 20;
 /// States after which a motion must have begun.
 const MAX_UNTIL_FIRST: u32 = 1000;
 /// Over so many states the share of answered ones is told.
-const N_JUDGED: usize = 100;
+const N_SUCCESS_WINDOW: usize = 100;
 /// A robot at rest is wanted where it was put; further off it was moved otherwise, and is wanted where it is.
-const SAG_RAD: f64 = 0.01;
+const MAX_SAG_RAD: f64 = 0.01;
 /// Torques from outside that end a motion until a client sets others, Nm.
-const USUAL_CONTACT_NM: f64 = 20.0;
+const DEFAULT_CONTACT_NM: f64 = 20.0;
 
 /// The controller of one robot, without its sockets.
 pub(super) struct Robot {
@@ -31,7 +31,7 @@ pub(super) struct Robot {
     pub(super) ee_from_stiffness: Transform,
     contact_nm: [f64; N_JOINTS],
     pub(super) joints: Joints,
-    pub(super) wanted: Wanted,
+    pub(super) commanded: CommandedJoints,
     pub(super) mode: Mode,
     pub(super) reflex_reason: Errors,
     answered: VecDeque<bool>,
@@ -47,14 +47,14 @@ pub(super) enum Mode {
 #[derive(Clone, Copy)]
 pub(super) struct Motion {
     command_id: u32,
-    pub(super) generator: Generator,
+    pub(super) generator: TrajectoryGenerator,
     pub(super) controller: v10::ControllerMode,
     has_begun: bool,
     n_missed: u32,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Generator {
+pub(super) enum TrajectoryGenerator {
     Position,
     Velocity,
 }
@@ -62,17 +62,17 @@ pub(super) enum Generator {
 impl Robot {
     /// At rest where its owner says.
     pub(super) fn new(config: RobotConfig, joints: Joints) -> Self {
-        let wanted = Wanted { position_rad: joints.position_rad, ..Wanted::default() };
+        let commanded = CommandedJoints { position_rad: joints.position_rad, ..CommandedJoints::default() };
         Self {
             config,
             nominal_from_ee: Transform::identity(),
             ee_from_stiffness: Transform::identity(),
-            contact_nm: [USUAL_CONTACT_NM; N_JOINTS],
+            contact_nm: [DEFAULT_CONTACT_NM; N_JOINTS],
             joints,
-            wanted,
+            commanded,
             mode: Mode::Idle,
             reflex_reason: Errors::default(),
-            answered: VecDeque::with_capacity(N_JUDGED),
+            answered: VecDeque::with_capacity(N_SUCCESS_WINDOW),
         }
     }
 
@@ -93,13 +93,14 @@ impl Robot {
             Request::Recover => {
                 if matches!(self.mode, Mode::Reflex) {
                     self.mode = Mode::Idle;
-                    self.wanted = Wanted { position_rad: self.joints.position_rad, ..Wanted::default() };
+                    self.commanded =
+                        CommandedJoints { position_rad: self.joints.position_rad, ..CommandedJoints::default() };
                 }
                 vec![u8::from(is_moving)]
             }
             Request::Model => [&[0], model::urdf(&self.config.limits).as_bytes()].concat(),
             Request::Library => vec![v5::LoadModelLibraryStatus::Error.to_u8()],
-            Request::Wall => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
+            Request::CartesianLimit => vec![0; size_of::<v5::GetCartesianLimitResponse>()],
             Request::Set(_) if is_moving => vec![v10::GetterSetterStatus::CommandNotPossibleRejected.to_u8()],
             Request::Set(setting) => vec![self.set(setting, payload).to_u8()],
         };
@@ -127,34 +128,34 @@ impl Robot {
             _ => return MoveStatus::InvalidArgumentRejected,
         };
         let generator = match v10::MoveMotionGeneratorMode::from_u32(generator) {
-            Some(v10::MoveMotionGeneratorMode::JointPosition) => Generator::Position,
-            Some(v10::MoveMotionGeneratorMode::JointVelocity) => Generator::Velocity,
+            Some(v10::MoveMotionGeneratorMode::JointPosition) => TrajectoryGenerator::Position,
+            Some(v10::MoveMotionGeneratorMode::JointVelocity) => TrajectoryGenerator::Velocity,
             _ => return MoveStatus::InvalidArgumentRejected,
         };
         self.mode = Mode::Move(Motion { command_id, generator, controller, has_begun: false, n_missed: 0 });
         self.reflex_reason = Errors::default();
-        self.wanted.is_moving = true;
+        self.commanded.is_moving = true;
         self.answered.clear();
         MoveStatus::MotionStarted
     }
 
     fn set(&mut self, setting: Setting, payload: &[u8]) -> v10::GetterSetterStatus {
-        const WRONG: v10::GetterSetterStatus = v10::GetterSetterStatus::InvalidArgumentRejected;
+        const INVALID: v10::GetterSetterStatus = v10::GetterSetterStatus::InvalidArgumentRejected;
         if payload.len() != setting.n_bytes() {
-            return WRONG;
+            return INVALID;
         }
         match setting {
             Setting::EeToStiffness | Setting::NominalToEe => {
-                let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else { return WRONG };
-                let Ok(pose) = pose(&f64s_to_f64(&matrix)) else { return WRONG };
+                let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else { return INVALID };
+                let Ok(pose) = pose(&f64s_to_f64(&matrix)) else { return INVALID };
                 match setting {
                     Setting::NominalToEe => self.nominal_from_ee = pose,
                     _ => self.ee_from_stiffness = pose,
                 }
             }
             Setting::Collision => {
-                let Ok(asked) = v10::SetCollisionBehaviorRequest::read_from_bytes(payload) else { return WRONG };
-                self.contact_nm = f64s_to_f64(&asked.upper_torque_thresholds_nominal);
+                let Ok(thresholds) = v10::SetCollisionBehaviorRequest::read_from_bytes(payload) else { return INVALID };
+                self.contact_nm = f64s_to_f64(&thresholds.upper_torque_thresholds_nominal);
             }
             Setting::JointImpedance
             | Setting::CartesianImpedance
@@ -167,46 +168,47 @@ impl Robot {
 
     /// Follows the motion by a millisecond: by the client's answer to the newest state, or on as before without one.
     ///
-    /// `had_time` says whether the client could have answered: a player that is late itself asks too much.
-    pub(super) fn follow(&mut self, command: Option<&Command>, had_time: bool) -> Option<Reply> {
+    /// `could_answer` says whether the client could have answered: a player that is late itself asks too much.
+    pub(super) fn follow(&mut self, command: Option<&Command>, could_answer: bool) -> Option<Reply> {
         let Mode::Move(mut motion) = self.mode else { return None };
-        if command.is_some() || (had_time && motion.has_begun) {
-            self.answered.truncate(N_JUDGED - 1);
+        if command.is_some() || (could_answer && motion.has_begun) {
+            self.answered.truncate(N_SUCCESS_WINDOW - 1);
             self.answered.push_front(command.is_some());
         }
-        let before = self.wanted;
+        let before = self.commanded;
         let Some(command) = command else {
-            motion.n_missed += u32::from(had_time);
-            let most = if motion.has_begun { MAX_MISSED } else { MAX_UNTIL_FIRST };
-            if motion.n_missed > most {
-                return self.stop_by("communication_constraints_violation");
+            motion.n_missed += u32::from(could_answer);
+            let max = if motion.has_begun { MAX_MISSED } else { MAX_UNTIL_FIRST };
+            if motion.n_missed > max {
+                return self.trigger_reflex("communication_constraints_violation");
             }
             self.mode = Mode::Move(motion);
             if motion.has_begun {
-                self.wanted =
-                    after(&before, |ix, _| before.velocity_rad_s[ix] + before.acceleration_rad_s2[ix] * STEP_SECS);
+                self.commanded = next_commanded(&before, |ix, _| {
+                    before.velocity_rad_s[ix] + before.acceleration_rad_s2[ix] * STEP_SECS
+                });
             }
             return None;
         };
-        let now = after(&before, |ix, from| match motion.generator {
-            Generator::Position => (command.position_rad[ix] - from) / STEP_SECS,
-            Generator::Velocity => command.velocity_rad_s[ix],
+        let now = next_commanded(&before, |ix, from| match motion.generator {
+            TrajectoryGenerator::Position => (command.position_rad[ix] - from) / STEP_SECS,
+            TrajectoryGenerator::Velocity => command.velocity_rad_s[ix],
         });
         if let Err(violation) = self.config.limits.check(&before, &now) {
-            let is_elsewhere = !motion.has_begun && motion.generator == Generator::Position;
-            let violation = if is_elsewhere { Violation::StartPose } else { violation };
-            return self.stop_by(violation.name());
+            let is_wrong_start = !motion.has_begun && motion.generator == TrajectoryGenerator::Position;
+            let violation = if is_wrong_start { Violation::StartPose } else { violation };
+            return self.trigger_reflex(violation.name());
         }
-        self.wanted = now;
+        self.commanded = now;
         if !command.is_last {
             self.mode = Mode::Move(Motion { has_begun: true, n_missed: 0, ..motion });
             return None;
         }
         // It stands still from here on.
-        let brakes = |(velocity, most): (f64, f64)| velocity.abs() <= most * STEP_SECS;
-        match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(brakes) {
+        let can_stop = |(velocity, max): (f64, f64)| velocity.abs() <= max * STEP_SECS;
+        match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(can_stop) {
             true => self.end(MoveStatus::Success),
-            false => self.stop_by(Violation::Acceleration.name()),
+            false => self.trigger_reflex(Violation::Acceleration.name()),
         }
     }
 
@@ -214,14 +216,14 @@ impl Robot {
     pub(super) fn observe(&mut self, joints: Joints) -> Option<Reply> {
         self.joints = joints;
         let Mode::Move(_) = self.mode else {
-            let is_off = |(wanted, is): (f64, f64)| (wanted - is).abs() > SAG_RAD;
-            if self.wanted.position_rad.into_iter().zip(joints.position_rad).any(is_off) {
-                self.wanted.position_rad = joints.position_rad;
+            let is_displaced = |(commanded, is): (f64, f64)| (commanded - is).abs() > MAX_SAG_RAD;
+            if self.commanded.position_rad.into_iter().zip(joints.position_rad).any(is_displaced) {
+                self.commanded.position_rad = joints.position_rad;
             }
             return None;
         };
-        let is_hit = joints.external_torque_nm.into_iter().zip(self.contact_nm).any(|(nm, most)| nm.abs() > most);
-        if is_hit { self.stop_by("joint_reflex") } else { None }
+        let has_contact = joints.external_torque_nm.into_iter().zip(self.contact_nm).any(|(nm, max)| nm.abs() > max);
+        if has_contact { self.trigger_reflex("joint_reflex") } else { None }
     }
 
     /// The client is gone.
@@ -236,7 +238,7 @@ impl Robot {
         n_answered as f64 / self.answered.len().max(1) as f64
     }
 
-    fn stop_by(&mut self, reason: &str) -> Option<Reply> {
+    fn trigger_reflex(&mut self, reason: &str) -> Option<Reply> {
         let mut reasons = Errors::default();
         reasons.0[Errors::index_of(reason)?] = true;
         let reply = self.end(MoveStatus::ReflexAborted);
@@ -250,7 +252,7 @@ impl Robot {
     fn end(&mut self, status: MoveStatus) -> Option<Reply> {
         let Mode::Move(Motion { command_id, .. }) = self.mode else { return None };
         self.mode = Mode::Idle;
-        self.wanted = Wanted { position_rad: self.wanted.position_rad, ..Wanted::default() };
+        self.commanded = CommandedJoints { position_rad: self.commanded.position_rad, ..CommandedJoints::default() };
         Some(Reply { command: v10::Command::Move.to_u32(), command_id, payload: vec![self.move_byte(status)] })
     }
 
@@ -270,9 +272,9 @@ impl Robot {
 }
 
 /// Where joints are wanted a millisecond later, with rates by joint and place.
-fn after(before: &Wanted, rate: impl Fn(usize, f64) -> f64) -> Wanted {
+fn next_commanded(before: &CommandedJoints, rate: impl Fn(usize, f64) -> f64) -> CommandedJoints {
     let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
-    Wanted {
+    CommandedJoints {
         position_rad: std::array::from_fn(|ix| before.position_rad[ix] + velocity_rad_s[ix] * STEP_SECS),
         velocity_rad_s,
         acceleration_rad_s2: std::array::from_fn(|ix| (velocity_rad_s[ix] - before.velocity_rad_s[ix]) / STEP_SECS),

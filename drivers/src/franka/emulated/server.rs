@@ -1,12 +1,12 @@
 //! The sockets of a played robot, and the thread that moves bytes between them and the robot a thousand times a second.
 
 #[cfg(any(test, fuzzing))]
-pub(crate) mod hostile;
+pub(crate) mod fuzz;
 
 use super::super::{N_JOINTS, realtime};
 use super::message::{Command, Reply, Request};
 use super::robot::Robot;
-use super::{Owner, RobotConfig, Wanted};
+use super::{CommandedJoints, JointSimulator, RobotConfig};
 use crate::{Error, clock};
 use franka::FciVersion;
 use franka::wire::robot::ConnectStatus;
@@ -22,7 +22,7 @@ use std::time::Duration;
 /// From state to state.
 const STEP: Duration = Duration::from_millis(1);
 /// States that are sent later rather than not at all where the player was not woken in time; longer gaps stay.
-const MAX_BEHIND: Duration = Duration::from_millis(100);
+const MAX_LAG: Duration = Duration::from_millis(100);
 /// No client asks for more in one message.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
 /// No command is longer; what is longer is none.
@@ -30,15 +30,15 @@ const MAX_COMMAND_BYTES: usize = 512;
 
 /// A robot that takes clients, one at a time, until it is dropped.
 #[derive(Debug)]
-pub struct PlayedRobot {
+pub struct EmulatedRobot {
     address: SocketAddr,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl PlayedRobot {
+impl EmulatedRobot {
     /// Listens, and asks the owner where the joints are from now on.
-    pub fn start(config: RobotConfig, mut owner: Owner) -> Result<Self, Error> {
+    pub fn start(config: RobotConfig, mut joint_simulator: JointSimulator) -> Result<Self, Error> {
         let device = "played robot".to_owned();
         let n = config.chain.n_joints();
         if n != N_JOINTS {
@@ -54,13 +54,13 @@ impl PlayedRobot {
         };
         let listen = |source| Error::Listen { device: device.clone(), address: config.address, source };
         let (address, listener, states) = bind().map_err(listen)?;
-        let joints = owner(clock::now(), &Wanted::default());
+        let joints = joint_simulator(clock::now(), &CommandedJoints::default());
         let stop = Arc::new(AtomicBool::new(false));
         let mut server = Server {
             listener,
             states,
             robot: Robot::new(config, joints),
-            owner,
+            joint_simulator,
             client: None,
             stop: Arc::clone(&stop),
         };
@@ -75,7 +75,7 @@ impl PlayedRobot {
     }
 }
 
-impl Drop for PlayedRobot {
+impl Drop for EmulatedRobot {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
@@ -89,7 +89,7 @@ struct Server {
     listener: TcpListener,
     states: UdpSocket,
     robot: Robot,
-    owner: Owner,
+    joint_simulator: JointSimulator,
     client: Option<Client>,
     stop: Arc<AtomicBool>,
 }
@@ -100,51 +100,51 @@ struct Client {
     /// Where states go, once it has said so.
     states_to: Option<SocketAddr>,
     /// What came of a message that is not complete.
-    inbox: Vec<u8>,
+    buffer_in: Vec<u8>,
 }
 
 /// The client has to go: it hung up, or talks nonsense.
-struct Gone;
+struct Disconnected;
 
 impl Server {
     fn run(&mut self) {
-        realtime::claim("played robot");
-        let began = clock::now();
+        realtime::request_realtime("played robot");
+        let start_time = clock::now();
         let mut n_steps: u32 = 0;
         // The robot has been on for a while.
         let mut number = 1_000_000;
         while !self.stop.load(Ordering::Relaxed) {
-            let due = began + STEP * n_steps;
+            let due = start_time + STEP * n_steps;
             let now = clock::now();
-            let behind = now.duration_since(due);
-            if behind > MAX_BEHIND {
-                let n_skipped = u32::try_from(behind.as_millis()).unwrap_or(u32::MAX);
+            let lag = now.duration_since(due);
+            if lag > MAX_LAG {
+                let n_skipped = u32::try_from(lag.as_millis()).unwrap_or(u32::MAX);
                 (n_steps, number) = (n_steps.saturating_add(n_skipped), number + u64::from(n_skipped));
                 continue;
             }
             std::thread::sleep(due.duration_since(now));
             // Before the last of several overdue states nobody can have answered.
-            self.step(due, number, behind < STEP);
+            self.step(due, number, lag < STEP);
             (n_steps, number) = (n_steps.saturating_add(1), number + 1);
         }
     }
 
     /// One millisecond: hears what clients want, moves on, tells the state.
-    fn step(&mut self, due: Stamp, number: u64, had_time: bool) {
+    fn step(&mut self, due: Stamp, number: u64, could_answer: bool) {
         if let Some(mut client) = self.client.take() {
-            match client.hear(&mut self.robot) {
+            match client.read_requests(&mut self.robot) {
                 Ok(()) => self.client = Some(client),
-                Err(Gone) => self.robot.abandon(),
+                Err(Disconnected) => self.robot.abandon(),
             }
         }
-        self.welcome();
+        self.accept_client();
         let command = self.newest_command(number - 1);
-        let ended = self.robot.follow(command.as_ref(), had_time);
-        let joints = (self.owner)(due, &self.robot.wanted);
-        let hit = self.robot.observe(joints);
+        let finished = self.robot.follow(command.as_ref(), could_answer);
+        let joints = (self.joint_simulator)(due, &self.robot.commanded);
+        let contact = self.robot.observe(joints);
         if let Some(client) = &mut self.client {
-            let told = ended.iter().chain(&hit).try_for_each(|reply| client.tell(reply));
-            if told.is_err() {
+            let sent = finished.iter().chain(&contact).try_for_each(|reply| client.send(reply));
+            if sent.is_err() {
                 self.client = None;
                 self.robot.abandon();
                 return;
@@ -157,14 +157,14 @@ impl Server {
     }
 
     /// Takes a client where there is none; others are sent away.
-    fn welcome(&mut self) {
+    fn accept_client(&mut self) {
         while let Ok((stream, peer)) = self.listener.accept() {
             if self.client.is_some() {
                 log::info!("played robot: {peer} is sent away, another client is there");
                 continue;
             }
             if stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true)).is_ok() {
-                self.client = Some(Client { stream, ip: peer.ip(), states_to: None, inbox: Vec::new() });
+                self.client = Some(Client { stream, ip: peer.ip(), states_to: None, buffer_in: Vec::new() });
             }
         }
     }
@@ -176,9 +176,9 @@ impl Server {
         loop {
             match self.states.recv_from(&mut buffer) {
                 Ok((n, from)) => {
-                    let is_its = self.client.as_ref().is_some_and(|client| client.ip == from.ip());
+                    let is_from_client = self.client.as_ref().is_some_and(|client| client.ip == from.ip());
                     let command = Command::decode(self.robot.config.version, &buffer[..n]);
-                    answer = command.filter(|command| is_its && command.number == number).or(answer);
+                    answer = command.filter(|command| is_from_client && command.number == number).or(answer);
                 }
                 // Where a client closed its port a send before this one is told here.
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => {}
@@ -190,57 +190,63 @@ impl Server {
 
 impl Client {
     /// Reads what has come and answers.
-    fn hear(&mut self, robot: &mut Robot) -> Result<(), Gone> {
+    fn read_requests(&mut self, robot: &mut Robot) -> Result<(), Disconnected> {
         let mut buffer = [0; 4096];
         loop {
             match self.stream.read(&mut buffer) {
-                Ok(0) => return Err(Gone),
-                Ok(n) => self.inbox.extend(&buffer[..n]),
+                Ok(0) => return Err(Disconnected),
+                Ok(n) => self.buffer_in.extend(&buffer[..n]),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return Ok(()),
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
-                Err(_) => return Err(Gone),
+                Err(_) => return Err(Disconnected),
             }
-            while let Some((command, command_id, size)) = HeaderLayout::Robot.decode_header(&self.inbox) {
+            while let Some((command, command_id, size)) = HeaderLayout::Robot.decode_header(&self.buffer_in) {
                 let size = usize::try_from(size).unwrap_or(usize::MAX);
                 if !(ROBOT_HEADER_LEN..=MAX_MESSAGE_BYTES).contains(&size) {
-                    return Err(Gone);
+                    return Err(Disconnected);
                 }
-                if self.inbox.len() < size {
+                if self.buffer_in.len() < size {
                     break;
                 }
-                let message: Vec<u8> = self.inbox.drain(..size).collect();
+                let message: Vec<u8> = self.buffer_in.drain(..size).collect();
                 self.answer(robot, command, command_id, &message[ROBOT_HEADER_LEN..])?;
             }
         }
     }
 
-    fn answer(&mut self, robot: &mut Robot, command: u32, command_id: u32, payload: &[u8]) -> Result<(), Gone> {
+    fn answer(&mut self, robot: &mut Robot, command: u32, command_id: u32, payload: &[u8]) -> Result<(), Disconnected> {
         match Request::from_number(robot.config.version, command) {
             Some(Request::Connect) => self.connect(robot.config.version, command, command_id, payload),
             Some(request) if self.states_to.is_some() => {
-                robot.answer(request, command, command_id, payload).iter().try_for_each(|reply| self.tell(reply))
+                robot.answer(request, command, command_id, payload).iter().try_for_each(|reply| self.send(reply))
             }
-            _ => Err(Gone),
+            _ => Err(Disconnected),
         }
     }
 
-    fn connect(&mut self, version: FciVersion, command: u32, command_id: u32, payload: &[u8]) -> Result<(), Gone> {
-        let [low, high, port_low, port_high] = *payload else { return Err(Gone) };
-        let ours: u16 = match version {
+    fn connect(
+        &mut self,
+        version: FciVersion,
+        command: u32,
+        command_id: u32,
+        payload: &[u8],
+    ) -> Result<(), Disconnected> {
+        let [low, high, port_low, port_high] = *payload else { return Err(Disconnected) };
+        let supported_version: u16 = match version {
             FciVersion::V5 => 5,
             FciVersion::V10 => 10,
         };
-        let status = if u16::from_le_bytes([low, high]) == ours {
+        let status = if u16::from_le_bytes([low, high]) == supported_version {
             self.states_to = Some(SocketAddr::new(self.ip, u16::from_le_bytes([port_low, port_high])));
             ConnectStatus::Success
         } else {
             ConnectStatus::IncompatibleLibraryVersion
         };
-        let payload = [&[status.to_u8()][..], &ours.to_le_bytes()].concat();
-        self.tell(&Reply { command, command_id, payload })
+        let payload = [&[status.to_u8()][..], &supported_version.to_le_bytes()].concat();
+        self.send(&Reply { command, command_id, payload })
     }
 
-    fn tell(&mut self, reply: &Reply) -> Result<(), Gone> {
-        self.stream.write_all(&reply.bytes()).map_err(|_| Gone)
+    fn send(&mut self, reply: &Reply) -> Result<(), Disconnected> {
+        self.stream.write_all(&reply.bytes()).map_err(|_| Disconnected)
     }
 }

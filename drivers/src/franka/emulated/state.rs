@@ -2,7 +2,7 @@
 
 use super::super::N_JOINTS;
 use super::super::state::columns;
-use super::robot::{Generator, Mode, Motion, Robot};
+use super::robot::{Mode, Motion, Robot, TrajectoryGenerator};
 use franka::FciVersion;
 use franka::wire::robot::{v5, v10};
 use kinematics::Transform;
@@ -15,7 +15,7 @@ const GRAVITY_M_S2: f64 = -9.81;
 macro_rules! state {
     ($robot:expr, $number:expr, $version:ident) => {{
         let robot: &Robot = $robot;
-        let (joints, wanted) = (&robot.joints, &robot.wanted);
+        let (joints, commanded) = (&robot.joints, &robot.commanded);
         let flange_from_nominal = robot.config.flange_from_ee;
         let flange_from_ee = flange_from_nominal * robot.nominal_from_ee;
         let ee_at = |position_rad| columns(&(robot.base_from_flange(position_rad) * flange_from_ee));
@@ -25,32 +25,32 @@ macro_rules! state {
         $version::RobotState {
             message_id: U64::new($number),
             O_T_EE: numbers(&ee_at(&joints.position_rad)),
-            O_T_EE_d: numbers(&ee_at(&wanted.position_rad)),
-            O_T_EE_c: numbers(&ee_at(&wanted.position_rad)),
+            O_T_EE_d: numbers(&ee_at(&commanded.position_rad)),
+            O_T_EE_c: numbers(&ee_at(&commanded.position_rad)),
             F_T_EE: numbers(&columns(&flange_from_ee)),
             F_T_NE: numbers(&columns(&flange_from_nominal)),
             NE_T_EE: numbers(&columns(&robot.nominal_from_ee)),
             EE_T_K: numbers(&columns(&robot.ee_from_stiffness)),
             elbow: numbers(&elbow(&joints.position_rad)),
-            elbow_d: numbers(&elbow(&wanted.position_rad)),
-            elbow_c: numbers(&elbow(&wanted.position_rad)),
+            elbow_d: numbers(&elbow(&commanded.position_rad)),
+            elbow_c: numbers(&elbow(&commanded.position_rad)),
             tau_J: numbers(&joints.torque_nm),
             tau_J_d: numbers(&joints.torque_nm),
             tau_ext_hat_filtered: numbers(&joints.external_torque_nm),
             q: numbers(&joints.position_rad),
-            q_d: numbers(&wanted.position_rad),
+            q_d: numbers(&commanded.position_rad),
             theta: numbers(&joints.position_rad),
             dq: numbers(&joints.velocity_rad_s),
-            dq_d: numbers(&wanted.velocity_rad_s),
+            dq_d: numbers(&commanded.velocity_rad_s),
             dtheta: numbers(&joints.velocity_rad_s),
-            ddq_d: numbers(&wanted.acceleration_rad_s2),
+            ddq_d: numbers(&commanded.acceleration_rad_s2),
             O_ddP_O: numbers(&[0.0, 0.0, GRAVITY_M_S2]),
             motion_generator_mode,
             controller_mode,
             robot_mode,
             errors: if matches!(robot.mode, Mode::Reflex) { reasons } else { [0; franka::errors::ERROR_COUNT] },
             reflex_reason: reasons,
-            control_command_success_rate: Number::of(robot.success_frac()),
+            control_command_success_rate: Number::values(robot.success_frac()),
             ..$version::RobotState::default()
         }
     }};
@@ -69,10 +69,10 @@ impl Robot {
         let (generator, controller, robot) = match self.mode {
             Mode::Idle => (v10::MotionGeneratorMode::Idle, v10::ControllerMode::Other, v10::RobotMode::Idle),
             Mode::Reflex => (v10::MotionGeneratorMode::Idle, v10::ControllerMode::Other, v10::RobotMode::Reflex),
-            Mode::Move(Motion { generator: Generator::Position, controller, .. }) => {
+            Mode::Move(Motion { generator: TrajectoryGenerator::Position, controller, .. }) => {
                 (v10::MotionGeneratorMode::JointPosition, controller, v10::RobotMode::Move)
             }
-            Mode::Move(Motion { generator: Generator::Velocity, controller, .. }) => {
+            Mode::Move(Motion { generator: TrajectoryGenerator::Velocity, controller, .. }) => {
                 (v10::MotionGeneratorMode::JointVelocity, controller, v10::RobotMode::Move)
             }
         };
@@ -86,22 +86,22 @@ impl Robot {
 
 /// A number of a state: FCI 5 sends doubles, FCI 10 floats.
 trait Number: Copy {
-    fn of(number: f64) -> Self;
+    fn values(number: f64) -> Self;
 }
 
 impl Number for F64 {
-    fn of(number: f64) -> Self {
+    fn values(number: f64) -> Self {
         Self::new(number)
     }
 }
 
 impl Number for F32 {
     #[expect(clippy::cast_possible_truncation, reason = "FCI 10 sends floats")]
-    fn of(number: f64) -> Self {
+    fn values(number: f64) -> Self {
         Self::new(number as f32)
     }
 }
 
-fn numbers<T: Number, const N: usize>(of: &[f64; N]) -> [T; N] {
-    of.map(T::of)
+fn numbers<T: Number, const N: usize>(values: &[f64; N]) -> [T; N] {
+    values.map(T::values)
 }

@@ -32,7 +32,7 @@ pub(super) struct VideoFrame {
     pub(super) domain: sys::rs2_timestamp_domain,
     pub(super) number: c_int,
     pub(super) profile: *const sys::rs2_stream_profile,
-    pub(super) metres_per_count: f32,
+    pub(super) meters_per_count: f32,
 }
 
 unsafe extern "C" {

@@ -5,7 +5,7 @@
 
 mod abi;
 
-use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, made, making, path_name};
+use super::sdk::{Context, Device, Mode, Modes, Queue, Sensor, call, device_creation_lock, non_null, path_name};
 use super::{Problem, lens};
 use crate::{Image, PixelFormat, YuvLayout};
 use abi::{VideoFrame, VideoStream};
@@ -20,11 +20,11 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Images that the library may still have to write: it drops what it cannot keep, so it is waited for.
-const MAX_UNWRITTEN: usize = 16;
+const MAX_QUEUED_IMAGES: usize = 16;
 /// A disk that takes no image for this long is full, or gone.
 const MAX_WAIT: Duration = Duration::from_secs(30);
 /// How often it is looked for whether images were written.
-const LOOK: Duration = Duration::from_millis(1);
+const POLL: Duration = Duration::from_millis(1);
 /// As the D400 family names its sensors; it counts the exposure of the second one in 100 us.
 const DEPTH_SENSOR: &CStr = c"Stereo Module";
 const IMAGE_SENSOR: &CStr = c"RGB Camera";
@@ -35,7 +35,7 @@ const NANOS_PER_MICRO: i64 = 1000;
 
 /// The camera that a file pretends to be of.
 #[derive(Clone, Debug)]
-pub struct PlayedCamera {
+pub struct EmulatedCamera {
     /// What it calls itself.
     pub name: String,
     /// Its serial number.
@@ -47,18 +47,18 @@ pub struct PlayedCamera {
     /// How their bytes are to be read: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes a pixel.
     pub format: PixelFormat,
     /// Its depth.
-    pub depth: Option<PlayedDepth>,
+    pub depth: Option<EmulatedDepth>,
 }
 
 /// Depth of such a camera.
 #[derive(Clone, Debug)]
-pub struct PlayedDepth {
+pub struct EmulatedDepth {
     /// Its lens.
     pub intrinsics: Intrinsics,
     /// Pose of the depth camera in the frame of the colour camera.
     pub camera_from_depth: Transform,
     /// Metres per count.
-    pub metres_per_count: f64,
+    pub meters_per_count: f64,
 }
 
 /// A file that is being written; [`BagWriter::finish`] ends it.
@@ -71,15 +71,15 @@ pub struct BagWriter {
     _modes: Vec<Modes>,
     recorder: Device,
     queue: Queue,
-    color: Played,
-    depth: Option<Played>,
-    _camera: Device,
+    color: EmulatedStream,
+    depth: Option<EmulatedStream>,
+    _device: Device,
     _context: Context,
 }
 
 /// One stream of the played camera.
 #[derive(Debug)]
-struct Played {
+struct EmulatedStream {
     sensor: NonNull<sys::rs2_sensor>,
     profile: NonNull<sys::rs2_stream_profile>,
     format: PixelFormat,
@@ -89,15 +89,15 @@ struct Played {
     n_images: i32,
 }
 
-// SAFETY: the library may be called from any thread, and what these point to lives in `BagWriter::_camera`.
-unsafe impl Send for Played {}
+// SAFETY: the library may be called from any thread, and what these point to lives in `BagWriter::_device`.
+unsafe impl Send for EmulatedStream {}
 
 impl BagWriter {
     /// Begins a file; one of that name is replaced.
-    pub fn create(path: &Path, camera: &PlayedCamera) -> Result<Self, Problem> {
+    pub fn create(path: &Path, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
         let _ = std::fs::remove_file(path); // Not there, mostly; what cannot be removed the library cannot write, and says so.
-        let _alone = making();
+        let _guard = device_creation_lock();
         // SAFETY: the device is checked and then ours; sensors and profiles live as long as it does.
         let device = unsafe {
             let device = call("make a software device", |error| abi::rs2_create_software_device(error))?;
@@ -106,35 +106,35 @@ impl BagWriter {
         };
         // SAFETY: as above; sensors that are added live in the device.
         let (color, depth) = unsafe {
-            let depth = camera.depth.as_ref().map(|depth| Played::depth(device, camera, depth)).transpose()?;
-            let color = Played::color(device, camera)?;
-            if let (Some(played), Some(depth)) = (&depth, &camera.depth) {
+            let depth = camera.depth.as_ref().map(|depth| EmulatedStream::depth(device, camera, depth)).transpose()?;
+            let color = EmulatedStream::color(device, camera)?;
+            if let (Some(emulated), Some(depth)) = (&depth, &camera.depth) {
                 let extrinsics = lens::extrinsics(&depth.camera_from_depth);
                 call("place two cameras", |error| {
-                    sys::rs2_register_extrinsics(played.profile.as_ptr(), color.profile.as_ptr(), extrinsics, error);
+                    sys::rs2_register_extrinsics(emulated.profile.as_ptr(), color.profile.as_ptr(), extrinsics, error);
                 })?;
             }
             (color, depth)
         };
         // SAFETY: nobody else frees it.
         let device = unsafe { Device::new(device)? };
-        let refused = |reason: String| Problem::File { path: path.to_owned(), reason };
-        let name = path_name(path).map_err(refused)?;
+        let file_problem = |reason: String| Problem::File { path: path.to_owned(), reason };
+        let name = path_name(path).map_err(file_problem)?;
         // SAFETY: device and name live; the recorder is then ours and keeps the device.
         let recorder = unsafe {
             let recorder =
                 call("record", |error| sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error));
-            Device::new(recorder.map_err(|problem| refused(problem.to_string()))?)?
+            Device::new(recorder.map_err(|problem| file_problem(problem.to_string()))?)?
         };
         let mut writer = Self {
             path: path.to_owned(),
             number: N_FILES.fetch_add(1, Ordering::Relaxed),
             _modes: Vec::new(),
             recorder,
-            queue: Queue::new(u8::try_from(MAX_UNWRITTEN).expect("a small number"))?,
+            queue: Queue::new(u8::try_from(MAX_QUEUED_IMAGES).expect("a small number"))?,
             color,
             depth,
-            _camera: device,
+            _device: device,
             _context: context,
         };
         writer.start()?;
@@ -155,20 +155,24 @@ impl BagWriter {
     ///
     /// Fails where the image is not what the camera was said to give, or the disk takes nothing more.
     pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
-        let refused = |reason: String| Problem::File { path: self.path.clone(), reason };
-        let played = match (image.is_depth(), &mut self.depth) {
+        let file_problem = |reason: String| Problem::File { path: self.path.clone(), reason };
+        let emulated = match (image.is_depth(), &mut self.depth) {
             (true, Some(depth)) => depth,
-            (true, None) => return Err(refused("the played camera has no depth".into())),
+            (true, None) => return Err(file_problem("the played camera has no depth".into())),
             (false, _) => &mut self.color,
         };
-        if image.format != played.format || image.size_px != played.size_px {
-            let (got, wanted) = (format!("{:?} {:?}", image.format, image.size_px), (played.format, played.size_px));
-            return Err(refused(format!("an image is {got}, the played camera gives {:?} {:?}", wanted.0, wanted.1)));
+        if image.format != emulated.format || image.size_px != emulated.size_px {
+            let (got, expected) =
+                (format!("{:?} {:?}", image.format, image.size_px), (emulated.format, emulated.size_px));
+            return Err(file_problem(format!(
+                "an image is {got}, the played camera gives {:?} {:?}",
+                expected.0, expected.1
+            )));
         }
-        let bytes = image.raw_bytes().map_err(|error| refused(error.to_string()))?;
-        played.send(self.number, image, bytes)?;
+        let bytes = image.raw_bytes().map_err(|error| file_problem(error.to_string()))?;
+        emulated.send(self.number, image, bytes)?;
         // What was recorded comes out of the recorder, too, and is lent as long as it is not freed.
-        wait_until_written(&self.path, self.number, MAX_UNWRITTEN, || self.queue.empty())
+        wait_until_written(&self.path, self.number, MAX_QUEUED_IMAGES, || self.queue.empty())
     }
 
     /// Ends the file: everything is in it then.
@@ -185,7 +189,7 @@ impl BagWriter {
 ///
 /// # Safety
 /// The pointer must be a software device.
-unsafe fn register(device: *mut sys::rs2_device, camera: &PlayedCamera) -> Result<(), Problem> {
+unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<(), Problem> {
     let text = |text: &str| {
         CString::new(text)
             .map_err(|error| Problem::Library { what: "take the name of a camera", reason: error.to_string() })
@@ -204,10 +208,10 @@ unsafe fn register(device: *mut sys::rs2_device, camera: &PlayedCamera) -> Resul
     Ok(())
 }
 
-impl Played {
+impl EmulatedStream {
     /// # Safety
     /// The pointer must be a software device that outlives this.
-    unsafe fn color(device: *mut sys::rs2_device, camera: &PlayedCamera) -> Result<Self, Problem> {
+    unsafe fn color(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let format = match camera.format {
             PixelFormat::Rgb8 => Some((sys::rs2_format_RS2_FORMAT_RGB8, 3)),
             PixelFormat::Bgr8 => Some((sys::rs2_format_RS2_FORMAT_BGR8, 3)),
@@ -227,18 +231,22 @@ impl Played {
 
     /// # Safety
     /// The pointer must be a software device that outlives this.
-    unsafe fn depth(device: *mut sys::rs2_device, camera: &PlayedCamera, depth: &PlayedDepth) -> Result<Self, Problem> {
+    unsafe fn depth(
+        device: *mut sys::rs2_device,
+        camera: &EmulatedCamera,
+        depth: &EmulatedDepth,
+    ) -> Result<Self, Problem> {
         let stream = stream(sys::rs2_stream_RS2_STREAM_DEPTH, 2, camera.rate_hz, &depth.intrinsics);
         let stream = VideoStream { bytes_per_pixel: 2, format: sys::rs2_format_RS2_FORMAT_Z16, ..stream };
-        let format = PixelFormat::DepthU16 { metres_per_count: depth.metres_per_count };
+        let format = PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count };
         // SAFETY: by the caller's word; the sensor lives in the device.
         unsafe {
-            let played = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
-            let (units, scale) = (sys::rs2_option_RS2_OPTION_DEPTH_UNITS, narrow(depth.metres_per_count));
+            let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
+            let (units, scale) = (sys::rs2_option_RS2_OPTION_DEPTH_UNITS, narrow(depth.meters_per_count));
             call("set depth units", |error| {
-                abi::rs2_software_sensor_add_read_only_option(played.sensor.as_ptr(), units, scale, error);
+                abi::rs2_software_sensor_add_read_only_option(emulated.sensor.as_ptr(), units, scale, error);
             })?;
-            Ok(played)
+            Ok(emulated)
         }
     }
 
@@ -255,13 +263,13 @@ impl Played {
         // SAFETY: device and name live; sensors and streams that are added live in the device.
         unsafe {
             let sensor = call(WHAT, |error| abi::rs2_software_device_add_sensor(device, name.as_ptr(), error))?;
-            let sensor = made(WHAT, sensor)?;
+            let sensor = non_null(WHAT, sensor)?;
             let profile =
                 call(WHAT, |error| abi::rs2_software_sensor_add_video_stream_ex(sensor.as_ptr(), stream, 1, error))?;
             let size_px = [stream.width, stream.height].map(|side| u32::try_from(side).unwrap_or(0));
             Ok(Self {
                 sensor,
-                profile: made(WHAT, profile)?,
+                profile: non_null(WHAT, profile)?,
                 format,
                 bytes_per_pixel: stream.bytes_per_pixel,
                 size_px,
@@ -275,36 +283,36 @@ impl Played {
     fn send(&mut self, file: u64, image: &Image, bytes: &[u8]) -> Result<(), Problem> {
         self.n_images += 1;
         let micros = image.stamp.0.div_euclid(NANOS_PER_MICRO);
-        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP, micros)?;
-        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER, self.n_images.into())?;
+        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP, micros)?;
+        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER, self.n_images.into())?;
         // The library divides by what it works out of two stamps where it is not told a rate.
-        self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS, 0)?;
+        self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS, 0)?;
         if let Some(secs) = image.exposure_secs {
             #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
             let counts = (secs / self.exposure_secs_per_count).round() as i64;
-            self.tell(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE, counts)?;
+            self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE, counts)?;
         }
         let frame = VideoFrame {
-            pixels: lend(file, bytes),
-            deleter: take_back,
+            pixels: lend_pixels(file, bytes),
+            deleter: reclaim_pixels,
             bytes_per_line: i32::try_from(self.size_px[0]).unwrap_or(0) * self.bytes_per_pixel,
             bytes_per_pixel: self.bytes_per_pixel,
             millis: image.stamp.0 as f64 / NANOS_PER_MILLI,
             domain: sys::rs2_timestamp_domain_RS2_TIMESTAMP_DOMAIN_HARDWARE_CLOCK,
             number: self.n_images,
             profile: self.profile.as_ptr(),
-            metres_per_count: match self.format {
-                PixelFormat::DepthU16 { metres_per_count } => narrow(metres_per_count),
+            meters_per_count: match self.format {
+                PixelFormat::DepthU16 { meters_per_count } => narrow(meters_per_count),
                 _ => 0.0,
             },
         };
-        // SAFETY: the sensor lives in the device; the pixels live until the library gives them back to `take_back`.
+        // SAFETY: the sensor lives in the device; the pixels live until the library gives them back to `reclaim_pixels`.
         call("take an image", |error| unsafe {
             abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);
         })
     }
 
-    fn tell(&self, key: sys::rs2_frame_metadata_value, value: i64) -> Result<(), Problem> {
+    fn set_metadata(&self, key: sys::rs2_frame_metadata_value, value: i64) -> Result<(), Problem> {
         // SAFETY: the sensor lives in the device.
         call("take metadata", |error| unsafe {
             abi::rs2_software_sensor_set_metadata(self.sensor.as_ptr(), key, value, error);
@@ -314,7 +322,7 @@ impl Played {
 
 /// What all streams have; format and bytes per pixel are the caller's.
 fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &Intrinsics) -> VideoStream {
-    let intrinsics = lens::told(intrinsics);
+    let intrinsics = lens::raw(intrinsics);
     VideoStream {
         stream,
         index: 0,
@@ -329,48 +337,48 @@ fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &In
 }
 
 /// Images by address, and beside each which file it is for.
-type Lent = BTreeMap<usize, (u64, Box<[u8]>)>;
+type LentPixels = BTreeMap<usize, (u64, Box<[u8]>)>;
 
 /// Images that the library has: it says only where they were when it gives them back.
-static LENT: Mutex<Lent> = Mutex::new(BTreeMap::new());
+static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
 /// Files begun so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);
 
-fn lent() -> MutexGuard<'static, Lent> {
-    LENT.lock().unwrap_or_else(PoisonError::into_inner)
+fn lent_pixels() -> MutexGuard<'static, LentPixels> {
+    LENT_PIXELS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn lend(file: u64, bytes: &[u8]) -> *mut c_void {
+fn lend_pixels(file: u64, bytes: &[u8]) -> *mut c_void {
     let mut copy: Box<[u8]> = bytes.into();
     let pixels = copy.as_mut_ptr();
-    lent().insert(pixels.addr(), (file, copy));
+    lent_pixels().insert(pixels.addr(), (file, copy));
     pixels.cast()
 }
 
-extern "C" fn take_back(pixels: *mut c_void) {
-    lent().remove(&pixels.addr());
+extern "C" fn reclaim_pixels(pixels: *mut c_void) {
+    lent_pixels().remove(&pixels.addr());
 }
 
 /// Waits until the library has at most so many images of a file.
 fn wait_until_written(
     path: &Path,
     file: u64,
-    most: usize,
-    meanwhile: impl Fn() -> Result<(), Problem>,
+    max_pending: usize,
+    poll: impl Fn() -> Result<(), Problem>,
 ) -> Result<(), Problem> {
-    let began = Instant::now();
+    let started = Instant::now();
     loop {
-        meanwhile()?;
-        if lent().values().filter(|(whose, _)| *whose == file).count() <= most {
+        poll()?;
+        if lent_pixels().values().filter(|(owner, _)| *owner == file).count() <= max_pending {
             return Ok(());
         }
-        if began.elapsed() > MAX_WAIT {
+        if started.elapsed() > MAX_WAIT {
             return Err(Problem::File {
                 path: path.to_owned(),
                 reason: format!("no image was written for {MAX_WAIT:?}"),
             });
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(POLL);
     }
 }
 

@@ -4,7 +4,7 @@
 //! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Transfers in segments and blocks
 //! are refused: no object that a drive needs is longer than four bytes.
 
-use super::{CanError, Frame, Id, defined};
+use super::{CanError, Frame, Id, decode_enum};
 
 /// How messages are called in errors.
 const SDO: &str = "SDO answer";
@@ -146,18 +146,18 @@ pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
 }
 
 /// An order about the state of a node, or of all.
-pub fn encode_nmt(order: Nmt, node: Option<Node>) -> Frame {
-    made(0, &[order as u8, node.map_or(0, Node::number)])
+pub fn encode_nmt(state_command: Nmt, node: Option<Node>) -> Frame {
+    data_frame(0, &[state_command as u8, node.map_or(0, Node::number)])
 }
 
 /// The beat at which nodes send and take their cyclic PDOs.
 pub fn encode_sync() -> Frame {
-    made(0x80, &[])
+    data_frame(0x80, &[])
 }
 
 /// A heartbeat: the host's own, so that drives stop without it, or that of a simulated node.
 pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
-    made(0x700 + u32::from(node.0), &[state as u8])
+    data_frame(0x700 + u32::from(node.0), &[state as u8])
 }
 
 /// Reads a heartbeat.
@@ -166,14 +166,14 @@ pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
     let &[state] = bytes else {
         return Err(CanError::Length { message: HEARTBEAT, got_bytes: bytes.len(), expected_bytes: 1 });
     };
-    let all = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
-    Ok((node, defined("the state of the node", state.into(), &all, |known| known as u32)?))
+    let states = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
+    Ok((node, decode_enum("the state of the node", state.into(), &states, |known| known as u32)?))
 }
 
 /// Asks a node for an object.
 pub fn encode_read(node: Node, object: Object) -> Frame {
     let [low, high] = object.index.to_le_bytes();
-    made(0x600 + u32::from(node.0), &[0x40, low, high, object.subindex, 0, 0, 0, 0])
+    data_frame(0x600 + u32::from(node.0), &[0x40, low, high, object.subindex, 0, 0, 0, 0])
 }
 
 /// Sets an object of a node; a value that has more bytes than the object is refused. Negative values go as two's complement.
@@ -195,7 +195,7 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
     let mut bytes = [command, low, high, object.subindex, 0, 0, 0, 0];
     let n_bytes = usize::from(object.n_bytes);
     bytes[4..4 + n_bytes].copy_from_slice(&value.to_le_bytes()[..n_bytes]);
-    Ok(made(0x600 + u32::from(node.0), &bytes))
+    Ok(data_frame(0x600 + u32::from(node.0), &bytes))
 }
 
 /// What a node answers about an object.
@@ -219,8 +219,8 @@ pub enum SdoAnswer {
 
 /// The number of a two's complement of so many bytes: 1, 2 or 4.
 pub fn signed(raw: u32, n_bytes: u8) -> i32 {
-    let unused = 32 - 8 * u32::from(n_bytes.clamp(1, 4));
-    (raw << unused).cast_signed() >> unused
+    let n_unused_bits = 32 - 8 * u32::from(n_bytes.clamp(1, 4));
+    (raw << n_unused_bits).cast_signed() >> n_unused_bits
 }
 
 /// Reads a node's answer about an object; a transfer that the node broke off or wants to do in segments is an error.
@@ -235,8 +235,8 @@ pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     match (command >> 5, command & 0b10 != 0, command & 0b01 != 0) {
         (3, ..) => Ok((node, SdoAnswer::Written { index, subindex })),
         (4, ..) => Err(CanError::Aborted { index, subindex, code: value }),
-        (2, true, is_told) => {
-            let n_bytes = if is_told { 4 - (command >> 2 & 0b11) } else { 4 };
+        (2, true, has_length) => {
+            let n_bytes = if has_length { 4 - (command >> 2 & 0b11) } else { 4 };
             let raw = value & (u32::MAX >> (32 - 8 * u32::from(n_bytes)));
             Ok((node, SdoAnswer::Value { object: Object { index, subindex, n_bytes }, raw }))
         }
@@ -276,7 +276,7 @@ pub fn abort_text(code: u32) -> &'static str {
     }
 }
 
-fn made(id: u32, bytes: &[u8]) -> Frame {
+fn data_frame(id: u32, bytes: &[u8]) -> Frame {
     let id = Id::standard(id).expect("at most 0x700 and 127");
     Frame::classic(id, bytes).expect("at most eight bytes")
 }
@@ -287,40 +287,43 @@ fn from_node<'a>(frame: &'a Frame, base: u32, message: &'static str) -> Result<(
     let node = id.checked_sub(base).and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
     match node {
         Some(node) if !frame.is_remote() && !frame.is_fd() && !frame.id().is_extended() => Ok((node, frame.data())),
-        _ => Err(CanError::Foreign { message, id }),
+        _ => Err(CanError::UnexpectedFrame { message, id }),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
 
     const NODE: Node = Node(5);
     const TARGET: Object = Object { index: 0x607A, subindex: 0, n_bytes: 4 };
 
     #[test]
-    fn what_is_sent_is_the_published_bytes() {
-        assert_eq!(encode_nmt(Nmt::Start, None), made(0, &[1, 0]));
-        assert_eq!(encode_nmt(Nmt::ResetNode, Some(NODE)), made(0, &[0x81, 5]));
-        assert_eq!(encode_sync(), made(0x80, &[]));
-        assert_eq!(encode_heartbeat(Node(127), NodeState::Operational), made(0x77F, &[5]));
+    fn encoded_frames_match_published_bytes() {
+        assert_eq!(encode_nmt(Nmt::Start, None), data_frame(0, &[1, 0]));
+        assert_eq!(encode_nmt(Nmt::ResetNode, Some(NODE)), data_frame(0, &[0x81, 5]));
+        assert_eq!(encode_sync(), data_frame(0x80, &[]));
+        assert_eq!(encode_heartbeat(Node(127), NodeState::Operational), data_frame(0x77F, &[5]));
         // christiansandberg/canopen, test_sdo: expedited upload of 0x1018:01 and download of 0x1017.
         let vendor = Object { index: 0x1018, subindex: 1, n_bytes: 4 };
-        assert_eq!(encode_read(Node(2), vendor), made(0x602, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0]));
+        assert_eq!(encode_read(Node(2), vendor), data_frame(0x602, &[0x40, 0x18, 0x10, 0x01, 0, 0, 0, 0]));
         assert_eq!(
             encode_write(Node(2), PRODUCER_HEARTBEAT, 4000),
-            Ok(made(0x602, &[0x2B, 0x17, 0x10, 0, 0xA0, 0x0F, 0, 0]))
+            Ok(data_frame(0x602, &[0x2B, 0x17, 0x10, 0, 0xA0, 0x0F, 0, 0]))
         );
         let mode = Object { index: 0x6060, subindex: 0, n_bytes: 1 };
-        assert_eq!(encode_write(NODE, mode, -1), Ok(made(0x605, &[0x2F, 0x60, 0x60, 0, 0xFF, 0, 0, 0])));
-        assert_eq!(encode_write(NODE, TARGET, -2), Ok(made(0x605, &[0x23, 0x7A, 0x60, 0, 0xFE, 0xFF, 0xFF, 0xFF])));
+        assert_eq!(encode_write(NODE, mode, -1), Ok(data_frame(0x605, &[0x2F, 0x60, 0x60, 0, 0xFF, 0, 0, 0])));
+        assert_eq!(
+            encode_write(NODE, TARGET, -2),
+            Ok(data_frame(0x605, &[0x23, 0x7A, 0x60, 0, 0xFE, 0xFF, 0xFF, 0xFF]))
+        );
         assert_eq!(consumer_heartbeat(Node(127), 100), 0x007F_0064);
         assert_eq!(TARGET.mapped(), 0x607A_0020);
     }
 
     #[test]
-    fn pdos_have_their_identifiers_and_objects() {
+    fn pdos_have_standard_identifiers_and_objects() {
         let ids =
             |direction| [Pdo::First, Pdo::Second, Pdo::Third, Pdo::Fourth].map(|pdo| pdo.id(direction, NODE).value());
         assert_eq!(ids(Direction::Transmit), [0x185, 0x285, 0x385, 0x485]);
@@ -334,8 +337,8 @@ mod tests {
     }
 
     #[test]
-    fn answers_are_read() {
-        let read = |bytes: &[u8]| decode_sdo(&made(0x585, bytes)).map(|(_, answer)| answer);
+    fn answers_are_decoded() {
+        let read = |bytes: &[u8]| decode_sdo(&data_frame(0x585, bytes)).map(|(_, answer)| answer);
         let value = |n_bytes, raw| SdoAnswer::Value { object: Object { index: 0x6064, subindex: 0, n_bytes }, raw };
         assert_eq!(read(&[0x43, 0x64, 0x60, 0, 1, 2, 3, 4]), Ok(value(4, 0x0403_0201)));
         assert_eq!(read(&[0x4B, 0x64, 0x60, 0, 0xFE, 0xFF, 9, 9]), Ok(value(2, 0xFFFE)));
@@ -357,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_amiss_is_refused() {
+    fn invalid_messages_are_rejected() {
         for number in [0, 128, 255] {
             assert!(Node::new(number).is_err());
         }
@@ -365,13 +368,13 @@ mod tests {
             assert!(matches!(encode_write(NODE, object, value), Err(CanError::Range { .. })), "{value}");
         }
         assert!(encode_write(NODE, Object { n_bytes: 8, ..TARGET }, 0).is_err());
-        for bent in cut_and_doubled(&made(0x585, &[0x43, 0x64, 0x60, 0, 1, 2, 3, 4])) {
-            assert!(decode_sdo(&bent).is_err(), "{bent:?}");
+        for malformed in truncated_and_doubled(&data_frame(0x585, &[0x43, 0x64, 0x60, 0, 1, 2, 3, 4])) {
+            assert!(decode_sdo(&malformed).is_err(), "{malformed:?}");
         }
         for (id, bytes) in [(0x705, &[][..]), (0x705, &[5, 5]), (0x705, &[6]), (0x700, &[5]), (0x6FF, &[5])] {
-            assert!(decode_heartbeat(&made(id, bytes)).is_err(), "{id:x} {bytes:?}");
+            assert!(decode_heartbeat(&data_frame(id, bytes)).is_err(), "{id:x} {bytes:?}");
         }
-        assert!(matches!(decode_sdo(&made(0x605, &[0x43; 8])), Err(CanError::Foreign { .. })));
+        assert!(matches!(decode_sdo(&data_frame(0x605, &[0x43; 8])), Err(CanError::UnexpectedFrame { .. })));
         let mut n_read = 0;
         for frame in random_frames(29, Id::standard(0x585).expect("11 bits")) {
             n_read += i32::from(decode_sdo(&frame).is_ok());

@@ -14,9 +14,9 @@ pub const ABORT_CONNECTION: Object = Object { index: 0x6007, subindex: 0, n_byte
 pub const QUICK_STOP_OPTION: Object = Object { index: 0x605A, subindex: 0, n_bytes: 2 };
 /// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in [`State::QuickStopActive`].
 pub const STAY_STOPPED: i64 = 6;
-/// Value of [`ABORT_CONNECTION`]: the order [`Order::DisableVoltage`].
+/// Value of [`ABORT_CONNECTION`]: the order [`StateCommand::DisableVoltage`].
 pub const ABORT_BY_DISABLING: i64 = 2;
-/// Value of [`ABORT_CONNECTION`]: the order [`Order::QuickStop`].
+/// Value of [`ABORT_CONNECTION`]: the order [`StateCommand::QuickStop`].
 pub const ABORT_BY_QUICK_STOP: i64 = 3;
 /// Modes that it has, a bit each: [`Mode`] `n` is bit `n - 1`.
 pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes: 4 };
@@ -24,7 +24,7 @@ pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes
 pub const INTERPOLATION_PERIOD: Object = Object { index: 0x60C2, subindex: 1, n_bytes: 1 };
 /// See [`INTERPOLATION_PERIOD`]; -3 is milliseconds.
 pub const INTERPOLATION_EXPONENT: Object = Object { index: 0x60C2, subindex: 2, n_bytes: 1 };
-/// Orders, [`Order::controlword`].
+/// Orders, [`StateCommand::controlword`].
 pub const CONTROLWORD: Object = Object { index: 0x6040, subindex: 0, n_bytes: 2 };
 /// State, [`State::from_statusword`].
 pub const STATUSWORD: Object = Object { index: 0x6041, subindex: 0, n_bytes: 2 };
@@ -90,7 +90,7 @@ pub enum State {
 
 /// An order to a drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Order {
+pub enum StateCommand {
     /// To [`State::ReadyToSwitchOn`].
     Shutdown,
     /// To [`State::SwitchedOn`].
@@ -114,7 +114,7 @@ impl Mode {
     }
 }
 
-impl Order {
+impl StateCommand {
     /// The bits of the controlword that all modes share.
     pub fn controlword(self) -> u16 {
         match self {
@@ -148,13 +148,13 @@ impl State {
     /// The order that brings a drive one state nearer to obeying; `None` where it obeys or must be waited for.
     ///
     /// A fault is only reset when that is allowed: what caused it may still be there.
-    pub fn order_to_enable(self, may_reset_fault: bool) -> Option<Order> {
+    pub fn next_enabling_command(self, may_reset_fault: bool) -> Option<StateCommand> {
         match self {
-            Self::SwitchOnDisabled => Some(Order::Shutdown),
-            Self::ReadyToSwitchOn => Some(Order::SwitchOn),
-            Self::SwitchedOn => Some(Order::EnableOperation),
-            Self::QuickStopActive => Some(Order::DisableVoltage),
-            Self::Fault if may_reset_fault => Some(Order::ResetFault),
+            Self::SwitchOnDisabled => Some(StateCommand::Shutdown),
+            Self::ReadyToSwitchOn => Some(StateCommand::SwitchOn),
+            Self::SwitchedOn => Some(StateCommand::EnableOperation),
+            Self::QuickStopActive => Some(StateCommand::DisableVoltage),
+            Self::Fault if may_reset_fault => Some(StateCommand::ResetFault),
             Self::Fault | Self::NotReadyToSwitchOn | Self::FaultReactionActive | Self::OperationEnabled => None,
         }
     }
@@ -162,20 +162,20 @@ impl State {
     /// The state after an order; the same where the order does nothing there.
     ///
     /// The drive's own transitions (0, 1, 12 by itself, 13, 14) are not orders.
-    pub fn after(self, order: Order) -> Self {
-        match (self, order) {
-            (Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled, Order::Shutdown) => {
+    pub fn after(self, state_command: StateCommand) -> Self {
+        match (self, state_command) {
+            (Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled, StateCommand::Shutdown) => {
                 Self::ReadyToSwitchOn
             }
-            (Self::ReadyToSwitchOn, Order::SwitchOn | Order::DisableOperation) => Self::SwitchedOn,
-            (Self::OperationEnabled, Order::SwitchOn | Order::DisableOperation) => Self::SwitchedOn,
-            (Self::SwitchedOn, Order::EnableOperation) => Self::OperationEnabled,
-            (Self::OperationEnabled, Order::QuickStop) => Self::QuickStopActive,
-            (Self::ReadyToSwitchOn | Self::SwitchedOn, Order::QuickStop | Order::DisableVoltage) => {
+            (Self::ReadyToSwitchOn, StateCommand::SwitchOn | StateCommand::DisableOperation) => Self::SwitchedOn,
+            (Self::OperationEnabled, StateCommand::SwitchOn | StateCommand::DisableOperation) => Self::SwitchedOn,
+            (Self::SwitchedOn, StateCommand::EnableOperation) => Self::OperationEnabled,
+            (Self::OperationEnabled, StateCommand::QuickStop) => Self::QuickStopActive,
+            (Self::ReadyToSwitchOn | Self::SwitchedOn, StateCommand::QuickStop | StateCommand::DisableVoltage) => {
                 Self::SwitchOnDisabled
             }
-            (Self::OperationEnabled | Self::QuickStopActive, Order::DisableVoltage) => Self::SwitchOnDisabled,
-            (Self::Fault, Order::ResetFault) => Self::SwitchOnDisabled,
+            (Self::OperationEnabled | Self::QuickStopActive, StateCommand::DisableVoltage) => Self::SwitchOnDisabled,
+            (Self::Fault, StateCommand::ResetFault) => Self::SwitchOnDisabled,
             (state, _) => state,
         }
     }
@@ -213,8 +213,8 @@ impl Units {
     /// The nearest count; what 32 bits do not hold is refused, for a position cannot be clamped without meaning another.
     pub fn raw_from_rad(&self, field: &'static str, value: f64) -> Result<i32, CanError> {
         let count = (value * self.counts_per_turn / TAU).round();
-        let ends = (f64::from(i32::MIN), f64::from(i32::MAX));
-        whole(field, count, ends, value, TAU / self.counts_per_turn)
+        let range = (f64::from(i32::MIN), f64::from(i32::MAX));
+        checked_count(field, count, range, value, TAU / self.counts_per_turn)
     }
 
     /// Torque of a count of [`TORQUE`], N m.
@@ -225,17 +225,17 @@ impl Units {
     /// The nearest count of [`TARGET_TORQUE`]; what 16 bits do not hold is refused.
     pub fn raw_from_nm(&self, value: f64) -> Result<i16, CanError> {
         let count = (value * 1000.0 / self.rated_torque_nm).round();
-        let ends = (f64::from(i16::MIN), f64::from(i16::MAX));
-        let raw = whole("the torque", count, ends, value, self.rated_torque_nm / 1000.0)?;
+        let range = (f64::from(i16::MIN), f64::from(i16::MAX));
+        let raw = checked_count("the torque", count, range, value, self.rated_torque_nm / 1000.0)?;
         Ok(i16::try_from(raw).expect("within 16 bits by the check"))
     }
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "within the ends, which are within 32 bits")]
-fn whole(field: &'static str, count: f64, ends: (f64, f64), value: f64, unit: f64) -> Result<i32, CanError> {
-    match (ends.0..=ends.1).contains(&count) {
+fn checked_count(field: &'static str, count: f64, range: (f64, f64), value: f64, unit: f64) -> Result<i32, CanError> {
+    match (range.0..=range.1).contains(&count) {
         true => Ok(count as i32),
-        false => Err(CanError::Range { field, value, lower: ends.0 * unit, upper: ends.1 * unit }),
+        false => Err(CanError::Range { field, value, lower: range.0 * unit, upper: range.1 * unit }),
     }
 }
 
@@ -257,7 +257,7 @@ mod tests {
     ];
 
     #[test]
-    fn statuswords_are_those_of_the_standards_table() {
+    fn statuswords_match_standard() {
         // xxxx xxxx x0xx 0000 and so on, x of both kinds; the last two as drives in the field send them.
         for (statusword, state) in [
             (0x0000, State::NotReadyToSwitchOn),
@@ -289,26 +289,28 @@ mod tests {
     }
 
     #[test]
-    fn orders_lead_from_every_state_to_obeying() {
+    fn commands_enable_drive_from_every_state() {
         for start in ALL {
             let mut state = start;
-            let mut n_orders = 0;
-            while let Some(order) = state.order_to_enable(true) {
-                assert_ne!(state.after(order), state, "{state:?} {order:?}");
-                state = state.after(order);
-                n_orders += 1;
-                assert!(n_orders <= 4, "{start:?}");
+            let mut n_commands = 0;
+            while let Some(state_command) = state.next_enabling_command(true) {
+                assert_ne!(state.after(state_command), state, "{state:?} {state_command:?}");
+                state = state.after(state_command);
+                n_commands += 1;
+                assert!(n_commands <= 4, "{start:?}");
             }
-            let must_wait = matches!(start, State::NotReadyToSwitchOn | State::FaultReactionActive);
-            assert_eq!(state, if must_wait { start } else { State::OperationEnabled }, "{start:?}");
+            let waits_for_drive = matches!(start, State::NotReadyToSwitchOn | State::FaultReactionActive);
+            assert_eq!(state, if waits_for_drive { start } else { State::OperationEnabled }, "{start:?}");
         }
-        assert_eq!(State::Fault.order_to_enable(false), None);
+        assert_eq!(State::Fault.next_enabling_command(false), None);
         for state in ALL {
-            let is_powered = matches!(state.after(Order::DisableVoltage), State::SwitchedOn | State::OperationEnabled);
+            let is_powered =
+                matches!(state.after(StateCommand::DisableVoltage), State::SwitchedOn | State::OperationEnabled);
             assert!(!is_powered, "{state:?}");
         }
         let node = Node::new(1).expect("in range");
-        let enable = encode_write(node, CONTROLWORD, Order::EnableOperation.controlword().into()).expect("16 bits");
+        let enable =
+            encode_write(node, CONTROLWORD, StateCommand::EnableOperation.controlword().into()).expect("16 bits");
         assert_eq!(enable.data(), [0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0]);
         let mode = encode_write(node, MODE, Mode::CyclicPosition as i64).expect("8 bits");
         assert_eq!(mode.data(), [0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
@@ -316,7 +318,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_come_back_and_what_does_not_fit_is_refused() {
+    fn counts_round_trip_and_out_of_range_is_rejected() {
         let units = Units { counts_per_turn: 524_288.0, rated_torque_nm: 2.5 };
         assert_eq!(units.raw_from_rad("the position", TAU), Ok(524_288));
         assert!((units.nm_from_raw(-1000) + 2.5).abs() < 1e-12);

@@ -6,7 +6,7 @@
 //! motor's feedback identifier (register `MST_ID`).
 
 use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id, defined, eight};
+use super::{CanError, Frame, Id, decode_enum, eight_bytes};
 
 /// Identifier of what is about registers.
 const REGISTER_ID: u32 = 0x7FF;
@@ -58,7 +58,7 @@ impl Model {
 /// An order without numbers: seven bytes `FF` and this one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Order {
+pub enum StateCommand {
     /// Forget the error that stopped the motor.
     ClearError = 0xFB,
     /// Obey commands from now on.
@@ -159,7 +159,7 @@ impl Register {
         Self::BitRate,
     ];
 
-    fn is_whole(self) -> bool {
+    fn is_integer(self) -> bool {
         !matches!(self, Self::PositionLimit | Self::VelocityLimit | Self::TorqueLimit)
     }
 }
@@ -168,9 +168,9 @@ impl Register {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value {
     /// In registers of numbers, codes and ticks.
-    Whole(u32),
+    Integer(u32),
     /// In registers of SI values.
-    Real(f32),
+    Float(f32),
 }
 
 /// A message about registers, to the motor or its answer.
@@ -185,12 +185,12 @@ pub struct RegisterMessage {
 /// What a message about registers does.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Access {
-    /// Asks for a register; the answer is [`Access::Told`].
+    /// Asks for a register; the answer is [`Access::Reported`].
     Read(Register),
     /// Writes a register until the power goes; the answer repeats it.
     Write(Register, Value),
     /// The answer to [`Access::Read`].
-    Told(Register, Value),
+    Reported(Register, Value),
     /// Keeps all registers over a loss of power; only while disabled.
     Store,
     /// Asks for feedback without a command.
@@ -216,9 +216,9 @@ pub fn timeout_secs(ticks: u32) -> f64 {
 
 /// What the counts of a motor cover by its registers `PMAX`, `VMAX` and `TMAX`; all must be above zero.
 pub fn limits_from_registers(p_max: f32, v_max: f32, t_max: f32) -> Result<Limits, CanError> {
-    for (field, most) in [("PMAX", p_max), ("VMAX", v_max), ("TMAX", t_max)] {
-        if !(most > 0.0 && most.is_finite()) {
-            return Err(CanError::Range { field, value: most.into(), lower: 0.0, upper: f32::MAX.into() });
+    for (field, max) in [("PMAX", p_max), ("VMAX", v_max), ("TMAX", t_max)] {
+        if !(max > 0.0 && max.is_finite()) {
+            return Err(CanError::Range { field, value: max.into(), lower: 0.0, upper: f32::MAX.into() });
         }
     }
     Ok(Limits::of(p_max.into(), v_max.into(), t_max.into()))
@@ -230,8 +230,8 @@ pub fn encode_command(motor: u16, command: &Command, limits: &Limits) -> Result<
 }
 
 /// The frame of an order.
-pub fn encode_order(motor: u16, order: Order) -> Result<Frame, CanError> {
-    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, order as u8])
+pub fn encode_state_command(motor: u16, state_command: StateCommand) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
 }
 
 /// The frame of a message about registers, as it goes to a motor; an answer bears the motor's feedback identifier instead.
@@ -239,7 +239,7 @@ pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Resu
     let (code, register, value) = match message.access {
         Access::Read(register) => (0x33, register as u8, [0; 4]),
         Access::Write(register, value) => (0x55, register as u8, value_bytes(register, value)?),
-        Access::Told(register, value) => (0x33, register as u8, value_bytes(register, value)?),
+        Access::Reported(register, value) => (0x33, register as u8, value_bytes(register, value)?),
         Access::Store => (0xAA, 0, [0; 4]),
         Access::Refresh => (0xCC, 0, [0; 4]),
     };
@@ -250,14 +250,14 @@ pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Resu
 
 /// Reads a motor's answer about a register.
 pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
-    let [low, high, code, number, a, b, c, d] = eight(frame, REGISTER, false)?;
-    let register = || defined("the register", number.into(), &Register::ALL, |known| known as u32);
-    let value = |register: Register| match register.is_whole() {
-        true => Value::Whole(u32::from_le_bytes([a, b, c, d])),
-        false => Value::Real(f32::from_le_bytes([a, b, c, d])),
+    let [low, high, code, number, a, b, c, d] = eight_bytes(frame, REGISTER, false)?;
+    let register = || decode_enum("the register", number.into(), &Register::ALL, |known| known as u32);
+    let value = |register: Register| match register.is_integer() {
+        true => Value::Integer(u32::from_le_bytes([a, b, c, d])),
+        false => Value::Float(f32::from_le_bytes([a, b, c, d])),
     };
     let access = match code {
-        0x33 => register().map(|register| Access::Told(register, value(register)))?,
+        0x33 => register().map(|register| Access::Reported(register, value(register)))?,
         0x55 => register().map(|register| Access::Write(register, value(register)))?,
         other => return Err(CanError::Undefined { field: "the kind of access", raw: other.into() }),
     };
@@ -266,10 +266,10 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
 
 /// Reads a motor's feedback. An answer about a register comes under the same identifier: the caller knows whether it asked.
 pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanError> {
-    let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight(frame, FEEDBACK, false)?;
+    let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight_bytes(frame, FEEDBACK, false)?;
     Ok(Feedback {
         motor_low: head & 0xF,
-        status: defined("the status", (head >> 4).into(), &Status::ALL, |known| known as u32)?,
+        status: decode_enum("the status", (head >> 4).into(), &Status::ALL, |known| known as u32)?,
         motion: mit::decode_motion([a, b, c, d, e], limits),
         drive_celsius,
         rotor_celsius,
@@ -284,16 +284,16 @@ pub fn encode_feedback(answer_id: Id, feedback: &Feedback, limits: &Limits) -> R
 }
 
 fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
-    match (register.is_whole(), value) {
-        (true, Value::Whole(whole)) => Ok(whole.to_le_bytes()),
-        (false, Value::Real(real)) if real.is_finite() => Ok(real.to_le_bytes()),
+    match (register.is_integer(), value) {
+        (true, Value::Integer(complete)) => Ok(complete.to_le_bytes()),
+        (false, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
         _ => Err(CanError::Undefined { field: "the kind of value of the register", raw: register as u32 }),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
 
     const LIMITS: Limits = Model::Dm4310.limits();
@@ -303,32 +303,35 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_to_a_motor_is_the_makers_bytes() {
+    fn encoded_frames_match_manufacturer_bytes() {
         let sent = |access| encode_register(&RegisterMessage { motor: 0x101, access }, None).expect("a message");
-        let timeout = Value::Whole(timeout_ticks(1.0).expect("in range"));
+        let timeout = Value::Integer(timeout_ticks(1.0).expect("in range"));
         for (access, bytes) in [
             (Access::Read(Register::PositionLimit), [0x01, 0x01, 0x33, 21, 0, 0, 0, 0]),
-            (Access::Write(Register::ControlMode, Value::Whole(1)), [0x01, 0x01, 0x55, 10, 1, 0, 0, 0]),
-            (Access::Write(Register::PositionLimit, Value::Real(12.5)), [0x01, 0x01, 0x55, 21, 0, 0, 0x48, 0x41]),
+            (Access::Write(Register::ControlMode, Value::Integer(1)), [0x01, 0x01, 0x55, 10, 1, 0, 0, 0]),
+            (Access::Write(Register::PositionLimit, Value::Float(12.5)), [0x01, 0x01, 0x55, 21, 0, 0, 0x48, 0x41]),
             (Access::Write(Register::Timeout, timeout), [0x01, 0x01, 0x55, 9, 0x20, 0x4E, 0, 0]),
             (Access::Store, [0x01, 0x01, 0xAA, 0, 0, 0, 0, 0]),
             (Access::Refresh, [0x01, 0x01, 0xCC, 0, 0, 0, 0, 0]),
         ] {
             assert_eq!((sent(access).id().value(), sent(access).data()), (0x7FF, &bytes[..]), "{access:?}");
         }
-        for (order, last) in
-            [(Order::ClearError, 0xFB), (Order::Enable, 0xFC), (Order::Disable, 0xFD), (Order::SetZero, 0xFE)]
-        {
-            let frame = encode_order(1, order).expect("a motor");
+        for (state_command, last) in [
+            (StateCommand::ClearError, 0xFB),
+            (StateCommand::Enable, 0xFC),
+            (StateCommand::Disable, 0xFD),
+            (StateCommand::SetZero, 0xFE),
+        ] {
+            let frame = encode_state_command(1, state_command).expect("a motor");
             assert_eq!((frame.id().value(), frame.data()), (1, &[255, 255, 255, 255, 255, 255, 255, last][..]));
         }
-        let still = encode_command(1, &Command::default(), &LIMITS).expect("numbers");
-        assert_eq!(still.data(), [0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF]);
-        assert_eq!(encode_order(0x800, Order::Enable), Err(CanError::IdRange { id: 0x800, bits: 11 }));
+        let zero_command = encode_command(1, &Command::default(), &LIMITS).expect("numbers");
+        assert_eq!(zero_command.data(), [0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF]);
+        assert_eq!(encode_state_command(0x800, StateCommand::Enable), Err(CanError::IdRange { id: 0x800, bits: 11 }));
     }
 
     #[test]
-    fn feedback_and_registers_are_read_and_made_again() {
+    fn feedback_and_registers_round_trip() {
         let frame = answer([0x11, 0xFF, 0xFF, 0x00, 0x0F, 0xFF, 31, 28]);
         let feedback = decode_feedback(&frame, &LIMITS).expect("feedback");
         let motion = Motion { position_rad: 12.5, velocity_rad_s: -30.0, torque_nm: 10.0 };
@@ -336,16 +339,16 @@ mod tests {
         assert_eq!(feedback, expected);
         assert_eq!(encode_feedback(frame.id(), &feedback, &LIMITS), Ok(frame));
 
-        let told = answer([0x01, 0x00, 0x33, 22, 0, 0, 0xF0, 0x41]);
-        let message = decode_register(&told).expect("a register");
-        let access = Access::Told(Register::VelocityLimit, Value::Real(30.0));
+        let register_frame = answer([0x01, 0x00, 0x33, 22, 0, 0, 0xF0, 0x41]);
+        let message = decode_register(&register_frame).expect("a register");
+        let access = Access::Reported(Register::VelocityLimit, Value::Float(30.0));
         assert_eq!(message, RegisterMessage { motor: 1, access });
-        assert_eq!(encode_register(&message, Some(told.id())), Ok(told));
+        assert_eq!(encode_register(&message, Some(register_frame.id())), Ok(register_frame));
         assert_eq!(limits_from_registers(12.5, 30.0, 10.0), Ok(LIMITS));
     }
 
     #[test]
-    fn a_timeout_is_ticks_of_50_us() {
+    fn timeout_is_in_ticks_of_50_us() {
         for (secs, ticks) in [(0.0, 0), (50e-6, 1), (0.02, 400), (0.4, 8000), (1.0, 20_000), (51e-6, 2), (1e-12, 1)] {
             assert_eq!(timeout_ticks(secs), Ok(ticks), "{secs}");
         }
@@ -356,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_amiss_is_refused() {
+    fn invalid_messages_are_rejected() {
         for status in [0x2, 0x7, 0xF] {
             let undefined = CanError::Undefined { field: "the status", raw: status };
             let head = u8::try_from(status << 4 | 1).expect("a byte");
@@ -367,22 +370,23 @@ mod tests {
         {
             assert!(matches!(decode_register(&answer(bytes)), Err(CanError::Undefined { field: f, .. }) if f == field));
         }
-        let whole = answer([0x11, 0x80, 0, 0x80, 0x08, 0, 30, 30]);
-        for bent in cut_and_doubled(&whole) {
-            assert!(matches!(decode_feedback(&bent, &LIMITS), Err(CanError::Length { .. })));
-            assert!(matches!(decode_register(&bent), Err(CanError::Length { .. })));
+        let complete = answer([0x11, 0x80, 0, 0x80, 0x08, 0, 30, 30]);
+        for malformed in truncated_and_doubled(&complete) {
+            assert!(matches!(decode_feedback(&malformed, &LIMITS), Err(CanError::Length { .. })));
+            assert!(matches!(decode_register(&malformed), Err(CanError::Length { .. })));
         }
-        let mixed = RegisterMessage { motor: 1, access: Access::Write(Register::Timeout, Value::Real(1.0)) };
+        let mixed = RegisterMessage { motor: 1, access: Access::Write(Register::Timeout, Value::Float(1.0)) };
         assert!(encode_register(&mixed, None).is_err());
-        let none = RegisterMessage { motor: 1, access: Access::Write(Register::TorqueLimit, Value::Real(f32::NAN)) };
-        assert!(encode_register(&none, None).is_err());
+        let non_finite =
+            RegisterMessage { motor: 1, access: Access::Write(Register::TorqueLimit, Value::Float(f32::NAN)) };
+        assert!(encode_register(&non_finite, None).is_err());
         for bad in [0.0, -1.0, f32::NAN, f32::INFINITY] {
             assert!(limits_from_registers(12.5, bad, 10.0).is_err(), "{bad}");
         }
     }
 
     #[test]
-    fn random_frames_never_panic_and_what_is_read_is_made_again() {
+    fn random_frames_never_panic_and_round_trip() {
         let mut n_read = 0;
         for frame in random_frames(13, Id::standard(0x11).expect("small")) {
             if let Ok(feedback) = decode_feedback(&frame, &LIMITS) {

@@ -67,7 +67,7 @@ impl Frame {
     /// A classic data frame of up to eight bytes.
     pub fn classic(id: Id, data: &[u8]) -> Result<Self, CanError> {
         match data.len() {
-            0..=8 => Ok(Self::made(id, Kind::Classic, data)),
+            0..=8 => Ok(Self::with_data(id, Kind::Classic, data)),
             got_bytes => Err(CanError::PayloadLength { format: "classic", got_bytes }),
         }
     }
@@ -83,12 +83,12 @@ impl Frame {
     /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes; `switched` when its data are sent at the second bit rate.
     pub fn fd(id: Id, data: &[u8], switched: bool) -> Result<Self, CanError> {
         match data.len() {
-            n if n <= 8 || FD_LENGTHS.contains(&n) => Ok(Self::made(id, Kind::Fd { switched }, data)),
+            n if n <= 8 || FD_LENGTHS.contains(&n) => Ok(Self::with_data(id, Kind::Fd { switched }, data)),
             got_bytes => Err(CanError::PayloadLength { format: "FD", got_bytes }),
         }
     }
 
-    fn made(id: Id, kind: Kind, data: &[u8]) -> Self {
+    fn with_data(id: Id, kind: Kind, data: &[u8]) -> Self {
         let mut bytes = [0; 64];
         bytes[..data.len()].copy_from_slice(data);
         Self { id, kind, n_bytes: data.len(), bytes }
@@ -133,21 +133,21 @@ impl Frame {
     /// split between the rates on the wire; they count at the first, slower one here.
     pub fn bits(&self, stuffing: Stuffing) -> Bits {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
-        let stuff = |n_bits: u32| match stuffing {
+        let n_stuff_bits = |n_bits: u32| match stuffing {
             Stuffing::None => 0,
             Stuffing::Worst => (n_bits - 1) / 4,
         };
         let Kind::Fd { switched } = self.kind else {
             // Start, identifier, control and CRC: these and the data are stuffed, what follows is not.
             let stuffed = if self.id.extended { 54 } else { 34 } + n_data;
-            return Bits { nominal: stuffed + stuff(stuffed) + 1 + TAIL_BITS, data: 0 };
+            return Bits { nominal: stuffed + n_stuff_bits(stuffed) + 1 + TAIL_BITS, data: 0 };
         };
         // Start to bit rate switch; then error state, length and data; then stuff count, CRC and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
         let check = if n_data <= 8 * 16 { 4 + 17 + 6 } else { 4 + 21 + 7 };
-        let nominal = head + stuff(head) + 1 + TAIL_BITS;
-        let data = body + stuff(head + body) - stuff(head) + check;
+        let nominal = head + n_stuff_bits(head) + 1 + TAIL_BITS;
+        let data = body + n_stuff_bits(head + body) - n_stuff_bits(head) + check;
         match switched {
             true => Bits { nominal, data },
             false => Bits { nominal: nominal + data, data: 0 },
@@ -223,14 +223,14 @@ mod tests {
     }
 
     #[test]
-    fn fd_frames_have_the_lengths_of_linux() {
+    fn fd_frame_lengths_match_linux() {
         // can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h, by hand.
         let cases = [(0, false, 62, 67), (8, false, 126, 147), (16, false, 190, 227), (20, false, 227, 272)];
         let extended = [(64, false, 579, 712), (0, true, 81, 91), (16, true, 209, 251), (64, true, 598, 736)];
-        for (n_bytes, is_extended, none, worst) in cases.into_iter().chain(extended) {
+        for (n_bytes, is_extended, non_finite, worst) in cases.into_iter().chain(extended) {
             let id = if is_extended { Id::extended(5) } else { Id::standard(5) }.expect("small");
             let frame = |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
-            for (stuffing, expected) in [(Stuffing::None, none), (Stuffing::Worst, worst)] {
+            for (stuffing, expected) in [(Stuffing::None, non_finite), (Stuffing::Worst, worst)] {
                 let Bits { nominal, data } = frame(true).bits(stuffing);
                 assert_eq!(nominal + data, expected, "{n_bytes} {is_extended} {stuffing:?}");
                 assert_eq!(frame(false).bits(stuffing), Bits { nominal: expected, data: 0 });
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn load_is_time_by_rate() {
+    fn bus_load_is_frame_time_times_rate() {
         let rates = BitRates { nominal_hz: 1e6, data_hz: 5e6 };
         // Six motors, a command and an answer each, 500 times a second: 135 us a frame.
         let bits = standard(8).bits(Stuffing::Worst);
@@ -252,15 +252,15 @@ mod tests {
     }
 
     #[test]
-    fn what_no_frame_can_be_is_refused() {
+    fn invalid_ids_and_lengths_are_rejected() {
         assert_eq!(Id::standard(0x800), Err(CanError::IdRange { id: 0x800, bits: 11 }));
         assert_eq!(Id::extended(0x2000_0000), Err(CanError::IdRange { id: 0x2000_0000, bits: 29 }));
         let id = Id::standard(0x7FF).expect("11 bits");
         assert_eq!(Frame::classic(id, &[0; 9]), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
         assert_eq!(Frame::remote(id, 9), Err(CanError::PayloadLength { format: "classic", got_bytes: 9 }));
         for n in 0..=65 {
-            let is_made = Frame::fd(id, &[0; 65][..n], false).is_ok();
-            assert_eq!(is_made, n <= 8 || [12, 16, 20, 24, 32, 48, 64].contains(&n), "{n}");
+            let is_valid = Frame::fd(id, &[0; 65][..n], false).is_ok();
+            assert_eq!(is_valid, n <= 8 || [12, 16, 20, 24, 32, 48, 64].contains(&n), "{n}");
         }
         assert_ne!(Id::standard(5).expect("small"), Id::extended(5).expect("small"));
     }

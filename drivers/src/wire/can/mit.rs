@@ -30,13 +30,13 @@ impl Limits {
 
     /// The command that is really sent: every number within its limits; no number stays none.
     pub fn clamped(&self, command: &Command) -> Command {
-        let within = |value: f64, most: f64| value.clamp(-most, most);
+        let clamp_symmetric = |value: f64, max: f64| value.clamp(-max, max);
         Command {
-            position_rad: within(command.position_rad, self.position_rad),
-            velocity_rad_s: within(command.velocity_rad_s, self.velocity_rad_s),
+            position_rad: clamp_symmetric(command.position_rad, self.position_rad),
+            velocity_rad_s: clamp_symmetric(command.velocity_rad_s, self.velocity_rad_s),
             kp_nm_rad: command.kp_nm_rad.clamp(0.0, self.kp_nm_rad),
             kd_nm_s_rad: command.kd_nm_s_rad.clamp(0.0, self.kd_nm_s_rad),
-            torque_nm: within(command.torque_nm, self.torque_nm),
+            torque_nm: clamp_symmetric(command.torque_nm, self.torque_nm),
         }
     }
 }
@@ -158,7 +158,7 @@ mod tests {
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
     #[test]
-    fn commands_are_the_bytes_of_the_makers_sample() {
+    fn commands_match_manufacturer_sample_bytes() {
         // DM_CAN.py, controlMIT with the limits of a DM4310: nothing, all ends, and kp = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
         let command = |kp_nm_rad, kd_nm_s_rad, position_rad, velocity_rad_s, torque_nm| Command {
             position_rad,
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn any_bytes_are_a_command_and_come_back() {
+    fn any_bytes_decode_and_round_trip() {
         let mut random = Random(3);
         for _ in 0..20_000 {
             let bytes = (u64::from(random.next()) << 32 | u64::from(random.next())).to_be_bytes();
@@ -191,49 +191,49 @@ mod tests {
     }
 
     #[test]
-    fn commands_come_back_to_the_resolution_over_the_whole_range() {
+    fn commands_round_trip_within_resolution() {
         let mut random = Random(5);
-        let mut spread = |most: f64| (2.0 * random.share() - 1.0) * most;
+        let mut random_within = |max: f64| (2.0 * random.unit_interval() - 1.0) * max;
         for _ in 0..20_000 {
             let command = Command {
-                position_rad: spread(12.5),
-                velocity_rad_s: spread(30.0),
-                kp_nm_rad: spread(500.0).abs(),
-                kd_nm_s_rad: spread(5.0).abs(),
-                torque_nm: spread(10.0),
+                position_rad: random_within(12.5),
+                velocity_rad_s: random_within(30.0),
+                kp_nm_rad: random_within(500.0).abs(),
+                kd_nm_s_rad: random_within(5.0).abs(),
+                torque_nm: random_within(10.0),
             };
             let back = decode(&encode(&command, &LIMITS).expect("numbers"), &LIMITS);
             // Half a step of the range.
-            for (name, off, range, counts) in [
+            for (name, error, range, counts) in [
                 ("position", back.position_rad - command.position_rad, 25.0, 65_535.0),
                 ("velocity", back.velocity_rad_s - command.velocity_rad_s, 60.0, 4095.0),
                 ("kp", back.kp_nm_rad - command.kp_nm_rad, 500.0, 4095.0),
                 ("kd", back.kd_nm_s_rad - command.kd_nm_s_rad, 5.0, 4095.0),
                 ("torque", back.torque_nm - command.torque_nm, 20.0, 4095.0),
             ] {
-                assert!(off.abs() <= 0.5 * range / counts * (1.0 + 1e-9), "{name}: {off}");
+                assert!(error.abs() <= 0.5 * range / counts * (1.0 + 1e-9), "{name}: {error}");
             }
         }
     }
 
     #[test]
-    fn what_is_beyond_the_limits_is_clamped_and_no_number_is_refused() {
-        let wild = Command {
+    fn out_of_range_is_clamped_and_non_finite_rejected() {
+        let out_of_range = Command {
             position_rad: 1e9,
             velocity_rad_s: -1e9,
             kp_nm_rad: -1.0,
             kd_nm_s_rad: 6.0,
             torque_nm: f64::INFINITY,
         };
-        let clamped = LIMITS.clamped(&wild);
+        let clamped = LIMITS.clamped(&out_of_range);
         assert_eq!(
             clamped,
             Command { position_rad: 12.5, velocity_rad_s: -30.0, kp_nm_rad: 0.0, kd_nm_s_rad: 5.0, torque_nm: 10.0 }
         );
-        assert_eq!(encode(&wild, &LIMITS), encode(&clamped, &LIMITS));
-        let none = Command { kp_nm_rad: f64::NAN, ..Command::default() };
-        assert_eq!(encode(&none, &LIMITS), Err(CanError::NotFinite { field: "kp" }));
-        let none = Motion { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
-        assert_eq!(encode_motion(&none, &LIMITS), Err(CanError::NotFinite { field: "the velocity" }));
+        assert_eq!(encode(&out_of_range, &LIMITS), encode(&clamped, &LIMITS));
+        let non_finite = Command { kp_nm_rad: f64::NAN, ..Command::default() };
+        assert_eq!(encode(&non_finite, &LIMITS), Err(CanError::NotFinite { field: "kp" }));
+        let non_finite = Motion { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
+        assert_eq!(encode_motion(&non_finite, &LIMITS), Err(CanError::NotFinite { field: "the velocity" }));
     }
 }

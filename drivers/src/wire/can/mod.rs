@@ -37,7 +37,7 @@ pub enum CanError {
     },
     /// A frame that is no message of this kind: its identifier or its kind is another's.
     #[error("the frame {id:#x} is no {message}")]
-    Foreign {
+    UnexpectedFrame {
         /// What was looked for.
         message: &'static str,
         /// Identifier of the frame.
@@ -108,15 +108,15 @@ pub enum CanError {
 }
 
 /// The one of `all` whose number a field holds.
-fn defined<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
+fn decode_enum<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
     all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
 }
 
 /// The eight bytes of a data frame with an 11-bit or 29-bit identifier; anything else is refused.
-fn eight(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
+fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() != extended {
-        return Err(CanError::Foreign { message, id: id.value() });
+        return Err(CanError::UnexpectedFrame { message, id: id.value() });
     }
     let got_bytes = frame.data().len();
     frame.data().try_into().map_err(|_| CanError::Length { message, got_bytes, expected_bytes: 8 })
@@ -136,7 +136,7 @@ mod testing {
         }
 
         /// A number from 0 to 1.
-        pub(super) fn share(&mut self) -> f64 {
+        pub(super) fn unit_interval(&mut self) -> f64 {
             f64::from(self.next()) / f64::from(u32::MAX)
         }
     }
@@ -145,11 +145,11 @@ mod testing {
     pub(super) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
         let mut random = Random(seed);
         (0..20_000).map(move |round| {
-            let own = match random.next() % 2 {
+            let identifier = match random.next() % 2 {
                 0 => Id::standard(random.next() & 0x7FF),
                 _ => Id::extended(random.next() & 0x1FFF_FFFF),
             };
-            let id = if round % 4 == 0 { id } else { own.expect("masked") };
+            let id = if round % 4 == 0 { id } else { identifier.expect("masked") };
             let bytes: Vec<u8> = (0..64).map(|_| random.next().to_le_bytes()[0]).collect();
             let len = usize::try_from(random.next() % 9).expect("small");
             match random.next() % 8 {
@@ -163,11 +163,11 @@ mod testing {
     }
 
     /// The same frame with every other length from 0 to 8, and twice as long as an FD frame: all must be refused.
-    pub(super) fn cut_and_doubled(frame: &Frame) -> Vec<Frame> {
+    pub(super) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
-        let own = frame.data().len();
-        let cut = (0..own).map(|len| Frame::classic(frame.id(), &bytes[..len]));
-        let doubled = (own == 8).then(|| Frame::fd(frame.id(), &bytes, false));
-        cut.chain(doubled).map(|made| made.expect("a length of its format")).collect()
+        let identifier = frame.data().len();
+        let cut = (0..identifier).map(|len| Frame::classic(frame.id(), &bytes[..len]));
+        let doubled = (identifier == 8).then(|| Frame::fd(frame.id(), &bytes, false));
+        cut.chain(doubled).map(|built| built.expect("a length of its format")).collect()
     }
 }

@@ -8,7 +8,7 @@ mod endpoints;
 
 pub use endpoints::{Endpoints, EndpointsError};
 
-use super::{CanError, Frame, Id, defined};
+use super::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
 
 /// First byte of `Get_Version`'s answer.
@@ -228,16 +228,16 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
         Request::SetState(state) => data(Code::SetState, &u32::from(state as u8).to_le_bytes()),
         Request::SetMode(control) => data(Code::SetMode, &[control as u8, 0, 0, 0, 1, 0, 0, 0]),
         Request::SetPosition { position_rad, velocity_rad_s, torque_nm } => {
-            let [a, b, c, d] = real("the position", position_rad / TAU)?;
-            let [e, f] = thousandths("the velocity", velocity_rad_s / TAU)?;
-            let [g, h] = thousandths("the torque", torque_nm)?;
+            let [a, b, c, d] = encode_f32("the position", position_rad / TAU)?;
+            let [e, f] = encode_thousandths("the velocity", velocity_rad_s / TAU)?;
+            let [g, h] = encode_thousandths("the torque", torque_nm)?;
             data(Code::SetPosition, &[a, b, c, d, e, f, g, h])
         }
         Request::SetVelocity { velocity_rad_s, torque_nm } => {
-            let halves = [real("the velocity", velocity_rad_s / TAU)?, real("the torque", torque_nm)?];
+            let halves = [encode_f32("the velocity", velocity_rad_s / TAU)?, encode_f32("the torque", torque_nm)?];
             data(Code::SetVelocity, halves.as_flattened())
         }
-        Request::SetTorque(torque_nm) => data(Code::SetTorque, &real("the torque", torque_nm)?),
+        Request::SetTorque(torque_nm) => data(Code::SetTorque, &encode_f32("the torque", torque_nm)?),
         Request::ReadEndpoint(number) => endpoint(0, number, [0; 4]),
         Request::WriteEndpoint(number, value) => endpoint(1, number, value),
     }
@@ -247,7 +247,7 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
 pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() {
-        return Err(CanError::Foreign { message: MESSAGE, id: id.value() });
+        return Err(CanError::UnexpectedFrame { message: MESSAGE, id: id.value() });
     }
     let [.., high, low] = id.value().to_be_bytes();
     let number = high << 3 | low >> 5;
@@ -267,7 +267,7 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     let answer = if is(Code::Version) {
         Answer::Version { hardware: [b, c, d], firmware: [e, f, g] }
     } else if is(Code::Heartbeat) {
-        let state = defined("the state of the axis", e.into(), &State::ALL, |known| known as u32)?;
+        let state = decode_enum("the state of the axis", e.into(), &State::ALL, |known| known as u32)?;
         Answer::Heartbeat { errors: words.0, state }
     } else if is(Code::Errors) {
         Answer::Errors { active: words.0, disarm_reason: words.1 }
@@ -300,14 +300,15 @@ pub fn encode_answer(node: Node, answer: &Answer) -> Result<Frame, CanError> {
             let [low, high] = number.to_le_bytes();
             (Code::EndpointAnswer, [[0, low, high, 0], value])
         }
-        Answer::Motion { position_rad, velocity_rad_s } => {
-            (Code::Motion, [real("the position", position_rad / TAU)?, real("the velocity", velocity_rad_s / TAU)?])
-        }
+        Answer::Motion { position_rad, velocity_rad_s } => (
+            Code::Motion,
+            [encode_f32("the position", position_rad / TAU)?, encode_f32("the velocity", velocity_rad_s / TAU)?],
+        ),
         Answer::Current { target_a, measured_a } => {
-            (Code::Current, [real("the current", target_a)?, real("the current", measured_a)?])
+            (Code::Current, [encode_f32("the current", target_a)?, encode_f32("the current", measured_a)?])
         }
         Answer::Torques { target_nm, estimate_nm } => {
-            (Code::Torques, [real("the torque", target_nm)?, real("the torque", estimate_nm)?])
+            (Code::Torques, [encode_f32("the torque", target_nm)?, encode_f32("the torque", estimate_nm)?])
         }
     };
     Frame::classic(id_of(node, code)?, halves.as_flattened())
@@ -318,13 +319,13 @@ fn id_of(node: Node, code: Code) -> Result<Id, CanError> {
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "what does not fit becomes infinite and is refused")]
-fn real(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
+fn encode_f32(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
     let single = value as f32;
     if single.is_finite() { Ok(single.to_le_bytes()) } else { Err(CanError::NotFinite { field }) }
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "the cast clamps, which is meant")]
-fn thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
+fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
     match value.is_nan() {
         true => Err(CanError::NotFinite { field }),
         false => Ok(((value / FEED_FORWARD).round() as i16).to_le_bytes()),
@@ -333,7 +334,7 @@ fn thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{Random, cut_and_doubled, random_frames};
+    use super::super::testing::{Random, random_frames, truncated_and_doubled};
     use super::*;
 
     const NODE: Node = Node(1);
@@ -343,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn requests_are_the_published_bytes() {
+    fn requests_match_published_bytes() {
         let sent = |request| encode_request(NODE, &request).expect("numbers");
         // The example of odrive-can-protocol: -2.5 turns a second and 0.25 N m to node 1.
         let velocity = Request::SetVelocity { velocity_rad_s: -2.5 * TAU, torque_nm: 0.25 };
@@ -357,12 +358,12 @@ mod tests {
         assert_eq!(sent(Request::EmergencyStop), frame(0x022, &[]));
         assert_eq!(sent(Request::ReadEndpoint(0x0182)), frame(0x024, &[0, 0x82, 0x01, 0, 0, 0, 0, 0]));
         assert_eq!(sent(Request::WriteEndpoint(0x0182, [1, 0, 0, 0])), frame(0x024, &[1, 0x82, 0x01, 0, 1, 0, 0, 0]));
-        let asked = sent(Request::Ask(Code::Motion));
-        assert!(asked.is_remote() && asked.id().value() == 0x029 && asked.n_bytes() == 8);
+        let requested = sent(Request::Ask(Code::Motion));
+        assert!(requested.is_remote() && requested.id().value() == 0x029 && requested.n_bytes() == 8);
     }
 
     #[test]
-    fn answers_are_read_and_made_again() {
+    fn answers_round_trip() {
         for (bytes, expected) in [
             (frame(0x020, &[2, 4, 4, 58, 0, 6, 9, 0]), Answer::Version { hardware: [4, 4, 58], firmware: [0, 6, 9] }),
             (
@@ -389,10 +390,11 @@ mod tests {
     }
 
     #[test]
-    fn motion_comes_back_to_single_precision() {
+    fn motion_round_trips_in_single_precision() {
         let mut random = Random(19);
         for _ in 0..10_000 {
-            let (position_rad, velocity_rad_s) = ((random.share() - 0.5) * 1e4, (random.share() - 0.5) * 1e3);
+            let (position_rad, velocity_rad_s) =
+                ((random.unit_interval() - 0.5) * 1e4, (random.unit_interval() - 0.5) * 1e3);
             let answer = Answer::Motion { position_rad, velocity_rad_s };
             let node = Node::new(random.next().to_le_bytes()[0] & 63).expect("masked");
             let (from, back) = decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
@@ -404,10 +406,10 @@ mod tests {
     }
 
     #[test]
-    fn what_is_amiss_is_refused() {
+    fn invalid_messages_are_rejected() {
         assert_eq!(Node::new(64), Err(CanError::IdRange { id: 64, bits: 6 }));
-        for bent in cut_and_doubled(&frame(0x029, &[0; 8])) {
-            assert!(matches!(decode_answer(&bent), Err(CanError::Length { .. })));
+        for malformed in truncated_and_doubled(&frame(0x029, &[0; 8])) {
+            assert!(matches!(decode_answer(&malformed), Err(CanError::Length { .. })));
         }
         let undefined = |field, raw| Err(CanError::Undefined { field, raw });
         assert_eq!(decode_answer(&frame(0x021, &[0, 0, 0, 0, 15, 0, 0, 0])), undefined("the state of the axis", 15));
@@ -416,8 +418,8 @@ mod tests {
         for bad in [f64::NAN, f64::INFINITY, 1e300] {
             assert!(encode_request(NODE, &Request::SetTorque(bad)).is_err(), "{bad}");
         }
-        let none = Request::SetPosition { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
-        assert_eq!(encode_request(NODE, &none), Err(CanError::NotFinite { field: "the velocity" }));
+        let non_finite = Request::SetPosition { position_rad: 0.0, velocity_rad_s: f64::NAN, torque_nm: 0.0 };
+        assert_eq!(encode_request(NODE, &non_finite), Err(CanError::NotFinite { field: "the velocity" }));
         let mut n_read = 0;
         for frame in random_frames(23, Id::standard(0x029).expect("11 bits")) {
             if decode_answer(&frame).is_ok() {

@@ -10,7 +10,7 @@ mod parameter;
 pub use parameter::{Parameter, Value, timeout};
 
 use super::mit::{Command, Limits, Motion, Scales};
-use super::{CanError, Frame, Id, defined, eight};
+use super::{CanError, Frame, Id, decode_enum, eight_bytes};
 use std::f64::consts::PI;
 
 /// How frames that come from a motor are called in errors.
@@ -18,9 +18,9 @@ const MESSAGE: &str = "answer of a Robstride motor";
 /// Value of [`Parameter::RunMode`] in which [`Request::Move`] is obeyed.
 pub const MOTION_MODE: u32 = 0;
 /// What some orders carry so that nothing else is taken for them.
-const SEAL: [u8; 6] = [1, 2, 3, 4, 5, 6];
+const MAGIC: [u8; 6] = [1, 2, 3, 4, 5, 6];
 /// The number that a motor's answer to [`Request::Identify`] goes to.
-const EVERYONE: u8 = 0xFE;
+const BROADCAST: u8 = 0xFE;
 
 /// A model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -166,7 +166,7 @@ pub struct Feedback {
     /// Number of the motor.
     pub motor: u8,
     /// Whether it came unasked (type 24).
-    pub is_unasked: bool,
+    pub is_unsolicited: bool,
     /// What it obeys.
     pub mode: Mode,
     /// What is wrong.
@@ -180,7 +180,7 @@ pub struct Feedback {
 /// The frame of a request from host number `host` to motor `motor`.
 pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -> Result<Frame, CanError> {
     let host_only = u16::from(host);
-    let sealed = |last: u8| [SEAL[0], SEAL[1], SEAL[2], SEAL[3], SEAL[4], SEAL[5], last, 8];
+    let with_magic = |last: u8| [MAGIC[0], MAGIC[1], MAGIC[2], MAGIC[3], MAGIC[4], MAGIC[5], last, 8];
     let (kind, middle, bytes) = match *request {
         Request::Identify => (Communication::Identity, host_only, [0; 8]),
         Request::Move(command) => {
@@ -199,15 +199,15 @@ pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -
         Request::Write(parameter, value) => {
             (Communication::WriteParameter, host_only, parameter.bytes(parameter.value_bytes(value)?))
         }
-        Request::Store => (Communication::Store, host_only, sealed(7)),
-        Request::ReportActively(on) => (Communication::ActiveReport, host_only, sealed(on.into())),
+        Request::Store => (Communication::Store, host_only, with_magic(7)),
+        Request::ReportActively(on) => (Communication::ActiveReport, host_only, with_magic(on.into())),
     };
     Frame::classic(id_of(kind, middle, motor)?, &bytes)
 }
 
 /// Reads a request to move that is for motor `motor`: what a simulated motor gets.
 pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command> {
-    let [a, b, c, d, e, f, g, h] = eight(frame, MESSAGE, true).ok()?;
+    let [a, b, c, d, e, f, g, h] = eight_bytes(frame, MESSAGE, true).ok()?;
     let [kind, t1, t0, to] = frame.id().value().to_be_bytes();
     if kind != Communication::Motion as u8 || to != motor {
         return None;
@@ -224,11 +224,11 @@ pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command>
 
 /// Reads what a motor sends to host number `host`.
 pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
-    let bytes = eight(frame, MESSAGE, true)?;
+    let bytes = eight_bytes(frame, MESSAGE, true)?;
     let [kind, flags, motor, to] = frame.id().value().to_be_bytes();
-    let foreign = CanError::Foreign { message: MESSAGE, id: frame.id().value() };
+    let foreign = CanError::UnexpectedFrame { message: MESSAGE, id: frame.id().value() };
     if kind == Communication::Identity as u8 {
-        return if to == EVERYONE { Ok(Answer::Identity { motor, serial: bytes }) } else { Err(foreign) };
+        return if to == BROADCAST { Ok(Answer::Identity { motor, serial: bytes }) } else { Err(foreign) };
     }
     if to != host {
         return Err(foreign);
@@ -239,8 +239,8 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
         let scales = Scales::with_bits(limits, 16);
         return Ok(Answer::Feedback(Feedback {
             motor,
-            is_unasked: kind == Communication::ActiveReport as u8,
-            mode: defined("the mode", (flags >> 6).into(), &modes, |known| known as u32)?,
+            is_unsolicited: kind == Communication::ActiveReport as u8,
+            mode: decode_enum("the mode", (flags >> 6).into(), &modes, |known| known as u32)?,
             faults: Faults(flags & 0x3F),
             motion: Motion {
                 position_rad: scales.position.value_from_raw(u16::from_be_bytes([a, b])),
@@ -279,7 +279,7 @@ pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result
         return Err(CanError::Range { field: "the temperature", value, lower: 0.0, upper: 6553.5 });
     }
     let [g, h] = (tenths as u16).to_be_bytes();
-    let kind = if feedback.is_unasked { Communication::ActiveReport } else { Communication::Feedback };
+    let kind = if feedback.is_unsolicited { Communication::ActiveReport } else { Communication::Feedback };
     let flags = (feedback.mode as u8) << 6 | (feedback.faults.0 & 0x3F);
     Frame::classic(id_of(kind, u16::from_be_bytes([flags, feedback.motor]), host)?, &[a, b, c, d, e, f, g, h])
 }
@@ -290,7 +290,7 @@ fn id_of(kind: Communication, middle: u16, to: u8) -> Result<Id, CanError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
 
     const LIMITS: Limits = Model::Rs00.limits();
@@ -301,14 +301,14 @@ mod tests {
     }
 
     #[test]
-    fn requests_are_the_makers_bytes() {
-        let still = Request::Move(Command::default());
-        let most =
+    fn requests_match_manufacturer_bytes() {
+        let zero_command = Request::Move(Command::default());
+        let max =
             Command { position_rad: 99.0, velocity_rad_s: 99.0, kp_nm_rad: 9e3, kd_nm_s_rad: 9.0, torque_nm: -99.0 };
         for (request, id, bytes) in [
             (Request::Identify, 0x0000_FD7F, [0; 8]),
-            (still, 0x017F_FF7F, [0x7F, 0xFF, 0x7F, 0xFF, 0, 0, 0, 0]),
-            (Request::Move(most), 0x0100_007F, [0xFF; 8]),
+            (zero_command, 0x017F_FF7F, [0x7F, 0xFF, 0x7F, 0xFF, 0, 0, 0, 0]),
+            (Request::Move(max), 0x0100_007F, [0xFF; 8]),
             (Request::Enable, 0x0300_FD7F, [0; 8]),
             (Request::Stop { clear_fault: false }, 0x0400_FD7F, [0; 8]),
             (Request::Stop { clear_fault: true }, 0x0400_FD7F, [1, 0, 0, 0, 0, 0, 0, 0]),
@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_request_to_move_comes_back() {
+    fn move_request_round_trips() {
         let command =
             Command { position_rad: 1.5, velocity_rad_s: -3.0, kp_nm_rad: 60.0, kd_nm_s_rad: 1.25, torque_nm: 0.5 };
         let sent = encode_request(HOST, 5, &Request::Move(command), &LIMITS).expect("numbers");
@@ -343,23 +343,24 @@ mod tests {
     }
 
     #[test]
-    fn answers_are_read() {
+    fn answers_are_decoded() {
         let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
         // The manual's example of type 17: loc_kp is 30.
-        let (parameter, value) = (Parameter::PositionGain, Value::Real(30.0));
-        let told = Answer::Parameter { motor: 0x7F, parameter, value };
-        assert_eq!(read(0x1100_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0xF0, 0x41]), Ok(told));
+        let (parameter, value) = (Parameter::PositionGain, Value::Float(30.0));
+        let parameter_answer = Answer::Parameter { motor: 0x7F, parameter, value };
+        assert_eq!(read(0x1100_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0xF0, 0x41]), Ok(parameter_answer));
         assert_eq!(read(0x1101_7FFD, [0x1E, 0x70, 0, 0, 0, 0, 0, 0]), Err(CanError::Refused { parameter: 0x701E }));
-        let mode = Answer::Parameter { motor: 1, parameter: Parameter::RunMode, value: Value::Whole(2) };
+        let mode = Answer::Parameter { motor: 1, parameter: Parameter::RunMode, value: Value::Integer(2) };
         assert_eq!(read(0x1100_01FD, [0x05, 0x70, 0, 0, 2, 9, 9, 9]), Ok(mode));
         assert_eq!(read(0x0000_05FE, [7; 8]), Ok(Answer::Identity { motor: 5, serial: [7; 8] }));
         let fault = Answer::Fault { motor: 5, faults: 1 << 14, warnings: 1 };
         assert_eq!(read(0x1500_05FD, [0, 0x40, 0, 0, 1, 0, 0, 0]), Ok(fault));
 
         let motion = Motion { position_rad: 4.0 * PI, velocity_rad_s: -33.0, torque_nm: 14.0 };
-        for (kind, is_unasked) in [(0x02, false), (0x18, true)] {
+        for (kind, is_unsolicited) in [(0x02, false), (0x18, true)] {
             let faults = Faults(Faults::UNCALIBRATED | Faults::UNDER_VOLTAGE);
-            let feedback = Feedback { motor: 0x11, is_unasked, mode: Mode::Run, faults, motion, winding_celsius: 30.5 };
+            let feedback =
+                Feedback { motor: 0x11, is_unsolicited, mode: Mode::Run, faults, motion, winding_celsius: 30.5 };
             let sent = frame(kind << 24 | 0x00A1_11FD, [0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0x01, 0x31]);
             assert_eq!(decode_answer(&sent, HOST, &LIMITS), Ok(Answer::Feedback(feedback)));
             assert_eq!(encode_feedback(HOST, &feedback, &LIMITS), Ok(sent));
@@ -367,25 +368,25 @@ mod tests {
     }
 
     #[test]
-    fn what_is_amiss_is_refused() {
+    fn invalid_messages_are_rejected() {
         let read = |id, bytes| decode_answer(&frame(id, bytes), HOST, &LIMITS);
-        assert!(matches!(read(0x0280_11FC, [0; 8]), Err(CanError::Foreign { .. })));
+        assert!(matches!(read(0x0280_11FC, [0; 8]), Err(CanError::UnexpectedFrame { .. })));
         assert_eq!(read(0x02C0_11FD, [0; 8]), Err(CanError::Undefined { field: "the mode", raw: 3 }));
         assert_eq!(read(0x1F00_11FD, [0; 8]), Err(CanError::Undefined { field: "the communication type", raw: 31 }));
         assert_eq!(read(0x1100_11FD, [1; 8]), Err(CanError::Undefined { field: "the parameter", raw: 0x0101 }));
-        for bent in cut_and_doubled(&frame(0x0280_11FD, [0x80; 8])) {
-            assert!(matches!(decode_answer(&bent, HOST, &LIMITS), Err(CanError::Length { .. })));
+        for malformed in truncated_and_doubled(&frame(0x0280_11FD, [0x80; 8])) {
+            assert!(matches!(decode_answer(&malformed, HOST, &LIMITS), Err(CanError::Length { .. })));
         }
-        let asked = |request| encode_request(HOST, 1, &request, &LIMITS);
-        assert!(asked(Request::Write(Parameter::RunMode, Value::Whole(256))).is_err());
-        assert!(asked(Request::Write(Parameter::RunMode, Value::Real(0.0))).is_err());
-        assert!(asked(Request::Write(Parameter::TorqueLimit, Value::Real(f32::NAN))).is_err());
-        let none = Command { torque_nm: f64::NAN, ..Command::default() };
-        assert_eq!(asked(Request::Move(none)), Err(CanError::NotFinite { field: "the torque" }));
+        let requested = |request| encode_request(HOST, 1, &request, &LIMITS);
+        assert!(requested(Request::Write(Parameter::RunMode, Value::Integer(256))).is_err());
+        assert!(requested(Request::Write(Parameter::RunMode, Value::Float(0.0))).is_err());
+        assert!(requested(Request::Write(Parameter::TorqueLimit, Value::Float(f32::NAN))).is_err());
+        let non_finite = Command { torque_nm: f64::NAN, ..Command::default() };
+        assert_eq!(requested(Request::Move(non_finite)), Err(CanError::NotFinite { field: "the torque" }));
     }
 
     #[test]
-    fn random_frames_never_panic_and_feedback_is_made_again() {
+    fn random_frames_never_panic_and_feedback_round_trips() {
         let mut n_read = 0;
         for frame in random_frames(17, Id::extended(0x0280_11FD).expect("29 bits")) {
             if let Ok(Answer::Feedback(feedback)) = decode_answer(&frame, HOST, &LIMITS) {
@@ -397,7 +398,7 @@ mod tests {
     }
 
     #[test]
-    fn every_models_ends_are_the_manuals() {
+    fn model_limits_match_manual() {
         for (model, velocity_rad_s, torque_nm, kp, kd) in [
             (Model::Rs00, 33.0, 14.0, 500.0, 5.0),
             (Model::Rs01, 44.0, 17.0, 500.0, 5.0),

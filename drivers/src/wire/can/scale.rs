@@ -19,18 +19,18 @@ pub struct Scale {
 
 impl Scale {
     /// A range that is as wide below zero as above.
-    pub const fn symmetric(most: f64, n_bits: u32) -> Self {
-        Self { lower: -most, upper: most, n_bits }
+    pub const fn symmetric(max: f64, n_bits: u32) -> Self {
+        Self { lower: -max, upper: max, n_bits }
     }
 
     /// A range that begins at zero.
-    pub const fn positive(most: f64, n_bits: u32) -> Self {
-        Self { lower: 0.0, upper: most, n_bits }
+    pub const fn positive(max: f64, n_bits: u32) -> Self {
+        Self { lower: 0.0, upper: max, n_bits }
     }
 
     /// What one count more is worth.
     pub fn step(&self) -> f64 {
-        (self.upper - self.lower) / self.most_raw()
+        (self.upper - self.lower) / self.max_raw()
     }
 
     /// The nearest count; values outside are clamped, no number is refused in the name of `field`.
@@ -39,8 +39,8 @@ impl Scale {
         if value.is_nan() {
             return Err(CanError::NotFinite { field });
         }
-        let share = (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
-        Ok((share * self.most_raw() - 0.5).ceil().clamp(0.0, self.most_raw()) as u16)
+        let unit_interval = (value.clamp(self.lower, self.upper) - self.lower) / (self.upper - self.lower);
+        Ok((unit_interval * self.max_raw() - 0.5).ceil().clamp(0.0, self.max_raw()) as u16)
     }
 
     /// The value of a count.
@@ -48,7 +48,7 @@ impl Scale {
         self.lower + f64::from(raw) * self.step()
     }
 
-    fn most_raw(&self) -> f64 {
+    fn max_raw(&self) -> f64 {
         f64::from((1_u32 << self.n_bits) - 1)
     }
 }
@@ -59,15 +59,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_count_comes_back_and_every_value_within_half_a_step() {
-        for (most, n_bits) in [(12.5, 16), (30.0, 12), (0.7, 5)] {
-            for scale in [Scale::symmetric(most, n_bits), Scale::positive(most, n_bits)] {
+    fn counts_round_trip_and_values_within_half_a_step() {
+        for (max, n_bits) in [(12.5, 16), (30.0, 12), (0.7, 5)] {
+            for scale in [Scale::symmetric(max, n_bits), Scale::positive(max, n_bits)] {
                 for raw in 0..=u16::try_from((1_u32 << n_bits) - 1).expect("16 bits") {
                     assert_eq!(scale.raw_from_value("x", scale.value_from_raw(raw)), Ok(raw));
                 }
                 let mut random = Random(7);
                 for _ in 0..10_000 {
-                    let value = scale.lower + random.share() * (scale.upper - scale.lower);
+                    let value = scale.lower + random.unit_interval() * (scale.upper - scale.lower);
                     let back = scale.value_from_raw(scale.raw_from_value("x", value).expect("a number"));
                     // Half a step and the rounding of doubles.
                     assert!((back - value).abs() <= scale.step() * (0.5 + 1e-9), "{value} {back}");
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_is_the_makers_zero_and_the_ends_clamp() {
+    fn zero_matches_manufacturer_and_values_are_clamped() {
         let scale = Scale::symmetric(12.5, 16);
         for (value, raw) in
             [(0.0, 0x7FFF), (12.5, 0xFFFF), (-12.5, 0), (99.0, 0xFFFF), (-99.0, 0), (f64::INFINITY, 0xFFFF)]

@@ -5,7 +5,7 @@
 //! are data and a rig may give its own.
 
 use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id, defined};
+use super::{CanError, Frame, Id, decode_enum};
 
 /// A model whose limits are known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,7 +41,7 @@ impl Model {
 /// An order without numbers: seven bytes `FF` and this one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-pub enum Order {
+pub enum StateCommand {
     /// Obey commands from now on.
     Enable = 0xFC,
     /// Let the shaft go.
@@ -86,7 +86,7 @@ impl Fault {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Thermometer {
     /// Count 40 is 0 degrees Celsius: the manual.
-    Less40,
+    Offset40,
     /// The count is degrees Celsius: what TMotorCANControl reads.
     Plain,
 }
@@ -117,15 +117,15 @@ pub fn encode_command(motor: u8, command: &Command, limits: &Limits) -> Result<F
 }
 
 /// The frame of an order to motor `motor`.
-pub fn encode_order(motor: u8, order: Order) -> Result<Frame, CanError> {
-    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, order as u8])
+pub fn encode_state_command(motor: u8, state_command: StateCommand) -> Result<Frame, CanError> {
+    Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
 }
 
 /// Reads a motor's answer, of six or eight bytes.
 pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer) -> Result<Feedback, CanError> {
     const MESSAGE: &str = "feedback of an AK motor";
     if frame.is_remote() || frame.id().is_extended() {
-        return Err(CanError::Foreign { message: MESSAGE, id: frame.id().value() });
+        return Err(CanError::UnexpectedFrame { message: MESSAGE, id: frame.id().value() });
     }
     let (motor, motion, rest) = match *frame.data() {
         [motor, a, b, c, d, e, ref rest @ ..] if rest.is_empty() || rest.len() == 2 => (motor, [a, b, c, d, e], rest),
@@ -133,8 +133,8 @@ pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer)
     };
     let health = match *rest {
         [temperature, code] => {
-            let zero = if thermometer == Thermometer::Less40 { 40.0 } else { 0.0 };
-            let fault = defined("the error code", code.into(), &Fault::ALL, |known| known as u32)?;
+            let zero = if thermometer == Thermometer::Offset40 { 40.0 } else { 0.0 };
+            let fault = decode_enum("the error code", code.into(), &Fault::ALL, |known| known as u32)?;
             Some(Health { drive_celsius: f64::from(temperature) - zero, fault })
         }
         _ => None,
@@ -153,7 +153,7 @@ pub fn encode_feedback(
     let mut bytes = vec![feedback.motor];
     bytes.extend(mit::encode_motion(&feedback.motion, limits)?);
     if let Some(Health { drive_celsius, fault }) = feedback.health {
-        let zero = if thermometer == Thermometer::Less40 { 40.0 } else { 0.0 };
+        let zero = if thermometer == Thermometer::Offset40 { 40.0 } else { 0.0 };
         let count = (drive_celsius + zero).round();
         if !(0.0..=255.0).contains(&count) {
             let field = "the temperature";
@@ -166,7 +166,7 @@ pub fn encode_feedback(
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{cut_and_doubled, random_frames};
+    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
 
     const LIMITS: Limits = Model::Ak80x9.limits();
@@ -176,53 +176,56 @@ mod tests {
     }
 
     #[test]
-    fn orders_and_commands_are_the_published_bytes() {
-        let enable = encode_order(1, Order::Enable).expect("a motor");
+    fn commands_match_published_bytes() {
+        let enable = encode_state_command(1, StateCommand::Enable).expect("a motor");
         assert_eq!((enable.id().value(), enable.data()), (1, &[255, 255, 255, 255, 255, 255, 255, 0xFC][..]));
-        assert_eq!(encode_order(1, Order::Disable).expect("a motor").data()[7], 0xFD);
-        assert_eq!(encode_order(1, Order::SetZero).expect("a motor").data()[7], 0xFE);
-        let still = encode_command(104, &Command::default(), &LIMITS).expect("numbers");
-        assert_eq!((still.id().value(), still.data()), (104, &[0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF][..]));
+        assert_eq!(encode_state_command(1, StateCommand::Disable).expect("a motor").data()[7], 0xFD);
+        assert_eq!(encode_state_command(1, StateCommand::SetZero).expect("a motor").data()[7], 0xFE);
+        let zero_command = encode_command(104, &Command::default(), &LIMITS).expect("numbers");
+        assert_eq!(
+            (zero_command.id().value(), zero_command.data()),
+            (104, &[0x7F, 0xFF, 0x7F, 0xF0, 0, 0, 0x07, 0xFF][..])
+        );
     }
 
     #[test]
-    fn feedback_is_read_and_made_again() {
+    fn feedback_round_trips() {
         let bytes = [0x68, 0xFF, 0xFF, 0x00, 0x0F, 0xFF, 75, 2];
-        let feedback = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Less40).expect("feedback");
+        let feedback = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Offset40).expect("feedback");
         let motion = Motion { position_rad: 12.5, velocity_rad_s: -50.0, torque_nm: 18.0 };
         let health = Some(Health { drive_celsius: 35.0, fault: Fault::OverCurrent });
         assert_eq!(feedback, Feedback { motor: 0x68, motion, health });
-        assert_eq!(encode_feedback(0, &feedback, &LIMITS, Thermometer::Less40), Ok(frame(&bytes)));
+        assert_eq!(encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40), Ok(frame(&bytes)));
         let plain = decode_feedback(&frame(&bytes), &LIMITS, Thermometer::Plain).expect("feedback");
         assert_eq!(plain.health.expect("eight bytes").drive_celsius, 75.0);
-        let short = decode_feedback(&frame(&bytes[..6]), &LIMITS, Thermometer::Less40).expect("feedback");
+        let short = decode_feedback(&frame(&bytes[..6]), &LIMITS, Thermometer::Offset40).expect("feedback");
         assert_eq!(short, Feedback { health: None, ..feedback });
-        assert_eq!(encode_feedback(0, &short, &LIMITS, Thermometer::Less40), Ok(frame(&bytes[..6])));
+        assert_eq!(encode_feedback(0, &short, &LIMITS, Thermometer::Offset40), Ok(frame(&bytes[..6])));
     }
 
     #[test]
-    fn what_is_amiss_is_refused() {
-        let whole = frame(&[1, 0x80, 0, 0x80, 0x08, 0, 65, 0]);
-        let read = |frame: &Frame| decode_feedback(frame, &LIMITS, Thermometer::Less40);
-        assert!(read(&whole).is_ok());
-        for bent in cut_and_doubled(&whole) {
-            assert_eq!(read(&bent).is_ok(), bent.data().len() == 6, "{bent:?}");
+    fn invalid_messages_are_rejected() {
+        let complete = frame(&[1, 0x80, 0, 0x80, 0x08, 0, 65, 0]);
+        let read = |frame: &Frame| decode_feedback(frame, &LIMITS, Thermometer::Offset40);
+        assert!(read(&complete).is_ok());
+        for malformed in truncated_and_doubled(&complete) {
+            assert_eq!(read(&malformed).is_ok(), malformed.data().len() == 6, "{malformed:?}");
         }
         let undefined = CanError::Undefined { field: "the error code", raw: 7 };
         assert_eq!(read(&frame(&[1, 0, 0, 0, 0, 0, 0, 7])), Err(undefined));
-        let own = Frame::remote(whole.id(), 8).expect("classic");
-        assert!(matches!(read(&own), Err(CanError::Foreign { .. })));
-        let hot = Feedback {
+        let identifier = Frame::remote(complete.id(), 8).expect("classic");
+        assert!(matches!(read(&identifier), Err(CanError::UnexpectedFrame { .. })));
+        let too_hot = Feedback {
             health: Some(Health { drive_celsius: 216.0, fault: Fault::None }),
-            ..read(&whole).expect("whole")
+            ..read(&complete).expect("whole")
         };
-        assert!(matches!(encode_feedback(0, &hot, &LIMITS, Thermometer::Less40), Err(CanError::Range { .. })));
+        assert!(matches!(encode_feedback(0, &too_hot, &LIMITS, Thermometer::Offset40), Err(CanError::Range { .. })));
         let mut n_read = 0;
-        for frame in random_frames(11, whole.id()) {
+        for frame in random_frames(11, complete.id()) {
             if let Ok(feedback) = read(&frame) {
                 n_read += 1;
                 assert_eq!(
-                    encode_feedback(0, &feedback, &LIMITS, Thermometer::Less40).expect("own").data(),
+                    encode_feedback(0, &feedback, &LIMITS, Thermometer::Offset40).expect("own").data(),
                     frame.data()
                 );
             }
@@ -231,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn every_models_limits_hold_its_own_ends() {
+    fn model_limits_cover_full_scale() {
         for (model, velocity_rad_s, torque_nm) in [
             (Model::Ak10x9, 50.0, 65.0),
             (Model::Ak60x6, 50.0, 15.0),
@@ -240,7 +243,7 @@ mod tests {
             (Model::Ak80x9, 50.0, 18.0),
             (Model::Ak80x64, 8.0, 144.0),
         ] {
-            let read = decode_feedback(&frame(&[1, 0, 0, 255, 255, 255]), &model.limits(), Thermometer::Less40);
+            let read = decode_feedback(&frame(&[1, 0, 0, 255, 255, 255]), &model.limits(), Thermometer::Offset40);
             let motion = Motion { position_rad: -12.5, velocity_rad_s, torque_nm };
             assert_eq!(read, Ok(Feedback { motor: 1, motion, health: None }), "{model:?}");
         }

@@ -1,88 +1,88 @@
 //! The state of a field on the way, and a field in a folder.
 
 use super::NerfModel;
-use super::images::{Saved, Trials};
+use super::images::{FieldSnapshot, Trials};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
+use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::nerf::extent::Extent;
-use crate::nerf::learner::Learner;
+use crate::nerf::field_trainer::FieldTrainer;
 use crate::nerf::options::NerfOptions;
-use crate::nerf::params::{TERM_STRIDE, Term};
+use crate::nerf::params::{IMAGE_PARAM_STRIDE, ImageParam};
 use crate::nerf::rays::RayImage;
 use crate::nerf::sizes::Sizes;
-use crate::seen::{self, Seen};
-use crate::splat::{TermSet, read_about};
-use crate::{Error, Keyframe, Method, Part};
+use crate::splat::{ParamSet, read_metadata};
+use crate::{Error, Keyframe, Method, TrialReport};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
 const METHOD: &str = "nerf";
 /// What is learned of images.
-const TERMS: &str = "terms";
+const IMAGE_PARAMS: &str = "image_params";
 /// The field: a checkpoint of what pictures need.
-const FIELD: &str = "field.nerf";
+const FIELD_FILE: &str = "field.nerf";
 
 /// All but the arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct State {
+struct NerfState {
     options: NerfOptions,
     step: u64,
-    images: Vec<Seen>,
-    is_extent_due: bool,
+    images: Vec<KeyframeSignature>,
+    is_extent_stale: bool,
     n_hinted: usize,
     /// Where there is a field.
     field: Option<(Extent, Sizes)>,
     /// Of images, along with the field.
-    learned: TermSet,
-    are_trials_over: bool,
-    parts: Vec<Part>,
-    n_taken_back: u64,
+    learned_params: ParamSet,
+    are_trials_finished: bool,
+    parts: Vec<TrialReport>,
+    n_discarded_steps: u64,
     /// How many images there is room for in what is learned of them.
-    n_terms: Option<u32>,
+    image_capacity: Option<u32>,
 }
 
-fn written(state: &State) -> Result<serde_json::Value, Error> {
-    serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))
+fn to_json(state: &NerfState) -> Result<serde_json::Value, Error> {
+    serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))
 }
 
-fn bad_state(reason: String) -> Error {
+fn invalid_state(reason: String) -> Error {
     Error::CheckpointState { reason }
 }
 
-impl Saved {
+impl FieldSnapshot {
     /// How many images there is room for in what is learned of them.
-    fn n_terms(&self) -> Option<u32> {
-        let terms = self.arrays.iter().find(|array| array.name == TERMS)?;
-        u32::try_from(terms.bytes.len() / (TERM_STRIDE * size_of::<Term>())).ok()
+    fn image_capacity(&self) -> Option<u32> {
+        let image_params = self.arrays.iter().find(|array| array.name == IMAGE_PARAMS)?;
+        u32::try_from(image_params.bytes.len() / (IMAGE_PARAM_STRIDE * size_of::<ImageParam>())).ok()
     }
 }
 
-impl Learner {
+impl FieldTrainer {
     /// What pictures need, by name.
-    fn drawn(&self) -> Vec<(String, &Buffer)> {
+    fn render_buffers(&self) -> Vec<(String, &Buffer)> {
         [("grid", &self.field.grid), ("occupied", &self.occupancy.occupied), ("weights", &self.field.weights)]
             .map(|(name, buffer)| (name.to_owned(), buffer))
             .to_vec()
     }
 
     /// All that decides how it goes on, by name.
-    fn learned(&self) -> Vec<(String, &Buffer)> {
-        let mut all = self.drawn();
+    fn learned_params(&self) -> Vec<(String, &Buffer)> {
+        let mut all = self.render_buffers();
         all.extend(
             [
                 ("grid_moments", &self.moments.grid),
                 ("weight_moments", &self.moments.weights),
-                ("scales", &self.slopes.scales),
-                ("counts", &self.slopes.counts),
+                ("scales", &self.gradients.scales),
+                ("counts", &self.gradients.counts),
                 ("steps", &self.moments.steps),
-                ("pace", &self.moments.pace),
-                ("thickness", &self.occupancy.thickness),
+                ("step_scale", &self.moments.step_scale),
+                ("cell_occupancy", &self.occupancy.cell_occupancy),
             ]
             .map(|(name, buffer)| (name.to_owned(), buffer)),
         );
-        all.extend(self.images.iter().map(|images| (TERMS.to_owned(), &images.terms)));
+        all.extend(self.images.iter().map(|images| (IMAGE_PARAMS.to_owned(), &images.image_params)));
         all
     }
 }
@@ -102,45 +102,53 @@ fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Er
 impl NerfModel {
     /// Whether a folder holds a saved field.
     pub fn is_saved_in(folder: &Path) -> bool {
-        folder.join(FIELD).is_file()
+        folder.join(FIELD_FILE).is_file()
     }
 
-    fn state(&self) -> Result<State, Error> {
-        Ok(State {
-            options: NerfOptions { effort: Some(self.effort()), ..self.options.clone() },
+    fn state(&self) -> Result<NerfState, Error> {
+        Ok(NerfState {
+            options: NerfOptions { nerf_budget: Some(self.nerf_budget()), ..self.options.clone() },
             step: self.step,
-            images: self.images.iter().map(|image| Seen::of(&image.keyframe)).collect(),
-            is_extent_due: self.is_extent_due,
+            images: self.images.iter().map(|image| KeyframeSignature::of(&image.keyframe)).collect(),
+            is_extent_stale: self.is_extent_stale,
             n_hinted: self.n_hinted,
-            field: self.field.as_ref().map(|(extent, learner)| (*extent, learner.sizes.clone())),
-            learned: self.learned,
-            are_trials_over: self.trials.are_over(),
-            parts: self.trials.ended.clone(),
-            n_taken_back: self.n_taken_back,
-            n_terms: self.field.as_ref().and_then(|(_, learner)| Some(learner.images.as_ref()?.n_images)),
+            field: self.field.as_ref().map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
+            learned_params: self.learned_params,
+            are_trials_finished: self.trials.are_finished(),
+            parts: self.trials.finished.clone(),
+            n_discarded_steps: self.n_discarded_steps,
+            image_capacity: self
+                .field
+                .as_ref()
+                .and_then(|(_, field_trainer)| Some(field_trainer.images.as_ref()?.n_images)),
         })
     }
 
     /// The field as it is; what was sent must be done.
-    pub(super) fn saved(&self) -> Result<Saved, Error> {
-        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.learned()));
-        let (step, n_hinted, learned) = (self.step, self.n_hinted, self.learned);
-        Ok(Saved { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned })
+    pub(super) fn snapshot(&self) -> Result<FieldSnapshot, Error> {
+        let reads = self
+            .field
+            .as_ref()
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.learned_params()));
+        let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
+        Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
     }
 
     /// Makes the field what it was; what was sent must be done.
-    pub(super) fn put_back(&mut self, saved: &Saved) -> Result<(), Error> {
-        (self.step, self.learned) = (saved.step, saved.learned);
-        self.n_hinted = saved.n_hinted.min(self.images.len());
-        self.is_extent_due |= self.n_hinted < self.images.len(); // Their hints are added again.
-        self.fixes = None;
-        let Some((_, learner)) = &mut self.field else { return Ok(()) };
-        match saved.n_terms() {
-            Some(n_terms) => learner.hold_images(&self.gpu, n_terms as usize, saved.learned)?,
-            None => learner.forget_images(),
+    pub(super) fn restore(&mut self, snapshot: &FieldSnapshot) -> Result<(), Error> {
+        (self.step, self.learned_params) = (snapshot.step, snapshot.learned_params);
+        self.n_hinted = snapshot.n_hinted.min(self.images.len());
+        self.is_extent_stale |= self.n_hinted < self.images.len(); // Their hints are added again.
+        self.corrections = None;
+        let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
+        match snapshot.image_capacity() {
+            Some(image_capacity) => {
+                field_trainer.allocate_images(&self.gpu, image_capacity as usize, snapshot.learned_params)?
+            }
+            None => field_trainer.drop_images(),
         }
-        for (name, buffer) in learner.learned() {
-            if let Some(array) = saved.arrays.iter().find(|array| array.name == name) {
+        for (name, buffer) in field_trainer.learned_params() {
+            if let Some(array) = snapshot.arrays.iter().find(|array| array.name == name) {
                 self.gpu.write(buffer, 0, &array.bytes);
             }
         }
@@ -149,17 +157,21 @@ impl NerfModel {
 
     /// In the midst of a trial the state from before it, with which the trial begins again.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
-        self.settle()?;
+        self.finish_in_flight()?;
         let (gpu, mut state) = (self.gpu.clone(), self.state()?);
         if let Some(before) = self.trials.before() {
-            (state.step, state.learned, state.n_terms) = (before.step, before.learned, before.n_terms());
+            (state.step, state.learned_params, state.image_capacity) =
+                (before.step, before.learned_params, before.image_capacity());
             state.n_hinted = before.n_hinted.min(self.images.len());
-            state.is_extent_due |= state.n_hinted < self.images.len();
-            let (state, arrays) = (written(&state)?, before.arrays.clone());
+            state.is_extent_stale |= state.n_hinted < self.images.len();
+            let (state, arrays) = (to_json(&state)?, before.arrays.clone());
             return Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))));
         }
-        let state = written(&state)?;
-        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&gpu, learner.learned()));
+        let state = to_json(&state)?;
+        let reads = self
+            .field
+            .as_ref()
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.learned_params()));
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
@@ -167,30 +179,30 @@ impl NerfModel {
     fn of_state(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
-        buffers: impl Fn(&Learner) -> Vec<(String, &Buffer)>,
-    ) -> Result<(Self, State), Error> {
+        buffers: impl Fn(&FieldTrainer) -> Vec<(String, &Buffer)>,
+    ) -> Result<(Self, NerfState), Error> {
         if checkpoint.method != METHOD {
-            return Err(bad_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
         }
-        let state: State =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
+        let state: NerfState =
+            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
         let mut model = Self::new(gpu, state.options.clone())?;
         if let Some((extent, sizes)) = &state.field {
             sizes.check()?;
             let compiled = model.compiled()?;
-            let mut learner = Learner::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
-            if let Some(n_terms) = state.n_terms {
-                learner.hold_images(&model.gpu, n_terms as usize, state.learned)?;
+            let mut field_trainer = FieldTrainer::new(&model.gpu, &model.options, sizes.clone(), compiled)?;
+            if let Some(image_capacity) = state.image_capacity {
+                field_trainer.allocate_images(&model.gpu, image_capacity as usize, state.learned_params)?;
             }
-            for (name, buffer) in buffers(&learner) {
+            for (name, buffer) in buffers(&field_trainer) {
                 model.gpu.write(buffer, 0, checkpoint.array(&name, buffer.bytes())?);
             }
-            model.field = Some((*extent, learner));
+            model.field = Some((*extent, field_trainer));
         }
         model.step = state.step;
-        model.n_taken_back = state.n_taken_back;
-        model.learned = state.learned;
-        model.trials = Trials::of(&state.options.cameras).after(state.parts.clone(), state.are_trials_over);
+        model.n_discarded_steps = state.n_discarded_steps;
+        model.learned_params = state.learned_params;
+        model.trials = Trials::of(&state.options.cameras).after(state.parts.clone(), state.are_trials_finished);
         Ok((model, state))
     }
 
@@ -201,32 +213,35 @@ impl NerfModel {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
-        let (mut model, state) = Self::of_state(gpu, checkpoint, Learner::learned)?;
-        let (images, rest) = seen::matched(&state.images, keyframes, Arc::clone)?;
+        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::learned_params)?;
+        let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes, Arc::clone)?;
         model.images = images.into_iter().map(RayImage::new).collect();
-        model.is_extent_due = state.is_extent_due;
+        model.is_extent_stale = state.is_extent_stale;
         model.n_hinted = state.n_hinted.min(model.images.len());
         Ok((model, rest))
     }
 
     /// A saved field, to be drawn.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
-        let checkpoint = Checkpoint::read(&folder.join(FIELD))?;
-        let mut model = Self::of_state(gpu, &checkpoint, Learner::drawn)?.0;
-        model.loaded_fixes = read_about(&folder.join("model.json"))?.cameras;
+        let checkpoint = Checkpoint::read(&folder.join(FIELD_FILE))?;
+        let mut model = Self::of_state(gpu, &checkpoint, FieldTrainer::render_buffers)?.0;
+        model.loaded_corrections = read_metadata(&folder.join("model.json"))?.cameras;
         Ok(model)
     }
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
-        self.settle()?;
-        let refused = |path: &Path, source| Error::Write { path: path.to_owned(), source };
-        std::fs::create_dir_all(folder).map_err(|source| refused(folder, source))?;
-        let reads = self.field.as_ref().map_or(Vec::new(), |(_, learner)| begin_read(&self.gpu, learner.drawn()));
-        let (state, arrays) = (written(&self.state()?)?, finish(&self.gpu, reads)?);
-        let cameras = self.camera_fixes()?.clone();
-        Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD))?;
-        let sizes = self.field.as_ref().map(|(_, learner)| &learner.sizes);
-        let about = serde_json::json!({
+        self.finish_in_flight()?;
+        let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+        std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
+        let reads = self
+            .field
+            .as_ref()
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.render_buffers()));
+        let (state, arrays) = (to_json(&self.state()?)?, finish(&self.gpu, reads)?);
+        let cameras = self.camera_corrections()?.clone();
+        Checkpoint::new(METHOD, state, arrays).write(&folder.join(FIELD_FILE))?;
+        let sizes = self.field.as_ref().map(|(_, field_trainer)| &field_trainer.sizes);
+        let description = serde_json::json!({
             "method": METHOD,
             "steps": self.step,
             "entries": self.progress().primitives,
@@ -235,6 +250,6 @@ impl NerfModel {
             "cameras": cameras,
         });
         let path = folder.join("model.json");
-        std::fs::write(&path, format!("{about:#}\n")).map_err(|source| refused(&path, source))
+        std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }

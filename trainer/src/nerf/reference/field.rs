@@ -5,14 +5,14 @@ use super::network::Network;
 use super::space::{contract, contract_backward};
 
 /// Numbers that the first network hands on to the second, after the density.
-pub const N_HANDED_ON: usize = 15;
+pub const N_GEOMETRY_FEATURES: usize = 15;
 /// Basis functions of the direction: spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
 /// The logarithm of the density ends here, so that no density is infinite.
-pub const MOST_LOG_DENSITY: f64 = 12.0;
+pub const MAX_LOG_DENSITY: f64 = 12.0;
 
 /// Added to what the network tells of the logarithm: a field that knows nothing is thin.
-pub const FIRST_LOG_DENSITY: f64 = 0.0;
+pub const LOG_DENSITY_BIAS: f64 = 0.0;
 
 /// All parameters of a field.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,17 +63,20 @@ pub struct Point {
 
 impl Field {
     /// Sizes of the two networks, with hidden layers of a width: one in the first, two in the second.
-    pub fn sizes(shape: &GridShape, width: usize, n_code: usize) -> [Vec<usize>; 2] {
-        [vec![shape.n_outputs(), width, 1 + N_HANDED_ON], vec![N_DIRECTION + N_HANDED_ON + n_code, width, width, 3]]
+    pub fn sizes(shape: &GridShape, width: usize, embedding_dim: usize) -> [Vec<usize>; 2] {
+        [
+            vec![shape.n_outputs(), width, 1 + N_GEOMETRY_FEATURES],
+            vec![N_DIRECTION + N_GEOMETRY_FEATURES + embedding_dim, width, width, 3],
+        ]
     }
 
     /// Density and color of a point, in units of the scene's radius around its middle, looked at along a direction of length 1, in an image with a code.
-    pub fn point(&self, at: [f64; 3], direction: [f64; 3], code: &[f64]) -> Point {
+    pub fn point(&self, at: [f64; 3], direction: [f64; 3], embedding: &[f64]) -> Point {
         let contracted = contract(at);
-        let density_layers = self.density.forward(&grid::look_up(&self.shape, &self.table, contracted));
+        let density_layers = self.density.forward(&grid::interpolate(&self.shape, &self.table, contracted));
         let out = density_layers.last().expect("an output layer");
-        let density = (out[0] + FIRST_LOG_DENSITY).min(MOST_LOG_DENSITY).exp();
-        let input = [&harmonics(direction)[..], &out[1..], code].concat();
+        let density = (out[0] + LOG_DENSITY_BIAS).min(MAX_LOG_DENSITY).exp();
+        let input = [&harmonics(direction)[..], &out[1..], embedding].concat();
         let color_layers = self.color.forward(&input);
         let out = color_layers.last().expect("an output layer");
         let rgb = std::array::from_fn(|channel| 1.0 / (1.0 + (-out[channel]).exp()));
@@ -92,14 +95,14 @@ impl Field {
     ) -> ([f64; 3], Vec<f64>) {
         let v_out: Vec<f64> = point.rgb.iter().zip(v_rgb).map(|(value, v)| v * value * (1.0 - value)).collect();
         let v_input = self.color.backward(&point.color_layers, &v_out, &mut gradient.color);
-        let (v_handed_on, v_code) = v_input[N_DIRECTION..].split_at(N_HANDED_ON);
+        let (v_geometry_features, v_embedding) = v_input[N_DIRECTION..].split_at(N_GEOMETRY_FEATURES);
         let log_density = point.density_layers.last().expect("an output layer")[0];
-        let v_log = if log_density + FIRST_LOG_DENSITY < MOST_LOG_DENSITY { v_density * point.density } else { 0.0 };
-        let v_out = [&[v_log][..], v_handed_on].concat();
+        let v_log = if log_density + LOG_DENSITY_BIAS < MAX_LOG_DENSITY { v_density * point.density } else { 0.0 };
+        let v_out = [&[v_log][..], v_geometry_features].concat();
         let v_found = self.density.backward(&point.density_layers, &v_out, &mut gradient.density);
         let v_contracted =
-            grid::look_up_backward(&self.shape, &self.table, point.contracted, &v_found, &mut gradient.table);
-        (contract_backward(at, v_contracted), v_code.to_vec())
+            grid::interpolate_backward(&self.shape, &self.table, point.contracted, &v_found, &mut gradient.table);
+        (contract_backward(at, v_contracted), v_embedding.to_vec())
     }
 }
 

@@ -23,9 +23,9 @@ impl GridShape {
 
     /// Entries of a level.
     pub fn n_entries(&self, level: usize) -> u32 {
-        let most = 1u64 << self.log2_entries;
+        let max_entries = 1u64 << self.log2_entries;
         let n_corners = (u64::from(self.n_cells[level]) + 1).pow(3);
-        u32::try_from(n_corners.min(most)).expect("at most 2^log2_entries, which is a u32")
+        u32::try_from(n_corners.min(max_entries)).expect("at most 2^log2_entries, which is a u32")
     }
 
     /// First entry of a level.
@@ -34,7 +34,7 @@ impl GridShape {
     }
 
     /// Entries of all levels.
-    pub fn n_entries_in_all(&self) -> u32 {
+    pub fn n_entries_total(&self) -> u32 {
         self.begin(self.n_cells.len())
     }
 
@@ -48,12 +48,12 @@ impl GridShape {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
         let is_dense = u64::from(side).pow(3) <= 1u64 << self.log2_entries;
-        let within = if is_dense {
+        let offset = if is_dense {
             x + side * (y + side * z)
         } else {
             (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & ((1 << self.log2_entries) - 1)
         };
-        self.begin(level) + within
+        self.begin(level) + offset
     }
 }
 
@@ -63,7 +63,7 @@ struct Corner {
     entry: usize,
     weight: f64,
     /// Of the weight towards the point, which is in units of the cube.
-    slope: [f64; 3],
+    weight_gradient: [f64; 3],
 }
 
 /// The corners of the cell of a level around a point of the unit cube; a point outside counts as the nearest one inside.
@@ -76,30 +76,30 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     std::array::from_fn(|ix| {
         let step: [u32; 3] = std::array::from_fn(|axis| u32::try_from(ix >> axis & 1).expect("0 or 1"));
         let part = |axis: usize| if step[axis] == 1 { share[axis] } else { 1.0 - share[axis] };
-        let slope = std::array::from_fn(|axis| {
+        let weight_gradient = std::array::from_fn(|axis| {
             let sign = if step[axis] == 1 { n_cells } else { -n_cells };
             let inside = at[axis] >= 0.0 && at[axis] <= 1.0;
             if inside { sign * part((axis + 1) % 3) * part((axis + 2) % 3) } else { 0.0 }
         });
         let corner = std::array::from_fn(|axis| first[axis] + step[axis]);
-        Corner { entry: shape.entry(level, corner) as usize, weight: part(0) * part(1) * part(2), slope }
+        Corner { entry: shape.entry(level, corner) as usize, weight: part(0) * part(1) * part(2), weight_gradient }
     })
 }
 
 /// What a point of the unit cube finds: two numbers a level, between the eight corners of its cell.
-pub fn look_up(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
-    let mut found = Vec::with_capacity(shape.n_outputs());
+pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
+    let mut features = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
         let corners = corners(shape, level, at);
         let sum =
             |feature: usize| -> f64 { corners.iter().map(|corner| corner.weight * table[corner.entry][feature]).sum() };
-        found.extend((0..N_FEATURES).map(sum));
+        features.extend((0..N_FEATURES).map(sum));
     }
-    found
+    features
 }
 
 /// Carries slopes towards what was found back to the table, where they add up, and to the point.
-pub fn look_up_backward(
+pub fn interpolate_backward(
     shape: &GridShape,
     table: &[[f64; N_FEATURES]],
     at: [f64; 3],
@@ -112,8 +112,8 @@ pub fn look_up_backward(
             for feature in 0..N_FEATURES {
                 let v = upstream[level * N_FEATURES + feature];
                 v_table[corner.entry][feature] += corner.weight * v;
-                for (sum, slope) in v_at.iter_mut().zip(corner.slope) {
-                    *sum += slope * table[corner.entry][feature] * v;
+                for (sum, weight_gradient) in v_at.iter_mut().zip(corner.weight_gradient) {
+                    *sum += weight_gradient * table[corner.entry][feature] * v;
                 }
             }
         }

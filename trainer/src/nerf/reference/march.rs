@@ -10,14 +10,14 @@ pub struct March {
     /// Length of a step inside the inner cube.
     pub step: f64,
     /// Most samples of a ray.
-    pub most_samples: usize,
+    pub max_samples: usize,
     /// Cells of the occupancy along an axis.
     pub n_cells: usize,
 }
 
 /// A piece of a ray in a cell that holds something.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Piece {
+pub struct RaySegment {
     /// Where it begins.
     pub begin: f64,
     /// How long it is.
@@ -25,7 +25,7 @@ pub struct Piece {
 }
 
 /// Directions less steep than this along an axis count as that steep.
-const LEAST_SLOPE: f64 = 1e-9;
+const MIN_DIRECTION: f64 = 1e-9;
 
 /// How a ray goes through the inner cube, and in how many steps.
 #[derive(Clone, Copy, Debug)]
@@ -40,14 +40,14 @@ struct Path {
 impl Path {
     /// Distance along the ray after so many steps.
     fn distance_at(&self, step: f64, n: f64) -> f64 {
-        let distance_of = |share: f64| 1.0 / (1.0 - share) - 1.0;
+        let distance_at_share = |share: f64| 1.0 / (1.0 - share) - 1.0;
         let inside = n - self.n_before;
         if inside < 0.0 {
-            self.enter - distance_of(-inside * step)
+            self.enter - distance_at_share(-inside * step)
         } else if inside < self.n_inside {
             self.enter + inside * step
         } else {
-            self.leave + distance_of((inside - self.n_inside) * step)
+            self.leave + distance_at_share((inside - self.n_inside) * step)
         }
     }
 }
@@ -62,73 +62,73 @@ impl March {
         (cell[0] + self.n_cells * (cell[1] + self.n_cells * cell[2]), margin)
     }
 
-    /// All pieces of a ray between two distances, the first of them `shift` of a step behind `range[0]`; and the least margin
+    /// All pieces of a ray between two distances, the first of them `jitter` of a step behind `range[0]`; and the least margin
     /// of any cell that was asked about, and of the number of pieces.
     ///
     /// Steps are even inside the inner cube; outside, the step at a distance u from where the ray meets it is (1 + u)^2 as long, so
     /// that 1 / (1 + u) changes by the same number with each.
-    pub fn pieces(
+    pub fn segments(
         &self,
         (origin, direction): ([f64; 3], [f64; 3]),
         range: [f64; 2],
-        shift: f64,
+        jitter: f64,
         is_occupied: impl Fn(usize) -> bool,
-    ) -> (Vec<Piece>, f64) {
+    ) -> (Vec<RaySegment>, f64) {
         let path = self.path((origin, direction), range);
-        let middle = |piece: &Piece| {
-            std::array::from_fn(|axis| origin[axis] + (piece.begin + 0.5 * piece.length) * direction[axis])
+        let middle = |segment: &RaySegment| {
+            std::array::from_fn(|axis| origin[axis] + (segment.begin + 0.5 * segment.length) * direction[axis])
         };
-        let n_pieces = (path.n_steps - shift).ceil().max(0.0);
-        let to_whole = path.n_steps - shift - (path.n_steps - shift).round();
-        let (mut found, mut least_margin) = (Vec::new(), to_whole.abs());
+        let n_segments = (path.n_steps - jitter).ceil().max(0.0);
+        let to_nearest_count = path.n_steps - jitter - (path.n_steps - jitter).round();
+        let (mut found, mut min_margin) = (Vec::new(), to_nearest_count.abs());
         let mut ix = 0.0;
-        while ix < n_pieces {
-            let [begin, end] = [ix, ix + 1.0].map(|ix| path.distance_at(self.step, ix + shift));
-            let piece = Piece { begin, length: end - begin };
-            let (cell, margin) = self.cell(middle(&piece));
-            least_margin = least_margin.min(margin);
+        while ix < n_segments {
+            let [begin, end] = [ix, ix + 1.0].map(|ix| path.distance_at(self.step, ix + jitter));
+            let segment = RaySegment { begin, length: end - begin };
+            let (cell, margin) = self.cell(middle(&segment));
+            min_margin = min_margin.min(margin);
             if is_occupied(cell) {
-                found.push(piece);
+                found.push(segment);
             }
             ix += 1.0;
         }
-        (found, least_margin)
+        (found, min_margin)
     }
 
     fn path(&self, (origin, direction): ([f64; 3], [f64; 3]), [begin, end]: [f64; 2]) -> Path {
         let [mut enter, mut leave] = [begin, f64::INFINITY];
         for axis in 0..3 {
-            let along = if direction[axis].abs() < LEAST_SLOPE { LEAST_SLOPE } else { direction[axis] };
+            let along = if direction[axis].abs() < MIN_DIRECTION { MIN_DIRECTION } else { direction[axis] };
             let [low, high] = [-1.0, 1.0].map(|side| (side - origin[axis]) / along);
             enter = enter.max(low.min(high));
             leave = leave.min(low.max(high));
         }
-        let share_of = |distance: f64| 1.0 - 1.0 / (1.0 + distance);
+        let contracted_share = |distance: f64| 1.0 - 1.0 / (1.0 + distance);
         let mut path = Path { enter: begin, leave: begin, n_before: 0.0, n_inside: 0.0, n_steps: 0.0 };
         if leave > enter {
-            let n_before = share_of(enter - begin) / self.step;
+            let n_before = contracted_share(enter - begin) / self.step;
             path = Path { enter, leave, n_before, n_inside: (leave - enter) / self.step, n_steps: 0.0 };
         }
         path.n_steps = if end < path.enter {
-            path.n_before - share_of(path.enter - end) / self.step
+            path.n_before - contracted_share(path.enter - end) / self.step
         } else if end < path.leave {
             path.n_before + (end - path.enter) / self.step
         } else {
-            let n_after = (share_of(end - path.leave) / self.step).min(1.0 / self.step - 1.0);
+            let n_after = (contracted_share(end - path.leave) / self.step).min(1.0 / self.step - 1.0);
             path.n_before + path.n_inside + n_after
         };
         path
     }
 
-    /// The spans of the samples that are kept of the pieces: no more than `most_samples`, each standing for as many.
-    pub fn spans(&self, pieces: &[Piece], shift: f64) -> Vec<[f64; 2]> {
-        let stride = pieces.len().div_ceil(self.most_samples).max(1);
+    /// The spans of the samples that are kept of the pieces: no more than `max_samples`, each standing for as many.
+    pub fn spans(&self, segments: &[RaySegment], jitter: f64) -> Vec<[f64; 2]> {
+        let stride = segments.len().div_ceil(self.max_samples).max(1);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of the stride")]
-        let phase = ((shift * stride as f64) as usize).min(stride - 1);
-        let span = |piece: &Piece| {
-            let (middle, reach) = (piece.begin + 0.5 * piece.length, 0.5 * piece.length * stride as f64);
+        let phase = ((jitter * stride as f64) as usize).min(stride - 1);
+        let span = |segment: &RaySegment| {
+            let (middle, reach) = (segment.begin + 0.5 * segment.length, 0.5 * segment.length * stride as f64);
             [middle - reach, middle + reach]
         };
-        pieces.iter().skip(phase).step_by(stride).map(span).collect()
+        segments.iter().skip(phase).step_by(stride).map(span).collect()
     }
 }

@@ -6,28 +6,28 @@ use nalgebra::{UnitQuaternion, Vector3};
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ImagePose {
     /// Rotation vector in world, radians.
-    pub turn_rad: [f64; 3],
+    pub rotation_rad: [f64; 3],
     /// In world, in units of the scene's radius.
-    pub shift: [f64; 3],
+    pub translation: [f64; 3],
 }
 
 impl ImagePose {
     /// Origin and direction of a ray.
-    pub fn aim(&self, origin: [f64; 3], direction: [f64; 3]) -> ([f64; 3], [f64; 3]) {
-        let turn = UnitQuaternion::from_scaled_axis(Vector3::from(self.turn_rad));
-        ((Vector3::from(origin) + Vector3::from(self.shift)).into(), (turn * Vector3::from(direction)).into())
+    pub fn apply_pose(&self, origin: [f64; 3], direction: [f64; 3]) -> ([f64; 3], [f64; 3]) {
+        let rotation = UnitQuaternion::from_scaled_axis(Vector3::from(self.rotation_rad));
+        ((Vector3::from(origin) + Vector3::from(self.translation)).into(), (rotation * Vector3::from(direction)).into())
     }
 
     /// Slopes towards a further small turn and shift of a ray, from those towards the places of its samples.
     ///
     /// * `direction`: of the ray as it is aimed now, of length 1.
-    /// * `places`: distance along the ray and slope of each sample.
-    pub fn slopes(direction: [f64; 3], places: &[(f64, [f64; 3])]) -> Self {
+    /// * `sample_positions`: distance along the ray and slope of each sample.
+    pub fn gradients(direction: [f64; 3], sample_positions: &[(f64, [f64; 3])]) -> Self {
         let (mut v_origin, mut v_direction) = (Vector3::zeros(), Vector3::zeros());
-        for (distance, slope) in places {
-            v_origin += Vector3::from(*slope);
-            v_direction += *distance * Vector3::from(*slope);
+        for (distance, gradient) in sample_positions {
+            v_origin += Vector3::from(*gradient);
+            v_direction += *distance * Vector3::from(*gradient);
         }
-        Self { turn_rad: Vector3::from(direction).cross(&v_direction).into(), shift: v_origin.into() }
+        Self { rotation_rad: Vector3::from(direction).cross(&v_direction).into(), translation: v_origin.into() }
     }
 }

@@ -24,7 +24,7 @@ impl Sample {
 
 /// What a ray sees.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Seen {
+pub struct RenderedRay {
     /// Premultiplied.
     pub rgb: [f64; 3],
     /// What is left of the light behind all samples.
@@ -36,19 +36,19 @@ pub struct Seen {
 }
 
 /// Adds up the samples of a ray, near ones first (Max 1995).
-pub fn composite(samples: &[Sample]) -> Seen {
-    let mut seen = Seen { rgb: [0.0; 3], transmittance: 1.0, distance: 0.0, weights: Vec::new() };
+pub fn composite(samples: &[Sample]) -> RenderedRay {
+    let mut rendered = RenderedRay { rgb: [0.0; 3], transmittance: 1.0, distance: 0.0, weights: Vec::new() };
     for sample in samples {
-        let left = (-sample.density * sample.length()).exp();
-        let weight = seen.transmittance * (1.0 - left);
+        let transmitted = (-sample.density * sample.length()).exp();
+        let weight = rendered.transmittance * (1.0 - transmitted);
         for channel in 0..3 {
-            seen.rgb[channel] += weight * sample.rgb[channel];
+            rendered.rgb[channel] += weight * sample.rgb[channel];
         }
-        seen.distance += weight * sample.middle();
-        seen.transmittance *= left;
-        seen.weights.push(weight);
+        rendered.distance += weight * sample.middle();
+        rendered.transmittance *= transmitted;
+        rendered.weights.push(weight);
     }
-    seen
+    rendered
 }
 
 /// Slopes of a loss towards what a ray sees.
@@ -65,25 +65,25 @@ pub struct Upstream {
 }
 
 /// Slopes towards density and color of each sample.
-pub fn composite_backward(samples: &[Sample], seen: &Seen, upstream: &Upstream) -> Vec<(f64, [f64; 3])> {
-    let worth = |ix: usize| {
+pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: &Upstream) -> Vec<(f64, [f64; 3])> {
+    let v_weight = |ix: usize| {
         let color: f64 = (0..3).map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel]).sum();
         color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
     };
     // What lies behind a sample loses as much light as the sample takes.
-    let mut behind = seen.transmittance * upstream.transmittance;
-    let mut slopes = Vec::with_capacity(samples.len());
+    let mut behind = rendered.transmittance * upstream.transmittance;
+    let mut gradients = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
         let transmittance_after: f64 = {
-            let upto: f64 = samples[..=ix].iter().map(|sample| sample.density * sample.length()).sum();
-            (-upto).exp()
+            let optical_depth: f64 = samples[..=ix].iter().map(|sample| sample.density * sample.length()).sum();
+            (-optical_depth).exp()
         };
-        let v_density = samples[ix].length() * (transmittance_after * worth(ix) - behind);
-        slopes.push((v_density, upstream.rgb.map(|v| v * seen.weights[ix])));
-        behind += seen.weights[ix] * worth(ix);
+        let v_density = samples[ix].length() * (transmittance_after * v_weight(ix) - behind);
+        gradients.push((v_density, upstream.rgb.map(|v| v * rendered.weights[ix])));
+        behind += rendered.weights[ix] * v_weight(ix);
     }
-    slopes.reverse();
-    slopes
+    gradients.reverse();
+    gradients
 }
 
 /// How far the weights of a ray are spread, and the slope towards each of them: zero where all light comes from one place.
@@ -91,24 +91,29 @@ pub fn composite_backward(samples: &[Sample], seen: &Seen, upstream: &Upstream) 
 /// Distances count as `near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation 15, summed in one
 /// pass as in Sun et al. 2022.
 pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f64>) {
-    let place = |t: f64| 1.0 - near / t.max(near);
-    let middles: Vec<f64> =
-        samples.iter().map(|sample| 0.5 * (place(sample.span[0]) + place(sample.span[1]))).collect();
-    let lengths: Vec<f64> = samples.iter().map(|sample| place(sample.span[1]) - place(sample.span[0])).collect();
-    let in_all: (f64, f64) = weights
+    let normalized_distance = |t: f64| 1.0 - near / t.max(near);
+    let middles: Vec<f64> = samples
+        .iter()
+        .map(|sample| 0.5 * (normalized_distance(sample.span[0]) + normalized_distance(sample.span[1])))
+        .collect();
+    let lengths: Vec<f64> = samples
+        .iter()
+        .map(|sample| normalized_distance(sample.span[1]) - normalized_distance(sample.span[0]))
+        .collect();
+    let total: (f64, f64) = weights
         .iter()
         .zip(&middles)
         .fold((0.0, 0.0), |sums, (weight, middle)| (sums.0 + weight, sums.1 + weight * middle));
     let (mut before, mut loss) = ((0.0, 0.0), 0.0);
-    let mut slopes = Vec::with_capacity(weights.len());
+    let mut gradients = Vec::with_capacity(weights.len());
     for ((weight, middle), length) in weights.iter().zip(&middles).zip(&lengths) {
-        let after = (in_all.0 - before.0 - weight, in_all.1 - before.1 - weight * middle);
-        let apart = middle * before.0 - before.1 + after.1 - middle * after.0;
-        loss += weight * apart + weight * weight * length / 3.0;
-        slopes.push(2.0 * apart + 2.0 * weight * length / 3.0);
+        let after = (total.0 - before.0 - weight, total.1 - before.1 - weight * middle);
+        let separation = middle * before.0 - before.1 + after.1 - middle * after.0;
+        loss += weight * separation + weight * weight * length / 3.0;
+        gradients.push(2.0 * separation + 2.0 * weight * length / 3.0);
         before = (before.0 + weight, before.1 + weight * middle);
     }
-    (loss, slopes)
+    (loss, gradients)
 }
 
 /// What an image shows where a ray ends.
@@ -132,7 +137,7 @@ pub struct Weights {
     /// Where the places of the spread begin.
     pub near: f64,
     /// Of light that is held back elsewhere than where the depth says.
-    pub sight: f64,
+    pub line_of_sight: f64,
     /// So close to a distance, per itself and at least, light may be held back.
     pub band: [f64; 2],
     /// Color behind everything.
@@ -143,38 +148,39 @@ pub struct Weights {
 ///
 /// Where the distance is known, light should be held back there and nowhere else (line of sight: Rematas et al. 2022,
 /// equations 9 to 12, with a band in place of a bell); glass, which a depth camera looks through, may still hold back some.
-pub fn loss(samples: &[Sample], seen: &Seen, target: &Target, weights: &Weights) -> (f64, Upstream) {
-    let (spread, v_weights) = distortion(samples, &seen.weights, weights.near);
+pub fn loss(samples: &[Sample], rendered: &RenderedRay, target: &Target, weights: &Weights) -> (f64, Upstream) {
+    let (distortion_loss, v_weights) = distortion(samples, &rendered.weights, weights.near);
     let mut upstream = Upstream {
         rgb: [0.0; 3],
         transmittance: 0.0,
         distance: 0.0,
         weights: v_weights.iter().map(|v| weights.distortion * v).collect(),
     };
-    let mut loss = weights.distortion * spread;
+    let mut loss = weights.distortion * distortion_loss;
     for channel in 0..3 {
         let background = weights.background_rgb[channel];
-        let miss = seen.rgb[channel] + seen.transmittance * background - target.rgb[channel];
-        loss += miss * miss / 3.0;
-        upstream.rgb[channel] = 2.0 * miss / 3.0;
-        upstream.transmittance += 2.0 * miss / 3.0 * background;
+        let residual = rendered.rgb[channel] + rendered.transmittance * background - target.rgb[channel];
+        loss += residual * residual / 3.0;
+        upstream.rgb[channel] = 2.0 * residual / 3.0;
+        upstream.transmittance += 2.0 * residual / 3.0 * background;
     }
     if target.distance > 0.0 {
-        let reach = weights.band[0] * target.distance + weights.band[1];
-        let is_close = |sample: &Sample| (sample.middle() - target.distance).abs() <= reach;
-        let parts = || samples.iter().zip(&seen.weights);
-        let close: f64 = parts().filter(|(sample, _)| is_close(sample)).map(|(_, weight)| weight).sum();
-        let off: f64 = parts().filter(|(sample, _)| !is_close(sample)).map(|(_, weight)| weight * weight).sum();
-        loss += weights.sight * ((1.0 - close).powi(2) + off);
+        let half_width = weights.band[0] * target.distance + weights.band[1];
+        let is_near_reading = |sample: &Sample| (sample.middle() - target.distance).abs() <= half_width;
+        let parts = || samples.iter().zip(&rendered.weights);
+        let near_weight: f64 = parts().filter(|(sample, _)| is_near_reading(sample)).map(|(_, weight)| weight).sum();
+        let elsewhere_weight_sq: f64 =
+            parts().filter(|(sample, _)| !is_near_reading(sample)).map(|(_, weight)| weight * weight).sum();
+        loss += weights.line_of_sight * ((1.0 - near_weight).powi(2) + elsewhere_weight_sq);
         for ((sample, weight), v) in parts().zip(&mut upstream.weights) {
-            *v += 2.0 * weights.sight * if is_close(sample) { close - 1.0 } else { *weight };
+            *v += 2.0 * weights.line_of_sight * if is_near_reading(sample) { near_weight - 1.0 } else { *weight };
         }
     }
-    let miss_far = seen.distance - (1.0 - seen.transmittance) * target.distance;
+    let distance_residual = rendered.distance - (1.0 - rendered.transmittance) * target.distance;
     if target.distance > 0.0 {
-        loss += weights.distance_weight * miss_far.abs().min(weights.distance_clip);
-        if miss_far.abs() < weights.distance_clip {
-            let v = weights.distance_weight * miss_far.signum();
+        loss += weights.distance_weight * distance_residual.abs().min(weights.distance_clip);
+        if distance_residual.abs() < weights.distance_clip {
+            let v = weights.distance_weight * distance_residual.signum();
             upstream.distance = v;
             upstream.transmittance += v * target.distance;
         }

@@ -10,7 +10,7 @@ fn rounded(value: f64) -> f64 {
     f64::from(crate::gpu::f32_of(value))
 }
 
-pub(crate) const N_CODE: usize = 3;
+pub(crate) const EMBEDDING_DIM: usize = 3;
 
 fn shape() -> GridShape {
     GridShape::between(2, 13, 4, 6) // The first level has an entry a corner, the others share 64.
@@ -24,9 +24,9 @@ fn network(random: &mut Random, sizes: Vec<usize>) -> Network {
 pub(crate) fn field(seed: u64) -> Field {
     let mut random = Random::new(seed);
     let shape = shape();
-    let [density, color] = Field::sizes(&shape, 7, N_CODE);
+    let [density, color] = Field::sizes(&shape, 7, EMBEDDING_DIM);
     Field {
-        table: (0..shape.n_entries_in_all()).map(|_| random.array(-0.8, 0.8)).collect(),
+        table: (0..shape.n_entries_total()).map(|_| random.array(-0.8, 0.8)).collect(),
         density: network(&mut random, density),
         color: network(&mut random, color),
         shape,
@@ -38,24 +38,24 @@ pub(crate) struct Ray {
     pub(crate) origin: [f64; 3],
     pub(crate) direction: [f64; 3],
     pub(crate) spans: Vec<[f64; 2]>,
-    pub(crate) code: Vec<f64>,
+    pub(crate) embedding: Vec<f64>,
     pub(crate) target: Target,
 }
 
 pub(crate) fn ray(seed: u64) -> Ray {
     let mut random = Random::new(seed);
     let direction = nalgebra::Vector3::from(random.array(-1.0, 1.0)).normalize().map(rounded);
-    let mut walked = 0.2;
+    let mut cursor = 0.2;
     let span = |_| {
-        let begin = rounded(walked + random.uniform(0.02, 0.2));
-        walked = rounded(begin + random.uniform(0.1, 0.6));
-        [begin, walked]
+        let begin = rounded(cursor + random.uniform(0.02, 0.2));
+        cursor = rounded(begin + random.uniform(0.1, 0.6));
+        [begin, cursor]
     };
     let spans = (0..7).map(span).collect();
-    let code = random.array::<N_CODE>(-0.5, 0.5).to_vec();
+    let embedding = random.array::<EMBEDDING_DIM>(-0.5, 0.5).to_vec();
     let target =
         Target { rgb: random.array(0.1, 0.9).map(|value: f64| (255.0 * value).round() / 255.0), distance: 1.75 };
-    Ray { origin: random.array(-0.4, 0.4), direction: direction.into(), spans, code, target }
+    Ray { origin: random.array(-0.4, 0.4), direction: direction.into(), spans, embedding, target }
 }
 
 pub(crate) const WEIGHTS: Weights = Weights {
@@ -63,54 +63,55 @@ pub(crate) const WEIGHTS: Weights = Weights {
     distance_clip: 5.0,
     distortion: 0.25,
     near: 0.125,
-    sight: 0.5,
+    line_of_sight: 0.5,
     band: [0.0625, 0.125],
     background_rgb: [0.25, 0.5, 0.75],
 };
 
-fn place(ray: &Ray, span: [f64; 2]) -> [f64; 3] {
+fn sample_position(ray: &Ray, span: [f64; 2]) -> [f64; 3] {
     std::array::from_fn(|axis| ray.origin[axis] + 0.5 * (span[0] + span[1]) * ray.direction[axis])
 }
 
 pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
-    samples_seen_along(field, ray, ray.direction)
+    samples_viewed_along(field, ray, ray.direction)
 }
 
 /// The samples of a ray as they look along another direction.
-fn samples_seen_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
+fn samples_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
     let sample = |span: &[f64; 2]| {
-        let point = field.point(place(ray, *span), direction, &ray.code);
+        let point = field.point(sample_position(ray, *span), direction, &ray.embedding);
         Sample { span: *span, density: point.density, rgb: point.rgb }
     };
     ray.spans.iter().map(sample).collect()
 }
 
 pub(crate) fn loss(field: &Field, ray: &Ray) -> f64 {
-    loss_seen_along(field, ray, ray.direction)
+    loss_viewed_along(field, ray, ray.direction)
 }
 
 /// As [`loss`], with colors as they look along another direction.
-pub(crate) fn loss_seen_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> f64 {
-    let samples = samples_seen_along(field, ray, direction);
+pub(crate) fn loss_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> f64 {
+    let samples = samples_viewed_along(field, ray, direction);
     ray::loss(&samples, &ray::composite(&samples), &ray.target, &WEIGHTS).0
 }
 
 /// Distance along a ray and slope of each of its samples.
-pub(crate) type Places = Vec<(f64, [f64; 3])>;
+pub(crate) type SamplePositions = Vec<(f64, [f64; 3])>;
 
 /// Gradient by the parameters, by the places of the samples (with their distance along the ray), and by the image's code.
-pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, Places, Vec<f64>) {
+pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, SamplePositions, Vec<f64>) {
     let samples = samples(field, ray);
-    let seen = ray::composite(&samples);
-    let (_, upstream) = ray::loss(&samples, &seen, &ray.target, &WEIGHTS);
-    let slopes = ray::composite_backward(&samples, &seen, &upstream);
-    let (mut gradient, mut v_places, mut v_code) = (FieldGrad::zeros(field), Vec::new(), vec![0.0; N_CODE]);
-    for (span, (v_density, v_rgb)) in ray.spans.iter().zip(slopes) {
-        let at = place(ray, *span);
-        let point = field.point(at, ray.direction, &ray.code);
-        let (v_at, v_own) = field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
-        v_places.push((0.5 * (span[0] + span[1]), v_at));
-        v_code.iter_mut().zip(v_own).for_each(|(sum, v)| *sum += v);
+    let rendered = ray::composite(&samples);
+    let (_, upstream) = ray::loss(&samples, &rendered, &ray.target, &WEIGHTS);
+    let gradients = ray::composite_backward(&samples, &rendered, &upstream);
+    let (mut gradient, mut v_positions, mut v_embedding) =
+        (FieldGrad::zeros(field), Vec::new(), vec![0.0; EMBEDDING_DIM]);
+    for (span, (v_density, v_rgb)) in ray.spans.iter().zip(gradients) {
+        let at = sample_position(ray, *span);
+        let point = field.point(at, ray.direction, &ray.embedding);
+        let (v_at, v_ray_embedding) = field.point_backward(at, &point, v_density, v_rgb, &mut gradient);
+        v_positions.push((0.5 * (span[0] + span[1]), v_at));
+        v_embedding.iter_mut().zip(v_ray_embedding).for_each(|(sum, v)| *sum += v);
     }
-    (gradient, v_places, v_code)
+    (gradient, v_positions, v_embedding)
 }

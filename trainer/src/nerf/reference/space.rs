@@ -14,17 +14,17 @@ pub fn contract(at: [f64; 3]) -> [f64; 3] {
 
 /// Carries a slope towards the contracted point back to the point.
 pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
-    let (axis, most) = largest(at);
-    if most <= 1.0 {
+    let (axis, max_abs) = largest(at);
+    if max_abs <= 1.0 {
         return upstream.map(|v| v / 4.0);
     }
     // x -> x (2 m - 1) / m^2, where m is the largest coordinate.
-    let factor = (2.0 * most - 1.0) / (most * most);
-    let by_most = (2.0 - 2.0 * most) / (most * most * most);
+    let factor = (2.0 * max_abs - 1.0) / (max_abs * max_abs);
+    let by_max = (2.0 - 2.0 * max_abs) / (max_abs * max_abs * max_abs);
     let along: f64 = at.iter().zip(upstream).map(|(x, v)| x * v).sum();
-    let mut slope = upstream.map(|v| v * factor);
-    slope[axis] += along * by_most * at[axis].signum();
-    slope.map(|v| v / 4.0)
+    let mut gradient = upstream.map(|v| v * factor);
+    gradient[axis] += along * by_max * at[axis].signum();
+    gradient.map(|v| v / 4.0)
 }
 
 /// The axis of the largest coordinate, and its size.

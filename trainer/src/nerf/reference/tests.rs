@@ -4,7 +4,7 @@ use super::field::Field;
 use super::grid::{self, GridShape};
 use super::pose::ImagePose;
 use super::ray::{self, Sample};
-use super::scene::{N_CODE, Ray, field, gradient, loss, loss_seen_along, ray};
+use super::scene::{EMBEDDING_DIM, Ray, field, gradient, loss, loss_viewed_along, ray};
 use super::space::{contract, contract_backward};
 use crate::mismatches::Mismatches;
 
@@ -16,89 +16,90 @@ fn central(at: impl Fn(f64) -> f64) -> f64 {
 }
 
 #[test]
-fn gradients_of_a_ray_match_central_differences() {
-    let mut wrong = Mismatches::default();
+fn ray_gradients_match_central_differences() {
+    let mut mismatches = Mismatches::default();
     for seed in [3, 4, 5] {
         let (field, ray) = (field(seed), ray(seed + 10));
-        let (slopes, v_places, v_code) = gradient(&field, &ray);
+        let (gradients, v_positions, v_embedding) = gradient(&field, &ray);
         let nudged = |change: &dyn Fn(&mut Field, f64), step: f64| {
             let mut field = field.clone();
             change(&mut field, step);
             loss(&field, &ray)
         };
-        for (ix, entry) in slopes.table.iter().enumerate() {
-            for (feature, slope) in entry.iter().enumerate() {
+        for (ix, entry) in gradients.table.iter().enumerate() {
+            for (feature, derivative) in entry.iter().enumerate() {
                 let numeric = central(|step| nudged(&|field, step| field.table[ix][feature] += step, step));
-                wrong.check(format!("{seed}: entry {ix} {feature}"), *slope, numeric, ABS, REL);
+                mismatches.check(format!("{seed}: entry {ix} {feature}"), *derivative, numeric, ABS, REL);
             }
         }
-        for (ix, slope) in slopes.density.iter().enumerate() {
+        for (ix, derivative) in gradients.density.iter().enumerate() {
             let numeric = central(|step| nudged(&|field, step| field.density.weights[ix] += step, step));
-            wrong.check(format!("{seed}: density {ix}"), *slope, numeric, ABS, REL);
+            mismatches.check(format!("{seed}: density {ix}"), *derivative, numeric, ABS, REL);
         }
-        for (ix, slope) in slopes.color.iter().enumerate() {
+        for (ix, derivative) in gradients.color.iter().enumerate() {
             let numeric = central(|step| nudged(&|field, step| field.color.weights[ix] += step, step));
-            wrong.check(format!("{seed}: color {ix}"), *slope, numeric, ABS, REL);
+            mismatches.check(format!("{seed}: color {ix}"), *derivative, numeric, ABS, REL);
         }
-        let pose = ImagePose::slopes(ray.direction, &v_places);
+        let pose = ImagePose::gradients(ray.direction, &v_positions);
         for axis in 0..3 {
             let moved = |pose: ImagePose| {
-                let (origin, direction) = pose.aim(ray.origin, ray.direction);
-                let moved = Ray { origin, direction, spans: ray.spans.clone(), code: ray.code.clone(), ..ray };
-                loss_seen_along(&field, &moved, ray.direction)
+                let (origin, direction) = pose.apply_pose(ray.origin, ray.direction);
+                let moved =
+                    Ray { origin, direction, spans: ray.spans.clone(), embedding: ray.embedding.clone(), ..ray };
+                loss_viewed_along(&field, &moved, ray.direction)
             };
             let along = |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
-            let shifted = |step: f64| moved(ImagePose { shift: along(step), ..ImagePose::default() });
-            wrong.check(format!("{seed}: shift {axis}"), pose.shift[axis], central(shifted), ABS, REL);
-            let turned = |step: f64| moved(ImagePose { turn_rad: along(step), ..ImagePose::default() });
-            wrong.check(format!("{seed}: turn {axis}"), pose.turn_rad[axis], central(turned), ABS, REL);
+            let translated = |step: f64| moved(ImagePose { translation: along(step), ..ImagePose::default() });
+            mismatches.check(format!("{seed}: shift {axis}"), pose.translation[axis], central(translated), ABS, REL);
+            let rotated = |step: f64| moved(ImagePose { rotation_rad: along(step), ..ImagePose::default() });
+            mismatches.check(format!("{seed}: turn {axis}"), pose.rotation_rad[axis], central(rotated), ABS, REL);
         }
-        for ix in 0..N_CODE {
+        for ix in 0..EMBEDDING_DIM {
             let moved = |step: f64| {
-                let mut code = ray.code.clone();
-                code[ix] += step;
-                loss(&field, &Ray { code, spans: ray.spans.clone(), ..ray })
+                let mut embedding = ray.embedding.clone();
+                embedding[ix] += step;
+                loss(&field, &Ray { embedding, spans: ray.spans.clone(), ..ray })
             };
-            wrong.check(format!("{seed}: code {ix}"), v_code[ix], central(moved), ABS, REL);
+            mismatches.check(format!("{seed}: code {ix}"), v_embedding[ix], central(moved), ABS, REL);
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
-fn contraction_keeps_the_inside_and_draws_in_the_outside() {
+fn contraction_is_linear_inside_and_bounded_outside() {
     assert_eq!(contract([0.0; 3]), [0.5; 3]);
     assert_eq!(contract([1.0, -1.0, 0.0]), [0.75, 0.25, 0.5]);
     let far = contract([1e9, 0.0, 0.0]);
     assert!(far[0] > 0.999_999 && far[0] < 1.0 && (far[1] - 0.5).abs() < 1e-9, "{far:?}");
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     let upstream = [0.7, -0.4, 0.9];
     for at in [[0.15, -0.4, 0.45], [4.0, -2.5, 0.5], [-10.5, 14.0, -26.5], [0.5, 0.25, -5.0]] {
-        let slopes = contract_backward(at, upstream);
+        let gradients = contract_backward(at, upstream);
         for axis in 0..3 {
             let numeric = central(|step| {
                 let mut moved = at;
                 moved[axis] += step;
                 contract(moved).iter().zip(upstream).map(|(x, v)| x * v).sum()
             });
-            wrong.check(format!("{at:?} {axis}"), slopes[axis], numeric, 1e-9, 1e-6);
+            mismatches.check(format!("{at:?} {axis}"), gradients[axis], numeric, 1e-9, 1e-6);
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
-fn a_grid_returns_what_its_corners_hold_and_lines_between_them() {
+fn grid_interpolates_linearly_between_corners() {
     let shape = GridShape { n_cells: vec![4], log2_entries: 10 };
     // A linear function is found again everywhere.
     let linear = |at: [f64; 3]| [0.3 + at[0] - 2.0 * at[1] + 0.5 * at[2], at[0] * 3.0 - at[2]];
-    let mut table = vec![[0.0; 2]; shape.n_entries_in_all() as usize];
+    let mut table = vec![[0.0; 2]; shape.n_entries_total() as usize];
     for ix in 0..125u32 {
         let corner = [ix % 5, ix / 5 % 5, ix / 25];
         table[shape.entry(0, corner) as usize] = linear(corner.map(|x| f64::from(x) / 4.0));
     }
     for at in [[0.0; 3], [1.0; 3], [0.25, 0.5, 0.75], [0.13, 0.99, 0.47]] {
-        let (found, expected) = (grid::look_up(&shape, &table, at), linear(at));
+        let (found, expected) = (grid::interpolate(&shape, &table, at), linear(at));
         assert!(
             found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-12),
             "{at:?}: {found:?}"
@@ -107,7 +108,7 @@ fn a_grid_returns_what_its_corners_hold_and_lines_between_them() {
 }
 
 #[test]
-fn levels_grow_evenly_and_large_ones_share_entries() {
+fn levels_grow_evenly_and_large_levels_hash() {
     let shape = GridShape::between(16, 2048, 16, 19);
     assert_eq!((shape.n_cells[0], shape.n_cells[15]), (16, 2048));
     assert!(shape.n_cells.windows(2).all(|pair| pair[1] > pair[0] && pair[1] < 2 * pair[0]));
@@ -115,36 +116,40 @@ fn levels_grow_evenly_and_large_ones_share_entries() {
     let hit: std::collections::BTreeSet<u32> =
         (0..20_000).map(|ix| shape.entry(15, [ix % 29, ix / 29 % 31, ix / 899])).collect();
     assert!(hit.len() > 19_000, "few share an entry while there are many more entries: {}", hit.len());
-    assert!(hit.iter().all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_in_all()));
+    assert!(hit.iter().all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_total()));
 }
 
 #[test]
-fn a_ray_adds_up_to_one_and_an_opaque_sample_hides_the_rest() {
+fn weights_sum_to_one_and_opaque_samples_occlude() {
     let sample =
         |begin: f64, density: f64, red: f64| Sample { span: [begin, begin + 0.5], density, rgb: [red, 0.0, 1.0] };
     let samples = [sample(1.0, 0.5, 0.2), sample(1.5, 1e3, 0.9), sample(2.0, 2.0, 0.1)];
-    let seen = ray::composite(&samples);
-    assert!((seen.weights.iter().sum::<f64>() + seen.transmittance - 1.0).abs() < 1e-12);
+    let rendered = ray::composite(&samples);
+    assert!((rendered.weights.iter().sum::<f64>() + rendered.transmittance - 1.0).abs() < 1e-12);
     let first = 1.0 - (-0.25f64).exp();
-    assert!((seen.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9 && seen.weights[2] < 1e-9);
-    assert!((seen.distance - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
+    assert!((rendered.rgb[0] - (first * 0.2 + (1.0 - first) * 0.9)).abs() < 1e-9 && rendered.weights[2] < 1e-9);
+    assert!((rendered.distance - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
 }
 
 /// The sum over all pairs, as it is defined.
 #[test]
-fn distortion_in_one_pass_is_the_sum_over_pairs() {
+fn one_pass_distortion_equals_pairwise_sum() {
     let samples: Vec<Sample> = [[1.0, 1.4], [1.5, 1.9], [1.9, 4.0], [6.0, 7.0]]
         .map(|span| Sample { span, density: 1.0, rgb: [0.0; 3] })
         .to_vec();
     let weights = [0.1, 0.4, 0.2, 0.15];
-    let place = |t: f64| 1.0 - 0.5 / t;
-    let middle = |ix: usize| 0.5 * (place(samples[ix].span[0]) + place(samples[ix].span[1]));
+    let normalized_distance = |t: f64| 1.0 - 0.5 / t;
+    let middle =
+        |ix: usize| 0.5 * (normalized_distance(samples[ix].span[0]) + normalized_distance(samples[ix].span[1]));
     let mut expected = 0.0;
     for i in 0..4 {
         for j in 0..4 {
             expected += weights[i] * weights[j] * (middle(i) - middle(j)).abs();
         }
-        expected += weights[i] * weights[i] * (place(samples[i].span[1]) - place(samples[i].span[0])) / 3.0;
+        expected += weights[i]
+            * weights[i]
+            * (normalized_distance(samples[i].span[1]) - normalized_distance(samples[i].span[0]))
+            / 3.0;
     }
     assert!((ray::distortion(&samples, &weights, 0.5).0 - expected).abs() < 1e-12);
     let alone = ray::distortion(&samples, &[0.0, 1e-9, 0.0, 0.0], 0.5);

@@ -44,13 +44,13 @@ pub(crate) fn update(
     ]
     .map(f64::from);
     let since = f64::from(step) - f64::from(rule.schedule_start);
-    let done = (since / f64::from(rule.n_planned_steps).max(1.0)).clamp(0.0, 1.0);
-    let mean_rate = of_mean * final_frac.powf(done);
+    let progress = (since / f64::from(rule.n_planned_steps).max(1.0)).clamp(0.0, 1.0);
+    let mean_rate = of_mean * final_frac.powf(progress);
     let opacity = sigmoid(splat.opacity_logit);
     let mut gradient = gradient.clone();
-    gradient.opacity_logit += (1.0 + done) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
+    gradient.opacity_logit += (1.0 + progress) * f64::from(rule.opacity_cost) * opacity * (1.0 - opacity);
     for axis in 0..3 {
-        gradient.log_scale[axis] += (1.0 + done) * f64::from(rule.scale_cost) * splat.log_scale[axis].exp();
+        gradient.log_scale[axis] += (1.0 + progress) * f64::from(rule.scale_cost) * splat.log_scale[axis].exp();
     }
     let rates: Vec<f64> = [mean_rate; 3]
         .into_iter()
@@ -59,33 +59,33 @@ pub(crate) fn update(
         .chain([of_opacity])
         .chain([of_dc; 3])
         .collect();
-    let mut moved = values(splat);
+    let mut updated = values(splat);
     let gradients = values(&gradient);
     let adam = Adam { beta1: rule.betas[0].into(), beta2: rule.betas[1].into(), epsilon: rule.epsilon.into() };
     let n_own = rates.len();
-    adam.update_all(step + 1, &rates, &mut moved[..n_own], &gradients[..n_own], &mut moments[..n_own]);
-    adam.update_alike(step + 1, of_rest, &mut moved[n_own..], &gradients[n_own..], &mut moments[n_own].second);
+    adam.update_all(step + 1, &rates, &mut updated[..n_own], &gradients[..n_own], &mut moments[..n_own]);
+    adam.update_shared(step + 1, of_rest, &mut updated[n_own..], &gradients[n_own..], &mut moments[n_own].second);
 
     let [w, x, y, z] = splat.rotation_wxyz;
-    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-    let along = turn.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
+    let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    let along = rotation.inverse() * Vector3::from(normal3([splat_ix, step, rule.seed]));
     let variance = Vector3::from(splat.log_scale.map(|scale| (2.0 * scale).exp()));
-    let loose = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
-    let jitter = turn * variance.component_mul(&along) * (noise * mean_rate * loose);
+    let noise_weight = 1.0 / (1.0 + (100.0 * (opacity - 0.005)).exp());
+    let jitter = rotation * variance.component_mul(&along) * (noise * mean_rate * noise_weight);
 
     let range = rule.log_scale_range.map(f64::from);
-    let norm = moved[6..10].iter().map(|part| part * part).sum::<f64>().sqrt();
+    let norm = updated[6..10].iter().map(|part| part * part).sum::<f64>().sqrt();
     Splat {
-        mean: std::array::from_fn(|axis| moved[axis] + jitter[axis]),
-        log_scale: std::array::from_fn(|axis| moved[3 + axis].clamp(range[0], range[1])),
-        rotation_wxyz: std::array::from_fn(|part| moved[6 + part] / norm),
-        opacity_logit: moved[10].clamp(-12.0, 12.0),
-        sh: moved[11..].as_chunks::<3>().0.to_vec(),
+        mean: std::array::from_fn(|axis| updated[axis] + jitter[axis]),
+        log_scale: std::array::from_fn(|axis| updated[3 + axis].clamp(range[0], range[1])),
+        rotation_wxyz: std::array::from_fn(|part| updated[6 + part] / norm),
+        opacity_logit: updated[10].clamp(-12.0, 12.0),
+        sh: updated[11..].as_chunks::<3>().0.to_vec(),
     }
 }
 
 /// Larger families are treated as this large.
-const MOST_FAMILY: u32 = 16;
+const MAX_FAMILY: u32 = 16;
 
 /// Splats after a change of their number, and who came of whom.
 pub(crate) struct Grown {
@@ -97,7 +97,7 @@ pub(crate) struct Grown {
 
 /// Gives dead and new splats a parent, chosen by error, a place within it and their share of its light.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
-    let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.least_opacity);
+    let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.min_opacity);
     let mut cumulative = Vec::with_capacity(splats.len());
     let mut total = 0.0;
     for (splat, error) in splats.iter().zip(errors) {
@@ -114,18 +114,18 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
         if splats.get(ix).is_some_and(|splat| !is_dead(splat)) {
             continue;
         }
-        let wanted = uniform3([child, growth.key, 7])[0] * total;
-        let parent = cumulative.partition_point(|sum| *sum <= wanted);
+        let threshold = uniform3([child, growth.key, 7])[0] * total;
+        let parent = cumulative.partition_point(|sum| *sum <= threshold);
         let before = if parent > 0 { cumulative[parent - 1] } else { 0.0 };
-        margin = margin.min((cumulative[parent] - wanted).min(wanted - before) / total);
+        margin = margin.min((cumulative[parent] - threshold).min(threshold - before) / total);
         parents[ix] = Some(parent);
         n_children[parent] += 1;
         let [w, x, y, z] = splats[parent].rotation_wxyz;
-        let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
         let normal = normal3([child, growth.key, 11]);
-        let within: [f64; 3] =
+        let offset_in_parent: [f64; 3] =
             std::array::from_fn(|axis| splats[parent].log_scale[axis].exp() * normal[axis].clamp(-2.0, 2.0));
-        let offset = turn * Vector3::from(within) * f64::from(growth.child_spread);
+        let offset = rotation * Vector3::from(offset_in_parent) * f64::from(growth.child_spread);
         grown[ix] = splats[parent].clone();
         for axis in 0..3 {
             grown[ix].mean[axis] += offset[axis];
@@ -134,14 +134,14 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     for (ix, splat) in grown.iter_mut().enumerate() {
         let n = n_children.get(parents[ix].unwrap_or(ix)).copied().unwrap_or(0);
         if n > 0 {
-            share_light(splat, (n + 1).min(MOST_FAMILY));
+            share_opacity(splat, (n + 1).min(MAX_FAMILY));
         }
     }
     Grown { splats: grown, parents, margin }
 }
 
 /// Opacity and size of one of `n` splats that together look as the one did.
-fn share_light(splat: &mut Splat, n: u32) {
+fn share_opacity(splat: &mut Splat, n: u32) {
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);
     let choose = |n: u32, k: u32| (0..k).map(|i| f64::from(n - i) / f64::from(i + 1)).product::<f64>();

@@ -12,7 +12,7 @@ const ABS: f64 = 2e-6;
 const REL: f64 = 1e-5;
 
 #[test]
-fn agrees_with_a_published_picture() {
+fn render_matches_a_published_picture() {
     let Some(folder) = crate::test_data::folder("splats") else { return };
     let bytes = std::fs::read(folder.join("brush_tiny_case.safetensors")).expect("the data hold it");
     let tensors = SafeTensors::deserialize(&bytes).expect("a valid file");
@@ -48,13 +48,13 @@ fn agrees_with_a_published_picture() {
     let splats: Vec<_> = (0..opacities.len()).map(splat).collect();
 
     let image = render(&view, &splats);
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for (pixel_ix, expected) in picture.as_chunks::<4>().0.iter().enumerate() {
         let [r, g, b] = image.rgb[pixel_ix];
         for (channel, got) in [r, g, b, 1.0 - image.transmittance[pixel_ix]].into_iter().enumerate() {
-            wrong.check(format!("pixel {pixel_ix} channel {channel}"), got, expected[channel], ABS, REL);
+            mismatches.check(format!("pixel {pixel_ix} channel {channel}"), got, expected[channel], ABS, REL);
         }
     }
     assert!(picture.iter().filter(|value| **value > 0.1).count() > 1000, "the picture shows something");
-    wrong.assert_none();
+    mismatches.assert_none();
 }

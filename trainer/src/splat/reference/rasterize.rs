@@ -24,7 +24,11 @@ pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
     Decisions {
-        row_shares: projected.iter().zip(splats).map(|(seen, splat)| seen.map(|_| row_share(view, splat))).collect(),
+        row_shares: projected
+            .iter()
+            .zip(splats)
+            .map(|(visible_splat, splat)| visible_splat.map(|_| row_share(view, splat)))
+            .collect(),
         contributors: view.pixel_centers().map(|center_px| contributors(&front_to_back, &center_px)).collect(),
     }
 }
@@ -100,7 +104,7 @@ fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) 
     for (_, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
         margin = margin.min(distance(coverage.unclamped, MIN_ALPHA)).min(distance(coverage.unclamped, MAX_ALPHA));
-        if !coverage.drawn() {
+        if !coverage.is_drawn() {
             continue;
         }
         if let Some(depth_in_front) = depth_in_front.filter(|&depth| depth != splat.depth) {
@@ -119,7 +123,7 @@ fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) 
 /// Visible splats with their indices, by depth rounded to f32; of equals the lower index first.
 fn front_to_back(projected: &[Option<Projected>]) -> Vec<(usize, Projected)> {
     let mut visible: Vec<_> =
-        projected.iter().enumerate().filter_map(|(ix, seen)| seen.map(|splat| (ix, splat))).collect();
+        projected.iter().enumerate().filter_map(|(ix, visible_splat)| visible_splat.map(|splat| (ix, splat))).collect();
     visible.sort_by_key(|(splat_ix, splat)| (depth_bits(splat.depth), *splat_ix));
     visible
 }
@@ -137,7 +141,7 @@ fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> V
     let mut transmittance = 1.0;
     for (splat_ix, splat) in front_to_back {
         let coverage = Coverage::new(splat, center_px);
-        if !coverage.drawn() {
+        if !coverage.is_drawn() {
             continue;
         }
         transmittance *= 1.0 - coverage.alpha();
@@ -175,7 +179,7 @@ impl Coverage {
     }
 
     /// A conic that is not positive, from rounding, draws nothing.
-    fn drawn(&self) -> bool {
+    fn is_drawn(&self) -> bool {
         self.sigma >= 0.0 && self.alpha() >= MIN_ALPHA
     }
 

@@ -102,7 +102,7 @@ impl Upstream {
 
 /// Names one raw value of a splat.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Param {
+pub(crate) enum SplatParam {
     Mean(usize),
     LogScale(usize),
     RotationWxyz(usize),
@@ -112,35 +112,37 @@ pub(crate) enum Param {
 
 impl Splat {
     /// Every raw value of this splat.
-    pub(crate) fn params(&self) -> Vec<Param> {
-        let mut params = vec![Param::OpacityLogit];
-        params.extend((0..3).map(Param::Mean));
-        params.extend((0..3).map(Param::LogScale));
-        params.extend((0..4).map(Param::RotationWxyz));
-        params.extend((0..self.sh.len()).flat_map(|coeff_ix| (0..3).map(move |channel| Param::Sh(coeff_ix, channel))));
+    pub(crate) fn params(&self) -> Vec<SplatParam> {
+        let mut params = vec![SplatParam::OpacityLogit];
+        params.extend((0..3).map(SplatParam::Mean));
+        params.extend((0..3).map(SplatParam::LogScale));
+        params.extend((0..4).map(SplatParam::RotationWxyz));
+        params.extend(
+            (0..self.sh.len()).flat_map(|coeff_ix| (0..3).map(move |channel| SplatParam::Sh(coeff_ix, channel))),
+        );
         params
     }
 
     /// One raw value (or its gradient, for a `SplatGrad`).
-    pub(crate) fn get(&self, param: Param) -> f64 {
+    pub(crate) fn get(&self, param: SplatParam) -> f64 {
         match param {
-            Param::Mean(axis) => self.mean[axis],
-            Param::LogScale(axis) => self.log_scale[axis],
-            Param::RotationWxyz(ix) => self.rotation_wxyz[ix],
-            Param::OpacityLogit => self.opacity_logit,
-            Param::Sh(coeff_ix, channel) => self.sh[coeff_ix][channel],
+            SplatParam::Mean(axis) => self.mean[axis],
+            SplatParam::LogScale(axis) => self.log_scale[axis],
+            SplatParam::RotationWxyz(ix) => self.rotation_wxyz[ix],
+            SplatParam::OpacityLogit => self.opacity_logit,
+            SplatParam::Sh(coeff_ix, channel) => self.sh[coeff_ix][channel],
         }
     }
 
     /// This splat with one raw value raised by `nudge`.
-    pub(crate) fn nudged(&self, param: Param, nudge: f64) -> Self {
+    pub(crate) fn nudged(&self, param: SplatParam, nudge: f64) -> Self {
         let mut splat = self.clone();
         *match param {
-            Param::Mean(axis) => &mut splat.mean[axis],
-            Param::LogScale(axis) => &mut splat.log_scale[axis],
-            Param::RotationWxyz(ix) => &mut splat.rotation_wxyz[ix],
-            Param::OpacityLogit => &mut splat.opacity_logit,
-            Param::Sh(coeff_ix, channel) => &mut splat.sh[coeff_ix][channel],
+            SplatParam::Mean(axis) => &mut splat.mean[axis],
+            SplatParam::LogScale(axis) => &mut splat.log_scale[axis],
+            SplatParam::RotationWxyz(ix) => &mut splat.rotation_wxyz[ix],
+            SplatParam::OpacityLogit => &mut splat.opacity_logit,
+            SplatParam::Sh(coeff_ix, channel) => &mut splat.sh[coeff_ix][channel],
         } += nudge;
         splat
     }

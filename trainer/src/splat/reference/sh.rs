@@ -132,13 +132,13 @@ mod tests {
                 }
             }
         }
-        let mut wrong = Mismatches::default();
+        let mut mismatches = Mismatches::default();
         for (i, row) in products.iter().enumerate() {
             for (j, &product) in row.iter().enumerate() {
-                wrong.check(format!("<{i}, {j}>"), product, if i == j { 1.0 } else { 0.0 }, 1e-12, 0.0);
+                mismatches.check(format!("<{i}, {j}>"), product, if i == j { 1.0 } else { 0.0 }, 1e-12, 0.0);
             }
         }
-        wrong.assert_none();
+        mismatches.assert_none();
     }
 
     #[test]

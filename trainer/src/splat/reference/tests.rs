@@ -13,7 +13,7 @@ const ABS: f64 = 2e-8;
 const REL: f64 = 1e-6;
 
 /// Compares every gradient of a render with central differences; decisions are held.
-fn check_gradients(view: &View, splats: &[Splat], wrong: &mut Mismatches) {
+fn check_gradients(view: &View, splats: &[Splat], mismatches: &mut Mismatches) {
     let upstream = some_upstream(7, view);
     let decisions = decide(view, splats);
     let grad = render_backward(view, splats, &upstream);
@@ -27,12 +27,24 @@ fn check_gradients(view: &View, splats: &[Splat], wrong: &mut Mismatches) {
                 loss(view, &splats)
             };
             let numeric = (nudged(NUDGE) - nudged(-NUDGE)) / (2.0 * NUDGE);
-            wrong.check(format!("splat {splat_ix} {param:?}"), grad.splats[splat_ix].get(param), numeric, ABS, REL);
+            mismatches.check(
+                format!("splat {splat_ix} {param:?}"),
+                grad.splats[splat_ix].get(param),
+                numeric,
+                ABS,
+                REL,
+            );
         }
     }
     for ix in 0..6 {
         let moved = |nudge| loss(&view.moved(&std::array::from_fn(|i| if i == ix { nudge } else { 0.0 })), splats);
-        wrong.check(format!("pose {ix}"), grad.view.pose[ix], (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE), ABS, REL);
+        mismatches.check(
+            format!("pose {ix}"),
+            grad.view.pose[ix],
+            (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE),
+            ABS,
+            REL,
+        );
     }
     for axis in 0..3 {
         let moved = |nudge: f64| {
@@ -47,36 +59,36 @@ fn check_gradients(view: &View, splats: &[Splat], wrong: &mut Mismatches) {
         };
         let by_linear = (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE);
         let by_angular = (turned(NUDGE) - turned(-NUDGE)) / (2.0 * NUDGE);
-        wrong.check(format!("linear {axis}"), grad.view.linear_m[axis], by_linear, ABS, REL);
-        wrong.check(format!("angular {axis}"), grad.view.angular_rad[axis], by_angular, ABS, REL);
+        mismatches.check(format!("linear {axis}"), grad.view.linear_m[axis], by_linear, ABS, REL);
+        mismatches.check(format!("angular {axis}"), grad.view.angular_rad[axis], by_angular, ABS, REL);
     }
 }
 
 #[test]
 fn gradients_match_central_differences() {
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for seed in 1..=3 {
-        check_gradients(&tilted_view(), &small_scene(seed, 12), &mut wrong);
+        check_gradients(&tilted_view(), &small_scene(seed, 12), &mut mismatches);
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
 fn gradients_match_central_differences_with_a_rolling_shutter() {
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for seed in 4..=5 {
-        check_gradients(&rolling_view(), &small_scene(seed, 12), &mut wrong);
+        check_gradients(&rolling_view(), &small_scene(seed, 12), &mut mismatches);
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
-fn gradients_match_central_differences_where_things_are_clamped() {
+fn gradients_match_central_differences_at_clamps() {
     let view = rolling_view();
     let splats = clamped_scene(&view);
-    let mut wrong = Mismatches::default();
-    check_gradients(&view, &splats, &mut wrong);
-    wrong.assert_none();
+    let mut mismatches = Mismatches::default();
+    check_gradients(&view, &splats, &mut mismatches);
+    mismatches.assert_none();
 
     let grad = render_backward(&view, &splats, &some_upstream(7, &view));
     assert!(
@@ -113,18 +125,18 @@ fn clamped_scene(view: &View) -> Vec<Splat> {
 }
 
 /// Half the squared distance of a pixel from a placed splat, in standard deviations.
-fn sigma(placed: &Projected, center_px: &[f64; 2]) -> f64 {
-    let [dx, dy] = [center_px[0] - placed.mean_px[0], center_px[1] - placed.mean_px[1]];
-    0.5 * (placed.conic[0] * dx * dx + placed.conic[2] * dy * dy) + placed.conic[1] * dx * dy
+fn sigma(projected: &Projected, center_px: &[f64; 2]) -> f64 {
+    let [dx, dy] = [center_px[0] - projected.mean_px[0], center_px[1] - projected.mean_px[1]];
+    0.5 * (projected.conic[0] * dx * dx + projected.conic[2] * dy * dy) + projected.conic[1] * dx * dy
 }
 
 #[test]
-fn a_wrong_gradient_is_noticed() {
+fn wrong_gradient_is_detected() {
     let (view, splats) = (tilted_view(), small_scene(1, 4));
     let upstream = some_upstream(7, &view);
     let grad = render_backward(&view, &splats, &upstream);
     let decisions = decide(&view, &splats);
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     let params = splats[0].params();
     for &param in &params {
         let loss = |nudge| {
@@ -133,13 +145,13 @@ fn a_wrong_gradient_is_noticed() {
             upstream.dot(&render_decided(&view, &splats, &decisions))
         };
         let numeric = (loss(NUDGE) - loss(-NUDGE)) / (2.0 * NUDGE);
-        wrong.check(format!("{param:?} off by 0.01 %"), grad.splats[0].get(param) * 1.0001, numeric, ABS, REL);
+        mismatches.check(format!("{param:?} off by 0.01 %"), grad.splats[0].get(param) * 1.0001, numeric, ABS, REL);
     }
-    assert_eq!(wrong.n_wrong(), params.len());
+    assert_eq!(mismatches.n_mismatches(), params.len());
 }
 
 #[test]
-fn each_parameter_matters_somewhere() {
+fn each_parameter_has_a_gradient() {
     // Else the comparison above would be one of zeros.
     let view = rolling_view();
     let grad = render_backward(&view, &small_scene(4, 12), &some_upstream(7, &view));
@@ -153,7 +165,7 @@ fn each_parameter_matters_somewhere() {
 }
 
 #[test]
-fn a_camera_at_rest_sees_the_same_with_and_without_readout() {
+fn static_camera_ignores_readout_time() {
     let splats = small_scene(2, 8);
     let still = render(&tilted_view(), &splats);
     let moving = render(&rolling_view(), &splats);
@@ -170,7 +182,7 @@ fn rolling_shutter_follows_the_camera_of_each_row() {
     // The first-order motion of the reference against the exact pose at the splat's own row.
     let view = View { linear_m: [2e-3, -1e-3, 3e-3], angular_rad: [1e-3, -2e-3, 2e-3], ..tilted_view() };
     const ABS_PX: f64 = 1e-3; // The second order of the motion: (2e-3)^2 times 31 px, and the row's own shift of 0.1 px.
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for (ix, splat) in small_scene(2, 8).iter().enumerate() {
         let share = row_share(&view, splat);
         let motion: [f64; 6] =
@@ -180,17 +192,17 @@ fn rolling_shutter_follows_the_camera_of_each_row() {
         let still = project_at(&tilted_view(), splat, 0.0);
         assert!((got.mean_px[0] - still.mean_px[0]).abs() > 5.0 * ABS_PX * share.abs(), "splat {ix} hardly moves");
         for axis in 0..2 {
-            wrong.check(format!("splat {ix} axis {axis}"), got.mean_px[axis], expected.mean_px[axis], ABS_PX, 0.0);
+            mismatches.check(format!("splat {ix} axis {axis}"), got.mean_px[axis], expected.mean_px[axis], ABS_PX, 0.0);
         }
         for (got, expected) in got.conic.into_iter().zip(expected.conic) {
-            wrong.check(format!("splat {ix} conic"), got, expected, 1e-6, 1e-4);
+            mismatches.check(format!("splat {ix} conic"), got, expected, 1e-6, 1e-4);
         }
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
-fn slopes_beyond_the_margin_are_clamped_in_the_covariance_alone() {
+fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
     // A round splat 2 m away in a camera at the world's origin: its covariance follows from the slopes by hand.
     let view = View { camera_from_world: Transform::identity(), ..tilted_view() };
     let scale_px: [f64; 2] = [0.1 * 31.0 / 2.0, 0.1 * 28.0 / 2.0];
@@ -203,25 +215,26 @@ fn slopes_beyond_the_margin_are_clamped_in_the_covariance_alone() {
     };
     // The margin is 0.15 of the image's side: to the right (28 - 13.3 + 4.2) / 31, upwards (10.4 + 3) / 28.
     let (right, up) = (18.9 / 31.0, -13.4 / 28.0);
-    let mut wrong = Mismatches::default();
+    let mut mismatches = Mismatches::default();
     for (slope_x, slope_y) in [(right - 0.01, up + 0.01), (right + 0.2, up + 0.01), (right - 0.01, up - 0.2)] {
-        let placed = project(&view, &splat([2.0 * slope_x, 2.0 * slope_y, 2.0])).expect("it is in front of the camera");
+        let projected =
+            project(&view, &splat([2.0 * slope_x, 2.0 * slope_y, 2.0])).expect("it is in front of the camera");
         let (clamped_x, clamped_y) = (slope_x.min(right), slope_y.max(up));
         let cov_xx = scale_px[0].powi(2) * (1.0 + clamped_x * clamped_x) + 0.3;
         let cov_yy = scale_px[1].powi(2) * (1.0 + clamped_y * clamped_y) + 0.3;
         let cov_xy = scale_px[0] * scale_px[1] * clamped_x * clamped_y;
         let determinant = cov_xx * cov_yy - cov_xy * cov_xy;
-        for (got, expected) in placed.conic.into_iter().zip([cov_yy, -cov_xy, cov_xx]) {
-            wrong.check(format!("conic at {slope_x} {slope_y}"), got, expected / determinant, 1e-12, 1e-12);
+        for (got, expected) in projected.conic.into_iter().zip([cov_yy, -cov_xy, cov_xx]) {
+            mismatches.check(format!("conic at {slope_x} {slope_y}"), got, expected / determinant, 1e-12, 1e-12);
         }
-        wrong.check("x", placed.mean_px[0], 31.0 * slope_x + 13.3, 1e-12, 1e-12);
-        wrong.check("y", placed.mean_px[1], 28.0 * slope_y + 10.4, 1e-12, 1e-12);
+        mismatches.check("x", projected.mean_px[0], 31.0 * slope_x + 13.3, 1e-12, 1e-12);
+        mismatches.check("y", projected.mean_px[1], 28.0 * slope_y + 10.4, 1e-12, 1e-12);
     }
-    wrong.assert_none();
+    mismatches.assert_none();
 }
 
 #[test]
-fn rows_beyond_the_image_are_read_with_its_first_or_last_row() {
+fn points_outside_the_image_use_first_or_last_row_time() {
     let view = rolling_view();
     let share_at = |x, y, z| {
         let mean = (view.camera_from_world.inverse() * nalgebra::Point3::new(x, y, z)).coords.into();
@@ -235,22 +248,23 @@ fn rows_beyond_the_image_are_read_with_its_first_or_last_row() {
 }
 
 #[test]
-fn the_extent_holds_all_that_is_drawn_and_no_more() {
+fn extent_bounds_drawn_pixels_tightly() {
     let view = rolling_view();
     for splat in small_scene(3, 20) {
-        let placed = project(&view, &splat).expect("all are in front of the camera");
-        let [a, b, c] = placed.conic;
+        let projected = project(&view, &splat).expect("all are in front of the camera");
+        let [a, b, c] = projected.conic;
         // The smallest sigma along each side of the box is that at which alpha is just not drawn.
-        let [half_x, half_y] = placed.extent_px;
+        let [half_x, half_y] = projected.extent_px;
         for (dx, dy) in [(half_x, -b / c * half_x), (-b / a * half_y, half_y)] {
-            let alpha = placed.opacity * (-sigma(&placed, &[placed.mean_px[0] + dx, placed.mean_px[1] + dy])).exp();
+            let alpha =
+                projected.opacity * (-sigma(&projected, &[projected.mean_px[0] + dx, projected.mean_px[1] + dy])).exp();
             assert!((alpha / MIN_ALPHA - 1.0).abs() < 1e-12, "{alpha}");
         }
     }
 }
 
 #[test]
-fn faint_splats_and_near_ones_are_not_seen() {
+fn faint_and_near_splats_are_not_drawn() {
     let view = tilted_view();
     let mut splat = small_scene(1, 1).remove(0);
     let logit = |opacity: f64| (opacity / (1.0 - opacity)).ln();
@@ -267,7 +281,7 @@ fn faint_splats_and_near_ones_are_not_seen() {
 }
 
 #[test]
-fn full_pixels_stop_and_keep_what_is_left() {
+fn saturated_pixels_stop_compositing() {
     let view = tilted_view();
     let mut random = Random::new(3);
     // Ten wide, almost opaque splats one behind the other, given back to front.
@@ -294,7 +308,7 @@ fn full_pixels_stop_and_keep_what_is_left() {
 }
 
 #[test]
-fn equal_depths_are_drawn_by_index_and_nothing_draws_nothing() {
+fn equal_depths_are_drawn_in_index_order() {
     let view = tilted_view();
     let mut splats = small_scene(4, 2);
     splats[1].mean = splats[0].mean;
@@ -308,12 +322,12 @@ fn equal_depths_are_drawn_by_index_and_nothing_draws_nothing() {
 }
 
 #[test]
-fn margins_tell_which_pixels_may_be_decided_otherwise() {
+fn margins_identify_ambiguous_pixels() {
     let (view, splats) = (tilted_view(), small_scene(1, 12));
     let margins = threshold_margins(&view, &splats);
     let before = decide(&view, &splats);
     // Raising every logit by a tenth changes alphas by up to a tenth: it may change a pixel's contributors only where the margin is as small.
-    let brighter: Vec<_> = splats.iter().map(|splat| splat.nudged(scene::Param::OpacityLogit, 0.1)).collect();
+    let brighter: Vec<_> = splats.iter().map(|splat| splat.nudged(scene::SplatParam::OpacityLogit, 0.1)).collect();
     let after = decide(&view, &brighter);
     let changed: Vec<_> =
         (0..view.n_pixels()).filter(|&ix| before.contributors[ix] != after.contributors[ix]).collect();

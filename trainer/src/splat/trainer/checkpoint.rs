@@ -1,16 +1,16 @@
 //! The state of a splat model in training: all that decides how it goes on, bit for bit.
 
-use super::{Seeding, SplatTrainer, State as ModelState};
-use crate::align::{Aligning, Alignment};
+use super::{Seeding, Snapshot, SplatTrainer};
+use crate::align::{Alignment, AlignmentTask};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
-use crate::seen::{self, Seen};
-use crate::splat::buffers::{N_PLANED, SplatBuffers};
-use crate::splat::camera_terms::{CameraSlots, TermSet};
+use crate::keyframe_signature::{self, KeyframeSignature};
+use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
+use crate::splat::camera_params::{CameraSlots, ParamSet};
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
-use crate::splat::seed::{Remembered, Seeder};
-use crate::splat::trials::{Arrival, Candidate, Running, Scores, Trial, Untried};
+use crate::splat::seed::{SeedSnapshot, Seeder};
+use crate::splat::trials::{Arrival, Candidate, RemainingTrials, RunningTrial, Scores, Trial};
 use crate::splat::views::TrainView;
 use crate::{Error, Keyframe};
 use kinematics::Stamp;
@@ -19,24 +19,24 @@ use std::sync::Arc;
 
 const METHOD: &str = "splat";
 /// Names of the arrays, in the order of [`SplatBuffers::planes`].
-const ARRAYS: [&str; N_PLANED] =
+const ARRAYS: [&str; N_PLANAR_BUFFERS] =
     ["means", "rotations", "shapes", "sh_dc", "sh_rest", "moments", "sh_dc_moments", "sh_rest_moments", "error_sums"];
-const SEED_PLACES: &str = "seed_places";
+const SEED_POSITIONS: &str = "seed_positions";
 const SEED_CELLS: &str = "seed_cells";
-const CAMERA_TERMS: &str = "camera_terms";
+const CAMERA_PARAMS: &str = "camera_params";
 /// Prefix of the array names of the other half of a trial in progress.
 const OTHER: &str = "other_";
 
 /// All but the arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct State {
+struct SavedState {
     /// As they were settled for the adapter.
     options: SplatOptions,
     step: u64,
     schedule_start: u64,
-    grown_at: u64,
-    n_poisoned: u32,
+    last_growth_step: u64,
+    n_non_finite: u32,
     n_splats: u32,
     capacity: u32,
     sh_degree: u32,
@@ -45,15 +45,15 @@ struct State {
     has_depth: bool,
     n_seeds: u64,
     /// What is learned from, in order: the order decides which view comes when.
-    views: Vec<Seen>,
+    views: Vec<KeyframeSignature>,
     /// Which of them wait to be given splats.
     unseeded: Vec<usize>,
     /// Where the terms of cameras and images lie.
     slots: CameraSlots,
     /// What is learned about cameras, and what is still to be tried.
-    terms: TermSet,
-    untried: Untried,
-    tried: Vec<Trial>,
+    params: ParamSet,
+    remaining_trials: RemainingTrials,
+    finished_trials: Vec<Trial>,
     /// Whether alignment is settled, and what it found; views are told as it corrected them.
     is_aligned: bool,
     alignment: Option<Alignment>,
@@ -68,22 +68,22 @@ struct State {
 struct TrialState {
     candidate: Candidate,
     until: u64,
-    scored: Vec<Image>,
+    scored: Vec<ImageKey>,
     /// Scores of the first half, once it is over.
-    scores_without: Option<Vec<(Image, f64)>>,
+    baseline_scores: Option<Vec<(ImageKey, f64)>>,
     arrivals: Vec<ArrivalState>,
     other: OtherHalf,
 }
 
 /// Camera and stamp, nanoseconds.
-type Image = (String, i64);
+type ImageKey = (String, i64);
 
 /// A keyframe that arrived in the first half of a trial. In the second half it is not a view until it arrives again.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ArrivalState {
     step: u64,
-    image: Seen,
+    image: KeyframeSignature,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -91,7 +91,7 @@ struct ArrivalState {
 struct OtherHalf {
     step: u64,
     schedule_start: u64,
-    grown_at: u64,
+    last_growth_step: u64,
     n_splats: u32,
     capacity: u32,
     sh_degree: u32,
@@ -99,35 +99,35 @@ struct OtherHalf {
     scene_size_m: f64,
     has_depth: bool,
     n_seeds: u64,
-    terms: TermSet,
-    n_term_bytes: u64,
+    params: ParamSet,
+    n_param_bytes: u64,
 }
 
-fn image((camera, stamp): &(Arc<str>, Stamp)) -> Image {
+fn image((camera, stamp): &(Arc<str>, Stamp)) -> ImageKey {
     (camera.to_string(), stamp.0)
 }
 
-fn id((camera, nanos): Image) -> (Arc<str>, Stamp) {
+fn id((camera, nanos): ImageKey) -> (Arc<str>, Stamp) {
     (camera.into(), Stamp(nanos))
 }
 
 impl TrialState {
-    fn of(trial: &Running, without_db: Option<&Scores>) -> Self {
-        let ModelState { splats, cameras: (terms, term_buffer), step, grown_at, seeding } = &*trial.other;
+    fn of(trial: &RunningTrial, baseline_db: Option<&Scores>) -> Self {
+        let Snapshot { splats, cameras: (params, param_buffer), step, last_growth_step, seeding } = &*trial.other;
         Self {
             candidate: trial.candidate,
             until: trial.until,
             scored: trial.scored.iter().map(image).collect(),
-            scores_without: without_db.map(|scores| scores.iter().map(|(of, db)| (image(of), *db)).collect()),
+            baseline_scores: baseline_db.map(|scores| scores.iter().map(|(of, db)| (image(of), *db)).collect()),
             arrivals: trial
                 .arrivals
                 .iter()
-                .map(|Arrival { step, keyframe }| ArrivalState { step: *step, image: Seen::of(keyframe) })
+                .map(|Arrival { step, keyframe }| ArrivalState { step: *step, image: KeyframeSignature::of(keyframe) })
                 .collect(),
             other: OtherHalf {
                 step: *step,
                 schedule_start: seeding.schedule_start,
-                grown_at: *grown_at,
+                last_growth_step: *last_growth_step,
                 n_splats: splats.n_splats,
                 capacity: splats.capacity,
                 sh_degree: splats.sh_degree,
@@ -135,8 +135,8 @@ impl TrialState {
                 scene_size_m: seeding.scene_size_m,
                 has_depth: seeding.has_depth,
                 n_seeds: seeding.seeder.n_seeds() as u64,
-                terms: *terms,
-                n_term_bytes: term_buffer.bytes(),
+                params: *params,
+                n_param_bytes: param_buffer.bytes(),
             },
         }
     }
@@ -147,20 +147,20 @@ impl TrialState {
         gpu: &Gpu,
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
-    ) -> Result<(Running, Option<Scores>), Error> {
+    ) -> Result<(RunningTrial, Option<Scores>), Error> {
         let other = self.other;
         let size = [other.n_splats, other.capacity, other.sh_degree, other.active_degree];
-        let state = ModelState {
+        let state = Snapshot {
             splats: read_splats(gpu, checkpoint, OTHER, size)?,
             cameras: (
-                other.terms,
+                other.params,
                 gpu.storage_with(
-                    "splat.camera_terms",
-                    checkpoint.array(&format!("{OTHER}{CAMERA_TERMS}"), other.n_term_bytes)?,
+                    "splat.camera_params",
+                    checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), other.n_param_bytes)?,
                 )?,
             ),
             step: other.step,
-            grown_at: other.grown_at,
+            last_growth_step: other.last_growth_step,
             seeding: Seeding {
                 seeder: read_seeds(checkpoint, OTHER, other.n_seeds)?,
                 scene_size_m: other.scene_size_m,
@@ -169,14 +169,14 @@ impl TrialState {
             },
         };
         let arrivals = self.arrivals.iter().zip(keyframes);
-        let trial = Running {
+        let trial = RunningTrial {
             candidate: self.candidate,
             until: self.until,
             other: Box::new(state),
             scored: self.scored.into_iter().map(id).collect(),
             arrivals: arrivals.map(|(at, keyframe)| Arrival { step: at.step, keyframe: keyframe.clone() }).collect(),
         };
-        let scores = self.scores_without.map(|scores| scores.into_iter().map(|(of, db)| (id(of), db)).collect());
+        let scores = self.baseline_scores.map(|scores| scores.into_iter().map(|(of, db)| (id(of), db)).collect());
         Ok((trial, scores))
     }
 }
@@ -189,7 +189,7 @@ fn read_splats(
     [n_splats, capacity, sh_degree, active_degree]: [u32; 4],
 ) -> Result<SplatBuffers, Error> {
     if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
-        return Err(bad_state(format!("{n_splats} splats of degree {active_degree} do not fit")));
+        return Err(invalid_state(format!("{n_splats} splats of degree {active_degree} do not fit")));
     }
     let mut splats = SplatBuffers::new(gpu, capacity, sh_degree)?;
     for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(splats.planes()) {
@@ -202,40 +202,40 @@ fn read_splats(
         }
     }
     splats.set_active_degree(gpu, active_degree);
-    splats.set_n(gpu, n_splats);
+    splats.set_n_splats(gpu, n_splats);
     Ok(splats)
 }
 
 fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) -> Result<Seeder, Error> {
     let array = |name: &str, bytes: u64| {
-        let n_bytes = n_seeds.checked_mul(bytes).ok_or_else(|| bad_state(format!("{n_seeds} seeds")))?;
+        let n_bytes = n_seeds.checked_mul(bytes).ok_or_else(|| invalid_state(format!("{n_seeds} seeds")))?;
         checkpoint.array(&format!("{prefix}{name}"), n_bytes)
     };
-    Ok(Seeder::of_bytes(array(SEED_PLACES, Seeder::PLACE_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
+    Ok(Seeder::from_bytes(array(SEED_POSITIONS, Seeder::POSITION_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
 }
 
 /// The arrays of one state of the model while they are copied to the host.
 struct PendingArrays {
     prefix: &'static str,
     planes: Vec<Planes>,
-    seeds: Remembered,
-    terms: Option<PendingRead>,
+    seeds: SeedSnapshot,
+    params: Option<PendingRead>,
 }
 
 impl PendingArrays {
-    fn begin(gpu: &Gpu, prefix: &'static str, splats: &SplatBuffers, seeder: &Seeder, terms: (&Buffer, u64)) -> Self {
+    fn begin(gpu: &Gpu, prefix: &'static str, splats: &SplatBuffers, seeder: &Seeder, params: (&Buffer, u64)) -> Self {
         let planes = splats.planes().map(|(buffer, n_planes, bytes)| Planes {
             read: begin_read(gpu, buffer, n_planes, bytes, splats),
             n_planes: n_planes as usize,
             used_bytes: splats.n_splats as usize * to_usize(bytes),
             stride_bytes: splats.capacity as usize * to_usize(bytes),
         });
-        let (buffer, n_bytes) = terms;
+        let (buffer, n_bytes) = params;
         Self {
             prefix,
             planes: planes.into(),
-            seeds: seeder.remembered(),
-            terms: (n_bytes > 0).then(|| gpu.begin_read(buffer, to_usize(n_bytes / 4))),
+            seeds: seeder.snapshot(),
+            params: (n_bytes > 0).then(|| gpu.begin_read(buffer, to_usize(n_bytes / 4))),
         }
     }
 
@@ -244,10 +244,10 @@ impl PendingArrays {
         for (name, planes) in ARRAYS.into_iter().zip(self.planes) {
             add(name, planes.finish(gpu)?);
         }
-        let (places, cells) = self.seeds.into_bytes();
-        add(SEED_PLACES, places);
+        let (positions, cells) = self.seeds.into_bytes();
+        add(SEED_POSITIONS, positions);
         add(SEED_CELLS, cells);
-        add(CAMERA_TERMS, self.terms.map_or(Ok(Vec::new()), |read| read.finish(gpu))?);
+        add(CAMERA_PARAMS, self.params.map_or(Ok(Vec::new()), |read| read.finish(gpu))?);
         Ok(())
     }
 }
@@ -257,10 +257,11 @@ impl SplatTrainer {
     /// [`PendingCheckpoint::finish`], on any thread, brings it to the host.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
-        self.settle()?;
+        self.finish_in_flight()?;
         let splats = &self.splats;
-        let place = |keyframe: &Arc<Keyframe>| self.views.iter().position(|view| Arc::ptr_eq(&view.keyframe, keyframe));
-        let state = State {
+        let position_of =
+            |keyframe: &Arc<Keyframe>| self.views.iter().position(|view| Arc::ptr_eq(&view.keyframe, keyframe));
+        let state = SavedState {
             options: SplatOptions {
                 coarse_steps: Some(self.coarse_steps),
                 seeds_per_image: Some(self.seeds_per_image),
@@ -268,8 +269,8 @@ impl SplatTrainer {
             },
             step: self.step,
             schedule_start: self.schedule_start,
-            grown_at: self.grown_at,
-            n_poisoned: u32::try_from(self.n_poisoned).unwrap_or(u32::MAX),
+            last_growth_step: self.last_growth_step,
+            n_non_finite: u32::try_from(self.n_non_finite).unwrap_or(u32::MAX),
             n_splats: splats.n_splats,
             capacity: splats.capacity,
             sh_degree: splats.sh_degree,
@@ -277,23 +278,23 @@ impl SplatTrainer {
             scene_size_m: self.scene_size_m,
             has_depth: self.has_depth,
             n_seeds: self.seeder.n_seeds() as u64,
-            views: self.views.iter().map(|view| Seen::of(&view.keyframe)).collect(),
-            unseeded: self.unseeded.iter().filter_map(place).collect(),
+            views: self.views.iter().map(|view| KeyframeSignature::of(&view.keyframe)).collect(),
+            unseeded: self.unseeded.iter().filter_map(position_of).collect(),
             slots: self.cameras.slots(),
-            terms: self.cameras.set,
-            untried: self.trials.untried(),
-            tried: self.trials.ended.clone(),
-            is_aligned: self.aligning.is_done(),
-            alignment: self.aligning.result().cloned(),
-            trial: self.trials.under_way().map(|(trial, without_db)| TrialState::of(trial, without_db)),
+            params: self.cameras.set,
+            remaining_trials: self.trials.remaining_trials(),
+            finished_trials: self.trials.finished.clone(),
+            is_aligned: self.alignment_task.is_done(),
+            alignment: self.alignment_task.result().cloned(),
+            trial: self.trials.running_trial().map(|(trial, baseline_db)| TrialState::of(trial, baseline_db)),
         };
         let state =
             serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
-        let terms = (&self.cameras.terms, self.cameras.used_bytes());
-        let mut halves = vec![PendingArrays::begin(&self.gpu, "", splats, &self.seeder, terms)];
-        if let Some((Running { other, .. }, _)) = self.trials.under_way() {
-            let terms = (&other.cameras.1, other.cameras.1.bytes());
-            halves.push(PendingArrays::begin(&self.gpu, OTHER, &other.splats, &other.seeding.seeder, terms));
+        let params = (&self.cameras.params, self.cameras.used_bytes());
+        let mut halves = vec![PendingArrays::begin(&self.gpu, "", splats, &self.seeder, params)];
+        if let Some((RunningTrial { other, .. }, _)) = self.trials.running_trial() {
+            let params = (&other.cameras.1, other.cameras.1.bytes());
+            halves.push(PendingArrays::begin(&self.gpu, OTHER, &other.splats, &other.seeding.seeder, params));
         }
         let gpu = self.gpu.clone();
         Ok(PendingCheckpoint::new(move || {
@@ -311,55 +312,58 @@ impl SplatTrainer {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         if checkpoint.method != METHOD {
-            return Err(bad_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
         }
-        let state: State =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
-        let aligning = if state.is_aligned {
-            Aligning::Done(state.alignment.clone())
+        let state: SavedState =
+            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
+        let alignment_task = if state.is_aligned {
+            AlignmentTask::Done(state.alignment.clone())
         } else {
-            Aligning::new(&state.options.align)
+            AlignmentTask::new(&state.options.align)
         };
         // In the second half of a trial, some keyframes have yet to arrive again; in the first half, they are views.
         let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
-        let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.scores_without.is_some());
+        let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.baseline_scores.is_some());
         let yet_to_arrive = arrivals().filter(|_| is_second_half);
-        let known: Vec<Seen> = state.views.iter().chain(yet_to_arrive).cloned().collect();
-        let (mut views, rest) = seen::matched(&known, keyframes, |keyframe| aligning.corrected(keyframe))?;
+        let known: Vec<KeyframeSignature> = state.views.iter().chain(yet_to_arrive).cloned().collect();
+        let (mut views, untrained) =
+            keyframe_signature::match_keyframes(&known, keyframes, |keyframe| alignment_task.corrected(keyframe))?;
         let yet_to_arrive = views.split_off(state.views.len());
         let arrived =
             arrivals().filter(|_| !is_second_half).map(|image| state.views.iter().position(|view| view == image));
         let arrived = arrived.map(|ix| views.get(ix?).cloned()).collect::<Option<Vec<_>>>();
-        let arrived = arrived.ok_or_else(|| bad_state("a view that arrived during a trial is missing".to_owned()))?;
+        let arrived =
+            arrived.ok_or_else(|| invalid_state("a view that arrived during a trial is missing".to_owned()))?;
         let arrivals = [arrived, yet_to_arrive].concat();
         let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
-        let unseeded = unseeded.collect::<Option<Vec<_>>>().ok_or_else(|| bad_state("a view is missing".to_owned()))?;
-        let step = u32::try_from(state.step).map_err(|_| bad_state(format!("step {}", state.step)))?;
+        let unseeded =
+            unseeded.collect::<Option<Vec<_>>>().ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
+        let step = u32::try_from(state.step).map_err(|_| invalid_state(format!("step {}", state.step)))?;
 
         let mut trainer = Self::new(gpu, state.options)?;
         let size = [state.n_splats, state.capacity, state.sh_degree, state.active_degree];
         trainer.splats = read_splats(&trainer.gpu, checkpoint, "", size)?;
-        trainer.tell_n();
-        for (ix, value) in [(status::STEP, step), (status::N_POISONED, state.n_poisoned)] {
+        trainer.write_n_splats();
+        for (ix, value) in [(status::STEP, step), (status::N_NON_FINITE, state.n_non_finite)] {
             trainer.gpu.write(&trainer.learn_status, 4 * ix as u64, &value.to_le_bytes());
         }
         trainer.seeder = read_seeds(checkpoint, "", state.n_seeds)?;
-        trainer.cameras.restore(&trainer.gpu, &state.slots, state.terms, checkpoint)?;
-        trainer.trials.restore(state.untried, state.tried);
+        trainer.cameras.restore(&trainer.gpu, &state.slots, state.params, checkpoint)?;
+        trainer.trials.restore(state.remaining_trials, state.finished_trials);
         if let Some(trial) = state.trial {
-            let (trial, without_db) = trial.restored(&trainer.gpu, checkpoint, &arrivals)?;
-            trainer.trials.restore_trial(trial, without_db);
+            let (trial, baseline_db) = trial.restored(&trainer.gpu, checkpoint, &arrivals)?;
+            trainer.trials.restore_trial(trial, baseline_db);
         }
         trainer.views = views.into_iter().map(TrainView::new).collect();
-        trainer.aligning = aligning;
+        trainer.alignment_task = alignment_task;
         trainer.unseeded = unseeded;
         trainer.scene_size_m = state.scene_size_m;
         trainer.has_depth = state.has_depth;
         trainer.step = state.step;
         trainer.schedule_start = state.schedule_start;
-        trainer.grown_at = state.grown_at;
-        trainer.n_poisoned = state.n_poisoned.into();
-        Ok((trainer, rest))
+        trainer.last_growth_step = state.last_growth_step;
+        trainer.n_non_finite = state.n_non_finite.into();
+        Ok((trainer, untrained))
     }
 }
 
@@ -392,7 +396,7 @@ fn begin_read(gpu: &Gpu, buffer: &Buffer, n_planes: u32, bytes: u64, splats: &Sp
     Some(gpu.begin_read(buffer, to_usize(n * bytes / 4)))
 }
 
-fn bad_state(reason: String) -> Error {
+fn invalid_state(reason: String) -> Error {
     Error::CheckpointState { reason }
 }
 

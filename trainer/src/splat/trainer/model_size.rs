@@ -7,25 +7,29 @@ use crate::splat::kernels::LearnPipelines;
 use crate::splat::params::{Gathering, status};
 
 /// Most views that tell what a splat contributes.
-const MOST_VIEWS: usize = 64;
+const MAX_VIEWS: usize = 64;
 
 impl SplatTrainer {
     /// What each splat contributes to the views: the sum of its blending weights, in pixels.
     pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
-        let stride = self.views.len().div_ceil(MOST_VIEWS).max(1);
-        let some: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
-        for view_ix in &some {
+        let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
+        let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
+        for view_ix in &sampled_views {
             self.make_space(*view_ix, 0)?;
         }
-        if let Some(frame) = &self.learn_frame {
+        if let Some(image_buffers) = &self.training_buffers {
             // An error of one in every pixel, and no slope.
-            self.gpu.write(&frame.rest, 0, bytemuck::cast_slice(&[0.0f32, 1.0].repeat(frame.n_pixels as usize)));
-            self.passes.clear(&frame.upstream);
+            self.gpu.write(
+                &image_buffers.pixel_totals,
+                0,
+                bytemuck::cast_slice(&[0.0f32, 1.0].repeat(image_buffers.n_pixels as usize)),
+            );
+            self.passes.clear(&image_buffers.upstream);
         }
-        for (ix, view_ix) in some.iter().copied().enumerate() {
+        for (ix, view_ix) in sampled_views.iter().copied().enumerate() {
             if ix % VIEWS_AT_ONCE == 0 {
-                let next = some[ix..].iter().take(VIEWS_AT_ONCE);
+                let next = sampled_views[ix..].iter().take(VIEWS_AT_ONCE);
                 self.make_levels(&next.map(|view_ix| (*view_ix, 0)).collect())?;
             }
             loop {
@@ -37,40 +41,41 @@ impl SplatTrainer {
                 list.submit(&self.gpu);
                 self.passes = list;
                 let counters: Vec<u32> = self.gpu.read(&self.learn_status, status::LEN)?;
-                if !self.mend(&counters)? {
+                if !self.grow_scratch(&counters)? {
                     break;
                 }
                 self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
             }
         }
-        self.passes.forget_bindings();
+        self.passes.clear_bindings();
         self.gpu.read(&contributions, self.splats.n_splats as usize)
     }
 
     /// Keeps the `n_kept` splats that contribute most, in their order.
-    pub(super) fn keep_most(&mut self, n_kept: u32) -> Result<(), Error> {
+    pub(super) fn keep_most_contributing(&mut self, n_kept: u32) -> Result<(), Error> {
         let learn = self.learn()?;
         let contributions = self.contributions(&learn)?;
-        let mut by_worth: Vec<u32> = (0..self.splats.n_splats).collect();
-        by_worth.sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
-        by_worth.truncate(n_kept as usize);
-        by_worth.sort_unstable();
-        self.splats = gathered(self, &learn, &by_worth)?;
-        self.passes.forget_bindings();
-        self.tell_n();
+        let mut by_contribution: Vec<u32> = (0..self.splats.n_splats).collect();
+        by_contribution
+            .sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
+        by_contribution.truncate(n_kept as usize);
+        by_contribution.sort_unstable();
+        self.splats = gather_splats(self, &learn, &by_contribution)?;
+        self.passes.clear_bindings();
+        self.write_n_splats();
         Ok(())
     }
 
     /// Goes on with colors of a lower degree.
     pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
-        self.splats = self.splats.reshaped(&self.gpu, self.splats.capacity, sh_degree)?;
-        self.passes.forget_bindings();
+        self.splats = self.splats.resized(&self.gpu, self.splats.capacity, sh_degree)?;
+        self.passes.clear_bindings();
         Ok(())
     }
 }
 
 /// The splats of the given indices with their moments.
-fn gathered(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
+fn gather_splats(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
     let (gpu, splats) = (&trainer.gpu, &trainer.splats);
     let n_kept = u32::try_from(kept.len()).expect("no more than there are splats");
     let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
@@ -95,7 +100,7 @@ fn gathered(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) ->
     }
     trainer.passes.submit(gpu);
     fewer.set_active_degree(gpu, splats.active_degree());
-    fewer.set_n(gpu, n_kept);
+    fewer.set_n_splats(gpu, n_kept);
     Ok(fewer)
 }
 
@@ -104,13 +109,13 @@ mod tests {
     use super::*;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::learning::{n_keyframes, options, request, test_psnr, train};
-    use crate::splat::trials::{Candidate, CountChoice};
+    use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
+    use crate::splat::trials::{Candidate, CountPolicy};
     use crate::splat::{SplatOptions, Trial};
     use crate::{Keyframe, Method, Split};
     use std::sync::Arc;
 
-    fn trained(count: CountChoice, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
+    fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
         let options = SplatOptions { count, max_splats: 4000, n_planned_steps: 1500, ..options() };
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
@@ -123,42 +128,42 @@ mod tests {
     fn some_trained(n_steps: u64) -> (SplatTrainer, Vec<Arc<Keyframe>>) {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let keyframes = n_keyframes(&gpu, 12, true);
-        (trained(CountChoice::Tested, &keyframes, gpu, n_steps), keyframes)
+        (trained(CountPolicy::Tested, &keyframes, gpu, n_steps), keyframes)
     }
 
     /// What blends into a pixel and what it lets through sum to one.
     #[test]
-    fn contributions_add_up_to_what_is_covered() {
+    fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
         trainer.views.truncate(1);
         let learn = trainer.learn().unwrap();
         let contributions = trainer.contributions(&learn).unwrap();
         let n_pixels = trainer.views[0].keyframe.size_px.iter().product::<u32>() as usize;
-        let image = &trainer.learn_frame.as_ref().unwrap().image;
+        let image = &trainer.training_buffers.as_ref().unwrap().image;
         let colors: Vec<[f32; 4]> = trainer.gpu.read(image, n_pixels).unwrap();
         let covered: f64 = colors.iter().map(|[.., transmittance]| 1.0 - f64::from(*transmittance)).sum();
-        let told: f64 = contributions.iter().map(|sum| f64::from(*sum)).sum();
-        assert!(covered > 0.2 * n_pixels as f64 && (told / covered - 1.0).abs() < 1e-4, "{told} of {covered}");
+        let reported: f64 = contributions.iter().map(|sum| f64::from(*sum)).sum();
+        assert!(covered > 0.2 * n_pixels as f64 && (reported / covered - 1.0).abs() < 1e-4, "{reported} of {covered}");
     }
 
     #[test]
-    fn the_splats_that_contribute_most_stay_as_they_are() {
+    fn most_contributing_splats_are_kept_unchanged() {
         let (mut trainer, _) = some_trained(120);
         let learn = trainer.learn().unwrap();
         let contributions = trainer.contributions(&learn).unwrap();
         let before = words(&trainer);
         let n_kept = trainer.splats.n_splats / 3;
-        trainer.keep_most(n_kept).unwrap();
+        trainer.keep_most_contributing(n_kept).unwrap();
         let after = words(&trainer);
         assert!(trainer.splats.n_splats == n_kept && n_kept > 50, "{n_kept}");
         let mut sorted = contributions.clone();
         sorted.sort_by(|a, b| b.total_cmp(a));
-        let least = sorted[n_kept as usize - 1];
-        let kept: Vec<usize> = (0..contributions.len()).filter(|ix| contributions[*ix] >= least).collect();
+        let min_kept = sorted[n_kept as usize - 1];
+        let kept: Vec<usize> = (0..contributions.len()).filter(|ix| contributions[*ix] >= min_kept).collect();
         assert_eq!(kept.len(), n_kept as usize, "no two contribute the same here");
         for (before, after) in before.iter().zip(&after) {
-            let picked: Vec<u32> = kept.iter().flat_map(|ix| before[*ix].iter().copied()).collect();
-            assert_eq!(picked, after.concat());
+            let expected: Vec<u32> = kept.iter().flat_map(|ix| before[*ix].iter().copied()).collect();
+            assert_eq!(expected, after.concat());
         }
     }
 
@@ -201,19 +206,22 @@ mod tests {
 
     /// Where noise hides the details, few splats are enough, and colors that do not change with the direction.
     #[test]
-    fn takes_no_more_than_the_scene_needs_and_the_same_twice() {
+    fn model_size_fits_the_scene_and_is_reproducible() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         let clean = n_keyframes(&gpu, 36, false); // Begins with a cloud as large as the cap.
         let keyframes = noisy(&clean);
-        let mut tested = trained(CountChoice::Tested, &keyframes, gpu.clone(), 1750);
-        let mut again = trained(CountChoice::Tested, &keyframes, gpu, 1750);
+        let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1750);
+        let mut again = trained(CountPolicy::Tested, &keyframes, gpu, 1750);
         assert!(again.arrays().unwrap() == tested.arrays().unwrap());
         train(&mut tested, 1200);
-        let told: Vec<Trial> = tested.trials().to_vec();
-        assert!(told.iter().any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept), "{told:?}");
+        let reported: Vec<Trial> = tested.trials().to_vec();
+        assert!(
+            reported.iter().any(|trial| matches!(trial.candidate, Candidate::Halved { .. }) && trial.kept),
+            "{reported:?}"
+        );
         let n_learned = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count();
-        assert!(!tested.trials.hold_back() && tested.views.len() == n_learned, "{told:?}");
-        assert!(tested.progress().primitives <= 2000 && tested.splats.sh_degree == 0, "{told:?}");
+        assert!(!tested.trials.holds_validation() && tested.views.len() == n_learned, "{reported:?}");
+        assert!(tested.progress().primitives <= 2000 && tested.splats.sh_degree == 0, "{reported:?}");
         let tests = keyframes.iter().zip(&clean).filter(|(keyframe, _)| keyframe.split == Split::Test);
         let ceilings: Vec<f64> = tests
             .map(|(noisy, clean)| {
@@ -222,25 +230,25 @@ mod tests {
             .collect();
         let ceiling = ceilings.iter().sum::<f64>() / ceilings.len() as f64;
         let reached = test_psnr(&mut tested, &keyframes);
-        assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {told:?}");
+        assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {reported:?}");
     }
 
     /// While half of the splats are being tried, people see all of them.
     #[test]
-    fn what_is_being_tried_is_not_shown() {
+    fn running_trial_is_not_displayed() {
         let (mut trainer, keyframes) = some_trained(400);
-        let state = trainer.state().unwrap();
+        let state = trainer.snapshot().unwrap();
         trainer.trials.begin(Candidate::Halved { from: 0, to: 0 }, state, 1);
         let view = request(keyframes[0].world_from_camera);
         let before = trainer.render(&view).unwrap();
         let n_before = trainer.progress().primitives;
-        let instead = trainer.state().unwrap();
-        trainer.trials.turn(instead, super::super::super::trials::Scores::new());
-        trainer.keep_most(50).unwrap();
+        let baseline = trainer.snapshot().unwrap();
+        trainer.trials.begin_second_half(baseline, super::super::super::trials::Scores::new());
+        trainer.keep_most_contributing(50).unwrap();
         assert_eq!(trainer.progress().primitives, n_before);
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
-        let instead = trainer.trials.give_up().unwrap().restored.unwrap();
-        trainer.go_back(instead).unwrap();
+        let baseline = trainer.trials.cancel().unwrap().restored.unwrap();
+        trainer.restore_snapshot(baseline).unwrap();
         assert!(trainer.render(&view).unwrap().rgba_srgb == before.rgba_srgb);
     }
 }

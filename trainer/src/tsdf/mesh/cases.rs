@@ -46,15 +46,15 @@ fn segments(case: usize) -> Vec<(Edge, Edge)> {
     let mut segments = Vec::new();
     for face in FACES {
         for at in 0..4 {
-            let (before, here) = (face[at], face[(at + 1) % 4]);
-            if is_inside(before) || !is_inside(here) {
+            let (before, current) = (face[at], face[(at + 1) % 4]);
+            if is_inside(before) || !is_inside(current) {
                 continue;
             }
             let mut along = at + 1;
             while is_inside(face[(along + 1) % 4]) {
                 along += 1;
             }
-            segments.push((edge_between(before, here), edge_between(face[along % 4], face[(along + 1) % 4])));
+            segments.push((edge_between(before, current), edge_between(face[along % 4], face[(along + 1) % 4])));
         }
     }
     segments
@@ -65,7 +65,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_crossed_edge_is_used_and_no_other() {
+    fn cases_use_exactly_the_crossed_edges() {
         for (case, triangles) in CASES.iter().enumerate() {
             for corner in 0..8usize {
                 for axis in (0..3).filter(|axis| corner >> axis & 1 == 0) {
@@ -75,17 +75,17 @@ mod tests {
                 }
             }
         }
-        let most = CASES.iter().map(Vec::len).max().unwrap();
-        assert!(most <= 5, "{most} triangles");
+        let max_triangles = CASES.iter().map(Vec::len).max().unwrap();
+        assert!(max_triangles <= 5, "{max_triangles} triangles");
     }
 
     #[test]
     fn triangles_face_away_from_the_inside() {
         // Corner 0 alone is inside: the normal points to where all coordinates grow.
-        let place = |edge: Edge| -> [f64; 3] {
+        let edge_center = |edge: Edge| -> [f64; 3] {
             std::array::from_fn(|axis| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 })
         };
-        let [a, b, c] = CASES[1][0].map(|edge| nalgebra::Vector3::from(place(edge)));
+        let [a, b, c] = CASES[1][0].map(|edge| nalgebra::Vector3::from(edge_center(edge)));
         assert!((b - a).cross(&(c - a)).dot(&nalgebra::Vector3::repeat(1.0)) > 0.0);
     }
 

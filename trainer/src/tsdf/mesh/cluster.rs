@@ -6,7 +6,7 @@ use std::collections::{BTreeSet, HashMap};
 
 /// What the vertices of a cell add up to.
 #[derive(Default)]
-struct Sum {
+struct CellSum {
     n: f64,
     position_m: Vector3<f64>,
     normal: Vector3<f64>,
@@ -25,21 +25,21 @@ impl Mesh {
             return self.clone();
         }
         let mut cells: HashMap<[i64; 3], u32> = HashMap::new();
-        let mut sums: Vec<Sum> = Vec::new();
-        let mut places = Vec::with_capacity(self.positions_m.len());
+        let mut sums: Vec<CellSum> = Vec::new();
+        let mut cell_of_vertex = Vec::with_capacity(self.positions_m.len());
         for (ix, position) in self.positions_m.iter().enumerate() {
             let cell = position.map(|along| (f64::from(along) / cell_m).floor() as i64);
             let next = u32::try_from(sums.len()).unwrap_or(u32::MAX);
             let at = *cells.entry(cell).or_insert(next);
             if at == next {
-                sums.push(Sum::default());
+                sums.push(CellSum::default());
             }
             let sum = &mut sums[at as usize];
             sum.n += 1.0;
             sum.position_m += Vector3::from(position.map(f64::from));
             sum.normal += Vector3::from(self.normals[ix].map(f64::from));
             sum.color += Vector3::from(self.colors_srgb[ix].map(f64::from));
-            places.push(at);
+            cell_of_vertex.push(at);
         }
         Self {
             origin_m: self.origin_m,
@@ -47,33 +47,33 @@ impl Mesh {
             normals: sums.iter().map(normal_of).collect(),
             #[expect(clippy::cast_sign_loss, reason = "a mean of bytes")]
             colors_srgb: sums.iter().map(|sum| (sum.color / sum.n).map(|part| part.round() as u8).into()).collect(),
-            triangles: merged(&self.triangles, &places),
+            triangles: merged(&self.triangles, &cell_of_vertex),
         }
     }
 }
 
 #[expect(clippy::cast_possible_truncation, reason = "sums are f64, normals f32")]
-fn normal_of(sum: &Sum) -> [f32; 3] {
+fn normal_of(sum: &CellSum) -> [f32; 3] {
     sum.normal.try_normalize(1e-9).unwrap_or_else(Vector3::z).map(|along| along as f32).into()
 }
 
 /// The triangles that are left, each once, whichever corner it begins with.
-fn merged(triangles: &[[u32; 3]], places: &[u32]) -> Vec<[u32; 3]> {
+fn merged(triangles: &[[u32; 3]], cell_of_vertex: &[u32]) -> Vec<[u32; 3]> {
     let mut seen = BTreeSet::new();
-    let mut left = Vec::new();
+    let mut kept = Vec::new();
     for triangle in triangles {
-        let [a, b, c] = triangle.map(|ix| places[ix as usize]);
-        let least = a.min(b).min(c);
-        let turned = if a == least {
+        let [a, b, c] = triangle.map(|ix| cell_of_vertex[ix as usize]);
+        let smallest = a.min(b).min(c);
+        let rotated = if a == smallest {
             [a, b, c]
-        } else if b == least {
+        } else if b == smallest {
             [b, c, a]
         } else {
             [c, a, b]
         };
-        if a != b && b != c && c != a && seen.insert(turned) {
-            left.push(turned);
+        if a != b && b != c && c != a && seen.insert(rotated) {
+            kept.push(rotated);
         }
     }
-    left
+    kept
 }

@@ -1,7 +1,7 @@
 //! Meshes as `.glb`: glTF 2.0 (Khronos 2021), one JSON and one binary chunk.
 
 use super::Mesh;
-use crate::{Error, whole_file};
+use crate::{Error, atomic_file};
 use serde_json::json;
 use std::io::Write;
 use std::path::Path;
@@ -16,7 +16,7 @@ const INDICES: u32 = 34_963;
 
 /// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: a node turns it; another holds the origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    whole_file::write(path, |file| file.write_all(&to_bytes(mesh)))
+    atomic_file::write(path, |file| file.write_all(&to_bytes(mesh)))
 }
 
 /// The file.
@@ -72,7 +72,7 @@ fn description(mesh: &Mesh, parts: &[Vec<u8>; 4]) -> serde_json::Value {
         })
         .collect();
     let extreme = |pick: fn(f32, f32) -> f32, begin: f32| -> Vec<f32> {
-        (0..3).map(|axis| mesh.positions_m.iter().map(|place| place[axis]).fold(begin, pick)).collect()
+        (0..3).map(|axis| mesh.positions_m.iter().map(|position| position[axis]).fold(begin, pick)).collect()
     };
     let n = mesh.positions_m.len();
     let vec3 = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": n, "type": "VEC3"});

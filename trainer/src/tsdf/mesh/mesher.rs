@@ -2,8 +2,8 @@
 
 use super::Mesh;
 use crate::gpu::f32_of;
-use crate::tsdf::block::{BLOCK_EDGE, Place};
-use crate::tsdf::chosen::Lattice;
+use crate::tsdf::block::{BLOCK_EDGE, GridCoord};
+use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::tsdf::params::MeshVertex;
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, HashMap};
@@ -18,46 +18,47 @@ pub(in crate::tsdf) struct BlockMesh {
 /// The triangles of blocks as they were made last.
 #[derive(Debug, Default)]
 pub(in crate::tsdf) struct Mesher {
-    meshes: BTreeMap<Place, BlockMesh>,
+    meshes: BTreeMap<GridCoord, BlockMesh>,
 }
 
 impl Mesher {
     /// Takes what blocks have now in place of what they had.
-    pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (Place, BlockMesh)>) {
-        for (place, mesh) in made {
+    pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (GridCoord, BlockMesh)>) {
+        for (block_coord, mesh) in made {
             if mesh.triangles.is_empty() {
-                self.meshes.remove(&place);
+                self.meshes.remove(&block_coord);
             } else {
-                self.meshes.insert(place, mesh);
+                self.meshes.insert(block_coord, mesh);
             }
         }
     }
 
     /// All triangles, in order of their blocks; a vertex that blocks share is there once.
-    pub(in crate::tsdf) fn mesh(&self, lattice: &Lattice) -> Mesh {
-        let mut whole = Mesh { origin_m: lattice.anchor_m, ..Mesh::default() };
-        let mut known: HashMap<(Place, u32), u32> = HashMap::new();
-        for (place, mesh) in &self.meshes {
-            let mut places = Vec::with_capacity(mesh.vertices.len());
+    pub(in crate::tsdf) fn mesh(&self, voxel_grid: &VoxelGrid) -> Mesh {
+        let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
+        let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
+        for (block_coord, mesh) in &self.meshes {
+            let mut vertex_ixs = Vec::with_capacity(mesh.vertices.len());
             for vertex in &mesh.vertices {
                 let next = u32::try_from(whole.positions_m.len()).unwrap_or(u32::MAX);
-                let at = shared_key(*place, vertex.edge).map_or(next, |key| *known.entry(key).or_insert(next));
+                let at = shared_key(*block_coord, vertex.edge)
+                    .map_or(next, |key| *shared_vertices.entry(key).or_insert(next));
                 if at == next {
                     whole.positions_m.push(vertex.position_m);
                     whole.normals.push(unit_of(vertex.normal));
                     let [red, green, blue, _] = vertex.color.to_le_bytes();
                     whole.colors_srgb.push([red, green, blue]);
                 }
-                places.push(at);
+                vertex_ixs.push(at);
             }
-            whole.triangles.extend(mesh.triangles.iter().map(|corners| corners.map(|ix| places[ix as usize])));
+            whole.triangles.extend(mesh.triangles.iter().map(|corners| corners.map(|ix| vertex_ixs[ix as usize])));
         }
         whole
     }
 }
 
 /// Names an edge that may belong to several blocks: its first voxel in the field, and its axis.
-fn shared_key(block: Place, edge: u32) -> Option<(Place, u32)> {
+fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| (std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]), edge % 3))

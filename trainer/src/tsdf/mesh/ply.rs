@@ -1,7 +1,7 @@
 //! Meshes as binary `.ply` (Turk 1994), as other programs read it.
 
 use super::Mesh;
-use crate::{Error, whole_file};
+use crate::{Error, atomic_file};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
@@ -10,7 +10,7 @@ const FAR_M: f64 = 1000.0;
 
 /// Writes a mesh in world metres.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
-    whole_file::write(path, |file| {
+    atomic_file::write(path, |file| {
         let mut file = BufWriter::new(file);
         write_to(&mut file, mesh)?;
         file.flush()
@@ -19,10 +19,10 @@ pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
 
 pub(super) fn write_to(file: &mut impl Write, mesh: &Mesh) -> std::io::Result<()> {
     let is_far = mesh.origin_m.iter().any(|along| along.abs() > FAR_M);
-    let places = if is_far { "double" } else { "float" };
+    let number_type = if is_far { "double" } else { "float" };
     writeln!(file, "ply\nformat binary_little_endian 1.0\nelement vertex {}", mesh.positions_m.len())?;
     for name in ["x", "y", "z"] {
-        writeln!(file, "property {places} {name}")?;
+        writeln!(file, "property {number_type} {name}")?;
     }
     for name in ["nx", "ny", "nz"] {
         writeln!(file, "property float {name}")?;

@@ -2,7 +2,7 @@
 
 use super::{Mesh, write_glb, write_ply};
 use crate::gpu::{Gpu, GpuOptions};
-use crate::test_scenes::{self as scenes, Shape};
+use crate::test_scenes::{self as scenes, TestShape};
 use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
 use crate::{Keyframe, Method};
@@ -19,14 +19,14 @@ fn model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     model
 }
 
-fn places(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
+fn vertex_positions(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
     let origin = Vector3::from(mesh.origin_m);
-    mesh.positions_m.iter().map(move |place| (Vector3::from(place.map(f64::from)) + origin).into())
+    mesh.positions_m.iter().map(move |vertex| (Vector3::from(vertex.map(f64::from)) + origin).into())
 }
 
 /// Mean and largest distance of the vertices from a shape, metres.
-fn errors_m(mesh: &Mesh, shape: &Shape) -> (f64, f64) {
-    let errors: Vec<f64> = places(mesh).map(|place| shape.distance_m(&place).abs()).collect();
+fn errors_m(mesh: &Mesh, shape: &TestShape) -> (f64, f64) {
+    let errors: Vec<f64> = vertex_positions(mesh).map(|vertex| shape.distance_m(&vertex).abs()).collect();
     (errors.iter().sum::<f64>() / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
 }
 
@@ -41,34 +41,34 @@ fn edges(mesh: &Mesh) -> BTreeMap<[u32; 2], i32> {
     edges
 }
 
-fn ball_mesh() -> (Mesh, Shape, f64) {
+fn ball_mesh() -> (Mesh, TestShape, f64) {
     let ball = scenes::ball(Point3::new(0.31, -0.22, 0.13));
-    let Shape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
+    let TestShape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
     let mut model = model(scenes::options(), &scenes::all_around(&[ball], center_m, 24));
     (model.mesh().unwrap(), ball, 0.02)
 }
 
 #[test]
-fn a_ball_seen_from_all_sides_is_closed_and_round() {
+fn mesh_of_ball_is_closed_and_round() {
     let (mesh, ball, voxel_m) = ball_mesh();
-    let (mean_m, most_m) = errors_m(&mesh, &ball);
-    assert!(mean_m < 0.1 * voxel_m && most_m < 0.5 * voxel_m, "mean {mean_m} m, most {most_m} m");
+    let (mean_m, max_m) = errors_m(&mesh, &ball);
+    assert!(mean_m < 0.1 * voxel_m && max_m < 0.5 * voxel_m, "mean {mean_m} m, most {max_m} m");
     let open = edges(&mesh).into_values().filter(|n| *n != 2).count();
     assert_eq!(open, 0, "of {} triangles", mesh.triangles.len());
     assert!(mesh.triangles.len() > 1000);
     // Euler: a closed surface without holes.
     let n_edges = edges(&mesh).len();
     assert_eq!(mesh.positions_m.len() + mesh.triangles.len(), n_edges + 2);
-    let Shape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
-    for (place, normal) in places(&mesh).zip(&mesh.normals) {
+    let TestShape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
+    for (vertex, normal) in vertex_positions(&mesh).zip(&mesh.normals) {
         let normal = Vector3::from(normal.map(f64::from));
         assert!((normal.norm() - 1.0).abs() < 1e-5);
-        assert!(normal.dot(&(place - center_m).normalize()) > 0.9, "{place} {normal}");
+        assert!(normal.dot(&(vertex - center_m).normalize()) > 0.9, "{vertex} {normal}");
     }
-    let off: f64 = places(&mesh)
+    let off: f64 = vertex_positions(&mesh)
         .zip(&mesh.colors_srgb)
-        .map(|(place, color)| {
-            let expected = scenes::color_srgb(&place);
+        .map(|(vertex, color)| {
+            let expected = scenes::color_srgb(&vertex);
             (0..3).map(|part| (f64::from(color[part]) / 255.0 - expected[part]).abs()).sum::<f64>() / 3.0
         })
         .sum::<f64>()
@@ -77,36 +77,36 @@ fn a_ball_seen_from_all_sides_is_closed_and_round() {
 }
 
 #[test]
-fn a_slanted_wall_is_flat() {
+fn mesh_of_slanted_wall_is_flat() {
     let normal = Vector3::new(0.3, -0.2, 1.0).normalize();
-    let wall = Shape::Plane { normal, offset_m: 0.05 };
+    let wall = TestShape::Plane { normal, offset_m: 0.05 };
     let mut model = model(scenes::options(), &scenes::ring(&[wall], Point3::origin(), 4));
     let mut mesh = model.mesh().unwrap();
     // Where pixels are not wider than voxels; far out they are, and slanted.
-    let is_near = places(&mesh).map(|place| place.coords.norm() < 0.8).collect::<Vec<_>>();
+    let is_near = vertex_positions(&mesh).map(|vertex| vertex.coords.norm() < 0.8).collect::<Vec<_>>();
     let mut near = is_near.iter();
     mesh.positions_m.retain(|_| near.next() == Some(&true));
     assert!(mesh.positions_m.len() > 1000);
-    let (mean_m, most_m) = errors_m(&mesh, &wall);
-    assert!(mean_m < 0.002 && most_m < 0.01, "mean {mean_m} m, most {most_m} m");
+    let (mean_m, max_m) = errors_m(&mesh, &wall);
+    assert!(mean_m < 0.002 && max_m < 0.01, "mean {mean_m} m, most {max_m} m");
 }
 
 #[test]
-fn a_mesh_that_followed_is_the_mesh_made_at_once() {
+fn incremental_mesh_equals_full_mesh() {
     let at = Point3::new(0.1, 0.0, 0.2);
     let keyframes = scenes::ring(&[scenes::ball(at), scenes::floor()], at, 4);
     let whole = model(scenes::options(), &keyframes).mesh().unwrap();
-    let mut followed = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
+    let mut incremental = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), scenes::options()).unwrap();
     for keyframe in &keyframes {
-        followed.push(keyframe.clone()).unwrap();
-        while followed.step(1).unwrap() > 0 {}
-        followed.mesh().unwrap();
+        incremental.push(keyframe.clone()).unwrap();
+        while incremental.step(1).unwrap() > 0 {}
+        incremental.mesh().unwrap();
     }
-    assert!(followed.mesh().unwrap() == whole);
+    assert!(incremental.mesh().unwrap() == whole);
 }
 
 #[test]
-fn clusters_are_fewer_and_stay_near() {
+fn clustered_mesh_is_smaller_and_close() {
     let (mesh, ball, _) = ball_mesh();
     let coarse = mesh.clustered(0.08);
     assert!(
@@ -131,7 +131,7 @@ fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
 }
 
 #[test]
-fn files_hold_the_mesh() {
+fn ply_and_glb_files_hold_the_mesh() {
     let (mesh, _, _) = ball_mesh();
     let folder = tempfile::tempdir().unwrap();
     let (ply, glb) = (folder.path().join("mesh.ply"), folder.path().join("mesh.glb"));

@@ -3,9 +3,9 @@
 //! Before a frame is fused, every block it could touch is brought back: so the field has the bits it would have with room
 //! for all.
 
-use super::super::block::{Blocks, Place};
-use super::super::chosen::Lattice;
-use super::super::params::DepthFrame;
+use super::super::block::{Blocks, GridCoord};
+use super::super::chosen_grid::VoxelGrid;
+use super::super::params::DepthView;
 use super::TsdfModel;
 use crate::Error;
 use crate::splat::Camera;
@@ -14,12 +14,12 @@ use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
 
 /// Share of the pool that is made free at once, so that not every frame sends blocks away.
-const FREED_FRAC: f64 = 0.125;
+const EVICTED_FRAC: f64 = 0.125;
 /// Added to the radius of a block, voxels: who decides on the GPU rounds differently.
 const SLACK_VOXELS: f64 = 0.5;
 
 /// What a camera can see, roughly.
-struct Cone {
+struct ViewFrustum {
     camera_from_field: Transform,
     center_m: Point3<f64>,
     focal_px: [f64; 2],
@@ -29,13 +29,13 @@ struct Cone {
     block_m: f64,
 }
 
-impl Cone {
+impl ViewFrustum {
     fn new(
         field_from_camera: &Transform,
         lens: [[f64; 2]; 2],
         size_px: [u32; 2],
         far_m: f64,
-        lattice: &Lattice,
+        voxel_grid: &VoxelGrid,
     ) -> Self {
         Self {
             camera_from_field: field_from_camera.inverse(),
@@ -44,64 +44,70 @@ impl Cone {
             principal_px: lens[1],
             size_px: size_px.map(f64::from),
             far_m,
-            block_m: 8.0 * lattice.voxel_m,
+            block_m: 8.0 * voxel_grid.voxel_m,
         }
     }
 
-    fn middle_m(&self, block: Place) -> Point3<f64> {
+    fn center_of_block_m(&self, block: GridCoord) -> Point3<f64> {
         (Vector3::from(block.map(|along| f64::from(along) + 0.5)) * self.block_m).into()
     }
 
     /// At least where the kernel `find_visible` says so.
-    fn may_see(&self, block: Place) -> bool {
-        let middle = self.camera_from_field * self.middle_m(block);
+    fn may_be_visible(&self, block: GridCoord) -> bool {
+        let center = self.camera_from_field * self.center_of_block_m(block);
         let radius_m = self.block_m * (7.0 + SLACK_VOXELS) / 8.0;
-        let sides = (0..2).all(|axis| {
+        let is_inside_sides = (0..2).all(|axis| {
             let (focal, low) = (self.focal_px[axis], self.principal_px[axis]);
             let high = self.size_px[axis] - low;
-            focal * middle[axis] + low * middle.z >= -radius_m * focal.hypot(low)
-                && high * middle.z - focal * middle[axis] >= -radius_m * focal.hypot(high)
+            focal * center[axis] + low * center.z >= -radius_m * focal.hypot(low)
+                && high * center.z - focal * center[axis] >= -radius_m * focal.hypot(high)
         });
-        sides && middle.z >= -radius_m && middle.z <= self.far_m + radius_m
+        is_inside_sides && center.z >= -radius_m && center.z <= self.far_m + radius_m
     }
 
-    fn distance_m(&self, block: Place) -> f64 {
-        (self.middle_m(block) - self.center_m).norm()
+    fn distance_m(&self, block: GridCoord) -> f64 {
+        (self.center_of_block_m(block) - self.center_m).norm()
     }
 }
 
 impl TsdfModel {
-    fn cone_of_next(&self) -> Option<Cone> {
-        let (lattice, keyframe) = (self.lattice.as_ref()?, self.pending.front()?);
+    fn next_frustum(&self) -> Option<ViewFrustum> {
+        let (voxel_grid, keyframe) = (self.voxel_grid.as_ref()?, self.pending.front()?);
         let depth = keyframe.depth.as_ref()?;
-        let field_from_depth = lattice.field_from_world() * depth.world_from_camera;
-        let far_m = lattice.max_depth_m + lattice.scale_m;
-        DepthFrame::of(keyframe, lattice)?;
-        Some(Cone::new(&field_from_depth, [depth.focal_px, depth.principal_px], depth.size_px, far_m, lattice))
+        let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
+        let far_m = voxel_grid.max_depth_m + voxel_grid.scale_m;
+        DepthView::of(keyframe, voxel_grid)?;
+        Some(ViewFrustum::new(
+            &field_from_depth,
+            [depth.focal_px, depth.principal_px],
+            depth.size_px,
+            far_m,
+            voxel_grid,
+        ))
     }
 
     /// Makes room for at least `n` blocks more than there is, for the next frame; leaves the frame out where it cannot.
-    pub(super) fn send_away(&mut self, n: u32) -> Result<(), Error> {
-        let Some(cone) = self.cone_of_next() else { return Ok(()) };
-        let spare = f64::from(self.most_blocks()) * FREED_FRAC;
-        let n_sent = self.exchange(&cone, n as usize, spare, Blocks::new())?;
+    pub(super) fn evict(&mut self, n: u32) -> Result<(), Error> {
+        let Some(frustum) = self.next_frustum() else { return Ok(()) };
+        let n_spare = f64::from(self.max_blocks()) * EVICTED_FRAC;
+        let n_sent = self.swap_blocks(&frustum, n as usize, n_spare, Blocks::new())?;
         if n_sent < n as usize {
-            self.n_refused += 1;
-            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.most_blocks());
-            self.pass_over();
+            self.n_skipped += 1;
+            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.max_blocks());
+            self.skip_first();
         }
         Ok(())
     }
 
     /// Brings back what the next frame could touch, and fuses it.
-    pub(super) fn step_within_budget(&mut self, n: u64) -> Result<u64, Error> {
+    pub(super) fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
         let before = self.step;
         let n = n.min(self.pending.len() as u64).min(1);
         if n == 0 {
             return Ok(0);
         }
-        if let Some(cone) = self.cone_of_next() {
-            self.bring(&cone, false)?;
+        if let Some(frustum) = self.next_frustum() {
+            self.load_blocks(&frustum, false)?;
         }
         if self.step != before {
             return Ok(n); // The frame was left out; the next one wants other blocks.
@@ -109,58 +115,66 @@ impl TsdfModel {
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
         let counters = self.field.as_ref().ok_or(Error::DeviceLost)?.counters(&self.gpu)?;
-        self.take_note(&counters)?;
+        self.apply_counters(&counters)?;
         Ok(n)
     }
 
     /// Brings back what a picture shows, the nearest first where not all fit.
-    pub(super) fn bring_for(&mut self, camera: &Camera) -> Result<(), Error> {
-        let Some(lattice) = self.lattice.as_ref().filter(|_| !self.waiting.is_empty()) else { return Ok(()) };
+    pub(super) fn load_visible(&mut self, camera: &Camera) -> Result<(), Error> {
+        let Some(voxel_grid) = self.voxel_grid.as_ref().filter(|_| !self.host_blocks.is_empty()) else { return Ok(()) };
         let lens = [camera.focal_px, camera.principal_px];
-        let cone = Cone::new(&camera.world_from_camera, lens, camera.size_px, camera.far_m, lattice);
-        self.bring(&cone, true)
+        let frustum = ViewFrustum::new(&camera.world_from_camera, lens, camera.size_px, camera.far_m, voxel_grid);
+        self.load_blocks(&frustum, true)
     }
 
-    /// Brings the waiting blocks that may be seen; `as_many_as_fit` of them, else a frame that cannot have all is left out.
-    fn bring(&mut self, cone: &Cone, as_many_as_fit: bool) -> Result<(), Error> {
-        let mut wanted: Vec<Place> = self.waiting.keys().copied().filter(|block| cone.may_see(*block)).collect();
-        if wanted.is_empty() {
+    /// Brings the waiting blocks that may be seen; `allows_partial` of them, else a frame that cannot have all is left out.
+    fn load_blocks(&mut self, frustum: &ViewFrustum, allows_partial: bool) -> Result<(), Error> {
+        let mut visible_host_blocks: Vec<GridCoord> =
+            self.host_blocks.keys().copied().filter(|block| frustum.may_be_visible(*block)).collect();
+        if visible_host_blocks.is_empty() {
             return Ok(());
         }
-        wanted.sort_by(|a, b| cone.distance_m(*a).total_cmp(&cone.distance_m(*b)));
+        visible_host_blocks.sort_by(|a, b| frustum.distance_m(*a).total_cmp(&frustum.distance_m(*b)));
         let Some(field) = &self.field else { return Ok(()) };
-        let n_seen = field.places(&self.gpu)?.into_iter().filter(|block| cone.may_see(*block)).count();
-        let most = field.capacity.n_blocks as usize - n_seen.min(field.capacity.n_blocks as usize);
-        if wanted.len() > most && !as_many_as_fit {
-            self.n_refused += 1;
-            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.most_blocks());
-            self.pass_over();
+        let n_observed =
+            field.block_coords(&self.gpu)?.into_iter().filter(|block| frustum.may_be_visible(*block)).count();
+        let n_free_slots = field.capacity.n_blocks as usize - n_observed.min(field.capacity.n_blocks as usize);
+        if visible_host_blocks.len() > n_free_slots && !allows_partial {
+            self.n_skipped += 1;
+            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.max_blocks());
+            self.skip_first();
             return Ok(());
         }
-        wanted.truncate(most);
-        let coming: Blocks =
-            wanted.into_iter().filter_map(|block| Some((block, self.waiting.remove(&block)?))).collect();
+        visible_host_blocks.truncate(n_free_slots);
+        let added: Blocks = visible_host_blocks
+            .into_iter()
+            .filter_map(|block| Some((block, self.host_blocks.remove(&block)?)))
+            .collect();
         let n_free = field.capacity.n_blocks as usize - field.n_blocks(&self.gpu)? as usize;
-        let n = coming.len().saturating_sub(n_free);
-        self.exchange(cone, n, 0.0, coming).map(drop)
+        let n = added.len().saturating_sub(n_free);
+        self.swap_blocks(frustum, n, 0.0, added).map(drop)
     }
 
-    /// Sends at least `n` blocks that the cone does not see to wait, the furthest first, and `spare` more where there are;
-    /// puts `coming` in. Says how many went.
-    fn exchange(&mut self, cone: &Cone, n: usize, spare: f64, coming: Blocks) -> Result<usize, Error> {
+    /// Sends at least `n` blocks that the cone does not see to wait, the furthest first, and `n_spare` more where there are;
+    /// puts `added` in. Says how many went.
+    fn swap_blocks(&mut self, frustum: &ViewFrustum, n: usize, n_spare: f64, added: Blocks) -> Result<usize, Error> {
         let Some(field) = &mut self.field else { return Ok(0) };
-        self.due.extend(field.take_changed(&self.gpu)?);
-        let places = field.places(&self.gpu)?;
-        let mut unseen: Vec<(u32, Place)> =
-            (0..).zip(&places).map(|(slot, place)| (slot, *place)).filter(|(_, block)| !cone.may_see(*block)).collect();
-        unseen.sort_by(|(_, a), (_, b)| cone.distance_m(*b).total_cmp(&cone.distance_m(*a)).then_with(|| a.cmp(b)));
+        self.stale.extend(field.take_changed(&self.gpu)?);
+        let block_coords = field.block_coords(&self.gpu)?;
+        let mut invisible_slots: Vec<(u32, GridCoord)> = (0..)
+            .zip(&block_coords)
+            .map(|(slot, block_coord)| (slot, *block_coord))
+            .filter(|(_, block)| !frustum.may_be_visible(*block))
+            .collect();
+        invisible_slots
+            .sort_by(|(_, a), (_, b)| frustum.distance_m(*b).total_cmp(&frustum.distance_m(*a)).then_with(|| a.cmp(b)));
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
-        unseen.truncate(n + spare as usize);
-        let leaving: BTreeSet<u32> = unseen.iter().map(|(slot, _)| *slot).collect();
-        let slots: Vec<u32> = leaving.iter().copied().collect();
+        invisible_slots.truncate(n + n_spare as usize);
+        let evicted: BTreeSet<u32> = invisible_slots.iter().map(|(slot, _)| *slot).collect();
+        let slots: Vec<u32> = evicted.iter().copied().collect();
         let blocks = field.read(&self.gpu, &self.pipelines, &slots)?;
-        self.waiting.extend(slots.iter().map(|slot| places[*slot as usize]).zip(blocks));
-        field.exchange(&self.gpu, &self.pipelines, &slots, &coming)?;
+        self.host_blocks.extend(slots.iter().map(|slot| block_coords[*slot as usize]).zip(blocks));
+        field.swap_blocks(&self.gpu, &self.pipelines, &slots, &added)?;
         self.n_resident = field.n_blocks(&self.gpu)?;
         Ok(slots.len())
     }

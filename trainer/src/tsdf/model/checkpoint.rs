@@ -1,34 +1,34 @@
 //! The state of a field on the way: all that decides how it goes on, bit for bit.
 
-use super::super::block::{Block, Blocks, N_VOXELS, Place};
+use super::super::block::{Block, Blocks, GridCoord, N_VOXELS};
 use super::super::buffers::{Capacity, FieldBuffers};
-use super::super::chosen::Lattice;
+use super::super::chosen_grid::VoxelGrid;
 use super::super::options::TsdfOptions;
-use super::{FIRST_CAPACITY, TsdfModel};
+use super::{INITIAL_CAPACITY, TsdfModel};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
-use crate::seen::{self, Seen};
+use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::{Error, Keyframe};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 pub(super) const METHOD: &str = "tsdf";
-const PLACES: &str = "places";
+const BLOCK_COORDS: &str = "block_coords";
 const GEOMETRY: &str = "geometry";
 const COLORS: &str = "colors";
 
 /// All but the blocks.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct State {
+pub(super) struct TsdfState {
     pub(super) options: TsdfOptions,
-    pub(super) lattice: Option<Lattice>,
+    pub(super) voxel_grid: Option<VoxelGrid>,
     pub(super) step: u64,
-    pub(super) n_refused: u64,
+    pub(super) n_skipped: u64,
     pub(super) n_blocks: u64,
-    pub(super) fused: Vec<Seen>,
+    pub(super) fused: Vec<KeyframeSignature>,
     /// Pushed and not fused, in order.
-    pub(super) pending: Vec<Seen>,
+    pub(super) pending: Vec<KeyframeSignature>,
 }
 
 impl TsdfModel {
@@ -40,16 +40,16 @@ impl TsdfModel {
     /// The state and the blocks, in order of their places.
     pub(super) fn state(&mut self) -> Result<(serde_json::Value, Vec<Array>), Error> {
         let blocks = self.blocks()?;
-        let state = State {
+        let state = TsdfState {
             options: self.options.clone(),
-            lattice: self.lattice.clone(),
+            voxel_grid: self.voxel_grid.clone(),
             step: self.step,
-            n_refused: self.n_refused,
+            n_skipped: self.n_skipped,
             n_blocks: blocks.len() as u64,
             fused: self.fused.clone(),
-            pending: self.pending.iter().map(|keyframe| Seen::of(keyframe)).collect(),
+            pending: self.pending.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
         };
-        let state = serde_json::to_value(state).map_err(|error| bad_state(error.to_string()))?;
+        let state = serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))?;
         Ok((state, arrays_of(&blocks)))
     }
 
@@ -61,82 +61,82 @@ impl TsdfModel {
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         let mut model = Self::of_state(gpu, checkpoint)?;
-        let seen: Vec<Seen> = model.fused.iter().chain(&model.to_match).cloned().collect();
-        let (mut found, rest) = seen::matched(&seen, keyframes, Arc::clone)?;
+        let keyframe_signature: Vec<KeyframeSignature> = model.fused.iter().chain(&model.unmatched).cloned().collect();
+        let (mut found, rest) = keyframe_signature::match_keyframes(&keyframe_signature, keyframes, Arc::clone)?;
         model.pending = found.split_off(model.fused.len()).into();
-        model.to_match.clear();
+        model.unmatched.clear();
         Ok((model, rest))
     }
 
     /// The model a checkpoint holds, without the keyframes it waits for.
     pub(super) fn of_state(gpu: Arc<Gpu>, checkpoint: &Checkpoint) -> Result<Self, Error> {
         if checkpoint.method != METHOD {
-            return Err(bad_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
         }
-        let state: State =
-            serde_json::from_value(checkpoint.state.clone()).map_err(|error| bad_state(error.to_string()))?;
+        let state: TsdfState =
+            serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
         let blocks = blocks_of(checkpoint, state.n_blocks)?;
-        let mut model = Self::within_any_budget(gpu, state.options)?;
-        let most = model.most_blocks() as usize;
-        model.due = blocks.keys().copied().collect();
+        let mut model = Self::without_budget_check(gpu, state.options)?;
+        let max_resident = model.max_blocks() as usize;
+        model.stale = blocks.keys().copied().collect();
         let mut resident = blocks;
-        if let Some(last) = resident.keys().nth(most).copied() {
-            model.waiting = resident.split_off(&last);
+        if let Some(last) = resident.keys().nth(max_resident).copied() {
+            model.host_blocks = resident.split_off(&last);
         }
-        if let Some(lattice) = &state.lattice {
-            check_lattice(lattice)?;
-            let n_blocks = FIRST_CAPACITY.n_blocks.min(model.most_blocks());
-            let capacity = Capacity { n_blocks, ..FIRST_CAPACITY };
-            let field = FieldBuffers::with_blocks(&model.gpu, &model.pipelines, lattice, &resident, capacity)?;
+        if let Some(voxel_grid) = &state.voxel_grid {
+            check_lattice(voxel_grid)?;
+            let n_blocks = INITIAL_CAPACITY.n_blocks.min(model.max_blocks());
+            let capacity = Capacity { n_blocks, ..INITIAL_CAPACITY };
+            let field = FieldBuffers::with_blocks(&model.gpu, &model.pipelines, voxel_grid, &resident, capacity)?;
             model.n_resident = field.n_blocks(&model.gpu)?;
             model.field = Some(field);
         }
-        model.lattice = state.lattice;
-        (model.step, model.n_refused) = (state.step, state.n_refused);
-        (model.fused, model.to_match) = (state.fused, state.pending);
+        model.voxel_grid = state.voxel_grid;
+        (model.step, model.n_skipped) = (state.step, state.n_skipped);
+        (model.fused, model.unmatched) = (state.fused, state.pending);
         Ok(model)
     }
 }
 
-fn check_lattice(lattice: &Lattice) -> Result<(), Error> {
-    let positive = [lattice.voxel_m, lattice.truncation_m, lattice.scale_m, lattice.max_depth_m];
+fn check_lattice(voxel_grid: &VoxelGrid) -> Result<(), Error> {
+    let positive = [voxel_grid.voxel_m, voxel_grid.truncation_m, voxel_grid.scale_m, voxel_grid.max_depth_m];
     let is_usable = positive.iter().all(|value| value.is_finite() && *value > 0.0)
-        && lattice.anchor_m.iter().all(|along| along.is_finite())
-        && lattice.noise_per_m2 >= 0.0
-        && lattice.truncation_m > lattice.voxel_m
-        && lattice.max_weight <= 65_535;
-    if is_usable { Ok(()) } else { Err(bad_state(format!("no field has such voxels: {lattice:?}"))) }
+        && voxel_grid.anchor_m.iter().all(|along| along.is_finite())
+        && voxel_grid.noise_per_m2 >= 0.0
+        && voxel_grid.truncation_m > voxel_grid.voxel_m
+        && voxel_grid.max_weight <= 65_535;
+    if is_usable { Ok(()) } else { Err(invalid_state(format!("no field has such voxels: {voxel_grid:?}"))) }
 }
 
 fn arrays_of(blocks: &Blocks) -> Vec<Array> {
-    let places: Vec<u8> = blocks.keys().flatten().flat_map(|along| along.to_le_bytes()).collect();
+    let block_coords: Vec<u8> = blocks.keys().flatten().flat_map(|along| along.to_le_bytes()).collect();
     let geometry: Vec<u8> =
         blocks.values().flat_map(|block| &block.geometry).flat_map(|word| word.to_le_bytes()).collect();
     let colors: Vec<u8> =
         blocks.values().flat_map(|block| &block.colors).flatten().flat_map(|word| word.to_le_bytes()).collect();
-    [(PLACES, places), (GEOMETRY, geometry), (COLORS, colors)]
+    [(BLOCK_COORDS, block_coords), (GEOMETRY, geometry), (COLORS, colors)]
         .map(|(name, bytes)| Array { name: name.to_owned(), bytes })
         .into()
 }
 
 fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
-    let n_bytes = |each: u64| n_blocks.checked_mul(each).ok_or_else(|| bad_state(format!("{n_blocks} blocks")));
-    let places = checkpoint.array(PLACES, n_bytes(12)?)?;
+    let n_bytes = |each: u64| n_blocks.checked_mul(each).ok_or_else(|| invalid_state(format!("{n_blocks} blocks")));
+    let block_coords = checkpoint.array(BLOCK_COORDS, n_bytes(12)?)?;
     let geometry = checkpoint.array(GEOMETRY, n_bytes(4 * 512)?)?;
     let colors = checkpoint.array(COLORS, n_bytes(8 * 512)?)?;
     let word = |bytes: &[u8]| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
-    let places = places
+    let block_coords = block_coords
         .chunks_exact(12)
-        .map(|bytes| -> Place { std::array::from_fn(|axis| word(&bytes[4 * axis..4 * axis + 4]).cast_signed()) });
+        .map(|bytes| -> GridCoord { std::array::from_fn(|axis| word(&bytes[4 * axis..4 * axis + 4]).cast_signed()) });
     let blocks =
         geometry.chunks_exact(4 * N_VOXELS).zip(colors.chunks_exact(8 * N_VOXELS)).map(|(geometry, colors)| Block {
             geometry: geometry.chunks_exact(4).map(word).collect(),
             colors: colors.chunks_exact(8).map(|both| [word(&both[..4]), word(&both[4..])]).collect(),
         });
-    let blocks: Blocks = places.zip(blocks).collect();
-    if blocks.len() as u64 == n_blocks { Ok(blocks) } else { Err(bad_state("a block is there twice".to_owned())) }
+    let blocks: Blocks = block_coords.zip(blocks).collect();
+    if blocks.len() as u64 == n_blocks { Ok(blocks) } else { Err(invalid_state("a block is there twice".to_owned())) }
 }
 
-pub(super) fn bad_state(reason: String) -> Error {
+pub(super) fn invalid_state(reason: String) -> Error {
     Error::CheckpointState { reason }
 }

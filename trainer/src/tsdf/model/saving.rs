@@ -1,7 +1,7 @@
 //! A field in a folder: the mesh for other programs, and the blocks for this one.
 
 use super::TsdfModel;
-use super::checkpoint::{METHOD, bad_state};
+use super::checkpoint::{METHOD, invalid_state};
 use crate::checkpoint::{Array, Checkpoint};
 use crate::gpu::Gpu;
 use crate::tsdf::mesh::{write_glb, write_ply};
@@ -14,53 +14,53 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// The blocks: a checkpoint whose arrays are deflated.
-const BLOCKS: &str = "field.blocks";
+const BLOCKS_FILE: &str = "field.blocks";
 /// Most bytes that an array may have when it is inflated.
 const MAX_ARRAY_BYTES: u64 = 1 << 36;
 
 impl TsdfModel {
     /// Whether a folder holds a saved field.
     pub fn is_saved_in(folder: &Path) -> bool {
-        folder.join(BLOCKS).is_file()
+        folder.join(BLOCKS_FILE).is_file()
     }
 
     /// A saved field, to be drawn or added to.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
-        let path = folder.join(BLOCKS);
+        let path = folder.join(BLOCKS_FILE);
         let mut checkpoint = Checkpoint::read(&path)?;
         for array in &mut checkpoint.arrays {
             let mut whole = Vec::new();
             let inflated = DeflateDecoder::new(array.bytes.as_slice()).take(MAX_ARRAY_BYTES).read_to_end(&mut whole);
-            inflated.map_err(|error| bad_state(format!("array {:?}: {error}", array.name)))?;
+            inflated.map_err(|error| invalid_state(format!("array {:?}: {error}", array.name)))?;
             array.bytes = whole;
         }
         Self::of_state(gpu, &checkpoint)
     }
 
     pub(super) fn write_folder(&mut self, folder: &Path) -> Result<(), Error> {
-        self.settle()?;
-        self.fuse_first()?;
-        let refused = |path: &Path, source| Error::Write { path: path.to_owned(), source };
-        std::fs::create_dir_all(folder).map_err(|source| refused(folder, source))?;
+        self.finish_in_flight()?;
+        self.fuse_one()?;
+        let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
+        std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let mesh = self.mesh()?;
         write_ply(&folder.join("mesh.ply"), &mesh)?;
         write_glb(&folder.join("mesh.glb"), &mesh)?;
-        let blocks = folder.join(BLOCKS);
+        let blocks = folder.join(BLOCKS_FILE);
         let (state, arrays) = self.state()?;
         let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();
-        let arrays = arrays.map_err(|source| refused(&blocks, source))?;
+        let arrays = arrays.map_err(|source| write_error(&blocks, source))?;
         Checkpoint::new(METHOD, state, arrays).write(&blocks)?;
-        let about = serde_json::json!({
+        let description = serde_json::json!({
             "method": METHOD,
             "steps": self.step,
             "blocks": self.progress().primitives,
-            "refused_keyframes": self.n_refused,
+            "refused_keyframes": self.n_skipped,
             "vertices": mesh.positions_m.len(),
             "triangles": mesh.triangles.len(),
-            "lattice": self.lattice,
+            "voxel_grid": self.voxel_grid,
         });
         let path = folder.join("model.json");
-        std::fs::write(&path, format!("{about:#}\n")).map_err(|source| refused(&path, source))
+        std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }
 

@@ -2,21 +2,21 @@
 
 use super::readings::{Reading, ray_of};
 use crate::DepthMap;
-use crate::tsdf::block::Place;
-use crate::tsdf::chosen::Lattice;
+use crate::tsdf::block::GridCoord;
+use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
 
 /// The blocks of one depth image.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Wanted {
+pub struct RequiredBlocks {
     /// Crossed for at least `margin` of a block's edge.
-    pub surely: BTreeSet<Place>,
+    pub definite: BTreeSet<GridCoord>,
     /// Crossed, or passed by within `margin`.
-    pub at_most: BTreeSet<Place>,
+    pub possible: BTreeSet<GridCoord>,
 }
 
-impl Lattice {
+impl VoxelGrid {
     /// Distance from the surface up to which a reading of this depth says something, metres.
     pub fn truncation_at(&self, depth_m: f64) -> f64 {
         (3.0 * self.noise_per_m2 * depth_m * depth_m).clamp(self.truncation_m, self.scale_m)
@@ -25,42 +25,42 @@ impl Lattice {
 
 /// The blocks that get room; `margin` in blocks, what rounding may decide.
 #[expect(clippy::cast_possible_truncation, reason = "places are rounded down on purpose")]
-pub fn wanted_blocks(depth: &DepthMap, readings: &[Reading], lattice: &Lattice, margin: f64) -> Wanted {
-    let field_from_depth = lattice.field_from_world() * depth.world_from_camera;
+pub fn required_blocks(depth: &DepthMap, readings: &[Reading], voxel_grid: &VoxelGrid, margin: f64) -> RequiredBlocks {
+    let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
     let width = depth.size_px[0] as usize;
-    let block_m = 8.0 * lattice.voxel_m;
-    let mut wanted = Wanted::default();
+    let block_m = 8.0 * voxel_grid.voxel_m;
+    let mut required = RequiredBlocks::default();
     for (ix, reading) in readings.iter().enumerate().filter(|(_, reading)| reading.depth_m > 0.0) {
         let ray = ray_of(depth, [(ix % width) as f64 + 0.5, (ix / width) as f64 + 0.5]);
-        let band_m = lattice.truncation_at(reading.depth_m) / ray.norm();
+        let band_m = voxel_grid.truncation_at(reading.depth_m) / ray.norm();
         let at = |z: f64| (field_from_depth * Point3::from(ray * z)).coords / block_m;
         let (begin, end) = (at((reading.depth_m - band_m).max(0.0)), at(reading.depth_m + band_m));
-        for (enter, leave) in pieces(&begin, &end) {
+        for (enter, leave) in intervals(&begin, &end) {
             let middle = begin + (end - begin) * (0.5 * (enter + leave));
-            let place: Place = middle.map(|along| along.floor() as i32).into();
-            if (leave - enter) * (end - begin).norm() > margin && is_within(&middle, margin / 8.0) {
-                wanted.surely.insert(place);
+            let block_coord: GridCoord = middle.map(|along| along.floor() as i32).into();
+            if (leave - enter) * (end - begin).norm() > margin && is_clear_of_faces(&middle, margin / 8.0) {
+                required.definite.insert(block_coord);
             }
             for share in [enter, leave] {
                 let point = begin + (end - begin) * share;
                 for ix in 0..27 {
                     let offset = Vector3::new(ix % 3 - 1, ix / 3 % 3 - 1, ix / 9 - 1).map(f64::from) * margin;
-                    wanted.at_most.insert((point + offset).map(|along| along.floor() as i32).into());
+                    required.possible.insert((point + offset).map(|along| along.floor() as i32).into());
                 }
             }
-            wanted.at_most.insert(place);
+            required.possible.insert(block_coord);
         }
     }
-    wanted
+    required
 }
 
 /// Whether a point is further than `margin` from every face of the blocks.
-fn is_within(point: &Vector3<f64>, margin: f64) -> bool {
+fn is_clear_of_faces(point: &Vector3<f64>, margin: f64) -> bool {
     point.iter().all(|along| (margin..1.0 - margin).contains(&(along - along.floor())))
 }
 
 /// Shares of the way between the faces that the line passes.
-fn pieces(begin: &Vector3<f64>, end: &Vector3<f64>) -> Vec<(f64, f64)> {
+fn intervals(begin: &Vector3<f64>, end: &Vector3<f64>) -> Vec<(f64, f64)> {
     let mut cuts = vec![0.0, 1.0];
     for axis in 0..3 {
         let (low, high) = (begin[axis].min(end[axis]), begin[axis].max(end[axis]));

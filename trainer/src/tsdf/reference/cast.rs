@@ -1,7 +1,7 @@
 //! Twin of `cast_rays.wgsl`: the first crossing from outside to inside, found by small even steps.
 
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
-use crate::tsdf::chosen::Lattice;
+use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
 
 /// Length of a step, voxels: short, because nothing is clever here.
@@ -28,9 +28,9 @@ pub struct Hit {
 }
 
 /// The first surface along the ray that faces its origin.
-pub fn cast(blocks: &Blocks, lattice: &Lattice, ray: &Ray) -> Option<Hit> {
-    let at = |depth_m: f64| (ray.origin_m + ray.along * depth_m).coords / lattice.voxel_m;
-    let step_m = STEP_VOXELS * lattice.voxel_m / ray.along.norm();
+pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray) -> Option<Hit> {
+    let at = |depth_m: f64| (ray.origin_m + ray.along * depth_m).coords / voxel_grid.voxel_m;
+    let step_m = STEP_VOXELS * voxel_grid.voxel_m / ray.along.norm();
     let mut depth_m = ray.range_m[0];
     let mut before: Option<(f64, f64)> = None;
     while depth_m < ray.range_m[1] {

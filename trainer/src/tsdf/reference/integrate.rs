@@ -1,8 +1,8 @@
 //! Twin of `integrate.wgsl`, on all blocks given: those the camera does not see it leaves as they are.
 
 use super::readings::{Reading, ray_of};
-use crate::tsdf::block::{N_VOXELS, Place};
-use crate::tsdf::chosen::Lattice;
+use crate::tsdf::block::{GridCoord, N_VOXELS};
+use crate::tsdf::chosen_grid::VoxelGrid;
 use crate::{DepthMap, Keyframe};
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
@@ -21,24 +21,25 @@ pub struct Voxel {
 }
 
 /// Voxels of blocks, x fastest.
-pub type VoxelBlocks = BTreeMap<Place, Vec<Voxel>>;
+pub type VoxelBlocks = BTreeMap<GridCoord, Vec<Voxel>>;
 
-const MIN_TURNED: f64 = 0.3;
+const MIN_RAY_DOT_NORMAL: f64 = 0.3;
 const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
 const COLOR_VOXELS: f64 = 2.0;
 
 /// Fuses a keyframe with depth into the blocks given.
-pub fn integrate(blocks: &mut VoxelBlocks, keyframe: &Keyframe, readings: &[Reading], lattice: &Lattice) {
+pub fn integrate(blocks: &mut VoxelBlocks, keyframe: &Keyframe, readings: &[Reading], voxel_grid: &VoxelGrid) {
     let Some(depth) = &keyframe.depth else { return };
-    for (place, voxels) in blocks {
+    for (block_coord, voxels) in blocks {
         debug_assert_eq!(voxels.len(), N_VOXELS, "a block has all its voxels");
         for (ix, voxel) in voxels.iter_mut().enumerate() {
             let offset = [ix % 8, ix / 8 % 8, ix / 64];
-            let along = |axis: usize| (f64::from(8 * place[axis]) + offset[axis] as f64 + 0.5) * lattice.voxel_m;
+            let along =
+                |axis: usize| (f64::from(8 * block_coord[axis]) + offset[axis] as f64 + 0.5) * voxel_grid.voxel_m;
             let in_field = Point3::new(along(0), along(1), along(2));
-            let in_world = lattice.field_from_world().inverse() * in_field;
-            fuse(voxel, keyframe, depth, readings, lattice, &in_world);
+            let in_world = voxel_grid.field_from_world().inverse() * in_field;
+            fuse(voxel, keyframe, depth, readings, voxel_grid, &in_world);
         }
     }
 }
@@ -48,74 +49,76 @@ fn fuse(
     keyframe: &Keyframe,
     depth: &DepthMap,
     readings: &[Reading],
-    lattice: &Lattice,
+    voxel_grid: &VoxelGrid,
     in_world: &Point3<f64>,
 ) {
     let point = depth.world_from_camera.inverse() * in_world;
-    let Some(place_px) = projected(&point, depth.focal_px, depth.principal_px, depth.size_px) else { return };
-    let reading = reading_near(depth, readings, place_px);
+    let Some(position_px) = projected(&point, depth.focal_px, depth.principal_px, depth.size_px) else { return };
+    let reading = reading_near(depth, readings, position_px);
     if reading.depth_m <= 0.0 {
         return;
     }
-    let distance_m = (reading.depth_m - point.z) * reading.turned.max(MIN_TURNED);
-    let truncation_m = lattice.truncation_at(reading.depth_m);
-    let ray_m = ray_of(depth, place_px).norm();
+    let distance_m = (reading.depth_m - point.z) * reading.ray_dot_normal.max(MIN_RAY_DOT_NORMAL);
+    let truncation_m = voxel_grid.truncation_at(reading.depth_m);
+    let ray_m = ray_of(depth, position_px).norm();
     let behind_m = (point.z - reading.depth_m) * ray_m;
     if behind_m > truncation_m {
         return;
     }
     let nearness = (1.0 / (reading.depth_m * reading.depth_m)).min(1.0);
-    let behind = ((truncation_m - behind_m) / (truncation_m - lattice.voxel_m)).clamp(0.0, 1.0);
-    let gain = nearness * (reading.turned / ray_m).powi(2) * behind;
+    let falloff = ((truncation_m - behind_m) / (truncation_m - voxel_grid.voxel_m)).clamp(0.0, 1.0);
+    let gain_frac = nearness * (reading.ray_dot_normal / ray_m).powi(2) * falloff;
     if distance_m > truncation_m {
         if voxel.weight > 0.0 && voxel.distance_m < 0.0 {
-            let beyond = (distance_m / truncation_m - 1.0).min(1.0);
-            let carving = CARVING_NEAR + (CARVING_FAR - CARVING_NEAR) * beyond;
-            let lost = (carving * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
-            if lost >= voxel.weight {
+            let past_truncation = (distance_m / truncation_m - 1.0).min(1.0);
+            let carving = CARVING_NEAR + (CARVING_FAR - CARVING_NEAR) * past_truncation;
+            let weight_loss = (carving * 256.0 * (1.0 / (point.z * point.z)).min(1.0) + 0.5).floor().max(1.0);
+            if weight_loss >= voxel.weight {
                 (voxel.distance_m, voxel.weight) = (0.0, 0.0);
             } else {
-                voxel.weight -= lost;
+                voxel.weight -= weight_loss;
             }
         }
         return;
     }
-    let gained = (256.0 * gain + 0.5).floor().clamp(1.0, 256.0);
-    let sum = voxel.weight + gained;
-    voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * gained) / sum;
-    voxel.weight = sum.min(f64::from(lattice.max_weight));
-    if distance_m.abs() <= COLOR_VOXELS * lattice.voxel_m {
-        fuse_color(voxel, keyframe, gained, f64::from(lattice.max_weight), in_world);
+    let weight_gain = (256.0 * gain_frac + 0.5).floor().clamp(1.0, 256.0);
+    let sum = voxel.weight + weight_gain;
+    voxel.distance_m = (voxel.distance_m * voxel.weight + distance_m * weight_gain) / sum;
+    voxel.weight = sum.min(f64::from(voxel_grid.max_weight));
+    if distance_m.abs() <= COLOR_VOXELS * voxel_grid.voxel_m {
+        fuse_color(voxel, keyframe, weight_gain, f64::from(voxel_grid.max_weight), in_world);
     }
 }
 
-fn fuse_color(voxel: &mut Voxel, keyframe: &Keyframe, gained: f64, max_weight: f64, in_world: &Point3<f64>) {
+fn fuse_color(voxel: &mut Voxel, keyframe: &Keyframe, weight_gain: f64, max_weight: f64, in_world: &Point3<f64>) {
     let point = keyframe.world_from_camera.inverse() * in_world;
-    let Some(place_px) = projected(&point, keyframe.focal_px, keyframe.principal_px, keyframe.size_px) else { return };
-    let [red, green, blue, alpha] = color_near(keyframe, place_px);
+    let Some(position_px) = projected(&point, keyframe.focal_px, keyframe.principal_px, keyframe.size_px) else {
+        return;
+    };
+    let [red, green, blue, alpha] = color_near(keyframe, position_px);
     if alpha <= 0.999 {
         return;
     }
-    let sum = voxel.color_weight + gained;
-    for (had, seen) in voxel.color_srgb.iter_mut().zip([red, green, blue]) {
-        *had = (*had * voxel.color_weight + seen * gained) / sum;
+    let sum = voxel.color_weight + weight_gain;
+    for (previous, observed) in voxel.color_srgb.iter_mut().zip([red, green, blue]) {
+        *previous = (*previous * voxel.color_weight + observed * weight_gain) / sum;
     }
     voxel.color_weight = sum.min(max_weight);
 }
 
 fn projected(point: &Point3<f64>, focal: [f64; 2], principal: [f64; 2], size_px: [u32; 2]) -> Option<[f64; 2]> {
-    let place: [f64; 2] = std::array::from_fn(|axis| focal[axis] * point[axis] / point.z + principal[axis]);
-    let inside = (0..2).all(|axis| place[axis] >= 0.0 && place[axis] < f64::from(size_px[axis]));
-    (point.z > 0.0 && inside).then_some(place)
+    let block_coord: [f64; 2] = std::array::from_fn(|axis| focal[axis] * point[axis] / point.z + principal[axis]);
+    let inside = (0..2).all(|axis| block_coord[axis] >= 0.0 && block_coord[axis] < f64::from(size_px[axis]));
+    (point.z > 0.0 && inside).then_some(block_coord)
 }
 
 /// The four pixels around a place, clamped to the image, and the shares of the right and the lower ones.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the image")]
-fn corners(place_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
-    let base = place_px.map(|along| (along - 0.5).floor());
+fn corners(position_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
+    let base = position_px.map(|along| (along - 0.5).floor());
     let clamped = |axis: usize, step: f64| (base[axis] + step).clamp(0.0, f64::from(size_px[axis]) - 1.0) as usize;
     let at = |x: f64, y: f64| clamped(1, y) * size_px[0] as usize + clamped(0, x);
-    ([at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)], [0, 1].map(|axis| place_px[axis] - 0.5 - base[axis]))
+    ([at(0.0, 0.0), at(1.0, 0.0), at(0.0, 1.0), at(1.0, 1.0)], [0, 1].map(|axis| position_px[axis] - 0.5 - base[axis]))
 }
 
 fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
@@ -124,24 +127,24 @@ fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place inside the image")]
-fn reading_near(depth: &DepthMap, readings: &[Reading], place_px: [f64; 2]) -> Reading {
-    let (at, share) = corners(place_px, depth.size_px);
+fn reading_near(depth: &DepthMap, readings: &[Reading], position_px: [f64; 2]) -> Reading {
+    let (at, share) = corners(position_px, depth.size_px);
     let four = at.map(|ix| readings[ix]);
     if four.iter().any(|reading| reading.depth_m <= 0.0) {
-        return readings[place_px[1] as usize * depth.size_px[0] as usize + place_px[0] as usize];
+        return readings[position_px[1] as usize * depth.size_px[0] as usize + position_px[0] as usize];
     }
     Reading {
         depth_m: mixed(four.map(|reading| reading.depth_m), share),
-        turned: mixed(four.map(|reading| reading.turned), share),
+        ray_dot_normal: mixed(four.map(|reading| reading.ray_dot_normal), share),
     }
 }
 
-fn color_near(keyframe: &Keyframe, place_px: [f64; 2]) -> [f64; 4] {
-    let (at, share) = corners(place_px, keyframe.size_px);
+fn color_near(keyframe: &Keyframe, position_px: [f64; 2]) -> [f64; 4] {
+    let (at, share) = corners(position_px, keyframe.size_px);
     std::array::from_fn(|part| mixed(at.map(|ix| f64::from(keyframe.rgba_srgb[4 * ix + part]) / 255.0), share))
 }
 
 /// Voxels that nobody has seen.
-pub fn unseen() -> Vec<Voxel> {
+pub fn unobserved() -> Vec<Voxel> {
     vec![Voxel { color_srgb: Vector3::zeros().into(), ..Voxel::default() }; N_VOXELS]
 }

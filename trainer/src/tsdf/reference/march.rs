@@ -1,18 +1,18 @@
 //! Twin of `march_cubes`: the triangles of one block.
 
-use crate::tsdf::block::{BLOCK_EDGE, Block, Blocks, Place, voxel_ix};
+use crate::tsdf::block::{BLOCK_EDGE, Block, Blocks, GridCoord, voxel_ix};
 use crate::tsdf::mesh::CASES;
 use nalgebra::Vector3;
 use std::collections::HashMap;
 
 /// Color where none was seen.
-const GREY: f64 = 0.5;
+const GRAY: f64 = 0.5;
 
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
     /// Between this voxel, counted from the block's first one, and the next along the axis.
-    pub between: (Place, usize),
+    pub between: (GridCoord, usize),
     /// From the field's anchor, along the world's axes, metres.
     pub position_m: [f64; 3],
     /// Out of the surface, of length 1.
@@ -31,43 +31,43 @@ pub struct BlockTriangles {
 }
 
 /// A block with those around it.
-struct Surrounded<'a> {
-    place: Place,
+struct BlockNeighborhood<'a> {
+    block_coord: GridCoord,
     blocks: [Option<&'a Block>; 27],
 }
 
-impl<'a> Surrounded<'a> {
-    fn new(blocks: &'a Blocks, place: Place) -> Self {
+impl<'a> BlockNeighborhood<'a> {
+    fn new(blocks: &'a Blocks, block_coord: GridCoord) -> Self {
         let offset = |ix: i32| [ix % 3 - 1, ix / 3 % 3 - 1, ix / 9 - 1];
         let mut found = [None; 27];
         for (ix, found) in (0..).zip(&mut found) {
             let [x, y, z] = offset(ix);
-            *found = blocks.get(&[place[0] + x, place[1] + y, place[2] + z]);
+            *found = blocks.get(&[block_coord[0] + x, block_coord[1] + y, block_coord[2] + z]);
         }
-        Self { place, blocks: found }
+        Self { block_coord, blocks: found }
     }
 
     /// The block of a voxel given from this block's first one, -8 to 15, and its place in it.
-    fn at(&self, voxel: Place) -> Option<(&'a Block, usize)> {
+    fn at(&self, voxel: GridCoord) -> Option<(&'a Block, usize)> {
         let [x, y, z] = voxel.map(|along| along.div_euclid(BLOCK_EDGE) + 1);
         let block = self.blocks[usize::try_from(9 * z + 3 * y + x).ok()?]?;
         Some((block, voxel_ix(voxel)))
     }
 
-    fn distance(&self, voxel: Place) -> Option<f64> {
+    fn distance(&self, voxel: GridCoord) -> Option<f64> {
         self.at(voxel).and_then(|(block, ix)| block.distance(ix))
     }
 
     /// Change of the distance along the axes, from both sides where both were seen.
-    fn slope(&self, voxel: Place) -> Vector3<f64> {
+    fn gradient(&self, voxel: GridCoord) -> Vector3<f64> {
         let here = self.distance(voxel);
         Vector3::from_fn(|axis, _| {
-            let beside = |step: i32| {
+            let neighbor = |step: i32| {
                 let mut other = voxel;
                 other[axis] += step;
                 self.distance(other)
             };
-            match (beside(-1), here, beside(1)) {
+            match (neighbor(-1), here, neighbor(1)) {
                 (Some(low), _, Some(high)) => 0.5 * (high - low),
                 (Some(low), Some(here), None) => here - low,
                 (None, Some(here), Some(high)) => high - here,
@@ -76,28 +76,28 @@ impl<'a> Surrounded<'a> {
         })
     }
 
-    fn color(&self, voxel: Place) -> Option<[f64; 3]> {
+    fn color(&self, voxel: GridCoord) -> Option<[f64; 3]> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
     /// Which corners of the cube that begins at `voxel` lie inside; `None` where one was not seen.
-    fn case_of(&self, voxel: Place) -> Option<usize> {
+    fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;
             Some(case | usize::from(is_inside) << corner)
         })
     }
 
-    fn vertex(&self, between: (Place, usize), voxel_m: f64) -> Vertex {
+    fn vertex(&self, between: (GridCoord, usize), voxel_m: f64) -> Vertex {
         let (from, axis) = between;
         let to = moved(from, 1 << axis);
         let [here, there] = [from, to].map(|voxel| self.distance(voxel).unwrap_or(0.0));
         let share = here / (here - there);
         let position_m = std::array::from_fn(|along| {
-            let voxel = f64::from(self.place[along] * BLOCK_EDGE + from[along]);
+            let voxel = f64::from(self.block_coord[along] * BLOCK_EDGE + from[along]);
             (voxel + 0.5 + if along == axis { share } else { 0.0 }) * voxel_m
         });
-        let normal = self.slope(from).lerp(&self.slope(to), share);
+        let normal = self.gradient(from).lerp(&self.gradient(to), share);
         let normal = normal.try_normalize(1e-12).unwrap_or_else(|| {
             let mut along = Vector3::zeros();
             along[axis] = (there - here).signum();
@@ -108,38 +108,38 @@ impl<'a> Surrounded<'a> {
     }
 }
 
-fn moved(voxel: Place, corner: usize) -> Place {
+fn moved(voxel: GridCoord, corner: usize) -> GridCoord {
     std::array::from_fn(|axis| voxel[axis] + i32::from(corner >> axis & 1 == 1))
 }
 
 /// Makes the triangles of a block; cubes with a corner that nobody saw have none.
-pub fn march(blocks: &Blocks, place: Place, voxel_m: f64) -> BlockTriangles {
-    let around = Surrounded::new(blocks, place);
-    let mut made = BlockTriangles::default();
-    let mut known: HashMap<(Place, usize), usize> = HashMap::new();
+pub fn march(blocks: &Blocks, block_coord: GridCoord, voxel_m: f64) -> BlockTriangles {
+    let around = BlockNeighborhood::new(blocks, block_coord);
+    let mut triangles_of_block = BlockTriangles::default();
+    let mut known: HashMap<(GridCoord, usize), usize> = HashMap::new();
     for z in 0..BLOCK_EDGE {
         for y in 0..BLOCK_EDGE {
             for x in 0..BLOCK_EDGE {
                 let cube = [x, y, z];
                 for triangle in around.case_of(cube).map_or(&[][..], |case| &CASES[case]) {
-                    made.triangles.push(triangle.map(|edge| {
+                    triangles_of_block.triangles.push(triangle.map(|edge| {
                         let between = (moved(cube, edge.corner), edge.axis);
                         *known.entry(between).or_insert_with(|| {
-                            made.vertices.push(around.vertex(between, voxel_m));
-                            made.vertices.len() - 1
+                            triangles_of_block.vertices.push(around.vertex(between, voxel_m));
+                            triangles_of_block.vertices.len() - 1
                         })
                     }));
                 }
             }
         }
     }
-    made
+    triangles_of_block
 }
 
 fn mixed(from: Option<[f64; 3]>, to: Option<[f64; 3]>, share: f64) -> [f64; 3] {
     match (from, to) {
         (Some(from), Some(to)) => std::array::from_fn(|part| from[part] + (to[part] - from[part]) * share),
         (Some(only), None) | (None, Some(only)) => only,
-        (None, None) => [GREY; 3],
+        (None, None) => [GRAY; 3],
     }
 }

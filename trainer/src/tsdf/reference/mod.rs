@@ -6,8 +6,8 @@ mod integrate;
 mod march;
 mod readings;
 
-pub use allocate::{Wanted, wanted_blocks};
+pub use allocate::{RequiredBlocks, required_blocks};
 pub use cast::{Hit, Ray, cast};
-pub use integrate::{Voxel, VoxelBlocks, integrate, unseen};
+pub use integrate::{Voxel, VoxelBlocks, integrate, unobserved};
 pub use march::{BlockTriangles, Vertex, march};
 pub use readings::{Reading, readings};

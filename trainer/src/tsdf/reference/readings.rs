@@ -1,7 +1,7 @@
 //! Twin of `readings.wgsl`.
 
 use crate::DepthMap;
-use crate::tsdf::chosen::Lattice;
+use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::Vector3;
 
 /// What a pixel says.
@@ -10,63 +10,65 @@ pub struct Reading {
     /// Metres along z; 0 where the pixel is not to be believed.
     pub depth_m: f64,
     /// The ray with z = 1 times the surface's unit normal.
-    pub turned: f64,
+    pub ray_dot_normal: f64,
 }
 
-const WIDE: i64 = 3;
-const FLAT_NOISES: f64 = 6.0;
+const WIDE_STEP: i64 = 3;
+const MAX_FLAT_NOISES: f64 = 6.0;
 const MIN_DEPTH_M: f64 = 0.01;
 const MAX_SLOPE: f64 = 6.0;
 
 /// The ray through a place of the image whose z is 1.
-pub(super) fn ray_of(depth: &DepthMap, place_px: [f64; 2]) -> Vector3<f64> {
-    let along = |axis: usize| (place_px[axis] - depth.principal_px[axis]) / depth.focal_px[axis];
+pub(super) fn ray_of(depth: &DepthMap, position_px: [f64; 2]) -> Vector3<f64> {
+    let along = |axis: usize| (position_px[axis] - depth.principal_px[axis]) / depth.focal_px[axis];
     Vector3::new(along(0), along(1), 1.0)
 }
 
 /// Which pixels are to be believed, and how their surface is turned.
-pub fn readings(depth: &DepthMap, lattice: &Lattice) -> Vec<Reading> {
+pub fn readings(depth: &DepthMap, voxel_grid: &VoxelGrid) -> Vec<Reading> {
     let [width, height] = depth.size_px.map(i64::from);
-    (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).map(|pixel| reading(depth, lattice, pixel)).collect()
+    (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).map(|pixel| reading(depth, voxel_grid, pixel)).collect()
 }
 
-fn depth_at(depth: &DepthMap, lattice: &Lattice, [x, y]: [i64; 2]) -> Option<f64> {
+fn depth_at(depth: &DepthMap, voxel_grid: &VoxelGrid, [x, y]: [i64; 2]) -> Option<f64> {
     let [width, height] = depth.size_px.map(i64::from);
     if x < 0 || y < 0 || x >= width || y >= height {
         return None;
     }
     let depth_m = f64::from(depth.depth_m[usize::try_from(y * width + x).ok()?]);
-    (MIN_DEPTH_M..=lattice.max_depth_m).contains(&depth_m).then_some(depth_m)
+    (MIN_DEPTH_M..=voxel_grid.max_depth_m).contains(&depth_m).then_some(depth_m)
 }
 
-fn reading(depth: &DepthMap, lattice: &Lattice, pixel: [i64; 2]) -> Reading {
-    let Some(center_m) = depth_at(depth, lattice, pixel) else { return Reading::default() };
+fn reading(depth: &DepthMap, voxel_grid: &VoxelGrid, pixel: [i64; 2]) -> Reading {
+    let Some(center_m) = depth_at(depth, voxel_grid, pixel) else { return Reading::default() };
     let point = |[x, y]: [i64; 2], depth_m: f64| ray_of(depth, [x as f64 + 0.5, y as f64 + 0.5]) * depth_m;
-    let beside = |axis: usize| -> Option<Vector3<f64>> {
-        let noise_m = lattice.noise_per_m2 * center_m * center_m;
+    let tangent_along = |axis: usize| -> Option<Vector3<f64>> {
+        let noise_m = voxel_grid.noise_per_m2 * center_m * center_m;
         let limit = MAX_SLOPE * center_m / depth.focal_px[axis] + 6.0 * noise_m;
         let at = |step: i64| {
             let mut other = pixel;
             other[axis] += step;
-            depth_at(depth, lattice, other).map(|depth_m| (other, depth_m))
+            depth_at(depth, voxel_grid, other).map(|depth_m| (other, depth_m))
         };
-        let wide = [at(WIDE), at(-WIDE)];
-        let is_flat = match wide {
-            [Some((_, high_m)), Some((_, low_m))] => (high_m - 2.0 * center_m + low_m).abs() <= FLAT_NOISES * noise_m,
+        let wide_pair = [at(WIDE_STEP), at(-WIDE_STEP)];
+        let is_flat = match wide_pair {
+            [Some((_, high_m)), Some((_, low_m))] => {
+                (high_m - 2.0 * center_m + low_m).abs() <= MAX_FLAT_NOISES * noise_m
+            }
             _ => false,
         };
         let sides = [at(1), at(-1)];
         if sides.iter().flatten().any(|(_, depth_m)| (depth_m - center_m).abs() > limit) || sides == [None, None] {
             return None;
         }
-        let taken = if is_flat { wide } else { sides };
+        let taken = if is_flat { wide_pair } else { sides };
         let [high, low] =
             taken.map(|side| side.map_or_else(|| point(pixel, center_m), |(at, depth_m)| point(at, depth_m)));
         Some(high - low)
     };
-    let (Some(x), Some(y)) = (beside(0), beside(1)) else { return Reading::default() };
+    let (Some(x), Some(y)) = (tangent_along(0), tangent_along(1)) else { return Reading::default() };
     let ray = ray_of(depth, [pixel[0] as f64 + 0.5, pixel[1] as f64 + 0.5]);
     let normal = x.cross(&y);
-    let turned = ray.dot(&normal) / normal.norm().max(1e-30);
-    if turned > 0.0 { Reading { depth_m: center_m, turned } } else { Reading::default() }
+    let ray_dot_normal = ray.dot(&normal) / normal.norm().max(1e-30);
+    if ray_dot_normal > 0.0 { Reading { depth_m: center_m, ray_dot_normal } } else { Reading::default() }
 }

@@ -1,8 +1,8 @@
 //! Messages and motion commands from anyone, to a played robot.
 
-use super::super::{Joints, Limits, Owner, RobotConfig, Wanted};
+use super::super::{CommandedJoints, JointSimulator, Joints, Limits, RobotConfig};
 use super::{Client, N_JOINTS, Robot, Server};
-use crate::hostile::take;
+use crate::fuzz::take;
 use franka::FciVersion;
 use kinematics::{Chain, Stamp, Transform};
 use std::io::{ErrorKind, Read, Write};
@@ -26,24 +26,24 @@ const MAX_STEPS: u16 = 500;
 /// joints are wanted, they got there within their limits.
 pub fn client(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
-        wanted(version, bytes);
+        commanded(version, bytes);
     }
 }
 
 /// Where the joints are wanted after that, see [`client`]; at first they rest at angles of their own.
-pub(crate) fn wanted(version: FciVersion, mut bytes: &[u8]) -> (Wanted, Wanted) {
+pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoints, CommandedJoints) {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let mut server = server(version, limits.clone());
-    let first = server.robot.wanted;
+    let first = server.robot.commanded;
     let Some((mut stream, commands)) = connect(&mut server) else { return (first, first) };
-    let (mut number, mut n_left) = (FIRST, MAX_STEPS);
+    let (mut number, mut n_remaining) = (FIRST, MAX_STEPS);
     while !bytes.is_empty() {
         let [kind] = take(&mut bytes);
         let length = u16::from_le_bytes(take(&mut bytes));
         let mut n_steps = 1;
         if kind % 3 == 2 {
-            n_steps = length.min(n_left);
-            n_left -= n_steps;
+            n_steps = length.min(n_remaining);
+            n_remaining -= n_steps;
         } else {
             let (sent, rest) = bytes.split_at(bytes.len().min(length.into()));
             bytes = rest;
@@ -54,14 +54,14 @@ pub(crate) fn wanted(version: FciVersion, mut bytes: &[u8]) -> (Wanted, Wanted) 
             };
         }
         for _ in 0..n_steps {
-            let before = server.robot.wanted;
+            let before = server.robot.commanded;
             server.step(Stamp(0), number, true);
             number += 1;
-            check(&limits, &before, &server.robot.wanted);
-            hear(&mut stream);
+            check(&limits, &before, &server.robot.commanded);
+            drain(&mut stream);
         }
     }
-    (first, server.robot.wanted)
+    (first, server.robot.commanded)
 }
 
 /// A robot whose joints are where they are wanted.
@@ -71,13 +71,13 @@ fn server(version: FciVersion, limits: Limits) -> Server {
     listener.set_nonblocking(true).and_then(|()| states.set_nonblocking(true)).expect("an open socket");
     let address = listener.local_addr().expect("an open socket");
     let config = RobotConfig { address, version, chain: CHAIN.clone(), flange_from_ee: Transform::identity(), limits };
-    let owner: Owner = Box::new(|_, wanted: &Wanted| Joints {
-        position_rad: wanted.position_rad,
-        velocity_rad_s: wanted.velocity_rad_s,
+    let joint_simulator: JointSimulator = Box::new(|_, commanded: &CommandedJoints| Joints {
+        position_rad: commanded.position_rad,
+        velocity_rad_s: commanded.velocity_rad_s,
         ..Joints::default()
     });
     let robot = Robot::new(config, Joints { position_rad: REST_RAD, ..Joints::default() });
-    Server { listener, states, robot, owner, client: None, stop: Arc::default() }
+    Server { listener, states, robot, joint_simulator, client: None, stop: Arc::default() }
 }
 
 /// A client that the server has taken, and its socket for commands.
@@ -87,7 +87,7 @@ fn connect(server: &mut Server) -> Option<(TcpStream, UdpSocket)> {
     let commands = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).ok()?;
     commands.connect(server.states.local_addr().ok()?).ok()?;
     for _ in 0..100 {
-        server.welcome();
+        server.accept_client();
         if let Some(Client { .. }) = server.client {
             return Some((stream, commands));
         }
@@ -97,7 +97,7 @@ fn connect(server: &mut Server) -> Option<(TcpStream, UdpSocket)> {
 }
 
 /// Takes what the server sent, so that its answers find room.
-fn hear(stream: &mut TcpStream) {
+fn drain(stream: &mut TcpStream) {
     let mut buffer = [0; 4096];
     loop {
         match stream.read(&mut buffer) {
@@ -109,17 +109,17 @@ fn hear(stream: &mut TcpStream) {
 }
 
 /// Angles are numbers, and no further on than a joint may turn in a millisecond.
-fn check(limits: &Limits, before: &Wanted, now: &Wanted) {
+fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
     for ix in 0..N_JOINTS {
-        let turned_rad = (now.position_rad[ix] - before.position_rad[ix]).abs();
-        assert!(turned_rad <= limits.velocity_rad_s[ix] * 1e-3 + 1e-7, "joint {ix}: {before:?}, then {now:?}");
+        let moved_rad = (now.position_rad[ix] - before.position_rad[ix]).abs();
+        assert!(moved_rad <= limits.velocity_rad_s[ix] * 1e-3 + 1e-7, "joint {ix}: {before:?}, then {now:?}");
     }
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::hostile::Random;
+    use crate::fuzz::Random;
     use franka::wire::HeaderLayout;
     use franka::wire::robot::{v5, v10};
     use zerocopy::IntoBytes;
@@ -149,7 +149,7 @@ pub(crate) mod tests {
     }
 
     /// A client that connects, sets a threshold, moves the joints a little and says goodbye: records as [`client`] takes them.
-    pub(crate) fn talk(version: FciVersion) -> Vec<Vec<u8>> {
+    pub(crate) fn example_traffic(version: FciVersion) -> Vec<Vec<u8>> {
         let (number, connect, collision, begin, n_begin) = match version {
             FciVersion::V5 => (
                 5_u16,
@@ -172,15 +172,15 @@ pub(crate) mod tests {
         records.push(message(begin, &vec![0; n_begin]));
         for step in 0..12_u32 {
             // Within the jerk that both allow: a third of a microradian a cube of milliseconds.
-            let way_rad = 3e-7 * f64::from(step.pow(3)) / 6.0;
-            records.push(record(1, &command(version, FIRST + 2 + u64::from(step), way_rad)));
+            let offset_rad = 3e-7 * f64::from(step.pow(3)) / 6.0;
+            records.push(record(1, &command(version, FIRST + 2 + u64::from(step), offset_rad)));
         }
         records.push([&[2_u8][..], &40_u16.to_le_bytes()].concat());
         records
     }
 
-    fn command(version: FciVersion, number: u64, way_rad: f64) -> Vec<u8> {
-        let q_c = REST_RAD.map(|rest| F64::new(rest + way_rad));
+    fn command(version: FciVersion, number: u64, offset_rad: f64) -> Vec<u8> {
+        let q_c = REST_RAD.map(|rest| F64::new(rest + offset_rad));
         match version {
             FciVersion::V5 => {
                 let mut command = v5::RobotCommand::default();
@@ -196,22 +196,22 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn only_a_client_that_begins_a_motion_moves_joints() {
+    fn only_a_started_motion_moves_joints() {
         let mut random = Random(4);
-        for version in crate::franka::hostile::tests::VERSIONS {
-            let records = talk(version);
-            let (first, last) = wanted(version, &records.concat());
+        for version in crate::franka::fuzz::tests::VERSIONS {
+            let records = example_traffic(version);
+            let (first, last) = commanded(version, &records.concat());
             assert_ne!(first.position_rad, last.position_rad, "the motion that is spoilt below: {version:?}");
             // Without the record that begins the motion, in any order, cut off or doubled.
             for round in 0..30 {
-                let mut spoilt: Vec<_> = records.iter().filter(|record| **record != records[2]).cloned().collect();
-                random.shuffle(&mut spoilt);
+                let mut corrupted: Vec<_> = records.iter().filter(|record| **record != records[2]).cloned().collect();
+                random.shuffle(&mut corrupted);
                 match round % 3 {
-                    0 => spoilt = spoilt.iter().flat_map(|record| [record.clone(), record.clone()]).collect(),
-                    1 => spoilt.iter_mut().for_each(|record| record.truncate(record.len() / 2)),
+                    0 => corrupted = corrupted.iter().flat_map(|record| [record.clone(), record.clone()]).collect(),
+                    1 => corrupted.iter_mut().for_each(|record| record.truncate(record.len() / 2)),
                     _ => {}
                 }
-                let (first, last) = wanted(version, &spoilt.concat());
+                let (first, last) = commanded(version, &corrupted.concat());
                 assert_eq!(first.position_rad, last.position_rad, "{version:?}, round {round}");
             }
         }

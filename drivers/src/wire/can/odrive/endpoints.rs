@@ -64,7 +64,7 @@ impl Endpoints {
     }
 
     /// Whether they are of an axis that tells these versions.
-    pub fn are_of(&self, hardware: [u8; 3], firmware: [u8; 3]) -> bool {
+    pub fn match_versions(&self, hardware: [u8; 3], firmware: [u8; 3]) -> bool {
         let dotted = |version: [u8; 3]| version.map(|part| part.to_string()).join(".");
         self.firmware == dotted(firmware) && self.hardware == dotted(hardware)
     }
@@ -81,20 +81,20 @@ mod tests {
         "axis0.config.enable_watchdog": {"id": 219, "type": "bool", "access": "rw"}}}"#;
 
     #[test]
-    fn the_watchdog_is_found_in_the_makers_file() {
+    fn watchdog_endpoints_are_found_in_manufacturer_file() {
         let endpoints = Endpoints::parse(TEXT).expect("a file");
         assert_eq!((endpoints.watchdog_timeout, endpoints.enable_watchdog), (218, 219));
-        assert!(endpoints.are_of([4, 4, 58], [0, 6, 9]));
-        assert!(!endpoints.are_of([4, 4, 58], [0, 6, 10]) && !endpoints.are_of([4, 4, 57], [0, 6, 9]));
+        assert!(endpoints.match_versions([4, 4, 58], [0, 6, 9]));
+        assert!(!endpoints.match_versions([4, 4, 58], [0, 6, 10]) && !endpoints.match_versions([4, 4, 57], [0, 6, 9]));
     }
 
     #[test]
-    fn another_file_is_refused() {
+    fn other_files_are_rejected() {
         assert!(matches!(Endpoints::parse("[]"), Err(EndpointsError::Malformed(_))));
         assert!(matches!(Endpoints::parse(&TEXT[..60]), Err(EndpointsError::Malformed(_))));
         let renamed = TEXT.replace("config.enable_watchdog", "config.watch");
         assert!(Endpoints::parse(&renamed).expect_err("no watchdog").to_string().contains("enable_watchdog"));
-        let wide = TEXT.replace("\"bool\"", "\"uint32\"");
-        assert!(matches!(Endpoints::parse(&wide), Err(EndpointsError::Missing { kind: "bool", .. })));
+        let wrong_type = TEXT.replace("\"bool\"", "\"uint32\"");
+        assert!(matches!(Endpoints::parse(&wrong_type), Err(EndpointsError::Missing { kind: "bool", .. })));
     }
 }

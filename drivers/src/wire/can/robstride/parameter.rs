@@ -2,7 +2,7 @@
 //!
 //! Sources: as of the frames, in the module above.
 
-use super::super::{CanError, defined};
+use super::super::{CanError, decode_enum};
 
 /// Counts of `canTimeout` a second.
 const TIMEOUT_TICKS_HZ: f64 = 20_000.0;
@@ -44,7 +44,7 @@ impl Parameter {
     ];
 
     /// How many bytes of a whole number it holds; `None` where it is a real one.
-    fn whole_bytes(self) -> Option<usize> {
+    fn integer_bytes(self) -> Option<usize> {
         match self {
             Self::RunMode => Some(1),
             Self::ReportInterval => Some(2),
@@ -55,26 +55,26 @@ impl Parameter {
 
     /// The parameter of an index.
     pub(super) fn of_index(index: u16) -> Result<Self, CanError> {
-        defined("the parameter", index.into(), &Self::ALL, |known| known as u32)
+        decode_enum("the parameter", index.into(), &Self::ALL, |known| known as u32)
     }
 
     /// What the last four bytes of a message about it hold.
     pub(super) fn value(self, [a, b, c, d]: [u8; 4]) -> Value {
-        match self.whole_bytes() {
-            Some(1) => Value::Whole(a.into()),
-            Some(2) => Value::Whole(u16::from_le_bytes([a, b]).into()),
-            Some(_) => Value::Whole(u32::from_le_bytes([a, b, c, d])),
-            None => Value::Real(f32::from_le_bytes([a, b, c, d])),
+        match self.integer_bytes() {
+            Some(1) => Value::Integer(a.into()),
+            Some(2) => Value::Integer(u16::from_le_bytes([a, b]).into()),
+            Some(_) => Value::Integer(u32::from_le_bytes([a, b, c, d])),
+            None => Value::Float(f32::from_le_bytes([a, b, c, d])),
         }
     }
 
     /// The last four bytes of a message that sets it.
     pub(super) fn value_bytes(self, value: Value) -> Result<[u8; 4], CanError> {
-        match (self.whole_bytes(), value) {
-            (Some(n_bytes), Value::Whole(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => {
+        match (self.integer_bytes(), value) {
+            (Some(n_bytes), Value::Integer(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => {
                 Ok(whole.to_le_bytes())
             }
-            (None, Value::Real(real)) if real.is_finite() => Ok(real.to_le_bytes()),
+            (None, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
             _ => Err(CanError::Undefined { field: "the value for the parameter", raw: self as u32 }),
         }
     }
@@ -90,9 +90,9 @@ impl Parameter {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value {
     /// In parameters of codes and ticks.
-    Whole(u32),
+    Integer(u32),
     /// In parameters of SI values.
-    Real(f32),
+    Float(f32),
 }
 
 /// The value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
@@ -100,9 +100,9 @@ pub enum Value {
 pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
     let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
     match (0.0..=upper).contains(&timeout_secs) {
-        true if timeout_secs == 0.0 => Ok(Value::Whole(0)),
+        true if timeout_secs == 0.0 => Ok(Value::Integer(0)),
         // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
-        true => Ok(Value::Whole((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
+        true => Ok(Value::Integer((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
         false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
     }
 }
@@ -112,12 +112,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_are_whole_ticks_and_never_shorter() {
+    fn timeouts_round_up_to_ticks() {
         for secs in [-1e-3, f64::NAN, f64::INFINITY, 1e9] {
             assert!(matches!(timeout(secs), Err(CanError::Range { .. })), "{secs}");
         }
         for (secs, ticks) in [(0.0, 0), (1e-12, 1), (0.1, 2000), (1.0, 20_000)] {
-            assert_eq!(timeout(secs), Ok(Value::Whole(ticks)), "{secs}");
+            assert_eq!(timeout(secs), Ok(Value::Integer(ticks)), "{secs}");
         }
     }
 }
