@@ -115,7 +115,7 @@ pub(crate) struct Data {
     /// Whether the stamps are times; else they only count the images.
     pub(crate) has_times: bool,
     /// What was lost on the way; anything here makes the exit code 3.
-    pub(crate) dropped_messages: Vec<String>,
+    pub(crate) data_losses: Vec<String>,
     /// What was found of the base's pose at each stand after the first.
     pub(crate) stations: Vec<StationReport>,
     /// What was drawn from a model for images that lack depth.
@@ -272,7 +272,7 @@ impl Data {
             names: loaded.names,
             rig: None,
             has_times: folder.has_times(),
-            dropped_messages: loaded.dropped_messages,
+            data_losses: loaded.data_losses,
             stations: Vec::new(),
             rendered_depth: None,
             preparation_time: Duration::ZERO,
@@ -315,16 +315,16 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut dropped_messages = join.counts().dropped_messages(SampleUse::Watched);
-        dropped_messages.extend(damage.get().cloned());
-        dropped_messages.extend(join.check_list()?);
+        let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+        data_losses.extend(damage.get().cloned());
+        data_losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
         Ok(Self {
             keyframes,
             names,
             rig: Some(rig),
             has_times: true,
-            dropped_messages,
+            data_losses,
             stations: Vec::new(),
             rendered_depth: None,
             preparation_time: Duration::ZERO,
@@ -356,7 +356,7 @@ impl Data {
     /// Keeps what a list names, as what it names it.
     fn take_only(&mut self, list: &KeyframeList) -> Result<(), InsufficientData> {
         let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        self.dropped_messages.extend(list.check_found(images(), images().next())?);
+        self.data_losses.extend(list.check_found(images(), images().next())?);
         let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
         for (mut keyframe, name) in all {
             if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {

@@ -24,7 +24,7 @@ pub(crate) struct LoadedDataset {
     /// What a user should know.
     pub(crate) notes: Vec<String>,
     /// What is there but did not decode.
-    pub(crate) dropped_messages: Vec<String>,
+    pub(crate) data_losses: Vec<String>,
 }
 
 /// Decodes all photos on all cores.
@@ -64,8 +64,8 @@ pub(crate) fn load(
         start += run.len();
     }
 
-    let (notes, dropped_messages) = (dataset.notes.clone(), dataset.dropped_messages.clone());
-    let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, dropped_messages };
+    let (notes, data_losses) = (dataset.notes.clone(), dataset.data_losses.clone());
+    let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, data_losses };
     let (mut image_errors, mut depth_errors) = (Vec::new(), Vec::new());
     for (name, result) in results {
         match result {
@@ -86,7 +86,7 @@ pub(crate) fn load(
     for (what, errors) in [("image", image_errors), ("depth image", depth_errors)] {
         if !errors.is_empty() {
             let n_unusable = counted(errors.len() as u64, what);
-            loaded.dropped_messages.push(format!("{n_unusable} cannot be used: {}", errors.join("; ")));
+            loaded.data_losses.push(format!("{n_unusable} cannot be used: {}", errors.join("; ")));
         }
     }
     Ok(loaded)

@@ -59,11 +59,11 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
 }
 
 /// The exit code of a command that did what it could: each loss of data that was to be kept is told on stderr.
-pub(crate) fn from_losses(dropped_messages: &[String]) -> Exit {
-    for loss in dropped_messages {
+pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
+    for loss in data_losses {
         log::warn!("lost: {loss}");
     }
-    if dropped_messages.is_empty() { Exit::Done } else { Exit::Loss }
+    if data_losses.is_empty() { Exit::Done } else { Exit::Loss }
 }
 
 /// Whether reading or writing a file failed, for example on a full disk.

@@ -56,7 +56,7 @@ impl Replay {
         if !self.decisions.is_complete() {
             let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
             let name = self.name();
-            data.dropped_messages
+            data.data_losses
                 .push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
         }
         Ok(data)

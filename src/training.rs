@@ -74,7 +74,7 @@ pub(crate) fn drive(
             if let Err(error) = time_slices::train_next(sessions, |_, _| u64::MAX, || false) {
                 recoveries.recover(sessions, error)?;
             }
-            sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::rest);
+            sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::mark_finished);
         }
         match sessions.iter().try_for_each(Session::wait) {
             Ok(()) => return Ok(()),

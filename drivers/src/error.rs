@@ -104,12 +104,12 @@ pub enum Error {
         waited: Duration,
     },
     /// A CAN interface is not set up as it must be.
-    #[error("CAN interface {interface:?}: {what}; mend it with: {command}")]
+    #[error("CAN interface {interface:?}: {problem}; fix it with: {command}")]
     CanLink {
         /// Name of the interface.
         interface: String,
         /// What is wrong.
-        what: String,
+        problem: String,
         /// What a person types to mend it.
         command: String,
     },

@@ -394,11 +394,11 @@ fn can(rig: Option<&Rig>) -> Vec<Finding> {
         if problems.is_empty() {
             findings.push(Finding::ok("can", link.to_string()));
         }
-        findings.extend(problems.into_iter().map(|complaint| {
-            let message = format!("{}: {}", link.interface, complaint.check);
+        findings.extend(problems.into_iter().map(|link_problem| {
+            let message = format!("{}: {}", link.interface, link_problem.problem);
             match bus {
-                Some(_) => Finding::fail("can", message, complaint.command),
-                None => Finding::warn("can", message, complaint.command),
+                Some(_) => Finding::fail("can", message, link_problem.command),
+                None => Finding::warn("can", message, link_problem.command),
             }
         }));
     }

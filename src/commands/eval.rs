@@ -76,7 +76,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         }
         print::line(format_args!("{:30} {scores}", format!("mean of {}", per_image.len())))?;
     }
-    Ok(exit::from_losses(&data.dropped_messages))
+    Ok(exit::from_losses(&data.data_losses))
 }
 
 /// Whether the base was realigned when the model was trained: else its scene is not where the images' poses have it.

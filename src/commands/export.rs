@@ -193,10 +193,10 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut dropped_messages = join.counts().dropped_messages(SampleUse::Watched);
-    dropped_messages.extend(opened.damage.get().cloned());
-    dropped_messages.extend(missing_from_list);
-    Ok(exit::from_losses(&dropped_messages))
+    let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+    data_losses.extend(opened.damage.get().cloned());
+    data_losses.extend(missing_from_list);
+    Ok(exit::from_losses(&data_losses))
 }
 
 fn sentence(written: Written) -> String {

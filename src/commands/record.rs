@@ -125,7 +125,7 @@ impl Recorded {
     }
 
     /// What did not come, a sentence a camera.
-    fn dropped_messages(&self) -> Vec<String> {
+    fn data_losses(&self) -> Vec<String> {
         let sentence = |(camera, dropped): (&String, &DroppedImages)| {
             format!("camera {camera:?} lost {} color and {} depth images", dropped.images, dropped.depth_images)
         };
@@ -160,7 +160,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let bar = print::bar(None, "{spinner} {elapsed} {msg}", args.json);
     let mut first: Option<Stamp> = None;
     let mut input_error = None;
-    let mut dropped_messages = Vec::new();
+    let mut data_losses = Vec::new();
     while !stop.requested() {
         let sample = match source.next_sample() {
             Ok(Some(sample)) => sample,
@@ -176,7 +176,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             break;
         }
         if let Err(error) = recorder.write(&sample) {
-            dropped_messages.push(format!("{:#}", anyhow::Error::new(error)));
+            data_losses.push(format!("{:#}", anyhow::Error::new(error)));
             recorded = recorded.recount_from_file();
             break;
         }
@@ -184,11 +184,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         bar.set_message(recorded.summary());
     }
     bar.finish_and_clear();
-    let finished = dropped_messages.is_empty().then(|| recorder.finish());
+    let finished = data_losses.is_empty().then(|| recorder.finish());
     let n_written = match finished {
         Some(Ok(finished)) => Some(finished.n_samples),
         Some(Err(error)) => {
-            dropped_messages.push(format!("{:#}", anyhow::Error::new(error)));
+            data_losses.push(format!("{:#}", anyhow::Error::new(error)));
             recorded = recorded.recount_from_file();
             None
         }
@@ -206,12 +206,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     } else {
         print::report(format_args!("{:.1} s, {} in {}", recorded.seconds, recorded.summary(), args.out.display()));
     }
-    dropped_messages.extend(recorded.dropped_messages());
-    dropped_messages.extend(recorded.missing_devices(&rig));
+    data_losses.extend(recorded.data_losses());
+    data_losses.extend(recorded.missing_devices(&rig));
     let n_dropped = source.n_other_samples_dropped();
     if n_dropped > 0 {
-        dropped_messages
+        data_losses
             .push(format!("{n_dropped} joint states, base poses and range scans, because the disk was too slow"));
     }
-    Ok(exit::from_losses(&dropped_messages))
+    Ok(exit::from_losses(&data_losses))
 }

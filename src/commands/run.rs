@@ -129,7 +129,7 @@ struct RunDetails {
     /// Turns of range scanners in the list beside the keyframes, and their points.
     range_scans: usize,
     range_points: usize,
-    dropped_messages: Vec<String>,
+    data_losses: Vec<String>,
     /// What was found of the base's pose at each stand after the first.
     stations: Vec<StationReport>,
     /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
@@ -400,7 +400,7 @@ fn save(
         Ok(input_result) => input_result,
         Err(error) => {
             // A bug of the input does not cost the models.
-            let details = || serde_json::json!({ "losses": [error.to_string()] });
+            let details = || serde_json::json!({ "data_losses": [error.to_string()] });
             let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
             if n_train > 0 {
                 session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
@@ -415,15 +415,15 @@ fn save(
     let listed = sessions.iter().zip(&folders).try_for_each(list);
     let counts = input_result.join.counts();
     log::info!("{counts}");
-    let mut dropped_messages = counts.dropped_messages(if args.record.is_some() && args.from.is_none() {
+    let mut data_losses = counts.data_losses(if args.record.is_some() && args.from.is_none() {
         SampleUse::Recorded
     } else {
         SampleUse::Watched
     });
     // Keyframes that the recording does not hold cannot be scored on it again.
     let is_recorded = input_result.recording_error.is_none();
-    dropped_messages.extend(input_result.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
-    dropped_messages.extend(damage.get().cloned());
+    data_losses.extend(input_result.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
+    data_losses.extend(damage.get().cloned());
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
         details: RunDetails {
@@ -435,7 +435,7 @@ fn save(
             device_skipped: counts.device_skipped,
             range_scans: input_result.join.range_scans().count(),
             range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
-            dropped_messages: dropped_messages.clone(),
+            data_losses: data_losses.clone(),
             stations: stations.clone(),
             max_position_error_m: position_error_m,
         },
@@ -455,7 +455,7 @@ fn save(
     if n_train == 0 {
         return Err(InsufficientData(no_model_reason(n_keyframes, counts, rig)).into());
     }
-    Ok((exit::from_losses(&dropped_messages), models))
+    Ok((exit::from_losses(&data_losses), models))
 }
 
 /// Camera and stamp of a keyframe for which there was no room.

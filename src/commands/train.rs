@@ -99,7 +99,7 @@ struct TrainDetails<'a> {
     n_train: usize,
     n_selection: usize,
     n_test: usize,
-    dropped_messages: &'a [String],
+    data_losses: &'a [String],
     /// What was found of the base's pose at each stand after the first.
     stations: &'a [StationReport],
     /// How much depth came from a model.
@@ -275,7 +275,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             n_train: data.of_split(Split::Train).len(),
             n_selection: data.of_split(Split::Validation).len(),
             n_test: data.of_split(Split::Test).len(),
-            dropped_messages: &data.dropped_messages,
+            data_losses: &data.data_losses,
             stations: &data.stations,
             rendered_depth: data.rendered_depth.as_ref(),
             alignment: session.alignment().cloned(),
@@ -289,7 +289,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
-    Ok(exit::from_losses(&data.dropped_messages))
+    Ok(exit::from_losses(&data.data_losses))
 }
 
 /// Writes the rig file, and says where nothing changed in it.

@@ -98,9 +98,7 @@ fn truncated_photos_are_skipped_and_named() {
     truncate("03.png");
     let loaded = load_at(folder.path(), 1.0).unwrap();
     assert_eq!((loaded.keyframes.len(), loaded.names.contains(&"03.png".to_owned())), (9, false));
-    assert!(
-        loaded.dropped_messages[0].contains("1 image cannot be used") && loaded.dropped_messages[0].contains("03.png")
-    );
+    assert!(loaded.data_losses[0].contains("1 image cannot be used") && loaded.data_losses[0].contains("03.png"));
     // The others keep the split they had.
     assert_eq!(loaded.keyframes[7].split, Split::Test);
     (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
@@ -117,9 +115,9 @@ fn unreadable_depth_is_a_loss_but_photo_is_kept() {
     std::fs::write(&path, document.to_string()).unwrap();
     std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
     let loaded = load_at(folder.path(), 1.0).unwrap();
-    assert_eq!((loaded.keyframes.len(), loaded.dropped_messages.len()), (3, 1));
+    assert_eq!((loaded.keyframes.len(), loaded.data_losses.len()), (3, 1));
     assert!(
-        loaded.dropped_messages[0].starts_with("1 depth image cannot be used")
-            && loaded.dropped_messages[0].contains("depth.png")
+        loaded.data_losses[0].starts_with("1 depth image cannot be used")
+            && loaded.data_losses[0].contains("depth.png")
     );
 }

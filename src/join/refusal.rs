@@ -107,15 +107,15 @@ pub(crate) enum SampleUse {
 
 impl Counts {
     /// What was lost of what should have been kept, one sentence each.
-    pub(crate) fn dropped_messages(&self, sample_use: SampleUse) -> Vec<String> {
-        let mut dropped_messages = Vec::new();
+    pub(crate) fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
+        let mut data_losses = Vec::new();
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
-            dropped_messages.push(dropped_by_devices(self.device_skipped));
+            data_losses.push(dropped_by_devices(self.device_skipped));
         }
         if let Some(n_undecodable) = self.refused.get(&Refusal::Undecodable) {
-            dropped_messages.push(format!("{} did not decode", counted(*n_undecodable, "image")));
+            data_losses.push(format!("{} did not decode", counted(*n_undecodable, "image")));
         }
-        dropped_messages
+        data_losses
     }
 
     pub(super) fn refuse(&mut self, why: Refusal) {
@@ -162,8 +162,8 @@ mod tests {
         let mut counts = Counts { device_skipped: 2, ..Counts::default() };
         counts.refuse(Refusal::Undecodable);
         counts.refuse(Refusal::NotMoved);
-        assert_eq!(counts.dropped_messages(SampleUse::Recorded).len(), 2);
-        assert_eq!(counts.dropped_messages(SampleUse::Watched), ["1 image did not decode"]);
+        assert_eq!(counts.data_losses(SampleUse::Recorded).len(), 2);
+        assert_eq!(counts.data_losses(SampleUse::Watched), ["1 image did not decode"]);
     }
 
     #[test]

@@ -55,7 +55,7 @@ impl Page<'_> {
             escaped(&self.subtitle())
         );
         page.push_str(&figures(done, self.primitive));
-        page.push_str(&dropped_messages(&report["losses"]));
+        page.push_str(&data_losses(&report["data_losses"]));
         page.push_str(&commands(self.next));
         page.push_str(&comparison_section(self.comparisons, array(&report["per_image"]).len()));
         page.push_str(&curve(report, method));
@@ -75,7 +75,7 @@ impl Page<'_> {
     }
 
     fn settings_tables(&self) -> String {
-        let excluded_keys = ["done", "losses", "evaluations", "parts", "passes", "per_image"];
+        let excluded_keys = ["done", "data_losses", "evaluations", "parts", "passes", "per_image"];
         let extra = self.report.as_object().into_iter().flatten();
         let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
         let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
@@ -128,12 +128,9 @@ fn figures(done: &Value, primitive: &str) -> String {
     html
 }
 
-fn dropped_messages(dropped_messages: &Value) -> String {
-    let items: String = array(dropped_messages)
-        .iter()
-        .filter_map(Value::as_str)
-        .map(|loss| format!("<li>{}</li>", escaped(loss)))
-        .collect();
+fn data_losses(data_losses: &Value) -> String {
+    let items: String =
+        array(data_losses).iter().filter_map(Value::as_str).map(|loss| format!("<li>{}</li>", escaped(loss))).collect();
     match items.is_empty() {
         true => String::new(),
         false => format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n"),
@@ -231,8 +228,8 @@ fn curve(report: &Value, method: &str) -> String {
             points: points.iter().map(|(x, y)| Point { x: *x, y: *y, low: *y, high: *y }).collect(),
             is_peer: false,
         }],
-        floors: Vec::new(),
-        rules: Vec::new(),
+        thresholds: Vec::new(),
+        markers: Vec::new(),
     };
     format!("<h2>Training curve</h2>\n<div class=\"chart card\">{}</div>\n", chart.draw().svg())
 }
@@ -438,7 +435,7 @@ mod tests {
             "done": { "method": "splat", "psnr": 23.456, "ssim": 0.9, "seconds": 8.0, "steps": 12345, "primitives": 4000000,
                       "bytes": 8000000, "psnr_per_camera": { "wrist": 22.0 } },
             "data": "my data", "adapter": "a GPU",
-            "losses": ["1 image <broken>"],
+            "data_losses": ["1 image <broken>"],
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
             "parts": [{ "part": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],

@@ -171,7 +171,7 @@ fn misconfigured_card_reports_fix_command() {
             sh(set_up);
         }
         let problems = card.link().problems(&card.config());
-        let problem_found = problems.iter().find(|complaint| complaint.what.contains(what));
+        let problem_found = problems.iter().find(|complaint| complaint.problem.contains(what));
         assert!(
             problem_found.is_some_and(|complaint| complaint.command == fix_command("can0")),
             "{set_up}: {problems:?}"
@@ -322,7 +322,7 @@ fn controller_state_changes_are_reported() {
     let link = card.link();
     assert_eq!(link.state, Some(State::BusOff), "{link}");
     let problems = link.problems(&card.config());
-    assert!(problems.iter().any(|complaint| complaint.what.starts_with("it is off the bus")), "{problems:?}");
+    assert!(problems.iter().any(|complaint| complaint.problem.starts_with("it is off the bus")), "{problems:?}");
     // Once the kernel has noticed that nothing goes out, which may take it a second, it takes frames and drops them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
     std::thread::sleep(Duration::from_millis(1200));

@@ -148,8 +148,11 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
         let step = self.model.progress().step;
-        let alignment_started = !self.alignment_task.is_done() && !self.alignment_task.is_requested();
-        if alignment_started && (step >= self.alignment_step || self.model.is_idle()) {
+        if !self.alignment_task.is_done() && (step >= self.alignment_step || (self.model.is_idle() && step > 0)) {
+            // A model that was resumed at this step has not begun it.
+            if self.alignment_task.is_requested() {
+                self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
+            }
             self.finish_alignment()?;
         }
         let remaining = if self.alignment_task.is_done() {
@@ -316,6 +319,7 @@ mod tests {
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
         learn(&mut uninterrupted, 2);
         assert!(uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP);
+        let due = uninterrupted.checkpoint().unwrap().finish().unwrap();
         learn(&mut uninterrupted, 1);
         assert_eq!(
             (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
@@ -347,6 +351,15 @@ mod tests {
         let [uninterrupted_end, interrupted_end] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
             .map(|model| model.checkpoint().unwrap().finish().unwrap());
         assert_eq!(uninterrupted_end, interrupted_end);
+
+        let (mut interrupted, untrained) = resumed(&due);
+        untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
+        learn(&mut *interrupted, 3);
+        assert_eq!(
+            interrupted.checkpoint().unwrap().finish().unwrap(),
+            uninterrupted_end,
+            "resumed when alignment is due"
+        );
 
         let folder = tempfile::tempdir().unwrap();
         uninterrupted.save(folder.path()).unwrap();

@@ -51,7 +51,7 @@ pub struct Link {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LinkProblem {
     /// In words.
-    pub what: String,
+    pub problem: String,
     /// What a person types to mend it.
     pub command: String,
 }
@@ -101,7 +101,7 @@ impl Link {
     pub fn problems(&self, config: &BusConfig) -> Vec<LinkProblem> {
         let command = set_up_command(&self.interface, self.is_virtual(), config);
         let mut problems = Vec::new();
-        let mut report = |what: String| problems.push(LinkProblem { what, command: command.clone() });
+        let mut report = |problem: String| problems.push(LinkProblem { problem, command: command.clone() });
         if !self.is_up {
             report("it is down".to_owned());
         }
@@ -138,8 +138,8 @@ impl Link {
     /// The first complaint as an error.
     pub fn check(&self, config: &BusConfig) -> Result<(), Error> {
         match self.problems(config).into_iter().next() {
-            Some(LinkProblem { what, command }) => {
-                Err(Error::CanLink { interface: self.interface.clone(), what, command })
+            Some(LinkProblem { problem, command }) => {
+                Err(Error::CanLink { interface: self.interface.clone(), problem, command })
             }
             None => Ok(()),
         }
@@ -248,7 +248,7 @@ mod tests {
         for (link, what) in broken_links {
             let problems = link.problems(&config(None));
             assert_eq!(problems.len(), 1, "{problems:?}");
-            assert!(problems[0].what.contains(what), "{problems:?}");
+            assert!(problems[0].problem.contains(what), "{problems:?}");
             assert_eq!(problems[0].command, EXPECTED_COMMAND);
             assert!(link.check(&config(None)).is_err_and(|error| error.to_string().contains(EXPECTED_COMMAND)));
         }

@@ -23,7 +23,7 @@ pub struct Dataset {
     /// What a user should know: one sentence each, with the first names of what was left out.
     pub notes: Vec<String>,
     /// What is there but broken, so that it is lost to the user: one sentence each.
-    pub losses: Vec<String>,
+    pub data_losses: Vec<String>,
 }
 
 impl Dataset {
@@ -82,8 +82,8 @@ impl SkippedFrames {
             notes.push(format!("{images} {verb} not there: {}", first_names(&self.missing)));
         }
         notes.extend(unusable_note(&self.unusable));
-        let losses = unusable_note(&self.broken).into_iter().collect();
-        Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes, losses })
+        let data_losses = unusable_note(&self.broken).into_iter().collect();
+        Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes, data_losses })
     }
 }
 

@@ -150,7 +150,7 @@ fn missing_and_garbage_images_are_skipped_and_counted() {
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (2, 1, 1));
     assert_eq!(dataset.notes, ["1 image is not there: none.png"]);
-    assert!(dataset.losses[0].starts_with("1 image cannot be used: garbage.jpg ("), "{:?}", dataset.losses);
+    assert!(dataset.data_losses[0].starts_with("1 image cannot be used: garbage.jpg ("), "{:?}", dataset.data_losses);
     for name in ["a.png", "b.png"] {
         std::fs::remove_file(folder.path().join(name)).unwrap();
     }
@@ -188,7 +188,7 @@ fn implausibly_far_pose_skips_frame() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
-    assert_eq!(dataset.losses, ["1 image cannot be used: a.png (a pose 1e30 m away, at most 1e4 m)"]);
+    assert_eq!(dataset.data_losses, ["1 image cannot be used: a.png (a pose 1e30 m away, at most 1e4 m)"]);
 }
 
 #[test]
@@ -250,7 +250,7 @@ fn invalid_pose_skips_image_with_note() {
         let corrupted = document.to_string().replacen("[1.0,0.0,0.0,0.0]", row, 1);
         std::fs::write(folder.path().join("transforms.json"), corrupted).unwrap();
         let dataset = read(folder.path()).unwrap();
-        let [note] = &dataset.losses[..] else { panic!("{:?}", dataset.losses) };
+        let [note] = &dataset.data_losses[..] else { panic!("{:?}", dataset.data_losses) };
         assert!(note.contains("b.png (") && note.contains(reason), "{note}");
         assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
     }

@@ -51,18 +51,18 @@ pub struct PlaybackClock {
     /// An instant of the script.
     pub scripted: Stamp,
     /// When that is, on the monotonic clock.
-    pub played: Stamp,
+    pub emulated: Stamp,
 }
 
 impl PlaybackClock {
     /// The instant of the script that is played at `now`.
     pub fn script_stamp_at(&self, now: Stamp) -> Stamp {
-        Stamp(now.0.saturating_sub(self.played.0).saturating_add(self.scripted.0))
+        Stamp(now.0.saturating_sub(self.emulated.0).saturating_add(self.scripted.0))
     }
 
     /// When an instant of the script is played.
     pub fn playback_stamp_of(&self, scripted: Stamp) -> Stamp {
-        Stamp(scripted.0.saturating_sub(self.scripted.0).saturating_add(self.played.0))
+        Stamp(scripted.0.saturating_sub(self.scripted.0).saturating_add(self.emulated.0))
     }
 }
 
@@ -113,7 +113,7 @@ mod tests {
             effort: vec![],
         };
         let readings: Vec<_> = (100..=200).step_by(10).map(reading).collect();
-        let playback_clock = PlaybackClock { scripted: Stamp(100_000_000), played: Stamp(7_000_000_000) };
+        let playback_clock = PlaybackClock { scripted: Stamp(100_000_000), emulated: Stamp(7_000_000_000) };
         let track = JointTrack::new(&readings, playback_clock).unwrap();
         let at = |millis: i64| track.at(Stamp(7_000_000_000 + millis * 1_000_000));
         assert_eq!((&at(-50).position[..], &at(-50).velocity[..]), (&[0.05][..], &[0.0][..]));

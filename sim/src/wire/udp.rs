@@ -246,13 +246,13 @@ mod tests {
         let mut arm = UdpArm::open(&names, free).expect("a free port");
         let mut base = UdpBase::open(free, [1.0; 2]).expect("a free port");
         let mut scanner = UdpScanner::open("lidar", free).expect("a free port");
-        let played = clock::now().plus_secs(0.2);
+        let emulated = clock::now().plus_secs(0.2);
         let datagram_targets = DatagramTargets {
             joints: Some((arm.address(), names)),
             base: Some(base.address()),
             scanners: vec![("lidar".into(), scanner.address())],
         };
-        let playback_clock = PlaybackClock { scripted: Stamp(0), played };
+        let playback_clock = PlaybackClock { scripted: Stamp(0), emulated };
         let _senders = EmulatedSenders::start(&script, playback_clock, datagram_targets).expect("a socket");
         let wait = Duration::from_secs(5);
         let at_rest_state = arm.read(wait).expect("joints");

@@ -121,7 +121,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let Some((findings, page)) = page {
         findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::from_losses(&data.data.dropped_messages))
+    Ok(exit::from_losses(&data.data.data_losses))
 }
 
 /// Whether it changes anything about how these data are learned.

@@ -106,11 +106,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     let mut bench = Bench { args, peers, results: Vec::new(), notes: Vec::new() };
-    let (mut dropped_messages, mut names) = (Vec::new(), HashSet::new());
+    let (mut data_losses, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;
     for (path, n_left) in args.data.iter().zip((1..=args.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
-        dropped_messages.extend(data.data.dropped_messages.iter().cloned());
+        data_losses.extend(data.data.data_losses.iter().cloned());
         let model_specs = bench.applicable(&data);
         runs.expect(n_left * model_specs.len() * usize::try_from(args.seeds)?);
         for model_spec in model_specs {
@@ -140,7 +140,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let Some((findings, page)) = page {
         findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::from_losses(&dropped_messages))
+    Ok(exit::from_losses(&data_losses))
 }
 
 impl CurveResult {

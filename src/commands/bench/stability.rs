@@ -148,7 +148,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     if let Some((findings, page)) = page {
         findings.print_summary(&page, args.bench.json)?;
     }
-    Ok(exit::from_losses(&data.data.dropped_messages))
+    Ok(exit::from_losses(&data.data.data_losses))
 }
 
 /// The ways to train that differ for these data: where nothing is looked for about cameras there is one.

@@ -47,7 +47,7 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, star
             options.noise = sums::noise_of(&sums)?;
             let scales = layout.params.iter().map(|param| param.scale());
             let values = layout.params.iter().map(|param| corrections.value(*param));
-            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::start);
+            let [scales, values] = [scales.collect::<Vec<f64>>(), values.collect()].map(DVector::from);
             let solution = Solution::new(scales, &values, &subset, &sums);
             corrections.apply_step(&layout, &solution.step);
             log::debug!(
