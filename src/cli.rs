@@ -40,7 +40,7 @@ pub(crate) enum Command {
     /// Draw pictures from a saved model
     Render(render::Args),
     /// Score a saved model on test images
-    Evaluation(eval::Args),
+    Eval(eval::Args),
     /// Compare two pictures
     Metrics(metrics::Args),
     /// Write a model or a recording in the formats of other programs

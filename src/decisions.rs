@@ -513,7 +513,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":1", "\"version\":9", "version 9, this program reads 1"),
+            ("\"version\":2", "\"version\":9", "version 9, this program reads 2"),
             ("\"version\"", "\"varsion\"", "line 1 tells no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),

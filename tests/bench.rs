@@ -108,7 +108,7 @@ fn curve_bench_draws_peers_and_resumes() {
     let first = runs.map(|run| run.expect("a run").path()).min().expect("a run");
     std::fs::remove_file(first).expect("removed");
     let again = events(folder, &[&args[..], &["--json"]].concat());
-    assert_eq!([&again[0]["kept"], &again[1]["kept"]], [&json!(false), &json!(true)]);
+    assert_eq!([&again[0]["cached"], &again[1]["cached"]], [&json!(false), &json!(true)]);
     assert_eq!(again[1]["end"], printed[1]["end"]);
     let changed = ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "400", "--out", "c"];
     assert_fails_with(folder, &changed, 2, &["max_splats", "--out c"]);
@@ -142,7 +142,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
     assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
     // More methods join in the same folder, and what is done is not repeated.
     let printed = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
-    let cached: Vec<bool> = printed.iter().filter_map(|event| event["kept"].as_bool()).collect();
+    let cached: Vec<bool> = printed.iter().filter_map(|event| event["cached"].as_bool()).collect();
     assert_eq!(cached, [true, false, false, true, false]);
     let findings = &printed.last().expect("events")["findings"];
     let lines = findings["lines"].as_array().expect("lines");

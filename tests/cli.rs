@@ -148,11 +148,11 @@ fn invalid_arguments_exit_with_2() {
     // Before data are read: there are none here.
     let refine = |words| ["train", "absent", "--method", "tsdf", "--refine", words];
     assert_fails_with(
-        &refine("mount,image-gains"),
+        &refine("extrinsics,image-gains"),
         2,
-        &["image-gains", "tsdf does not", "mount, delay, joints, depth-pose"],
+        &["image-gains", "tsdf does not", "extrinsics, time-offset, joints, depth-pose"],
     );
-    assert_fails_with(&refine("mount,auto"), 2, &["stand alone"]);
+    assert_fails_with(&refine("extrinsics,auto"), 2, &["stand alone"]);
     for (flag, value) in [("--splats", "0"), ("--splats", "100000000000"), ("--repeats", "0"), ("--size", "0x9")] {
         assert_fails_with(&["bench", "kernels", flag, value], 2, &[flag]);
     }
@@ -172,7 +172,7 @@ fn invalid_arguments_exit_with_2() {
     assert!(!out.exists(), "what is refused leaves nothing behind");
     let out = folder.path().join("refused");
     let to = ["--listen", "127.0.0.1:0", "--out", out.to_str().expect("a plain name")];
-    for (flag, value) in [("--max-splats", "9"), ("--refine", "mount"), ("--count", "to-cap")] {
+    for (flag, value) in [("--max-splats", "9"), ("--refine", "extrinsics"), ("--count", "to-cap")] {
         for method in ["nerf", "tsdf"] {
             let run = ["run", &rig, "--sim", "--method", method, flag, value];
             assert_fails_with(&[&run[..], &to].concat(), 2, &[flag, "method", method]);
@@ -186,7 +186,7 @@ fn invalid_arguments_exit_with_2() {
     }
     assert_fails_with(&["eval", "model", "absent", "--holdout", "0"], 2, &["--holdout 0"]);
     for meters in ["0", "nan", "-1"] {
-        assert_fails_with(&["metrics", "a.png", "b.png", &format!("--metres-per-count={meters}")], 2, &["above 0"]);
+        assert_fails_with(&["metrics", "a.png", "b.png", &format!("--meters-per-count={meters}")], 2, &["above 0"]);
     }
     assert_fails_with(&["render", "model", "--pose", "1 2 3"], 2, &["16"]);
     assert_fails_with(&["render", "model", "--pose", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"], 2, &["rotation"]);

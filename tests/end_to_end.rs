@@ -416,7 +416,7 @@ fn decision_log_reproduces_a_real_time_run() {
         let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
         serde_json::from_str(stdout.lines().last().expect("events")).expect("a JSON object a line")
     };
-    let run = ["run", "rig.toml", "--sim", "--seconds", "5", "--refine", "mount", "--max-splats", "3000"];
+    let run = ["run", "rig.toml", "--sim", "--seconds", "5", "--refine", "extrinsics", "--max-splats", "3000"];
     let outputs = ["--record", "scan.mcap", "--out", "live", "--listen", "127.0.0.1:0", "--json"];
     let live = done(&[&run[..], &outputs[..]].concat(), &[0, 3]);
 

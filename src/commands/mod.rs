@@ -39,7 +39,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
         Command::Train(args) => train::run(&args),
         Command::View(args) => view::run(&args),
         Command::Render(args) => render::run(&args),
-        Command::Evaluation(args) => eval::run(&args),
+        Command::Eval(args) => eval::run(&args),
         Command::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
         Command::Export(args) => export::run(&args),
         Command::Fk(args) => fk::run(args).map(|()| Exit::Done),
