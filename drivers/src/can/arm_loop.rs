@@ -472,7 +472,7 @@ impl WatchdogPlan {
         }
         if plan.timeout < MIN_CYCLES * plan.period {
             let reason = format!(
-                "arm.motion.timeout_millis must leave room for {MIN_CYCLES} cycles of {:.1} ms",
+                "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
                 1e3 * plan.period.as_secs_f64()
             );
             return Err(Error::Motion { reason });

@@ -29,9 +29,9 @@ pub struct Limits {
 /// Source: libfranka 0.21.2, `joint_velocity_limits.h`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BrakingLimit {
-    /// Deceleration that is counted with, rad/s².
+    /// Assumed deceleration, rad/s².
     pub deceleration_rad_s2: f64,
-    /// Taken off the rate, rad/s.
+    /// Margin subtracted from the velocity, rad/s.
     pub margin_rad_s: f64,
 }
 
