@@ -155,8 +155,8 @@ impl ArmLoop {
                     next_cycle = now + self.plan.period;
                 }
             }
-            let last_heard = self.listen(next_cycle.duration_since(clock::now()).min(POLL));
-            if let Err(error) = last_heard {
+            let result = self.listen(next_cycle.duration_since(clock::now()).min(POLL));
+            if let Err(error) = result {
                 self.abort(&reason_of(&error));
             }
         }
@@ -326,9 +326,9 @@ impl ArmLoop {
                 };
                 match arrived {
                     (stamp, BusEvent::Frame(frame)) => {
-                        if let Some(pending_fail_safe) = prepared.process_frame(bus_ix, stamp, &frame) {
+                        if let Some(reading) = prepared.process_frame(bus_ix, stamp, &frame) {
                             // If the reader is slow, the newest reading is dropped.
-                            let _ = self.readings.try_send(Ok(pending_fail_safe));
+                            let _ = self.readings.try_send(Ok(reading));
                         }
                     }
                     (_, BusEvent::Errors(new_errors)) => {
@@ -358,7 +358,7 @@ impl ArmLoop {
         self.stopped(reason, Some(fail_safe));
     }
 
-    /// If not all motors of the arm are enabled, all of them are released.
+    /// The fail-safe command of all motors: that of `on_loss`, or to release if not all motors were enabled yet.
     fn fail_safe_command(&self) -> OnLoss {
         if matches!(self.arm_state, ArmState::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
     }
@@ -387,8 +387,8 @@ impl ArmLoop {
     /// Maximum time for the arm to come to rest.
     fn max_stop_duration(&self) -> Duration {
         let secs = |joint: &MotionLimits| joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk;
-        let most_silent = self.config.motion.limits.iter().map(secs).fold(0.0, f64::max);
-        Duration::try_from_secs_f64(most_silent).unwrap_or(Duration::ZERO) + STOP_MARGIN
+        let max_secs = self.config.motion.limits.iter().map(secs).fold(0.0, f64::max);
+        Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
     /// Sends the fail-safe command, and resends it until it is no longer pending.
@@ -416,8 +416,8 @@ impl ArmLoop {
     }
 
     /// Resends the fail-safe command once per cycle to motors without a watchdog, which would otherwise execute their
-    /// last command forever if they missed it. Continues until the watchdogs of the other motors have expired and
-    /// these motors have answered, or until a deadline.
+    /// last command forever if they missed it. Continues until each of them has been heard after the timeout, when the
+    /// watchdogs of the other motors have expired, or until [`STARTUP_TIMEOUT`] after that.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped { since, pending_fail_safe, .. } = &mut self.arm_state else { return };
         let (Some(prepared), Some(fail_safe)) = (&self.prepared, *pending_fail_safe) else {
@@ -671,11 +671,7 @@ fn reason_of(error: &Error) -> String {
 /// An unused CANopen node number for this computer.
 fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
     let is_used = |node: canopen::Node| {
-        config
-            .arm
-            .motors
-            .iter()
-            .any(|motor| matches!(motor.family, Family::Cia402 { node: accepted, .. } if accepted == node))
+        config.arm.motors.iter().any(|motor| matches!(motor.family, Family::Cia402 { node: used, .. } if used == node))
     };
     let mut numbers = (1..=127).rev().filter_map(|number| canopen::Node::new(number).ok());
     let unused = numbers.find(|node| !is_used(*node));

@@ -323,12 +323,12 @@ pub(crate) mod tests {
         let config = motors().remove(3);
         let Family::Odrive { node } = config.family else { panic!("the fourth is an ODrive") };
         let motor = Motor::with_limits(config, LIMITS);
-        let expected_readings = |position_rad, velocity_rad_s| {
+        let read = |position_rad, velocity_rad_s| {
             motor.read(&odrive::encode_answer(node, &odrive::Answer::Motion { position_rad, velocity_rad_s }).unwrap())
         };
-        assert!(expected_readings(3.0, 1.0).is_some());
-        assert_eq!(expected_readings(1e30, 1.0), None);
-        assert_eq!(expected_readings(3.0, -1e30), None);
+        assert!(read(3.0, 1.0).is_some());
+        assert_eq!(read(1e30, 1.0), None);
+        assert_eq!(read(3.0, -1e30), None);
     }
 
     #[test]

@@ -40,7 +40,7 @@ pub(super) struct WatchdogPlan {
 }
 
 impl WatchdogPlan {
-    /// Whether a motor detects missing commands itself.
+    /// Whether a motor detects missing commands.
     pub(super) fn has_watchdog(&self, family: &Family) -> bool {
         match family {
             Family::TMotor { .. } => false,

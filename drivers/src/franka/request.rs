@@ -217,14 +217,14 @@ fn status_text<T: std::fmt::Debug>(status: Option<T>) -> String {
 
 /// `CommandNotPossibleRejected` as "command not possible rejected".
 fn split_words(name: &str) -> String {
-    let mut split_words = String::new();
+    let mut words = String::new();
     for letter in name.chars() {
-        if letter.is_uppercase() && !split_words.is_empty() {
-            split_words.push(' ');
+        if letter.is_uppercase() && !words.is_empty() {
+            words.push(' ');
         }
-        split_words.extend(letter.to_lowercase());
+        words.extend(letter.to_lowercase());
     }
-    split_words
+    words
 }
 
 #[cfg(test)]

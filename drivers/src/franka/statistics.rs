@@ -88,7 +88,7 @@ pub struct MotionStatistics {
     /// Commands that were changed to keep the robot's own limits.
     pub n_limited: u64,
     delays: Delays,
-    summary: ReportedSuccess,
+    reported_success: ReportedSuccess,
 }
 
 /// Success rate of commands as reported by the robot.
@@ -111,7 +111,7 @@ impl MotionStatistics {
     /// The robot's own `control_command_success_rate`, 0 to 1: the mean, and the minimum over any 100 consecutive
     /// commands. `None` if no motion was long enough.
     pub fn robot_success_frac(&self) -> Option<[f64; 2]> {
-        let ReportedSuccess { n, sum_frac, min_frac } = self.summary;
+        let ReportedSuccess { n, sum_frac, min_frac } = self.reported_success;
         (n > 0).then(|| [sum_frac / n as f64, min_frac])
     }
 
@@ -128,7 +128,7 @@ impl MotionStatistics {
 
     /// Counts the success rate that the robot reports for its last 100 commands.
     pub(super) fn count_robot_success(&mut self, frac: f64) {
-        let ReportedSuccess { n, sum_frac, min_frac } = &mut self.summary;
+        let ReportedSuccess { n, sum_frac, min_frac } = &mut self.reported_success;
         *min_frac = if *n == 0 { frac } else { min_frac.min(frac) };
         *n += 1;
         *sum_frac += frac;
@@ -209,7 +209,7 @@ mod tests {
         for micros in 0..1000 {
             statistics.count(Duration::from_micros(micros));
         }
-        let within = |summary: Duration, micros: u128| summary.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros();
+        let within = |delay: Duration, micros: u128| delay.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros();
         assert!(within(statistics.delay(0.5), 500), "{statistics}");
         assert!(within(statistics.delay(0.99), 990), "{statistics}");
         statistics.count(Duration::from_secs(7));

@@ -39,9 +39,9 @@ pub struct TrajectoryGenerator {
 
 impl std::fmt::Debug for TrajectoryGenerator {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Generator")
+        f.debug_struct("TrajectoryGenerator")
             .field("limits", &self.limits)
-            .field("is_held", &self.is_at_rest)
+            .field("is_at_rest", &self.is_at_rest)
             .finish_non_exhaustive()
     }
 }
@@ -204,10 +204,10 @@ fn data_array(values: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
 
 fn describe(error: &RuckigError) -> String {
     // The rest of the message repeats the input.
-    let describe = error.to_string();
+    let message = error.to_string();
     format!(
         "found no trajectory to the target: {}",
-        describe.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
+        message.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
     )
 }
 

@@ -111,7 +111,7 @@ pub const RAW_IMAGE: Schema = Schema {
     enums: &[],
 };
 
-/// Lens parameters of a camera.
+/// Intrinsics of a camera.
 pub const CAMERA_CALIBRATION: Schema = Schema {
     name: "foxglove.CameraCalibration",
     fields: &[

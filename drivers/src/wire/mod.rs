@@ -44,7 +44,7 @@ pub enum Malformed {
     /// The pixel format is unknown.
     #[error("the pixel format {name:?} is unknown")]
     PixelFormat {
-        /// The format's name.
+        /// Name of the pixel format.
         name: String,
     },
     /// JSON that does not match its schema.

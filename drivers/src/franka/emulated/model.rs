@@ -16,7 +16,7 @@ const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
     (0.088, 0.0, 0.0, 1.0),
 ];
 
-/// URDF of the joints with the limits that clients read, without links' geometry.
+/// URDF of the joints with the limits that clients read, without link geometry.
 pub(super) fn urdf(limits: &Limits) -> String {
     let mut text = String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
     for (ix, (x, y, z, quarters)) in JOINT_ORIGINS.into_iter().enumerate() {

@@ -20,8 +20,8 @@ const MAX_MISSED: u32 = 20;
 const MAX_UNTIL_FIRST: u32 = 1000;
 /// Number of states over which the success rate is computed.
 const N_SUCCESS_WINDOW: usize = 100;
-/// A robot at rest holds its commanded position. A greater deviation means that it was moved by hand; the command
-/// then follows.
+/// Maximum deviation of a robot at rest from its commanded position. A greater one means that it was moved by hand; the
+/// commanded position then follows.
 const MAX_SAG_RAD: f64 = 0.01;
 /// External torques that end a motion, until a client sets other thresholds, Nm.
 const DEFAULT_CONTACT_NM: f64 = 20.0;

@@ -142,7 +142,7 @@ pub enum Register {
     VelocityLimit = 22,
     /// `TMAX`: maximum absolute torque of its raw values, N m.
     TorqueLimit = 23,
-    /// Code of the bit rate.
+    /// Bit rate, as a numeric code.
     BitRate = 35,
 }
 
@@ -191,9 +191,9 @@ pub enum Access {
     Write(Register, Value),
     /// The answer to [`Access::Read`].
     Reported(Register, Value),
-    /// Keeps all registers over a loss of power; only while disabled.
+    /// Stores all registers permanently; only possible while disabled.
     Store,
-    /// Asks for feedback without a command.
+    /// Requests feedback without a command.
     Refresh,
 }
 
@@ -286,7 +286,7 @@ pub fn encode_feedback(answer_id: Id, feedback: &Feedback, limits: &Limits) -> R
 
 fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
     match (register.is_integer(), value) {
-        (true, Value::Integer(complete)) => Ok(complete.to_le_bytes()),
+        (true, Value::Integer(integer)) => Ok(integer.to_le_bytes()),
         (false, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
         _ => Err(CanError::Undefined { field: "the kind of value of the register", raw: register as u32 }),
     }

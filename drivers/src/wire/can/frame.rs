@@ -231,10 +231,10 @@ mod tests {
         // Computed by hand from can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h.
         let cases = [(0, false, 62, 67), (8, false, 126, 147), (16, false, 190, 227), (20, false, 227, 272)];
         let extended = [(64, false, 579, 712), (0, true, 81, 91), (16, true, 209, 251), (64, true, 598, 736)];
-        for (n_bytes, is_extended, non_finite, worst) in cases.into_iter().chain(extended) {
+        for (n_bytes, is_extended, unstuffed, worst) in cases.into_iter().chain(extended) {
             let id = if is_extended { Id::extended(5) } else { Id::standard(5) }.expect("small");
             let frame = |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
-            for (stuffing, expected) in [(Stuffing::None, non_finite), (Stuffing::Worst, worst)] {
+            for (stuffing, expected) in [(Stuffing::None, unstuffed), (Stuffing::Worst, worst)] {
                 let Bits { nominal, data } = frame(true).bits(stuffing);
                 assert_eq!(nominal + data, expected, "{n_bytes} {is_extended} {stuffing:?}");
                 assert_eq!(frame(false).bits(stuffing), Bits { nominal: expected, data: 0 });

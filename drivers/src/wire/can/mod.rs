@@ -166,9 +166,9 @@ mod testing {
     /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these must be rejected.
     pub(super) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
-        let identifier = frame.data().len();
-        let cut = (0..identifier).map(|len| Frame::classic(frame.id(), &bytes[..len]));
-        let doubled = (identifier == 8).then(|| Frame::fd(frame.id(), &bytes, false));
+        let n_bytes = frame.data().len();
+        let cut = (0..n_bytes).map(|len| Frame::classic(frame.id(), &bytes[..len]));
+        let doubled = (n_bytes == 8).then(|| Frame::fd(frame.id(), &bytes, false));
         cut.chain(doubled).map(|built| built.expect("the length is valid for the format")).collect()
     }
 }

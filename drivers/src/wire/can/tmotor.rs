@@ -213,8 +213,8 @@ mod tests {
         }
         let undefined = CanError::Undefined { field: "the error code", raw: 7 };
         assert_eq!(read(&frame(&[1, 0, 0, 0, 0, 0, 0, 7])), Err(undefined));
-        let identifier = Frame::remote(complete.id(), 8).expect("classic");
-        assert!(matches!(read(&identifier), Err(CanError::UnexpectedFrame { .. })));
+        let remote = Frame::remote(complete.id(), 8).expect("classic");
+        assert!(matches!(read(&remote), Err(CanError::UnexpectedFrame { .. })));
         let too_hot = Feedback {
             health: Some(Health { drive_celsius: 216.0, fault: Fault::None }),
             ..read(&complete).expect("whole")
