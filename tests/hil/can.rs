@@ -298,7 +298,7 @@ fn missing_interfaces_and_motors_are_errors() {
     );
     ip("link set vcan3 down");
     let printed = open(wire.config(false), vec![damiao(1)]);
-    assert!(printed.ends_with("it is down; mend it with: sudo ip link set vcan3 up"), "{printed}");
+    assert!(printed.ends_with("it is down; fix it with: sudo ip link set vcan3 up"), "{printed}");
 }
 
 #[test]
@@ -319,7 +319,7 @@ fn silent_motor_and_bus_down_are_errors() {
             other => break other.expect_err("the second motor is silent"),
         }
     };
-    assert!(error.to_string().contains("\"damiao2\" on \"vcan4\": it has said nothing for 1s"), "{error}");
+    assert!(error.to_string().contains("\"damiao2\" on \"vcan4\": no frame from the motor for 1s"), "{error}");
 
     let mut arm = CanArm::open(&ArmConfig { motors: vec![damiao(1)], ..config }).expect("the first answers");
     arm.read(Duration::from_secs(1)).expect("it reports");
@@ -353,7 +353,7 @@ fn binary_records_camera_and_can_arm() {
     let (_, printed) = fieldrig(&["doctor", "/rigs/vivid-can.toml"]);
     assert!(printed.contains("vcan5: it is down") && printed.contains("sudo ip link set vcan5 up"), "{printed}");
     let (is_done, printed) = fieldrig(&["record", "/rigs/vivid-can.toml", "--out", "/tmp/down.mcap", "--seconds", "1"]);
-    assert!(!is_done && printed.contains("it is down; mend it with: sudo ip link set vcan5 up"), "{printed}");
+    assert!(!is_done && printed.contains("it is down; fix it with: sudo ip link set vcan5 up"), "{printed}");
     ip("link set vcan5 up");
     let (_, printed) = fieldrig(&["devices"]);
     assert!(printed.contains("vcan5") && printed.contains("[arm.bus.vcan5]"), "{printed}");

@@ -378,12 +378,12 @@ fn unsafe_configurations_are_not_enabled() {
     assert_rejected(&with(&|config| config.motion.on_loss = OnLoss::Hold), "can only \"release\"");
     assert_rejected(&with(&|config| config.motion.on_loss = OnLoss::Damp), "can only \"release\"");
     assert_rejected(&with(&|config| config.motion.accept_no_watchdog = false), "accept_no_watchdog = true");
-    assert_rejected(&with(&|config| config.arm.motors[0].gains = None), "needs its stiffness_nm_rad");
-    assert_rejected(&with(&|config| config.motion.timeout = Duration::from_millis(10)), "room for 4 cycles");
+    assert_rejected(&with(&|config| config.arm.motors[0].gains = None), "set its stiffness_nm_rad");
+    assert_rejected(&with(&|config| config.motion.timeout = Duration::from_millis(10)), "at least 4 cycles");
     let too_stiff = Gains { stiffness_nm_rad: 900.0, ..GAINS };
-    assert_rejected(&with(&|config| config.arm.motors[0].gains = Some(too_stiff)), "counts hold up to 500");
+    assert_rejected(&with(&|config| config.arm.motors[0].gains = Some(too_stiff)), "supports at most 500");
     let older_endpoints = || Some(odrive::Endpoints { firmware: "0.6.8".to_owned(), ..emulated::endpoints() });
-    assert_rejected(&with(&|config| config.odrive_endpoints = older_endpoints()), "of firmware 0.6.8");
+    assert_rejected(&with(&|config| config.odrive_endpoints = older_endpoints()), "for firmware 0.6.8");
     let narrow = MotionLimits { position: [1.0, 2.0], ..LIMITS };
     assert_rejected(&with(&|config| config.motion.limits[0] = narrow), "outside its range");
     assert_rejected(&movable(wire.config(false), &[damiao(7)], OnLoss::Release), "no answer");
@@ -457,7 +457,7 @@ fn faults_stop_the_arm_until_recovery() {
             }
             let assert_rejected =
                 arm.command(&JointTarget { position: vec![0.0; n] }).expect_err("it was not recovered");
-            assert!(assert_rejected.to_string().contains("not recovered"), "{assert_rejected}");
+            assert!(assert_rejected.to_string().contains("not been recovered"), "{assert_rejected}");
             let n_commands: usize = before.iter().map(|observed| observed.commanded_rad.len()).sum();
             assert_eq!(
                 motors.observed().iter().map(|observed| observed.commanded_rad.len()).sum::<usize>(),
@@ -605,7 +605,7 @@ fn killed_or_suspended_program_triggers_watchdogs() {
         };
         let line = next("child: stopped");
         println!("can: SIGCONT: {line}");
-        assert!(line.contains("stood still"), "{line}");
+        assert!(line.contains("stalled for"), "{line}");
         std::thread::sleep(Duration::from_millis(500));
         for (before, after) in before.iter().zip(motors.observed().iter()) {
             assert_eq!(after.state, if name == "hold" { State::Holding } else { State::Free }, "{after:?}");

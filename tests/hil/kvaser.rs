@@ -154,14 +154,14 @@ fn errors_until(bus: &Bus, condition: impl Fn(&WireErrors) -> bool) -> WireError
 #[ignore = "needs the machine with CAN cards"]
 fn misconfigured_card_reports_fix_command() {
     let wrong_setups = [
-        ("", "no bit rate is set, 1000000 is wanted"),
+        ("", "no bit rate is set; the rig file requires 1000000"),
         (
             "sudo ip link set can0 up type can bitrate 500000 restart-ms 100",
-            "its bit rate is 500000, the rig file says 1000000",
+            "its bit rate is 500000, but the rig file requires 1000000",
         ),
         (
             "sudo ip link set can0 up type can bitrate 1000000",
-            "it does not come back by itself once it went off the bus",
+            "it does not restart after it goes off the bus",
         ),
         ("sudo ip link set can0 type can bitrate 1000000 restart-ms 100", "it is down"),
     ];
@@ -263,7 +263,7 @@ fn persistent_bus_off_is_reported_as_cause() {
         }
     };
     println!("kvaser: {error}");
-    assert!(error.contains("it has said nothing for 1s") && error.contains("1 time off the bus, 0 back"), "{error}");
+    assert!(error.contains("no frame from the motor for 1s") && error.contains("1 time off the bus, 0 restarts"), "{error}");
 }
 
 #[test]
@@ -290,7 +290,7 @@ fn bus_off_stops_moving_arm_until_recovery() {
         std::thread::sleep(Duration::from_millis(500));
         assert_eq!(motors.states(), [emulated::State::Free; 2], "the bus is back");
         let open_error = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("it was not recovered");
-        assert!(open_error.to_string().contains("not recovered"), "{open_error}");
+        assert!(open_error.to_string().contains("not been recovered"), "{open_error}");
         arm.recover().expect("the motors answer again");
         assert!(!matches!(arm.motion(), Motion::Stopped { .. }), "{:?}", arm.motion());
         motors.wait_until("all obey", |observed| {
@@ -359,11 +359,11 @@ fn unacknowledged_frames_are_distinguished_from_silence() {
     let card = Card::up("can0");
     let config = ArmConfig { buses: vec![card.config()], motors: vec![damiao(1)], rate_hz: 100.0 };
     let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
-    assert!(printed.contains("no answer to 4 questions"), "{printed}");
+    assert!(printed.contains("no answer to 4 requests"), "{printed}");
     // The chip tells it with the first question; that driver has no word for frames that nobody acknowledges.
     card.inject(HAS_ERRORS, PASSIVE_CHANGED);
     let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
-    assert!(printed.contains("nobody acknowledges frames"), "{printed}");
+    assert!(printed.contains("no node acknowledges frames"), "{printed}");
 }
 
 #[test]

@@ -1,4 +1,5 @@
-//! An arm whose joints are motors on CAN buses: a thread a bus asks and listens, the caller gets states of all joints.
+//! An arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller gets states of all
+//! joints.
 
 use super::bus::{Bus, BusEvent, WireErrors};
 use super::bus_load::max_cycle_rate_hz;
@@ -14,16 +15,16 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How soon a bus's thread notices that it is to stop, where no cycle is due before.
+/// Interval at which a bus thread checks whether it should stop, if no cycle is due earlier.
 const POLL: Duration = Duration::from_millis(50);
-/// Readings that may wait for a slow caller: a second of seven motors at 1 kHz.
+/// Capacity of the queue of readings for a slow caller: one second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
-/// A turn of a bus's thread that took longer was held up from outside.
+/// A longer loop iteration of a bus thread means that the thread was not scheduled.
 const MAX_LOOP_DELAY: Duration = Duration::from_millis(200);
-/// A motor that says nothing for so long while the others do is told.
+/// A motor that sends nothing for this long while the others do is an error.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
-/// An arm that is read; nothing here moves it. Dropping it stops asking; motors keep doing what they did.
+/// A read-only arm. Nothing here moves it. Dropping it stops the polling and does not change what the motors do.
 #[derive(Debug)]
 pub struct CanArm {
     names: Vec<String>,
@@ -34,7 +35,10 @@ pub struct CanArm {
 }
 
 impl CanArm {
-    /// Checks how the buses are set up, finds all motors and starts to read; the first that does not answer is an error.
+    /// Checks the configuration of the buses, finds all motors and starts reading.
+    ///
+    /// # Errors
+    /// If a bus is not set up as configured or a motor does not answer.
     pub fn open(config: &ArmConfig) -> Result<Self, Error> {
         let (sender, readings) = sync_channel(MAX_WAITING);
         let stop = Arc::new(AtomicBool::new(false));
@@ -64,8 +68,8 @@ impl Arm for CanArm {
         &self.names
     }
 
-    /// A state of all joints is told as soon as each has told something new; it is stamped with the newest of these readings, and
-    /// the others are carried on to there with their own velocity.
+    /// Returns a state of all joints as soon as every motor has sent a new reading. The state has the stamp of the
+    /// newest of these readings; the others are extrapolated to it with their own velocity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         loop {
@@ -89,13 +93,13 @@ impl Drop for CanArm {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // A thread that panicked has said so.
+            // A thread that panicked has already printed the panic message.
             let _ = thread.join();
         }
     }
 }
 
-/// What is sent again and again on a bus.
+/// The frames sent periodically on a bus.
 #[derive(Debug)]
 struct Cycle {
     poll_frames: Vec<Frame>,
@@ -103,7 +107,7 @@ struct Cycle {
 }
 
 impl Cycle {
-    /// Asks as often as wanted, or as often as keeps the bus's load in bounds.
+    /// Polls at the requested rate, or at the highest rate that keeps the bus load within bounds.
     fn new(bus: &BusConfig, motors: &[(usize, Motor)], rate_hz: f64) -> Self {
         let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.poll_frame()).collect();
         if motors.iter().any(|(_, motor)| motor.needs_sync()) {
@@ -118,7 +122,7 @@ impl Cycle {
             }
         }
         let poll_rate_hz = match poll_frames.is_empty() {
-            // Nobody is asked; what comes, comes as often as the motors have it.
+            // There are no polls; the motors choose their own rates.
             true => rate_hz,
             false => max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz),
         };
@@ -126,7 +130,7 @@ impl Cycle {
     }
 }
 
-/// A bus with its motors, on its thread.
+/// A bus with its motors, moved to the thread of the bus.
 struct BusReader {
     bus: Bus,
     motors: Vec<(usize, Motor)>,
@@ -138,7 +142,7 @@ struct BusReader {
 impl BusReader {
     fn run(self) {
         if let Err(error) = self.read() {
-            // Nobody may listen any more, or be so far behind that the arm is as good as silent.
+            // The receiver may be gone, or so far behind that the arm counts as silent anyway.
             let _ = self.sender.try_send(Err(error));
         }
     }
@@ -154,14 +158,14 @@ impl BusReader {
             let now = clock::now();
             let stall = now.duration_since(std::mem::replace(&mut previous, now));
             if stall > MAX_LOOP_DELAY {
-                // While this computer did something else, nobody listened: no motor is silent for that.
+                // Nobody listened while this computer was stalled, so that time does not count as silence of a motor.
                 last_heard.iter_mut().for_each(|last_heard| *last_heard = last_heard.plus_secs(stall.as_secs_f64()));
             }
             if !self.cycle.poll_frames.is_empty() && now >= next_cycle {
                 for poll_frame in &self.cycle.poll_frames {
                     n_unsent += u64::from(!self.bus.send(poll_frame)?);
                 }
-                // Cycles that were missed are not made up for.
+                // Missed cycles are not made up for.
                 next_cycle = (next_cycle + self.cycle.period).max(now);
                 self.check_silence(&last_heard, now, &errors)?;
             }
@@ -171,7 +175,7 @@ impl BusReader {
                 Some((stamp, BusEvent::Frame(frame))) => {
                     for (ix, (joint_ix, motor)) in self.motors.iter().enumerate() {
                         let Some(reading) = motor.read(&frame) else { continue };
-                        // Not its stamp: whoever reads late does not make a motor silent.
+                        // Uses the time of reading, not the stamp: a late reader does not make a motor silent.
                         last_heard[ix] = now;
                         let reading_of_joint = JointReading { joint_ix: *joint_ix, stamp, reading };
                         match self.sender.try_send(Ok(reading_of_joint)) {
@@ -190,21 +194,21 @@ impl BusReader {
         let interface = &self.bus.config().interface;
         let load = 100.0 * self.bus.busy().as_secs_f64() / seconds.max(1e-9);
         log::info!(
-            "{interface}: {load:.1} % of the bus was in use, stuff bits left out; {n_unsent} questions found no room, {n_dropped} readings were dropped; \
+            "{interface}: bus load {load:.1} % without stuff bits; {n_unsent} polls not sent (queue full), {n_dropped} readings dropped; \
              errors on the wire: {errors}"
         );
         Ok(())
     }
 
-    /// The first motor that has said nothing for too long is an error: the joints' states stop with it. What was wrong on the wire is
-    /// told with it, for a bus that is lost silences motors, too.
+    /// Returns an error for the first motor that has been silent for too long; this ends the joint states. The error
+    /// includes the errors on the wire, because a failed bus silences its motors, too.
     fn check_silence(&self, last_heard: &[Stamp], now: Stamp, errors: &WireErrors) -> Result<(), Error> {
         let silent = |last_heard: &Stamp| now.duration_since(*last_heard) > MAX_SILENCE;
         let Some(((_, motor), _)) = self.motors.iter().zip(last_heard).find(|(_, last_heard)| silent(last_heard))
         else {
             return Ok(());
         };
-        let mut reason = format!("it has said nothing for {MAX_SILENCE:?}");
+        let mut reason = format!("no frame from the motor for {MAX_SILENCE:?}");
         if errors.n_frames > 0 {
             reason += &format!("; errors on the wire so far: {errors}");
         }
@@ -212,7 +216,8 @@ impl BusReader {
         Err(Error::Motor { joint: motor.config().joint.clone(), interface, reason })
     }
 
-    /// Logs errors on the wire: every time that the bus was lost, and others each time that they have doubled.
+    /// Logs errors on the wire: each time the controller goes off the bus or restarts, and otherwise each time the
+    /// count has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
         let previous = total.n_frames.checked_ilog2();
         total.add(new_errors);
@@ -251,7 +256,7 @@ mod tests {
                 (usize::from(ix), Motor::with_limits(config, crate::wire::can::mit::Limits::of(12.5, 30.0, 10.0)))
             })
             .collect();
-        // Seven motors, two frames of 135 bits at worst each: 1.89 ms a cycle.
+        // Seven motors with two frames each, at most 135 bits per frame: 1.89 ms per cycle.
         let cycle = Cycle::new(&bus, &motors, 500.0);
         let rate_hz = 1.0 / cycle.period.as_secs_f64();
         assert!((rate_hz - 0.7 / (14.0 * 135e-6)).abs() < 0.1, "{rate_hz}");

@@ -1,9 +1,9 @@
-//! The thread that moves an arm: it makes the motors ready, switches them on, sends setpoints, and stops for good where anything is
-//! not as it must be.
+//! The thread that moves an arm. It prepares the motors, enables them, sends setpoints, and stops permanently on any
+//! fault.
 //!
-//! What stops it: a motor that is silent or tells that it stopped, a bus that is lost, and this computer itself, when it stood still for
-//! so long that the motors have stopped by themselves or are about to. No setpoint of before is sent then, and none before somebody
-//! asks for [`Request::Recover`].
+//! It stops if a motor is silent or reports that it stopped, if a bus fails, or if this computer stalls for so long
+//! that the watchdogs of the motors have expired or are about to. After that it sends none of the earlier setpoints,
+//! and no new ones until it receives [`Request::Recover`].
 
 use super::bus::{Bus, BusEvent, WireErrors};
 use super::bus_load::max_cycle_rate_hz;
@@ -23,59 +23,61 @@ use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-/// Share of the motors' timeout after which we stop by ourselves: before they do, so that none is commanded that others have left.
+/// Fraction of the motors' timeout after which we stop. We stop before the motors do, so that no motor is commanded
+/// while others have already stopped.
 const SILENCE_FRAC: f64 = 0.8;
-/// The timeout must leave room for so many cycles.
+/// Minimum length of the timeout in cycles.
 const MIN_CYCLES: u32 = 4;
-/// A motor is silent only after so many cycles: where we were late ourselves, its answer is still to come.
+/// A motor counts as silent only after this many cycles: if we were late ourselves, its answer is still to come.
 const MIN_MISSED_CYCLES: u64 = 3;
-/// How long motors may take to say where they are, and that they are switched on.
+/// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
-/// A queue of ten frames, as interfaces have it, is half empty after so long.
+/// Time in which an interface's queue of ten frames, the usual length, is half emptied.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
-/// Last words may wait so long for room in the queue; one that stays full has nobody who listens.
+/// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full, nobody is
+/// receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
-/// How soon a thread with nothing to do looks whether it is asked for something.
+/// Interval at which an idle thread checks for requests.
 const POLL: Duration = Duration::from_millis(20);
-/// Beyond the time that its limits need, an arm that ends may take so long to come to rest.
+/// Extra time, beyond what its limits require, in which an arm must come to rest on shutdown.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
 
-/// What the arm's owner wants.
+/// A request from the owner of the arm.
 #[derive(Debug)]
 pub(super) enum Request {
-    /// To go somewhere; the answer is where it goes.
+    /// Move to a target. The reply is the target that was accepted.
     SetTarget(JointTarget, Reply<JointTarget>),
-    /// To come to rest.
+    /// Come to rest.
     Stop(Reply<()>),
-    /// To be made ready and switched on; the answer comes when it is.
+    /// Prepare and enable the motors. The reply comes when they are enabled.
     Recover(Reply<()>),
 }
 
-/// What is being done.
+/// State of the arm.
 #[derive(Debug)]
 enum ArmState {
-    /// Nothing is commanded since; what the motors were told to do is told again as long as some may not have heard it.
+    /// No setpoints are sent. The fail-safe command is resent as long as some motors may not have received it.
     Stopped { since: Stamp, reason: String, pending_fail_safe: Option<OnLoss> },
-    /// All motors are ready and off, and are asked where they are.
+    /// All motors are prepared and disabled, and are polled for their positions.
     Measuring { since: Stamp, reply: Reply<()> },
-    /// They are commanded to stay there, and switched on.
+    /// The motors are commanded to hold their positions, and are being enabled.
     Enabling { since: Stamp, is_ordered: bool, generator: Box<TrajectoryGenerator>, reply: Reply<()> },
-    /// They follow.
+    /// The motors follow the trajectory.
     Moving { generator: Box<TrajectoryGenerator> },
 }
 
-/// Buses and motors that were made ready.
+/// Buses and motors that have been prepared.
 #[derive(Debug)]
 struct PreparedMotors {
     buses: Vec<Bus>,
-    /// A motor a joint.
+    /// One motor per joint.
     movable_motors: Vec<MovableMotor>,
-    /// When each was heard last, and in which cycle.
+    /// When each motor was last heard, and in which cycle.
     last_heard: Vec<(Stamp, u64)>,
     latest: Vec<Option<Reading>>,
-    /// Where each was sent last.
+    /// Last commanded position of each joint.
     sent_rad: Vec<f64>,
     cycle_ix: u64,
     errors: WireErrors,
@@ -92,15 +94,18 @@ pub(super) struct ArmLoop {
     is_shutting_down: Arc<AtomicBool>,
     prepared: Option<PreparedMotors>,
     arm_state: ArmState,
-    /// When the last cycle began, on a clock that counts while the computer sleeps.
+    /// Start of the last cycle, on a clock that keeps counting while the computer is suspended.
     last_cycle: Stamp,
-    /// Cycles that began so late that they were put off.
+    /// Number of cycles that started late.
     n_late: u64,
     max_stall: Duration,
 }
 
 impl ArmLoop {
-    /// Fails where the arm cannot be moved as planned; nothing is sent.
+    /// Creates the loop without sending anything.
+    ///
+    /// # Errors
+    /// If the arm cannot be moved as planned.
     pub(super) fn new(
         config: &MovableArmConfig,
         requests: Receiver<Request>,
@@ -125,7 +130,7 @@ impl ArmLoop {
         })
     }
 
-    /// Works until the arm's owner drops it.
+    /// Runs until the owner drops the arm.
     pub(super) fn run(mut self) {
         let mut next_cycle = clock::now();
         let mut shutdown_deadline = None;
@@ -144,14 +149,14 @@ impl ArmLoop {
                 if let Err(error) = self.cycle(now) {
                     self.abort(&reason_of(&error));
                 }
-                // Cycles that were missed are not made up for, and no two come at once.
+                // Missed cycles are not made up for, and no two cycles run back to back.
                 next_cycle += self.plan.period;
                 if next_cycle < now {
                     next_cycle = now + self.plan.period;
                 }
             }
-            let last_heard = self.listen(next_cycle.duration_since(clock::now()).min(POLL));
-            if let Err(error) = last_heard {
+            let result = self.listen(next_cycle.duration_since(clock::now()).min(POLL));
+            if let Err(error) = result {
                 self.abort(&reason_of(&error));
             }
         }
@@ -159,12 +164,12 @@ impl ArmLoop {
     }
 
     fn handle_request(&mut self, request: Request) {
-        // Whoever asked may have gone.
+        // The requester may have gone away.
         match (request, &mut self.arm_state) {
             (Request::SetTarget(target, answer), ArmState::Moving { generator }) => {
                 let accepted = generator.set_target(&target).map_err(|reason| Error::Motion { reason });
                 if accepted.is_ok() {
-                    // Whoever hears that a target is taken may wait for its end at once.
+                    // A requester may start waiting for the end of the motion as soon as its target is accepted.
                     *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Moving;
                 }
                 let _ = answer.try_send(accepted);
@@ -174,7 +179,7 @@ impl ArmLoop {
                 let _ = answer.try_send(Ok(()));
             }
             (Request::SetTarget(_, answer), arm_state) => drop(answer.try_send(Err(arm_state.refusal()))),
-            // What does not move is at rest.
+            // An arm that is not moving is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
             (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
                 Ok(prepared) => {
@@ -188,12 +193,12 @@ impl ArmLoop {
                     let _ = answer.try_send(Err(error));
                 }
             },
-            // It is switched on, or is being so.
+            // The arm is enabled, or is being enabled.
             (Request::Recover(answer), _) => drop(answer.try_send(Ok(()))),
         }
     }
 
-    /// Opens all buses anew and makes every motor ready; none is switched on.
+    /// Reopens all buses and prepares every motor; enables none.
     fn prepare(&self) -> Result<PreparedMotors, Error> {
         let arm = &self.config.arm;
         let buses = arm.buses.iter().map(Bus::open).collect::<Result<Vec<_>, _>>()?;
@@ -212,7 +217,7 @@ impl ArmLoop {
         })
     }
 
-    /// One cycle of whatever is being done.
+    /// Runs one cycle in the current state.
     fn cycle(&mut self, now: Stamp) -> Result<(), Error> {
         let now_including_suspend = clock::now_including_suspend();
         let stall = now_including_suspend.duration_since(self.last_cycle);
@@ -225,12 +230,12 @@ impl ArmLoop {
         }
         let max_silence_allowed = self.plan.timeout.mul_f64(SILENCE_FRAC);
         let is_overdue = stall > max_silence_allowed;
-        let stall_error = || motion(format!("this computer stood still for {:.0} ms", 1e3 * stall.as_secs_f64()));
+        let stall_error = || motion(format!("this computer stalled for {:.0} ms", 1e3 * stall.as_secs_f64()));
         match &mut self.arm_state {
             ArmState::Stopped { since, .. } => {
-                // Questions, too, may keep a watchdog quiet: they wait until it has done its work.
+                // Polls may also reset a watchdog, so they wait until it has expired.
                 if now.duration_since(*since) > 2 * self.plan.timeout {
-                    // A lost bus has been told.
+                    // A bus failure has already been reported.
                     let _ = prepared.poll_stopped();
                 }
                 self.resend_fail_safe(now);
@@ -286,19 +291,19 @@ impl ArmLoop {
                 return Ok(());
             }
         }
-        // All obey.
+        // All motors are enabled.
         if let ArmState::Enabling { generator, reply, .. } =
             std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
         {
             self.arm_state = ArmState::Moving { generator };
             *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Holding;
-            log::info!("the arm is switched on and held");
+            log::info!("the arm is enabled and holds its position");
             let _ = reply.try_send(Ok(()));
         }
         Ok(())
     }
 
-    /// Takes what comes until the time is over.
+    /// Processes incoming frames until the timeout expires.
     fn listen(&mut self, timeout: Duration) -> Result<(), Error> {
         let Some(prepared) = &mut self.prepared else {
             std::thread::sleep(timeout);
@@ -312,7 +317,8 @@ impl ArmLoop {
                     Ok(Some(arrived)) => arrived,
                     Ok(None) => break,
                     Err(_) if is_stopped => {
-                        // It has been told; one that stays lost must not keep this thread busy.
+                        // The failure has already been reported. A bus that stays down must not keep this thread
+                        // busy.
                         std::thread::sleep(timeout);
                         break;
                     }
@@ -320,9 +326,9 @@ impl ArmLoop {
                 };
                 match arrived {
                     (stamp, BusEvent::Frame(frame)) => {
-                        if let Some(pending_fail_safe) = prepared.process_frame(bus_ix, stamp, &frame) {
-                            // A slow reader loses the newest.
-                            let _ = self.readings.try_send(Ok(pending_fail_safe));
+                        if let Some(reading) = prepared.process_frame(bus_ix, stamp, &frame) {
+                            // If the reader is slow, the newest reading is dropped.
+                            let _ = self.readings.try_send(Ok(reading));
                         }
                     }
                     (_, BusEvent::Errors(new_errors)) => {
@@ -339,7 +345,8 @@ impl ArmLoop {
         Ok(())
     }
 
-    /// Stops commanding: each motor is told what it would do by itself soon, and what is wrong is told.
+    /// Stops commanding: sends each motor the fail-safe command, which does what its watchdog would soon do, and
+    /// reports the reason.
     fn abort(&mut self, reason: &str) {
         if let ArmState::Stopped { .. } = self.arm_state {
             return;
@@ -351,7 +358,7 @@ impl ArmLoop {
         self.stopped(reason, Some(fail_safe));
     }
 
-    /// An arm that was not switched on as a whole is switched off as a whole.
+    /// The fail-safe command of all motors: that of `on_loss`, or to release if not all motors were enabled yet.
     fn fail_safe_command(&self) -> OnLoss {
         if matches!(self.arm_state, ArmState::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
     }
@@ -366,7 +373,7 @@ impl ArmLoop {
         }
     }
 
-    /// Whether nothing moves any more; one that moves is brought to rest.
+    /// Returns whether the arm is at rest, and brings it to rest if it moves.
     fn is_at_rest(&mut self) -> bool {
         match &mut self.arm_state {
             ArmState::Moving { generator } => {
@@ -377,14 +384,14 @@ impl ArmLoop {
         }
     }
 
-    /// As long as coming to rest may take.
+    /// Maximum time for the arm to come to rest.
     fn max_stop_duration(&self) -> Duration {
         let secs = |joint: &MotionLimits| joint.velocity / joint.acceleration + 2.0 * joint.acceleration / joint.jerk;
-        let most_silent = self.config.motion.limits.iter().map(secs).fold(0.0, f64::max);
-        Duration::try_from_secs_f64(most_silent).unwrap_or(Duration::ZERO) + STOP_MARGIN
+        let max_secs = self.config.motion.limits.iter().map(secs).fold(0.0, f64::max);
+        Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
-    /// The last words.
+    /// Sends the fail-safe command, and resends it until it is no longer pending.
     fn end(mut self) {
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared
@@ -392,7 +399,7 @@ impl ArmLoop {
         {
             prepared.shutdown(fail_safe, |_| true);
             log::info!(
-                "the arm is left with on_loss = {:?}; {} cycles, {} of them late, {:.1} ms at most",
+                "the arm was shut down with on_loss = {:?}; {} cycles, {} of them late, longest stall {:.1} ms",
                 fail_safe.name(),
                 prepared.cycle_ix,
                 self.n_late,
@@ -402,14 +409,15 @@ impl ArmLoop {
         }
         while let ArmState::Stopped { pending_fail_safe: Some(_), .. } = self.arm_state {
             std::thread::sleep(self.plan.period);
-            // A bus that is lost has been told.
+            // A bus failure has already been reported.
             let _ = self.listen(Duration::ZERO);
             self.resend_fail_safe(clock::now());
         }
     }
 
-    /// Motors without a watchdog would go on for ever where they did not hear the last words: they are told again, once a cycle, for as
-    /// long as the others take to notice that nothing comes any more, and until they say something.
+    /// Resends the fail-safe command once per cycle to motors without a watchdog, which would otherwise execute their
+    /// last command forever if they missed it. Continues until each of them has been heard after the timeout, when the
+    /// watchdogs of the other motors have expired, or until [`STARTUP_TIMEOUT`] after that.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped { since, pending_fail_safe, .. } = &mut self.arm_state else { return };
         let (Some(prepared), Some(fail_safe)) = (&self.prepared, *pending_fail_safe) else {
@@ -428,7 +436,7 @@ impl ArmLoop {
         }
         for (movable_motor, _) in silent_motors {
             log::error!(
-                "joint {:?}: its motor has no watchdog and says nothing since it was told to {}; it may still obey its last command: \
+                "joint {:?}: its motor has no watchdog and has not answered since the fail-safe command {:?} was sent; it may still execute its last command: \
                  cut its power",
                 movable_motor.config().joint,
                 fail_safe.name()
@@ -439,11 +447,15 @@ impl ArmLoop {
 }
 
 impl WatchdogPlan {
-    /// Checks all that can be checked before anything is sent.
+    /// Checks everything that can be checked before anything is sent.
     pub(super) fn new(config: &MovableArmConfig) -> Result<Self, Error> {
         let (arm, motion_config) = (&config.arm, &config.motion);
         if motion_config.limits.len() != arm.motors.len() {
-            let reason = format!("there are limits for {} joints of {}", motion_config.limits.len(), arm.motors.len());
+            let reason = format!(
+                "limits are given for {} joints, but the arm has {}",
+                motion_config.limits.len(),
+                arm.motors.len()
+            );
             return Err(Error::Motion { reason });
         }
         let host = unused_node(config)?;
@@ -460,7 +472,7 @@ impl WatchdogPlan {
         }
         if plan.timeout < MIN_CYCLES * plan.period {
             let reason = format!(
-                "arm.motion.timeout_millis must leave room for {MIN_CYCLES} cycles of {:.1} ms",
+                "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
                 1e3 * plan.period.as_secs_f64()
             );
             return Err(Error::Motion { reason });
@@ -474,18 +486,18 @@ impl ArmState {
         Self::Stopped { since, reason: String::new(), pending_fail_safe }
     }
 
-    /// Why no target is taken.
+    /// Why a target is refused.
     fn refusal(&self) -> Error {
         motion(match self {
-            Self::Stopped { reason, .. } => format!("it stopped, and was not recovered: {reason}"),
-            Self::Measuring { .. } | Self::Enabling { .. } => "it is being switched on".to_owned(),
-            Self::Moving { .. } => "it moves".to_owned(),
+            Self::Stopped { reason, .. } => format!("the arm stopped and has not been recovered: {reason}"),
+            Self::Measuring { .. } | Self::Enabling { .. } => "the arm is being enabled".to_owned(),
+            Self::Moving { .. } => "the arm is moving".to_owned(),
         })
     }
 }
 
 impl PreparedMotors {
-    /// What a frame tells of a joint.
+    /// Updates the state of the motor that sent a frame, and returns its reading, if any.
     fn process_frame(&mut self, bus_ix: usize, stamp: Stamp, frame: &Frame) -> Option<JointReading> {
         for (joint_ix, movable_motor) in self.movable_motors.iter_mut().enumerate() {
             if movable_motor.config().bus_ix != bus_ix {
@@ -500,7 +512,7 @@ impl PreparedMotors {
         None
     }
 
-    /// Where all joints are, once every motor has told since then.
+    /// Positions of all joints, once every motor has reported since `since`.
     fn positions(&self, since: Stamp) -> Option<Vec<f64>> {
         let of = |(reading, last_heard): (&Option<Reading>, &(Stamp, u64))| {
             reading.filter(|_| last_heard.0 >= since).map(|reading| reading.position_rad)
@@ -521,13 +533,13 @@ impl PreparedMotors {
         Error::Motor { joint: movable_motor.config().joint.clone(), interface, reason: reason.into() }
     }
 
-    /// Asks motors that are off, and stay so, where they are.
+    /// Polls motors that are disabled and stay so for their positions.
     fn poll_disabled(&self) -> Result<(), Error> {
         self.poll(MovableMotor::poll_frame)
     }
 
-    /// Asks motors that do what `on_loss` says where they are, as one who only reads; without a SYNC, at which drives would take what
-    /// they were told last.
+    /// Polls motors that are executing `on_loss` for their positions, as a read-only arm does. Sends no SYNC, because
+    /// drives would then take the last target they received.
     fn poll_stopped(&self) -> Result<(), Error> {
         self.poll(|movable_motor| movable_motor.motor().poll_frame())
     }
@@ -541,13 +553,13 @@ impl PreparedMotors {
         Ok(())
     }
 
-    /// Sends all motors where they are to be in this cycle.
+    /// Sends every motor its setpoint for this cycle.
     fn command(&mut self, generator: &mut TrajectoryGenerator) -> Result<(), Error> {
         let setpoint = generator.step().map_err(motion)?;
         for (ix, movable_motor) in self.movable_motors.iter().enumerate() {
             let command = movable_motor.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(movable_motor, error.to_string()))?;
-            // A frame without room in the queue is let go: the next one is better.
+            // If the queue is full, the frame is dropped: the next one is more recent.
             self.bus_of(movable_motor).send_within(&command, MAX_QUEUED)?;
         }
         self.sent_rad = setpoint.position;
@@ -564,7 +576,7 @@ impl PreparedMotors {
         Ok(())
     }
 
-    /// Says that we live, and gives the beat at which drives take their targets.
+    /// Sends our heartbeat, and the SYNC at which drives take their targets.
     fn send_sync(&self, host: canopen::Node) -> Result<(), Error> {
         for bus in self.buses_with_drives() {
             bus.send_within(&canopen::encode_heartbeat(host, NodeState::Operational), MAX_QUEUED)?;
@@ -586,26 +598,29 @@ impl PreparedMotors {
         self.movable_motors.iter().all(|movable_motor| movable_motor.health() == Some(&Health::Enabled))
     }
 
-    /// That no motor is silent, and all obey.
+    /// Checks that no motor is silent and that all are enabled.
     fn check(&self, now: Stamp, max_silence_allowed: Duration) -> Result<(), Error> {
         for (movable_motor, (stamp, cycle_ix)) in self.movable_motors.iter().zip(&self.last_heard) {
             match movable_motor.health() {
                 Some(Health::Enabled) => {}
                 Some(Health::Fault(reason)) => return Err(self.fault(movable_motor, reason.clone())),
-                Some(Health::Off) | None => return Err(self.fault(movable_motor, "it is switched off, and not by us")),
+                Some(Health::Off) | None => {
+                    return Err(self.fault(movable_motor, "the motor was disabled by something else"));
+                }
             }
             let silence = now.duration_since(*stamp);
             if silence > movable_motor.max_silence(max_silence_allowed) && self.cycle_ix - cycle_ix > MIN_MISSED_CYCLES
             {
-                return Err(
-                    self.fault(movable_motor, format!("it has said nothing for {:.0} ms", 1e3 * silence.as_secs_f64()))
-                );
+                return Err(self.fault(
+                    movable_motor,
+                    format!("no frame from the motor for {:.0} ms", 1e3 * silence.as_secs_f64()),
+                ));
             }
         }
         Ok(())
     }
 
-    /// Says the last words to these motors, as far as there is a bus to say them on.
+    /// Sends the fail-safe command to the selected motors. Errors of the bus are ignored.
     fn shutdown(&self, fail_safe: OnLoss, selects: impl Fn(&MovableMotor) -> bool) {
         for (movable_motor, sent_rad) in
             self.movable_motors.iter().zip(&self.sent_rad).filter(|(movable_motor, _)| selects(movable_motor))
@@ -619,7 +634,10 @@ impl PreparedMotors {
     fn silent_before_start(&self) -> Error {
         let most_silent =
             self.last_heard.iter().enumerate().min_by_key(|(_, (stamp, _))| *stamp).map_or(0, |(ix, _)| ix);
-        self.fault(&self.movable_motors[most_silent], format!("it does not say where it is for {STARTUP_TIMEOUT:?}"))
+        self.fault(
+            &self.movable_motors[most_silent],
+            format!("the motor reported no position within {STARTUP_TIMEOUT:?}"),
+        )
     }
 
     fn not_enabled(&self) -> Error {
@@ -629,11 +647,11 @@ impl PreparedMotors {
             Some(movable_motor) => self.fault(
                 movable_motor,
                 match movable_motor.health() {
-                    Some(Health::Fault(reason)) => format!("it cannot be switched on: {reason}"),
-                    _ => format!("it was switched on and does not say so for {STARTUP_TIMEOUT:?}"),
+                    Some(Health::Fault(reason)) => format!("the motor cannot be enabled: {reason}"),
+                    _ => format!("the motor did not report that it is enabled within {STARTUP_TIMEOUT:?}"),
                 },
             ),
-            None => motion("it took too long to switch the motors on".to_owned()),
+            None => motion("the motors took too long to be enabled".to_owned()),
         }
     }
 }
@@ -642,7 +660,7 @@ fn motion(reason: String) -> Error {
     Error::Motion { reason }
 }
 
-/// What is wrong, without that the arm is not moved.
+/// Reason of the error, without the prefix that the arm is not moved.
 fn reason_of(error: &Error) -> String {
     match error {
         Error::Motion { reason } => reason.clone(),
@@ -650,21 +668,18 @@ fn reason_of(error: &Error) -> String {
     }
 }
 
-/// A number among CANopen nodes that no drive has, for us.
+/// An unused CANopen node number for this computer.
 fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
     let is_used = |node: canopen::Node| {
-        config
-            .arm
-            .motors
-            .iter()
-            .any(|motor| matches!(motor.family, Family::Cia402 { node: accepted, .. } if accepted == node))
+        config.arm.motors.iter().any(|motor| matches!(motor.family, Family::Cia402 { node: used, .. } if used == node))
     };
     let mut numbers = (1..=127).rev().filter_map(|number| canopen::Node::new(number).ok());
     let unused = numbers.find(|node| !is_used(*node));
-    unused.ok_or_else(|| motion("no number of a CANopen node is free for this computer".to_owned()))
+    unused.ok_or_else(|| motion("no free CANopen node number is left for this computer".to_owned()))
 }
 
-/// From cycle to cycle: as the slowest bus allows, in whole milliseconds where there are drives, which count so.
+/// Cycle period that the slowest bus allows. It is rounded up to whole milliseconds if there are drives, because they
+/// count in milliseconds.
 fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
     let mut rate_hz = config.arm.rate_hz;
     let is_drive = |family: &Family| matches!(family, Family::Cia402 { .. });
@@ -734,7 +749,7 @@ mod tests {
         let host = canopen::Node::new(127).expect("a node");
         let damiao = |ix: u16| Family::Damiao { motor: ix, feedback: 0x10 + ix };
         assert_eq!(period(&config(vec![damiao(1), damiao(2)]), host), Duration::from_millis(1));
-        // Seven motors, two frames of 135 bits at worst each.
+        // Seven motors with two frames each, at most 135 bits per frame.
         let seven = period(&config((1..8).map(damiao).collect()), host).as_secs_f64();
         assert!((seven - 14.0 * 135e-6 / 0.7).abs() < 1e-6, "{seven}");
     }

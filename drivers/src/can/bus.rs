@@ -1,4 +1,4 @@
-//! One CAN bus: frames out, frames and errors in, each stamped as the kernel got it.
+//! One CAN bus: sends frames, and receives frames and errors with the kernel's time stamps.
 
 use super::config::BusConfig;
 use super::link::Link;
@@ -16,36 +16,36 @@ use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// A frame that found no room in the interface's queue is tried again for so long.
+/// How long sending is retried while the interface's queue is full.
 const MAX_SENDING: Duration = Duration::from_millis(20);
-/// The system's number for "no buffer space": the interface's queue is full.
+/// `errno` for "no buffer space": the interface's queue is full.
 const ENOBUFS: i32 = 105;
 
-/// What came.
+/// Something received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum BusEvent {
-    /// A frame of somebody else.
+    /// A frame from another node.
     Frame(Frame),
-    /// The controller tells of errors on the wire.
+    /// Errors on the wire, reported by the controller.
     Errors(WireErrors),
 }
 
-/// What error frames told, counted; one frame may tell several.
+/// Counters of error frames. One error frame may report several errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct WireErrors {
     /// Error frames.
     pub n_frames: u64,
     /// The controller went off the bus.
     pub n_bus_off: u64,
-    /// It came back.
+    /// The controller restarted.
     pub n_restarts: u64,
-    /// It passed the mark of 96 errors.
+    /// The controller reached its warning level of 96 errors.
     pub n_warnings: u64,
-    /// It passed the mark of 128 errors.
+    /// The controller became error-passive, at 128 errors.
     pub n_passive: u64,
-    /// Nobody acknowledged a frame: there is no one else, or no one at this bit rate.
+    /// Nobody acknowledged a frame: there is no other node, or none at this bit rate.
     pub n_unacknowledged: u64,
-    /// Frames that the controller or the kernel had no room for.
+    /// Frames dropped because a buffer of the controller or the kernel was full.
     pub n_overflows: u64,
 }
 
@@ -65,7 +65,7 @@ impl WireErrors {
         }
     }
 
-    /// Adds what another one counted.
+    /// Adds the counters of `other`.
     pub fn add(&mut self, other: &Self) {
         self.n_frames += other.n_frames;
         self.n_bus_off += other.n_bus_off;
@@ -83,23 +83,26 @@ impl std::fmt::Display for WireErrors {
         let times = if *n_bus_off == 1 { "time" } else { "times" };
         write!(
             f,
-            "{n_bus_off} {times} off the bus, {n_restarts} back; {n_warnings} warnings, {n_passive} passive, \
-             {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in all"
+            "{n_bus_off} {times} off the bus, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
+             {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in total"
         )
     }
 }
 
-/// An open bus. Dropping it closes the socket; the interface stays as it is.
+/// An open bus. Dropping it closes the socket and does not change the interface.
 #[derive(Debug)]
 pub struct Bus {
     config: BusConfig,
     socket: CanFdSocket,
-    /// How long frames kept the bus busy, those of others and our own, nanoseconds.
+    /// Total duration of all frames on the bus, our own included, in nanoseconds.
     busy_nanos: AtomicU64,
 }
 
 impl Bus {
-    /// Opens an interface that is set up as `config` wants it; where it is not, the error names the command that mends it.
+    /// Opens an interface and checks that it is set up as in `config`.
+    ///
+    /// # Errors
+    /// If it is not. The error contains the command that sets it up.
     pub fn open(config: &BusConfig) -> Result<Self, Error> {
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
@@ -112,23 +115,26 @@ impl Bus {
         Ok(Self { config: config.clone(), socket, busy_nanos: AtomicU64::new(0) })
     }
 
-    /// How it was opened.
+    /// The configuration with which the bus was opened.
     pub fn config(&self) -> &BusConfig {
         &self.config
     }
 
-    /// How long frames have kept the bus busy since it was opened, errors and stuff bits left out.
+    /// Total duration of the frames since the bus was opened, without error frames and stuff bits.
     pub fn busy(&self) -> Duration {
         Duration::from_nanos(self.busy_nanos.load(Ordering::Relaxed))
     }
 
-    /// Sends a frame; waits a moment where the interface's queue is full. False where it stayed full, as it does while nobody
-    /// acknowledges. True says no more than that the kernel took it: those for a controller that is off the bus it takes and drops.
+    /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the kernel accepted the
+    /// frame.
+    ///
+    /// It returns `false` if the queue stayed full, which happens if no node acknowledges. `true` does not mean that
+    /// the frame was sent: the kernel accepts and drops frames for a controller that is off the bus.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }
 
-    /// The same, with another bound: what is of this instant only must not wait.
+    /// Like [`Bus::send`], but waits at most `bound`. Use it for frames that are valid only now.
     pub fn send_within(&self, frame: &Frame, bound: Duration) -> Result<bool, Error> {
         let start = clock::now();
         loop {
@@ -163,16 +169,16 @@ impl Bus {
         self.socket.write_frame(&CanDataFrame::new(id, frame.data()).ok_or_else(invalid)?)
     }
 
-    /// Waits until something came on any of them, or the time is over.
+    /// Waits until one of the buses has received something, or the timeout expires.
     pub fn wait_for_any(buses: &[Self], timeout: Duration) {
         let mut polled: Vec<_> = buses.iter().map(|bus| PollFd::new(&bus.socket, PollFlags::IN)).collect();
-        // What is wrong with a bus is told where it is read.
+        // Errors are reported when the bus is read.
         let _ = poll(&mut polled, Some(&timespec(timeout)));
     }
 
-    /// Waits for what comes next; `None` where nothing came.
+    /// Waits for the next event. Returns `None` if there was none within the timeout.
     pub fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error> {
-        // A receive timeout of the socket counts in jiffies, up to 10 ms each; that of ppoll is fine.
+        // The socket's receive timeout has a resolution of a jiffy, up to 10 ms; `ppoll` has a high resolution.
         match poll(&mut [PollFd::new(&self.socket, PollFlags::IN)], Some(&timespec(timeout))) {
             Ok(0) | Err(Errno::INTR) => return Ok(None),
             Ok(_) => {}
@@ -184,7 +190,7 @@ impl Bus {
             Err(source) => return Err(self.bus_error(source)),
         };
         let now = clock::now();
-        // The kernel's stamp is of the wall clock; how long ago it was is the same on ours.
+        // The kernel stamps with the wall clock. The age of the frame converts that to our clock.
         let stamp = at.elapsed().map_or(now, |age| now - age);
         let frame = match frame {
             CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(WireErrors::of(error))))),
@@ -214,10 +220,10 @@ fn timespec(timeout: Duration) -> Timespec {
 
 fn socket_id(id: Id) -> SocketId {
     match id.is_extended() {
-        true => SocketId::Extended(ExtendedId::new(id.value()).expect("29 bits by its making")),
+        true => SocketId::Extended(ExtendedId::new(id.value()).expect("an extended ID has at most 29 bits")),
         false => {
-            let value = u16::try_from(id.value()).expect("11 bits by its making");
-            SocketId::Standard(StandardId::new(value).expect("11 bits by its making"))
+            let value = u16::try_from(id.value()).expect("a standard ID has at most 11 bits");
+            SocketId::Standard(StandardId::new(value).expect("a standard ID has at most 11 bits"))
         }
     }
 }

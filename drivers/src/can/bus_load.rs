@@ -1,15 +1,16 @@
-//! How often a bus can carry what goes over it again and again.
+//! Maximum rate of periodic traffic on a bus.
 
 use super::config::BusConfig;
 use crate::wire::can::Frame;
 use crate::wire::can::frame::{Stuffing, load_frac};
 
-/// Most of the bus that asking, commanding and answering may take: errors are repeated, and others may speak too.
+/// Maximum fraction of the bus for polls, commands and answers. Errors cause retransmissions, and other nodes may
+/// send, too.
 const MAX_LOAD_FRAC: f64 = 0.7;
 
-/// How many cycles a second, as many as wanted or as keep the bus's load in bounds.
+/// Cycles per second: the requested rate, or the highest that keeps the bus load within bounds.
 ///
-/// `cycle_frames`: all frames of a cycle, of both sides; `unsolicited`: frames that come besides, and how often in a second.
+/// `cycle_frames`: all frames of a cycle, sent and received. `unsolicited`: other frames, with their rate in Hz.
 pub(super) fn max_cycle_rate_hz(
     bus: &BusConfig,
     cycle_frames: &[Frame],
@@ -24,12 +25,12 @@ pub(super) fn max_cycle_rate_hz(
     let interface = &bus.interface;
     if rate_hz < requested_hz {
         log::warn!(
-            "{interface}: {requested_hz} cycles a second would take more than {:.0} % of the bus; there are {rate_hz:.0} ({load_percent:.0} %): \
-             a second bus or FD makes room",
+            "{interface}: a rate of {requested_hz} Hz would exceed {:.0} % bus load; reduced to {rate_hz:.0} Hz ({load_percent:.0} %); \
+             use a second bus or CAN FD for a higher rate",
             100.0 * MAX_LOAD_FRAC
         );
     } else {
-        log::info!("{interface}: {rate_hz:.0} cycles a second take {load_percent:.0} % of the bus at most");
+        log::info!("{interface}: a rate of {rate_hz:.0} Hz takes at most {load_percent:.0} % of the bus");
     }
     rate_hz
 }

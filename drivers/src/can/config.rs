@@ -1,83 +1,85 @@
-//! Buses, motors and arms as a rig file has them.
+//! Buses, motors and arms as described in the rig file.
 
 use crate::wire::can::frame::BitRates;
 use crate::wire::can::{canopen, cia402, odrive, robstride, tmotor};
 
-/// An arm as the rig file has it.
+/// Configuration of an arm from the rig file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ArmConfig {
-    /// Buses.
+    /// The buses of the arm.
     pub buses: Vec<BusConfig>,
-    /// A motor a joint, in the order of the readings.
+    /// One motor per joint, in the order of the readings.
     pub motors: Vec<MotorConfig>,
-    /// How often motors that answer questions are asked; less where the bus would be busy for more than 70 % of the time.
+    /// Rate at which motors are polled, in Hz. It is reduced if the load of a bus would exceed 70 %.
     pub rate_hz: f64,
 }
 
-/// A bus as the rig file has it.
+/// Configuration of a bus from the rig file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BusConfig {
-    /// Name of the interface, `can0` for instance.
+    /// Name of the interface, for instance `can0`.
     pub interface: String,
-    /// Bits a second.
+    /// Bit rate, bit/s.
     pub bitrate_hz: u32,
-    /// Bits a second of the data of FD frames; `None` on a classic bus.
+    /// Bit rate of the data phase of FD frames, bit/s; `None` on a classic bus.
     pub data_bitrate_hz: Option<u32>,
-    /// The kernel cannot restart the adapter (those on a serial line, `slcan`): once it is off the bus it stays off.
+    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`): once off the bus,
+    /// it stays off.
     pub accept_no_restart: bool,
 }
 
 impl BusConfig {
-    /// Both rates.
+    /// Nominal and data bit rate.
     pub fn rates(&self) -> BitRates {
         let nominal_hz = f64::from(self.bitrate_hz);
         BitRates { nominal_hz, data_hz: self.data_bitrate_hz.map_or(nominal_hz, f64::from) }
     }
 }
 
-/// The protocol of a motor and what names it on its bus.
+/// Protocol of a motor, and its address on the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Family {
-    /// Damiao: its number, and the identifier of its answers (register `MST_ID`). What its counts cover is read from it.
+    /// Damiao: motor ID, and the identifier of its answers (register `MST_ID`). The ranges of its raw values are read
+    /// from the motor.
     Damiao {
-        /// Number of the motor.
+        /// Motor ID.
         motor: u16,
         /// Identifier of its answers.
         feedback: u16,
     },
     /// Robstride, private protocol.
     Robstride {
-        /// Number of the motor.
+        /// Motor ID.
         motor: u8,
-        /// Its model, which says what its counts cover.
+        /// Model, which determines the ranges of its raw values.
         model: robstride::Model,
     },
-    /// T-Motor AK in MIT mode, listened to only.
+    /// T-Motor AK in MIT mode. A read-only arm only listens to it.
     TMotor {
-        /// Number of the motor.
+        /// Motor ID.
         motor: u8,
-        /// Its model, which says what its counts cover.
+        /// Model, which determines the ranges of its raw values.
         model: tmotor::Model,
     },
     /// ODrive CANSimple.
     Odrive {
-        /// Number of the axis.
+        /// Node ID of the axis.
         node: odrive::Node,
     },
     /// CiA 402 drive.
     Cia402 {
-        /// Number of the node.
+        /// Node ID.
         node: canopen::Node,
-        /// What its counts are worth.
+        /// Units of its raw values.
         units: cia402::Units,
     },
 }
 
 impl Family {
-    /// Whether it could not be told from another one on the same bus.
+    /// Whether the two motors could not be distinguished on the same bus.
     pub fn conflicts_with(&self, other: &Self) -> bool {
         match (self, other) {
-            // It would take the other one's answers for orders.
+            // A motor would take the answers of the other one for commands.
             (Self::Damiao { motor: a, feedback: b }, Self::Damiao { motor: c, feedback: d }) => {
                 a == c || b == d || a == d || b == c
             }
@@ -90,30 +92,32 @@ impl Family {
     }
 }
 
-/// A motor and its joint: `joint = direction * motor / gear_ratio + offset_rad`, the direction -1 where it is reversed.
+/// A motor and its joint: `joint = direction * motor / gear_ratio + offset_rad`, where the direction is -1 if the
+/// motor is reversed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotorConfig {
-    /// The joint that it moves.
+    /// Name of the joint that it moves.
     pub joint: String,
-    /// Which of the arm's buses it is on.
+    /// Index of its bus in [`ArmConfig::buses`].
     pub bus_ix: usize,
     /// Its protocol.
     pub family: Family,
-    /// Turns of what it tells in a turn of the joint: 1 where it tells its output shaft, and no gear is behind that.
+    /// Turns of the reported shaft per turn of the joint: 1 if the motor reports its output shaft and no further gear
+    /// follows.
     pub gear_ratio: f64,
-    /// Whether it turns against its joint.
+    /// Whether it turns in the opposite direction to its joint.
     pub is_reversed: bool,
-    /// Angle of the joint where the motor tells 0, rad.
+    /// Joint angle at which the motor reports 0, rad.
     pub offset_rad: f64,
-    /// How it is held where each command carries that, in MIT mode; `None` where it is only read.
+    /// Gains for families whose commands include them (MIT mode); `None` if the motor is only read.
     pub gains: Option<Gains>,
 }
 
-/// How stiffly a joint is held. The motor in front of a gear gets both divided by the square of the ratio.
+/// Stiffness and damping of a joint. A motor in front of a gear gets both divided by the square of the gear ratio.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gains {
-    /// Torque by how far it is from where it shall be, N m / rad of the joint.
+    /// Torque per position error, N m / rad of the joint.
     pub stiffness_nm_rad: f64,
-    /// Torque by how much slower it is than it shall be, N m s / rad of the joint.
+    /// Torque per velocity error, N m s / rad of the joint.
     pub damping_nm_s_rad: f64,
 }

@@ -1,4 +1,4 @@
-//! Frames from anyone, through every codec and to a motor of each family.
+//! Fuzz target: arbitrary frames for every codec and for an emulated motor of each family.
 
 use super::ROBSTRIDE_HOST;
 use super::config::{Family, MotorConfig};
@@ -11,12 +11,12 @@ use crate::wire::can::{Frame, Id, canopen, cia402, damiao, odrive, robstride, tm
 use kinematics::Stamp;
 use std::time::Duration;
 
-/// What the counts of motors cover here.
+/// Ranges of the raw values of the motors in this test.
 pub(crate) const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
-/// Payloads of FD frames by the upper half of their codes.
+/// Payload lengths of FD frames for the length codes above 8.
 const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
 
-/// A motor of each family, each on a bus of its own.
+/// A motor of each family, each on its own bus.
 pub(crate) fn motors() -> Vec<MotorConfig> {
     let families = [
         Family::Damiao { motor: 1, feedback: 0x11 },
@@ -40,7 +40,8 @@ pub(crate) fn motors() -> Vec<MotorConfig> {
     families.into_iter().enumerate().map(motor).collect()
 }
 
-/// Frames one behind the other: a byte of length (codes of FD) and kind, four of the identifier, little-endian, then the payload.
+/// Decodes concatenated frames: one byte with length code (as in FD) and flags, four bytes identifier, little-endian,
+/// then the payload.
 pub(crate) fn decode_frames(mut bytes: &[u8]) -> Vec<Frame> {
     let mut frames = Vec::new();
     while !bytes.is_empty() {
@@ -50,7 +51,7 @@ pub(crate) fn decode_frames(mut bytes: &[u8]) -> Vec<Frame> {
         let is_fd = head & 0x40 != 0;
         let n_bytes = if is_fd && code > 8 { FD_LENGTHS[code - 9] } else { code.min(8) };
         let id = if head & 0x10 != 0 { Id::extended(number & 0x1FFF_FFFF) } else { Id::standard(number & 0x7FF) };
-        let id = id.expect("masked");
+        let id = id.expect("the identifier is masked to 11 or 29 bits");
         let is_remote = head & 0x20 != 0 && !is_fd;
         let payload = &take::<64>(&mut &bytes[..bytes.len().min(n_bytes)])[..n_bytes];
         let frame = match is_remote {
@@ -59,12 +60,12 @@ pub(crate) fn decode_frames(mut bytes: &[u8]) -> Vec<Frame> {
             false => Frame::classic(id, payload),
         };
         bytes = if is_remote { bytes } else { &bytes[bytes.len().min(n_bytes)..] };
-        frames.push(frame.expect("a length of its format"));
+        frames.push(frame.expect("the length is valid for the format"));
     }
     frames
 }
 
-/// Frames as [`decode_frames`] takes them.
+/// Encodes frames in the format of [`decode_frames`].
 #[cfg(test)]
 pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
     let encode = |frame: &Frame| {
@@ -81,8 +82,9 @@ pub(crate) fn encode_frames(frames: &[Frame]) -> Vec<u8> {
     frames.iter().flat_map(encode).collect()
 }
 
-/// Frames as [`decode_frames`] takes them, a millisecond apart: no codec panics, no motor tells of motions that there cannot be,
-/// whatever played motors send is read, and their shafts are somewhere.
+/// Runs frames in the format of [`decode_frames`], a millisecond apart. Checks that no codec panics, that no motor
+/// reports an impossible motion, that the answers of the emulated motors can be read, and that their shafts stay
+/// finite.
 pub fn frames(bytes: &[u8]) {
     let configs = motors();
     let listeners: Vec<_> = configs.iter().map(|config| Motor::with_limits(config.clone(), LIMITS)).collect();
@@ -103,7 +105,7 @@ pub fn frames(bytes: &[u8]) {
     }
 }
 
-/// A reading is within what the motor's counts cover, and within what joints do.
+/// Checks that a reading is within the range of the motor's raw values and plausible for a joint.
 fn check(motor: &Motor, frame: &Frame) {
     let Some(reading) = motor.read(frame) else { return };
     let config = motor.config();
@@ -121,7 +123,7 @@ fn check(motor: &Motor, frame: &Frame) {
     assert!(reading.effort_nm.is_none_or(|nm| nm.abs() <= max_nm + 1e-9), "{frame:?}: {reading:?}");
 }
 
-/// Every codec on one frame; what it reads is not looked at here.
+/// Runs every codec on one frame. The results are not checked here.
 fn codecs(frame: &Frame) {
     let _ = canopen::decode_heartbeat(frame);
     if let Err(error) = canopen::decode_sdo(frame) {
@@ -158,12 +160,12 @@ pub(crate) mod tests {
     use crate::can::motor::Reading;
     use crate::fuzz::Random;
 
-    /// What is said on all buses while an arm is set up and read for some cycles.
+    /// All frames on the buses while an arm is set up and read for some cycles.
     pub(crate) fn example_traffic() -> Vec<Frame> {
         record_traffic().into_iter().flat_map(|(sent_frames, _)| sent_frames).collect()
     }
 
-    /// That, for each motor on its bus, and what it told of its joint.
+    /// For each motor: the frames on its bus, and the readings that they contain.
     fn record_traffic() -> Vec<(Vec<Frame>, Vec<Reading>)> {
         motors().into_iter().map(|config| record_traffic_of(&config)).collect()
     }
@@ -180,7 +182,7 @@ pub(crate) mod tests {
             let mut poll_frames: Vec<Frame> = listeners.poll_frame().into_iter().collect();
             poll_frames.extend(listeners.needs_sync().then(canopen::encode_sync));
             if let Family::TMotor { motor, .. } = config.family {
-                // Another master commands it; here we are that master.
+                // In the real setup another master commands the motor; here the test does.
                 poll_frames.push(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap());
             }
             let mut answers: Vec<Frame> = poll_frames.iter().flat_map(|frame| emulated.take(frame).unwrap()).collect();
@@ -192,7 +194,7 @@ pub(crate) mod tests {
         (sent_frames, expected_readings)
     }
 
-    /// What the driver says so that a motor reports.
+    /// The frames with which the driver makes a motor report.
     fn set_up(config: &MotorConfig) -> Vec<Frame> {
         match config.family {
             Family::Damiao { motor, .. } => {
@@ -225,7 +227,7 @@ pub(crate) mod tests {
         let mut random = Random(1);
         for (config, (sent_frames, expected_readings)) in motors().into_iter().zip(record_traffic()) {
             let motor = Motor::with_limits(config, LIMITS);
-            assert!(expected_readings.len() >= 5, "{motor:?} tells");
+            assert!(expected_readings.len() >= 5, "{motor:?} reports");
             let read = |frames: &[Frame]| {
                 let readings: Vec<Reading> = frames.iter().filter_map(|frame| motor.read(frame)).collect();
                 assert!(readings.iter().all(|reading| expected_readings.contains(reading)), "{motor:?}: {readings:?}");
@@ -243,13 +245,17 @@ pub(crate) mod tests {
                 let cut = (0..frame.data().len()).map(|n| Frame::classic(frame.id(), &bytes[..n]).unwrap());
                 read(&cut.collect::<Vec<_>>());
                 if bytes.len() == 16 {
-                    assert_eq!(read(&[Frame::fd(frame.id(), &bytes, true).unwrap()]), 0, "two in one frame are none");
+                    assert_eq!(
+                        read(&[Frame::fd(frame.id(), &bytes, true).unwrap()]),
+                        0,
+                        "two messages in one frame are not a reading"
+                    );
                 }
             }
         }
     }
 
-    /// A command to go elsewhere, stiffly; none switches a motor on.
+    /// A command to move away stiffly. It does not enable the motor.
     fn command(config: &MotorConfig) -> Frame {
         let target = Command { position_rad: 1.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, ..Command::default() };
         match config.family {
@@ -270,14 +276,14 @@ pub(crate) mod tests {
         .unwrap()
     }
 
-    /// Where a shaft is that began at 0, after frames a millisecond apart and a tenth of a second more.
+    /// Position of a shaft that started at 0, after frames a millisecond apart and another tenth of a second.
     fn shaft_after(config: &MotorConfig, frames: &[Frame]) -> (f64, State) {
         let mut emulated = EmulatedMotor::new(config.family, LIMITS);
         for millis in 0..100 + frames.len() {
             let now = Stamp(0) + Duration::from_millis(millis as u64);
             emulated.report(now).unwrap();
             if let Some(frame) = frames.get(millis) {
-                // What it cannot read it does not obey.
+                // Frames that it cannot read have no effect.
                 let _ = emulated.take(frame);
             }
         }
@@ -309,7 +315,7 @@ pub(crate) mod tests {
             command(damiao),
         ];
         let (position_rad, state) = shaft_after(damiao, &on);
-        assert!(position_rad > 0.1 && state == State::Enabled, "once it is on it does: {position_rad} rad, {state:?}");
+        assert!(position_rad > 0.1 && state == State::Enabled, "an enabled motor moves: {position_rad} rad, {state:?}");
     }
 
     #[test]
@@ -317,12 +323,12 @@ pub(crate) mod tests {
         let config = motors().remove(3);
         let Family::Odrive { node } = config.family else { panic!("the fourth is an ODrive") };
         let motor = Motor::with_limits(config, LIMITS);
-        let expected_readings = |position_rad, velocity_rad_s| {
+        let read = |position_rad, velocity_rad_s| {
             motor.read(&odrive::encode_answer(node, &odrive::Answer::Motion { position_rad, velocity_rad_s }).unwrap())
         };
-        assert!(expected_readings(3.0, 1.0).is_some());
-        assert_eq!(expected_readings(1e30, 1.0), None);
-        assert_eq!(expected_readings(3.0, -1e30), None);
+        assert!(read(3.0, 1.0).is_some());
+        assert_eq!(read(1e30, 1.0), None);
+        assert_eq!(read(3.0, -1e30), None);
     }
 
     #[test]

@@ -1,8 +1,8 @@
-//! Which CAN interfaces there are.
+//! Lists the CAN interfaces of this computer.
 
 use std::path::Path;
 
-/// Names of the CAN interfaces below a folder like `/sys`, virtual ones too, in order.
+/// Sorted names of the CAN interfaces in a folder such as `/sys`, including virtual ones.
 pub fn interfaces(sys: &Path) -> Vec<String> {
     let net = sys.join("class/net");
     // ARPHRD_CAN of `linux/if_arp.h`.

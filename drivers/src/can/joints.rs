@@ -1,9 +1,9 @@
-//! States of all joints, made of what single motors tell.
+//! Combines the readings of single motors into states of all joints.
 
 use super::motor::Reading;
 use kinematics::{JointState, Stamp};
 
-/// What a motor told.
+/// A reading of one joint.
 #[derive(Debug)]
 pub(super) struct JointReading {
     pub(super) joint_ix: usize,
@@ -11,7 +11,7 @@ pub(super) struct JointReading {
     pub(super) reading: Reading,
 }
 
-/// The newest readings of all joints.
+/// The newest reading of each joint.
 #[derive(Debug)]
 pub(super) struct Joints {
     newest: Vec<Option<(Stamp, Reading)>>,
@@ -22,7 +22,7 @@ impl Joints {
         Self { newest: vec![None; n] }
     }
 
-    /// Takes a reading; gives a state and begins anew once every joint has one.
+    /// Adds a reading. Once every joint has one, returns a state and starts over.
     pub(super) fn take(&mut self, joint_reading: &JointReading) -> Option<JointState> {
         self.newest[joint_reading.joint_ix] = Some((joint_reading.stamp, joint_reading.reading));
         let all = self.newest.iter().copied().collect::<Option<Vec<_>>>()?;
@@ -54,12 +54,12 @@ mod tests {
         let mut joints = Joints::new(3);
         assert_eq!(joints.take(&joint_reading(0, 1, 0.0)), None);
         assert_eq!(joints.take(&joint_reading(2, 2, 0.2)), None);
-        assert_eq!(joints.take(&joint_reading(0, 3, 0.1)), None, "the newer one counts");
+        assert_eq!(joints.take(&joint_reading(0, 3, 0.1)), None, "the newer reading replaces the older");
         let state = joints.take(&joint_reading(1, 5, 0.3)).unwrap();
         assert_eq!(state.stamp, Stamp(5_000_000));
         let expected = [0.1 + 2.0 * 0.002, 0.3, 0.2 + 2.0 * 0.003];
         assert!(state.position.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-12));
         assert_eq!((state.velocity, state.effort), (vec![2.0; 3], vec![0.5; 3]));
-        assert_eq!(joints.take(&joint_reading(1, 6, 0.3)), None, "it begins anew");
+        assert_eq!(joints.take(&joint_reading(1, 6, 0.3)), None, "it starts over");
     }
 }

@@ -1,4 +1,4 @@
-//! How a CAN interface is set up, what is wrong with that, and the command that mends it.
+//! Checks the configuration of a CAN interface, and names the command that repairs it.
 
 use super::config::BusConfig;
 use super::interfaces::interfaces;
@@ -8,56 +8,59 @@ use socketcan::nl::{CanState, InterfaceDetails, Mtu};
 use std::io;
 use std::path::Path;
 
-/// How long a controller that went off the bus waits before it tries again, as we have it set up, milliseconds.
+/// Time after which a controller that went off the bus restarts, in our configuration, milliseconds.
 const RESTART_MILLIS: u32 = 100;
 
-/// What the error counters of a controller have come to.
+/// State of a controller according to its error counters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum State {
-    /// All is well.
+    /// Fewer than 96 errors.
     Active,
-    /// 96 errors and more.
+    /// At least 96 errors.
     Warning,
-    /// 128 and more: it no longer disturbs others' frames.
+    /// At least 128 errors: it no longer sends active error flags, which would destroy frames of others.
     Passive,
-    /// 256 and more: it takes no part any more until it is restarted.
+    /// At least 256 errors: it takes no part in the bus until it is restarted.
     BusOff,
     /// Down or asleep.
     Stopped,
 }
 
-/// How an interface is set up, as the kernel tells.
+/// Configuration of an interface as reported by the kernel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Link {
     /// Name.
     pub interface: String,
     /// Whether it is up.
     pub is_up: bool,
-    /// Whether it takes FD frames.
+    /// Whether it accepts FD frames.
     pub is_fd: bool,
-    /// Bits a second; `None` where it has none, as virtual ones have not, or none was set.
+    /// Bit rate, bit/s; `None` if it has none (virtual interfaces) or none is set.
     pub bitrate_hz: Option<u32>,
-    /// Bits a second of the data of FD frames.
+    /// Bit rate of the data phase of FD frames, bit/s.
     pub data_bitrate_hz: Option<u32>,
-    /// After how long it comes back by itself when it went off the bus; 0 is never.
+    /// Time after which it restarts automatically when off the bus, milliseconds; 0 means never.
     pub restart_millis: Option<u32>,
-    /// What its error counters have come to; `None` where it has none.
+    /// State according to its error counters; `None` if it has no counters.
     pub state: Option<State>,
-    /// Errors counted while sending and while receiving, now.
+    /// Current transmit and receive error counters.
     pub n_errors: Option<[u16; 2]>,
 }
 
-/// What is wrong with an interface.
+/// A problem with an interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LinkProblem {
-    /// In words.
+    /// Description of the problem.
     pub problem: String,
-    /// What a person types to mend it.
+    /// Shell command that fixes it.
     pub command: String,
 }
 
 impl Link {
-    /// Asks the kernel. An interface that does not exist is an error that says how the others are called.
+    /// Reads the configuration from the kernel.
+    ///
+    /// # Errors
+    /// If the interface does not exist. The error lists the existing ones.
     pub fn read(interface: &str) -> Result<Self, Error> {
         let details = CanInterface::open(interface).and_then(|open| open.details());
         details.map(|details| Self::of(interface, &details)).map_err(|error| {
@@ -92,12 +95,12 @@ impl Link {
         }
     }
 
-    /// Whether it is a virtual interface: it has no bits, so no rate and no errors.
+    /// Whether it is a virtual interface, which has neither a bit rate nor error counters.
     fn is_virtual(&self) -> bool {
         self.state.is_none()
     }
 
-    /// What must be mended before motors on it can be read as `config`; nothing where all is well.
+    /// Problems that must be fixed before motors can be read with `config`. Empty if there are none.
     pub fn problems(&self, config: &BusConfig) -> Vec<LinkProblem> {
         let command = set_up_command(&self.interface, self.is_virtual(), config);
         let mut problems = Vec::new();
@@ -106,7 +109,7 @@ impl Link {
             report("it is down".to_owned());
         }
         if config.data_bitrate_hz.is_some() && !self.is_fd {
-            report("it does not take FD frames".to_owned());
+            report("it does not accept FD frames".to_owned());
         }
         if self.is_virtual() {
             return problems;
@@ -114,28 +117,28 @@ impl Link {
         match self.bitrate_hz {
             Some(bitrate_hz) if bitrate_hz == config.bitrate_hz => {}
             Some(bitrate_hz) => {
-                report(format!("its bit rate is {bitrate_hz}, the rig file says {}", config.bitrate_hz));
+                report(format!("its bit rate is {bitrate_hz}, but the rig file requires {}", config.bitrate_hz));
             }
-            None => report(format!("no bit rate is set, {} is wanted", config.bitrate_hz)),
+            None => report(format!("no bit rate is set; the rig file requires {}", config.bitrate_hz)),
         }
         if let Some(data_bitrate_hz) = config.data_bitrate_hz.filter(|rate| self.data_bitrate_hz != Some(*rate)) {
             let reported = self.data_bitrate_hz.map_or_else(|| "not set".to_owned(), |rate| rate.to_string());
-            report(format!("its bit rate of FD data is {reported}, the rig file says {data_bitrate_hz}"));
+            report(format!("its bit rate for FD data is {reported}, but the rig file requires {data_bitrate_hz}"));
         }
         if self.restart_millis == Some(0) && !config.accept_no_restart {
             report(format!(
-                "it does not come back by itself once it went off the bus (restart-ms 0; for an adapter that cannot, on a serial \
-                 line for instance, arm.bus.{}.accept_no_restart = true)",
+                "it does not restart after it goes off the bus (restart-ms 0; for an adapter without automatic restart, on a serial \
+                 line for instance, set arm.bus.{}.accept_no_restart = true)",
                 self.interface
             ));
         }
         if self.is_up && self.state >= Some(State::BusOff) {
-            report("it is off the bus: look at wiring, termination and the bit rate of the others".to_owned());
+            report("it is off the bus: check wiring, termination and the bit rate of the other nodes".to_owned());
         }
         problems
     }
 
-    /// The first complaint as an error.
+    /// Returns the first problem as an error.
     pub fn check(&self, config: &BusConfig) -> Result<(), Error> {
         match self.problems(config).into_iter().next() {
             Some(LinkProblem { problem, command }) => {
@@ -165,11 +168,11 @@ impl std::fmt::Display for Link {
     }
 }
 
-/// The line that sets an interface up as wanted.
+/// Command that sets an interface up as configured.
 fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> String {
     if is_virtual {
         return match config.data_bitrate_hz {
-            // Its length of frames cannot be changed while it is up.
+            // The MTU cannot be changed while the interface is up.
             Some(_) => format!("sudo ip link set {interface} down; sudo ip link set {interface} mtu 72 up"),
             None => format!("sudo ip link set {interface} up"),
         };
@@ -182,7 +185,7 @@ fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> Stri
     )
 }
 
-/// The system's number for "no such device".
+/// `errno` for "no such device".
 const ENODEV: i32 = 19;
 
 fn missing_interface(interface: &str) -> io::Error {
@@ -191,17 +194,17 @@ fn missing_interface(interface: &str) -> io::Error {
             format!("sudo modprobe vcan; sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up");
         return io::Error::new(
             io::ErrorKind::NotFound,
-            format!("no such interface; a virtual one is made with: {create_command}"),
+            format!("no such interface; create a virtual one with: {create_command}"),
         );
     }
     let others = match interfaces(Path::new("/sys")).as_slice() {
-        [] => "this machine has none; is the adapter plugged in, and its driver loaded?".to_owned(),
-        names => format!("there is {}", names.join(", ")),
+        [] => "this computer has none; check that the adapter is plugged in and its driver is loaded".to_owned(),
+        names => format!("existing interfaces: {}", names.join(", ")),
     };
     io::Error::new(io::ErrorKind::NotFound, format!("no such interface: {others}"))
 }
 
-/// What the system said, with its number where there is one.
+/// The error of the system, with its number if it has one.
 fn io_error(error: socketcan::Error) -> io::Error {
     match error {
         socketcan::Error::Io(error) => error,
@@ -240,9 +243,12 @@ mod tests {
         assert_eq!(good_link().problems(&config(None)), []);
         let broken_links: [(Link, &str); 5] = [
             (Link { is_up: false, state: Some(State::Stopped), ..good_link() }, "it is down"),
-            (Link { bitrate_hz: Some(500_000), ..good_link() }, "its bit rate is 500000, the rig file says 1000000"),
+            (
+                Link { bitrate_hz: Some(500_000), ..good_link() },
+                "its bit rate is 500000, but the rig file requires 1000000",
+            ),
             (Link { bitrate_hz: None, ..good_link() }, "no bit rate is set"),
-            (Link { restart_millis: Some(0), ..good_link() }, "does not come back by itself"),
+            (Link { restart_millis: Some(0), ..good_link() }, "does not restart after it goes off the bus"),
             (Link { state: Some(State::BusOff), ..good_link() }, "off the bus"),
         ];
         for (link, what) in broken_links {

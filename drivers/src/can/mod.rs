@@ -1,9 +1,11 @@
 //! Arms whose joints are motors on CAN buses, over Linux sockets.
 //!
-//! `link` checks how an interface is set up, `bus` moves frames and counts what is wrong on the wire. `motor` reads one motor of any
-//! family, `arm` makes joint states of what all of them say, a thread a bus; nothing in these two commands a motor. `movable_motor` is a motor
-//! that may be moved, `watchdog` what it does when this computer falls silent, `movable` an arm of them, with `arm_loop` as its thread.
-//! `emulated` is the other side: motors for tests and simulators.
+//! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on the wire.
+//! * `motor` reads one motor of any family. `arm` combines the readings of all motors into joint states, with one
+//!   thread per bus. Neither commands a motor.
+//! * `movable_motor` is a motor that may be moved. `watchdog` configures what it does when this computer stops
+//!   sending. `movable` is an arm of such motors; `arm_loop` is its thread.
+//! * `emulated` has emulated motors for tests and simulators.
 
 #[cfg(target_os = "linux")]
 mod arm;
@@ -44,5 +46,5 @@ pub use link::{Link, LinkProblem, State};
 #[cfg(target_os = "linux")]
 pub use movable::{MovableArmConfig, MovableCanArm};
 
-/// Our number among Robstride hosts, as in the maker's program.
+/// Our host ID on Robstride buses. The manufacturer's program uses the same ID.
 const ROBSTRIDE_HOST: u8 = 0xFD;

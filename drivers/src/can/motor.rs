@@ -1,8 +1,9 @@
-//! One motor of any family: what is said to it so that it tells where it is, and what its frames mean for its joint.
+//! One motor of any family: the frames that make it report its position, and what its frames mean for its joint.
 //!
-//! Reading never commands: Damiao motors are asked for feedback, Robstride motors report by themselves once they are told to,
-//! `ODrive` axes send their cyclic messages, CiA 402 drives answer each SYNC with a PDO. An AK motor in MIT mode speaks only when it is
-//! commanded, and a command without gains would make it limp: so it is only listened to, while another master commands it.
+//! Reading never commands a motor. Damiao motors are polled for feedback, Robstride motors report periodically once
+//! configured, `ODrive` axes send cyclic messages, and CiA 402 drives answer each SYNC with a PDO. An AK motor in MIT
+//! mode answers only commands, and a command without gains would make it limp. It is therefore only listened to,
+//! while another master commands it.
 
 use super::ROBSTRIDE_HOST;
 use super::bus::Bus;
@@ -17,24 +18,24 @@ use crate::wire::can::tmotor::{self, Thermometer};
 use crate::wire::can::{Frame, Id, cia402, odrive};
 use std::time::Duration;
 
-/// How long a motor that reports by itself may take to do so.
+/// Maximum time until the first report of a motor that reports unasked.
 const MAX_REPORT: Duration = Duration::from_secs(1);
-/// Value of [`Parameter::ReportInterval`] for the shortest interval there is.
+/// Value of [`Parameter::ReportInterval`] for the shortest interval.
 const SHORTEST_REPORT: u32 = 1;
-/// Seconds from report to report at that value.
+/// Report interval at that value, seconds.
 const ROBSTRIDE_REPORT_SECS: f64 = 0.01;
-/// The usual interval of an `ODrive` encoder's message.
+/// Default interval of an `ODrive` encoder's message, seconds.
 const ODRIVE_REPORT_SECS: f64 = 0.01;
-/// An interval at which a drive sends its heartbeat, milliseconds.
+/// Heartbeat interval that a drive is set to, milliseconds.
 const HEARTBEAT_MILLIS: i64 = 500;
-/// A PDO's entry 2: send at every SYNC.
+/// PDO communication entry 2: send at every SYNC.
 const EVERY_SYNC: i64 = 1;
-/// Bit of a PDO's entry 1 that switches it off.
+/// Bit of PDO communication entry 1 that disables the PDO.
 const PDO_OFF: i64 = 1 << 31;
-/// No joint is further from its zero, or faster, rad or rad/s: such a reading is noise.
+/// Greater positions (rad) or velocities (rad/s) of a joint are treated as noise.
 pub(super) const MAX_RAD: f64 = 1e4;
 
-/// What a joint does.
+/// Position, velocity and effort of a joint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Reading {
     pub(super) position_rad: f64,
@@ -50,7 +51,7 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    /// Asks the motor for what its counts cover, and has it report.
+    /// Reads the ranges of the motor's raw values, if it has them, and makes it report.
     pub(super) fn set_up(bus: &Bus, config: &MotorConfig) -> Result<Self, Error> {
         let query = MotorQuery::new(bus, config);
         let mut motor = Self::with_limits(config.clone(), Limits::of(1.0, 1.0, 1.0));
@@ -58,12 +59,14 @@ impl Motor {
             Family::Damiao { motor: number, feedback } => {
                 let real = |register| match query.register(number, feedback, register)? {
                     Value::Float(real) => Ok(real),
-                    Value::Integer(_) => Err(query.fault(format!("register {register:?} holds no real number"))),
+                    Value::Integer(_) => {
+                        Err(query.fault(format!("register {register:?} is not a floating-point number")))
+                    }
                 };
                 let [p_max, v_max, t_max] =
                     [Register::PositionLimit, Register::VelocityLimit, Register::TorqueLimit].map(real);
                 motor.limits = query.map_error(damiao::limits_from_registers(p_max?, v_max?, t_max?))?;
-                log::debug!("{}: counts cover {:?}", query.name(), motor.limits);
+                log::debug!("{}: ranges of raw values: {:?}", query.name(), motor.limits);
             }
             Family::Robstride { motor: number, model } => {
                 motor.limits = model.limits();
@@ -73,26 +76,26 @@ impl Motor {
                 }
                 motor.wait_for_reading(
                     &query,
-                    "it does not report; is its number right, and its firmware one with active report?",
+                    "the motor does not report; check its id, and whether its firmware supports active reporting",
                 )?;
             }
             Family::TMotor { model, .. } => {
                 motor.limits = model.limits();
                 motor.wait_for_reading(
                     &query,
-                    "an AK motor in MIT mode speaks only when another master commands it, and none does",
+                    "an AK motor in MIT mode answers only when another master commands it, and none does",
                 )?;
             }
             Family::Odrive { .. } => motor.wait_for_reading(
                 &query,
-                "it sends no encoder estimates; set axis0.config.can.encoder_msg_rate_ms = 10, and look at its node_id",
+                "it sends no encoder estimates; set axis0.config.can.encoder_msg_rate_ms = 10, and check its node_id",
             )?,
             Family::Cia402 { node, .. } => set_up_drive(&query, node)?,
         }
         Ok(motor)
     }
 
-    /// One whose counts cover so much.
+    /// A motor with these ranges of its raw values.
     pub(super) fn with_limits(config: MotorConfig, limits: Limits) -> Self {
         Self { config, limits }
     }
@@ -101,18 +104,18 @@ impl Motor {
         &self.config
     }
 
-    /// What its counts cover, where it has counts.
+    /// Ranges of its raw values, for families that have them.
     pub(super) fn limits(&self) -> &Limits {
         &self.limits
     }
 
-    /// How far the joint turns in a turn of the motor, negative where it turns the other way.
+    /// Turns of the joint per turn of the motor; negative if they turn in opposite directions.
     pub(super) fn per_turn(&self) -> f64 {
         let direction = if self.config.is_reversed { -1.0 } else { 1.0 };
         direction / self.config.gear_ratio
     }
 
-    /// What is sent in each cycle so that it tells where it is; `None` where it tells unasked, or at a SYNC.
+    /// The frame that polls its position in each cycle; `None` if it reports unasked or at a SYNC.
     pub(super) fn poll_frame(&self) -> Option<Frame> {
         match self.config.family {
             Family::Damiao { motor, .. } => {
@@ -126,7 +129,7 @@ impl Motor {
         matches!(self.config.family, Family::Cia402 { .. })
     }
 
-    /// A frame like those that tell where it is, and how often it comes in a second where that is not ours to say.
+    /// A frame like its position reports, and their rate in Hz if the motor determines it.
     pub(super) fn typical_answer(&self) -> (Frame, Option<f64>) {
         let (id, rate_hz) = match self.config.family {
             Family::Damiao { feedback, .. } => (Id::standard(feedback.into()), None),
@@ -135,11 +138,11 @@ impl Motor {
             Family::Odrive { .. } => (Id::standard(0), Some(1.0 / ODRIVE_REPORT_SECS)),
             Family::Cia402 { node, .. } => (Ok(Pdo::First.id(Direction::Transmit, node)), None),
         };
-        let id = id.unwrap_or(Id::standard(0).expect("the least there is"));
+        let id = id.unwrap_or(Id::standard(0).expect("0 is a valid identifier"));
         (Frame::classic(id, &[0; 8]).expect("eight bytes"), rate_hz)
     }
 
-    /// What its joint does, where a frame tells; `None` where it is of another motor or about something else.
+    /// The reading of its joint in a frame; `None` if the frame is from another motor or has other content.
     pub(super) fn read(&self, frame: &Frame) -> Option<Reading> {
         let (position, velocity, torque) = match self.config.family {
             Family::Damiao { motor, feedback } => {
@@ -164,7 +167,8 @@ impl Motor {
                 _ => return None,
             },
             Family::TMotor { motor, .. } => {
-                // Commands to motors bear their numbers; what comes back bears the master's, and the motor's in its first byte.
+                // Commands carry the motor's number as identifier; answers carry the master's, and the motor's number
+                // in the first byte.
                 if frame.id().value() == u32::from(motor) {
                     return None;
                 }
@@ -202,18 +206,19 @@ impl Motor {
         (reading.position_rad.abs() <= MAX_RAD && reading.velocity_rad_s.abs() <= MAX_RAD).then_some(reading)
     }
 
-    /// Waits until the motor tells where it is.
+    /// Waits for the first reading.
     fn wait_for_reading(&self, query: &MotorQuery<'_>, timeout_reason: &str) -> Result<(), Error> {
         query.wait(MAX_REPORT, |frame| self.read(frame))?.map(drop).ok_or_else(|| query.fault(timeout_reason))
     }
 }
 
-/// Whether a Damiao motor's frame is about a register: an answer that came too late for its question is no feedback.
+/// Whether a frame of a Damiao motor is a register answer: an answer that arrives late must not be taken for
+/// feedback.
 fn is_register(frame: &Frame, motor: u16) -> bool {
     damiao::decode_register(frame).is_ok_and(|message| message.motor == motor)
 }
 
-/// Has a drive send position and velocity at every SYNC, and starts it; it stays switched off.
+/// Makes a drive send position and velocity at every SYNC, and starts it. The drive stays disabled.
 fn set_up_drive(query: &MotorQuery<'_>, node: canopen::Node) -> Result<(), Error> {
     let mut entries =
         map_pdo_at_every_sync(Pdo::First, Direction::Transmit, node, &[cia402::POSITION, cia402::VELOCITY]);
@@ -221,9 +226,9 @@ fn set_up_drive(query: &MotorQuery<'_>, node: canopen::Node) -> Result<(), Error
     start_drive(query, node, &entries)
 }
 
-/// The entries that lay objects into a PDO of a drive and have it sent, or taken, at every SYNC.
+/// The entries that map objects into a PDO of a drive and have it sent, or accepted, at every SYNC.
 ///
-/// Source: CiA 301, section 7.5.2.36: a PDO is switched off while its mapping is changed.
+/// Source: CiA 301, section 7.5.2.36: a PDO is disabled while its mapping is changed.
 pub(super) fn map_pdo_at_every_sync(
     pdo: Pdo,
     direction: Direction,
@@ -235,12 +240,12 @@ pub(super) fn map_pdo_at_every_sync(
     for (place, object) in (1..).zip(objects) {
         entries.push((pdo.mapping(direction, place), object.mapped().into()));
     }
-    entries.push((pdo.mapping(direction, 0), i64::try_from(objects.len()).expect("at most eight")));
+    entries.push((pdo.mapping(direction, 0), i64::try_from(objects.len()).expect("at most eight objects")));
     entries.extend([(pdo.communication(direction, 2), EVERY_SYNC), (pdo.communication(direction, 1), id)]);
     entries
 }
 
-/// Sets entries while a drive's PDOs rest, and starts these.
+/// Writes entries while a drive's PDOs are inactive, then starts the PDOs.
 pub(super) fn start_drive(query: &MotorQuery<'_>, node: canopen::Node, entries: &[(Object, i64)]) -> Result<(), Error> {
     query.send(Ok(canopen::encode_nmt(Nmt::EnterPreOperational, Some(node))))?;
     for (object, value) in entries {
@@ -251,5 +256,5 @@ pub(super) fn start_drive(query: &MotorQuery<'_>, node: canopen::Node, entries: 
         Ok((from, NodeState::Operational)) => (from == node).then_some(()),
         _ => None,
     })?;
-    started.ok_or_else(|| query.fault("the drive was started and does not say that it is operational"))
+    started.ok_or_else(|| query.fault("the drive was started but did not report the operational state"))
 }

@@ -1,7 +1,7 @@
 //! An arm of motors on CAN buses that may be moved.
 //!
-//! One thread speaks to all buses of the arm, so that its joints set out and arrive together. In each cycle it sends every motor where
-//! to be, which is also what keeps the motors' own watchdogs quiet.
+//! One thread serves all buses of the arm, so that its joints start and arrive together. In each cycle it sends every
+//! motor its setpoint, which also resets the motors' watchdogs.
 
 use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
@@ -18,26 +18,26 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How long the arm's thread may take to answer: it looks for requests once a cycle.
+/// Maximum time for the arm's thread to reply. It checks for requests once per cycle.
 const MAX_ANSWER: Duration = Duration::from_secs(1);
-/// Making motors ready and switching them on takes some hundred milliseconds a motor.
+/// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
 const MAX_RECOVERY: Duration = Duration::from_secs(60);
 
-/// An arm as the rig file has it, and how it may be moved.
+/// Configuration of an arm that may be moved.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MovableArmConfig {
-    /// Buses and motors; those in MIT mode need their gains.
+    /// Buses and motors. Motors in MIT mode need their gains.
     pub arm: ArmConfig,
-    /// Limits of each joint, in the order of the motors, and what happens when this computer falls silent.
+    /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this computer stops sending.
     pub motion: MotionConfig,
-    /// Numbers of the endpoints of `ODrive` axes, without which their watchdog cannot be set.
+    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
     pub odrive_endpoints: Option<Endpoints>,
 }
 
 /// An arm that is held where it was found, and may be moved.
 ///
-/// Dropping it brings it to rest within its limits; then each motor is told what `on_loss` says, those without a watchdog until they
-/// answer.
+/// Dropping it brings it to rest within its limits. Then each motor gets the fail-safe command for `on_loss`; motors
+/// without a watchdog get it repeatedly until they answer, for a limited time.
 #[derive(Debug)]
 pub struct MovableCanArm {
     names: Vec<String>,
@@ -50,23 +50,25 @@ pub struct MovableCanArm {
 }
 
 impl MovableCanArm {
-    /// Checks what can be checked without the motors: limits, and whether each of them can do what is asked for.
+    /// Checks what can be checked without the motors: the limits, and whether each motor supports the configuration.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
         WatchdogPlan::new(config).map(drop)
     }
 
-    /// Checks what the motors can do, sets their timeouts and reads them back, and switches them on, held where they are.
+    /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them, holding their
+    /// positions.
     ///
-    /// Where anything fails, all of them are left switched off.
+    /// # Errors
+    /// If anything fails. All motors are left disabled then.
     pub fn open(config: &MovableArmConfig) -> Result<Self, Error> {
         let names: Vec<String> = config.arm.motors.iter().map(|motor| motor.joint.clone()).collect();
         let (sender, readings) = sync_channel(MAX_WAITING);
         let (requests, request_receiver) = sync_channel(1);
-        let motion = Arc::new(Mutex::new(Motion::Stopped { reason: "it was not switched on yet".to_owned() }));
+        let motion = Arc::new(Mutex::new(Motion::Stopped { reason: "the arm has not been enabled yet".to_owned() }));
         let is_shutting_down = Arc::new(AtomicBool::new(false));
         let arm_loop =
             ArmLoop::new(config, request_receiver, sender, Arc::clone(&motion), Arc::clone(&is_shutting_down))?;
-        let device = "moved CAN arm".to_owned();
+        let device = "movable CAN arm".to_owned();
         let thread = std::thread::Builder::new().name(device.clone()).spawn(move || arm_loop.run());
         let thread = Some(thread.map_err(|source| Error::Thread { device, source })?);
         let joints = Joints::new(names.len());
@@ -75,14 +77,14 @@ impl MovableCanArm {
         Ok(arm)
     }
 
-    /// Has the arm's thread do something, and waits for what came of it.
+    /// Sends a request to the arm's thread, and waits for the reply.
     fn request_and_wait<T>(
         &self,
         request: impl FnOnce(SyncSender<Result<T, Error>>) -> Request,
         timeout: Duration,
     ) -> Result<T, Error> {
         let (sender, answer) = sync_channel(1);
-        let no_answer = || Error::Motion { reason: "its thread does not answer".to_owned() };
+        let no_answer = || Error::Motion { reason: "the arm's thread does not answer".to_owned() };
         self.requests.try_send(request(sender)).map_err(|_| no_answer())?;
         answer.recv_timeout(timeout).map_err(|_| no_answer())?
     }
@@ -93,8 +95,8 @@ impl Arm for MovableCanArm {
         &self.names
     }
 
-    /// As of [`CanArm`](super::CanArm). An arm that stopped goes on being read where its motors tell without being
-    /// commanded and without a SYNC.
+    /// Like [`CanArm`](super::CanArm). A stopped arm is still read, as long as its motors report without commands and
+    /// without a SYNC.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         loop {
@@ -134,7 +136,7 @@ impl Drop for MovableCanArm {
     fn drop(&mut self) {
         self.is_shutting_down.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has said so.
+            // A thread that panicked has already printed the panic message.
             let _ = thread.join();
         }
     }

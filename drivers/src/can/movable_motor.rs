@@ -1,8 +1,9 @@
-//! One motor that may be moved: how it is made ready while it is switched off, what is said to it in each cycle, and how it is by
-//! what it tells.
+//! One motor that may be moved: its preparation while it is disabled, its commands in each cycle, and its health
+//! according to its reports.
 //!
-//! Positions go as they are planned, with their velocity ahead where the protocol has a place for it. Motors in MIT mode get the
-//! rig's stiffness and damping with each command; `ODrive` axes and CiA 402 drives keep the gains that they were tuned to.
+//! Positions are sent as planned, with their velocity as feedforward where the protocol supports it. Motors in MIT
+//! mode get the rig's stiffness and damping with each command; `ODrive` axes and CiA 402 drives keep the gains that
+//! they were tuned to.
 
 use super::ROBSTRIDE_HOST;
 use super::bus::Bus;
@@ -20,35 +21,35 @@ use crate::wire::can::{CanError, Frame, Id, cia402, odrive};
 use crate::{Error, clock};
 use std::time::Duration;
 
-/// How long a motor may take to say that it is off, or in another mode.
+/// Maximum time for a motor to report that it is disabled, or in another mode.
 const MAX_CHANGE: Duration = Duration::from_secs(1);
-/// An `ODrive` axis tells by itself how it is ten times a second, and where it is a hundred times.
+/// An `ODrive` axis reports its state ten times per second, and its position a hundred times.
 const ODRIVE_HEARTBEAT_HZ: f64 = 10.0;
-/// ... and so does a Robstride motor.
+/// Report rate of `ODrive` axes and Robstride motors.
 const REPORT_HZ: f64 = 100.0;
-/// A motor that tells unasked where it is does so at least this often.
+/// Longest interval between reports of a motor that reports unasked.
 const MAX_UNSOLICITED_INTERVAL: Duration = Duration::from_millis(50);
-/// What an SDO answer says where a drive has no such object.
+/// SDO abort code of a drive that does not have the object.
 const NO_SUCH_OBJECT: u32 = 0x0602_0000;
 
-/// How a motor is, by what it told last.
+/// State of a motor according to its last report.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Health {
-    /// Switched off.
+    /// Disabled.
     Off,
-    /// It obeys commands.
+    /// Enabled: it follows commands.
     Enabled,
-    /// It stopped by itself.
+    /// It stopped because of a fault.
     Fault(String),
 }
 
-/// Frames of both sides that keep a motor moving: those of each cycle, and others with how often they come in a second.
+/// Frames sent and received while a motor moves: those of each cycle, and others with their rate in Hz.
 pub(super) struct Traffic {
     pub(super) cycle_frames: Vec<Frame>,
     pub(super) unsolicited: Vec<(Frame, f64)>,
 }
 
-/// A motor that may be moved, and is switched off until [`MovableMotor::enable`] is sent.
+/// A motor that may be moved. It is disabled until [`MovableMotor::enable`] is sent.
 #[derive(Debug)]
 pub(super) struct MovableMotor {
     motor: Motor,
@@ -58,10 +59,10 @@ pub(super) struct MovableMotor {
 }
 
 impl MovableMotor {
-    /// Finds a motor, switches it off, forgets its faults, sets its watchdog and its mode, and reads both back.
+    /// Finds a motor, disables it, clears its faults, sets its watchdog and its mode, and verifies both.
     pub(super) fn prepare(bus: &Bus, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Self, Error> {
         let motor = match config.family {
-            // It answers commands only, and is asked with the order that switches it off.
+            // It answers only commands, so it is polled with the command that disables it.
             Family::TMotor { model, .. } => Motor::with_limits(config.clone(), model.limits()),
             _ => Motor::set_up(bus, config)?,
         };
@@ -78,7 +79,7 @@ impl MovableMotor {
         self.motor.config()
     }
 
-    /// The motor alone, for who only reads it.
+    /// The motor for reading only.
     pub(super) fn motor(&self) -> &Motor {
         &self.motor
     }
@@ -87,12 +88,12 @@ impl MovableMotor {
         self.health.as_ref()
     }
 
-    /// Forgets what it told about itself.
+    /// Forgets the last reported health.
     pub(super) fn clear_health(&mut self) {
         self.health = None;
     }
 
-    /// The joint's limits, and no further and faster than the motor's counts go.
+    /// Limits of the joint, reduced to the range of the motor's raw values.
     pub(super) fn limits(&self, joint: &MotionLimits) -> MotionLimits {
         let (config, per_turn) = (self.motor.config(), self.motor.per_turn());
         let (max_rad, max_rad_s) = match config.family {
@@ -109,7 +110,7 @@ impl MovableMotor {
         }
     }
 
-    /// How long it may be silent before it counts as lost, where `default_limit` is what others may.
+    /// How long the motor may be silent before it counts as lost. `default_limit` applies to most families.
     pub(super) fn max_silence(&self, default_limit: Duration) -> Duration {
         match self.motor.config().family {
             Family::Odrive { .. } => default_limit.max(MAX_UNSOLICITED_INTERVAL),
@@ -117,7 +118,7 @@ impl MovableMotor {
         }
     }
 
-    /// What goes over its bus while it moves.
+    /// Traffic on its bus while it moves.
     pub(super) fn traffic(family: &Family) -> Traffic {
         let frame_of_8_bytes = |id: Id| Frame::classic(id, &[0; 8]).expect("eight bytes");
         let (short, long) =
@@ -132,7 +133,7 @@ impl MovableMotor {
         Traffic { cycle_frames, unsolicited }
     }
 
-    /// What is sent so that it tells where it is while it is off; `None` where it tells unasked, or at a SYNC.
+    /// The frame that polls the position of the disabled motor; `None` if it reports unasked or at a SYNC.
     pub(super) fn poll_frame(&self) -> Option<Frame> {
         match self.motor.config().family {
             Family::TMotor { motor, .. } => tmotor::encode_state_command(motor, tmotor::StateCommand::Disable).ok(),
@@ -144,7 +145,7 @@ impl MovableMotor {
         self.motor.needs_sync()
     }
 
-    /// What switches it on; a CiA 402 drive is brought there by its commands.
+    /// Frames that enable it. A CiA 402 drive needs none, because its commands enable it.
     pub(super) fn enable(&self) -> Result<Vec<Frame>, CanError> {
         let limits = self.motor.limits();
         match self.motor.config().family {
@@ -159,14 +160,14 @@ impl MovableMotor {
             }
             Family::Odrive { node } => {
                 let closed = odrive::Request::SetState(odrive::State::ClosedLoopControl);
-                // Its watchdog may have run out while it was off.
+                // Its watchdog may have expired while it was disabled.
                 [odrive::Request::ClearErrors, closed].iter().map(|it| odrive::encode_request(node, it)).collect()
             }
             Family::Cia402 { .. } => Ok(Vec::new()),
         }
     }
 
-    /// A command: where its joint shall be and how fast, rad and rad/s.
+    /// A command for the position and velocity of its joint, rad and rad/s.
     pub(super) fn command(&self, position_rad: f64, velocity_rad_s: f64) -> Result<Frame, CanError> {
         let stiffness = self.gains().map_or(0.0, |[kp, _]| kp);
         self.command_with(position_rad, velocity_rad_s, stiffness)
@@ -190,7 +191,7 @@ impl MovableMotor {
                 odrive::encode_request(node, &request)
             }
             Family::Cia402 { node, units } => {
-                // What brings it one state nearer to obeying, and keeps it there; a fault is not reset by this.
+                // Advances the drive by one state towards enabled, and keeps it there. This does not reset a fault.
                 let state_command = match self.drive {
                     cia402::State::OperationEnabled => cia402::StateCommand::EnableOperation,
                     state => state.next_enabling_command(false).unwrap_or(cia402::StateCommand::DisableVoltage),
@@ -202,7 +203,8 @@ impl MovableMotor {
         }
     }
 
-    /// What is said to it last, where it shall do by itself from now on what `on_loss` says; `position_rad` is where its joint was sent.
+    /// The fail-safe command, which makes the motor do what `on_loss` specifies without further commands.
+    /// `position_rad` is the last commanded position of its joint.
     pub(super) fn shutdown(&self, on_loss: OnLoss, position_rad: f64) -> Result<Vec<Frame>, CanError> {
         match (on_loss, self.motor.config().family) {
             (OnLoss::Release, _) => self.release(),
@@ -214,7 +216,7 @@ impl MovableMotor {
         }
     }
 
-    /// What switches it off.
+    /// Frames that disable it.
     fn release(&self) -> Result<Vec<Frame>, CanError> {
         let frame = match self.motor.config().family {
             Family::Damiao { motor, .. } => damiao::encode_state_command(motor, damiao::StateCommand::Disable),
@@ -229,7 +231,7 @@ impl MovableMotor {
         Ok(vec![frame?])
     }
 
-    /// What its joint does, where a frame tells; how it is, is kept.
+    /// Updates the motor's health from a frame, and returns the reading of its joint, if the frame has one.
     pub(super) fn process_frame(&mut self, frame: &Frame) -> Option<Reading> {
         let reading = self.motor.read(frame);
         let is_feedback = reading.is_some();
@@ -242,7 +244,7 @@ impl MovableMotor {
                     damiao::Status::Disabled => Health::Off,
                     damiao::Status::Enabled => Health::Enabled,
                     damiao::Status::LostCommunication => Health::Fault(COMMUNICATION_LOST.to_owned()),
-                    status => Health::Fault(format!("it stopped: {status:?}")),
+                    status => Health::Fault(format!("the motor stopped: {status:?}")),
                 });
             }
             Family::Robstride { motor, .. } => match robstride::decode_answer(frame, ROBSTRIDE_HOST, &limits) {
@@ -250,20 +252,20 @@ impl MovableMotor {
                     self.health = Some(match (reported.mode, reported.faults) {
                         (robstride::Mode::Run, Faults(0)) => Health::Enabled,
                         (_, Faults(0)) => Health::Off,
-                        (_, Faults(bits)) => Health::Fault(format!("it has the fault bits {bits:#08b}")),
+                        (_, Faults(bits)) => Health::Fault(format!("the motor reports the fault bits {bits:#08b}")),
                     });
                 }
                 Ok(robstride::Answer::Fault { motor: from, faults, .. }) if from == motor && faults != 0 => {
-                    self.health = Some(Health::Fault(format!("it has the faults {faults:#x}")));
+                    self.health = Some(Health::Fault(format!("the motor reports the faults {faults:#x}")));
                 }
                 _ => {}
             },
             Family::TMotor { .. } if is_feedback => {
                 let reported = tmotor::decode_feedback(frame, &limits, Thermometer::Offset40).ok()?;
-                // It does not tell whether it obeys.
+                // It does not report whether it is enabled.
                 self.health = Some(match reported.health.map(|health| health.fault) {
                     None | Some(tmotor::Fault::None) => Health::Enabled,
-                    Some(fault) => Health::Fault(format!("it stopped: {fault:?}")),
+                    Some(fault) => Health::Fault(format!("the motor stopped: {fault:?}")),
                 });
             }
             Family::Odrive { node } => {
@@ -274,7 +276,7 @@ impl MovableMotor {
                         (0, odrive::State::ClosedLoopControl) => Health::Enabled,
                         (0, _) => Health::Off,
                         (odrive::WATCHDOG_TIMER_EXPIRED, _) => Health::Fault(COMMUNICATION_LOST.to_owned()),
-                        (errors, _) => Health::Fault(format!("it has the errors {errors:#x}")),
+                        (errors, _) => Health::Fault(format!("the axis reports the errors {errors:#x}")),
                     });
                 }
             }
@@ -283,9 +285,9 @@ impl MovableMotor {
                     self.drive = state;
                     self.health = Some(match state {
                         cia402::State::OperationEnabled => Health::Enabled,
-                        cia402::State::QuickStopActive => Health::Fault("it made a quick stop".to_owned()),
+                        cia402::State::QuickStopActive => Health::Fault("the drive made a quick stop".to_owned()),
                         cia402::State::Fault | cia402::State::FaultReactionActive => {
-                            Health::Fault("it has a fault".to_owned())
+                            Health::Fault("the drive reports a fault".to_owned())
                         }
                         _ => Health::Off,
                     });
@@ -296,30 +298,30 @@ impl MovableMotor {
         reading
     }
 
-    /// Stiffness and damping of the motor: those of its joint, divided by the square of the gear's ratio.
+    /// Stiffness and damping of the motor: those of its joint, divided by the square of the gear ratio.
     fn gains(&self) -> Option<[f64; 2]> {
         let squared = self.motor.per_turn().powi(2);
         let gains = self.motor.config().gains?;
         Some([gains.stiffness_nm_rad * squared, gains.damping_nm_s_rad * squared])
     }
 
-    /// What its counts do not hold would be cut off without a word.
+    /// Checks the gains against the motor's range, because larger values would be clamped silently.
     fn check_gains(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let Some([kp, kd]) = self.gains() else { return Ok(()) };
         let max = self.motor.limits();
         match kp <= max.kp_nm_rad && kd <= max.kd_nm_s_rad {
             true => Ok(()),
             false => Err(query.fault(format!(
-                "its stiffness and damping are {kp} N m / rad and {kd} N m s / rad at the motor, whose counts hold up to {} and {}",
+                "stiffness and damping at the motor are {kp} N m / rad and {kd} N m s / rad, but its protocol supports at most {} and {}",
                 max.kp_nm_rad, max.kd_nm_s_rad
             ))),
         }
     }
 
-    /// Switches it off and forgets what had stopped it, which is logged.
+    /// Disables the motor, and clears its faults after logging them.
     fn switch_off(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let switch_off_error =
-            |why: String| query.fault(format!("it is to be switched off and does not say so: {why}"));
+            |why: String| query.fault(format!("the motor was disabled but does not report it: {why}"));
         match self.motor.config().family {
             Family::Damiao { motor, .. } => {
                 let mut status = damiao::Status::Enabled;
@@ -336,7 +338,7 @@ impl MovableMotor {
                     if status == damiao::Status::Disabled {
                         return Ok(());
                     }
-                    log::warn!("{}: it tells {status:?}", query.name());
+                    log::warn!("{}: the motor reports {status:?}", query.name());
                 }
                 Err(switch_off_error(format!("{status:?}")))
             }
@@ -382,7 +384,7 @@ impl MovableMotor {
                     let requested = match state {
                         cia402::State::SwitchOnDisabled => return Ok(()),
                         cia402::State::Fault => {
-                            log::warn!("{}: it has a fault, which is reset", query.name());
+                            log::warn!("{}: the drive reports a fault; resetting it", query.name());
                             cia402::StateCommand::ResetFault
                         }
                         _ => cia402::StateCommand::DisableVoltage,
@@ -390,7 +392,7 @@ impl MovableMotor {
                     if clock::now() > deadline {
                         return Err(switch_off_error(format!("{state:?}")));
                     }
-                    // A reset counts when its bit rises.
+                    // A reset takes effect on the rising edge of its bit.
                     for state_command in [cia402::StateCommand::DisableVoltage, requested] {
                         query.set(node, cia402::CONTROLWORD, state_command.controlword().into())?;
                     }
@@ -399,10 +401,10 @@ impl MovableMotor {
         }
     }
 
-    /// What commands mean to it.
+    /// Sets the control mode, which determines the meaning of commands.
     fn set_mode(&self, query: &MotorQuery<'_>, plan: &WatchdogPlan) -> Result<(), Error> {
         let mode_mismatch =
-            |reported: String| Err(query.fault(format!("its mode was set and reads back as {reported}")));
+            |reported: String| Err(query.fault(format!("its mode was set but reads back as {reported}")));
         match self.motor.config().family {
             Family::Damiao { motor, feedback } => {
                 let requested = damiao::Value::Integer(damiao::MIT_MODE);
@@ -430,10 +432,10 @@ impl MovableMotor {
     }
 }
 
-/// What a motor tells whose own timeout has passed.
-const COMMUNICATION_LOST: &str = "nothing of us came to it for longer than its timeout";
+/// Fault of a motor whose own timeout has expired.
+const COMMUNICATION_LOST: &str = "it received no command for longer than its timeout";
 
-/// An order to a drive outside the cycle.
+/// A state command to a drive outside the cycle.
 fn state_command(node: canopen::Node, state_command: cia402::StateCommand) -> Result<Frame, CanError> {
     canopen::encode_write(node, cia402::CONTROLWORD, state_command.controlword().into())
 }
@@ -447,12 +449,12 @@ fn state_of(frame: &Frame, node: canopen::Node) -> Option<cia402::State> {
     cia402::State::from_statusword(statusword).ok()
 }
 
-/// A position at every SYNC, and the state told at every SYNC.
+/// Makes the drive accept a position and report its state at every SYNC.
 fn set_drive_mode(query: &MotorQuery<'_>, node: canopen::Node, period: Duration) -> Result<(), Error> {
     let supported = query.get(node, cia402::SUPPORTED_MODES)?;
     if !cia402::Mode::CyclicPosition.is_in(supported) {
         return Err(query.fault(format!(
-            "the drive has no cyclic synchronous position mode (object 0x6502 is {supported:#x}), and no other is spoken"
+            "the drive has no cyclic synchronous position mode (object 0x6502 is {supported:#x}), and no other mode is supported"
         )));
     }
     query.set(node, cia402::MODE, cia402::Mode::CyclicPosition as i64)?;
@@ -462,7 +464,7 @@ fn set_drive_mode(query: &MotorQuery<'_>, node: canopen::Node, period: Duration)
             return Err(query.fault("the drive does not change to cyclic synchronous position mode"));
         }
     }
-    // The period is whole milliseconds where there are drives; one that does not interpolate has no such object.
+    // With drives the period is in whole milliseconds. A drive that does not interpolate does not have this object.
     let millis = i64::try_from(period.as_millis()).unwrap_or(i64::MAX);
     for (object, value) in [(cia402::INTERPOLATION_PERIOD, millis), (cia402::INTERPOLATION_EXPONENT, -3)] {
         match query.try_set(node, object, value)? {
@@ -484,7 +486,7 @@ mod tests {
 
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
-    /// Behind a gear of 4, turning the other way.
+    /// A motor behind a gear of 4 that turns in the opposite direction.
     fn movable_motor(family: Family) -> MovableMotor {
         let config = MotorConfig {
             joint: "elbow".to_owned(),
@@ -507,7 +509,7 @@ mod tests {
     fn commands_are_in_motor_coordinates() {
         let sent = damiao().command(1.0, 0.25).expect("numbers");
         let got = mit::decode(sent.data().try_into().expect("eight bytes"), &LIMITS);
-        // Half a count of 16 and 12 bits.
+        // Half a raw unit of 16 and 12 bits.
         assert!((got.position_rad + 2.0).abs() < 2e-4 && (got.velocity_rad_s + 1.0).abs() < 8e-3, "{got:?}");
         assert!((got.kp_nm_rad - 10.0).abs() < 0.07 && (got.kd_nm_s_rad - 1.0).abs() < 7e-4, "{got:?}");
         assert!(got.torque_nm.abs() < 3e-3, "{got:?}");
@@ -533,7 +535,7 @@ mod tests {
         let mut process_state = |state: cia402::State| {
             let id = Pdo::Second.id(Direction::Transmit, node);
             let reported = Frame::classic(id, &state.statusword().to_le_bytes()).expect("two bytes");
-            assert_eq!(drive.process_frame(&reported), None, "it is no position");
+            assert_eq!(drive.process_frame(&reported), None, "a statusword is not a position");
             let command = drive.command(0.5, 0.0).expect("numbers");
             assert_eq!((command.id(), &command.data()[2..]), (Pdo::First.id(Direction::Receive, node), &[0; 4][..]));
             (command.data()[0], drive.health().cloned())

@@ -1,4 +1,4 @@
-//! Questions to one motor and its answers, while nothing else reads the bus: what is done before a cycle begins.
+//! Requests to one motor and its answers, for use before the cycle starts, while nothing else reads the bus.
 
 use super::ROBSTRIDE_HOST;
 use super::bus::{Bus, BusEvent, WireErrors};
@@ -12,12 +12,12 @@ use crate::{Error, clock};
 use std::cell::Cell;
 use std::time::Duration;
 
-/// How long an answer may take; on a full bus at 1 Mbit/s a frame waits for some milliseconds.
+/// Maximum time for an answer. On a full bus at 1 Mbit/s a frame waits for some milliseconds.
 const MAX_ANSWER: Duration = Duration::from_millis(50);
-/// How often a question is asked before the motor counts as silent.
+/// Number of requests before the motor counts as silent.
 const MAX_ATTEMPTS: usize = 4;
 
-/// A conversation with one motor.
+/// Request-response access to one motor.
 pub(super) struct MotorQuery<'a> {
     bus: &'a Bus,
     config: &'a MotorConfig,
@@ -38,21 +38,21 @@ impl<'a> MotorQuery<'a> {
         Error::Motor { joint: self.config.joint.clone(), interface, reason: reason.into() }
     }
 
-    /// What a codec said, as an error of this motor.
+    /// Converts the error of a codec to an error of this motor.
     pub(super) fn map_error<T>(&self, result: Result<T, CanError>) -> Result<T, Error> {
         result.map_err(|error| self.fault(error.to_string()))
     }
 
-    /// Sends what a codec made.
+    /// Sends an encoded frame.
     pub(super) fn send(&self, frame: Result<Frame, CanError>) -> Result<(), Error> {
         let frame = self.map_error(frame)?;
         match self.bus.send(&frame)? {
             true => Ok(()),
-            false => Err(self.fault("nothing can be sent: the interface's queue stays full")),
+            false => Err(self.fault("cannot send: the interface's queue stays full")),
         }
     }
 
-    /// The first frame within a time that `matches`.
+    /// Returns the first result of `matches` on a received frame, or `None` if there is none within the time limit.
     pub(super) fn wait<T>(
         &self,
         timeout_limit: Duration,
@@ -80,7 +80,7 @@ impl<'a> MotorQuery<'a> {
         }
     }
 
-    /// Asks until an answer comes, some times.
+    /// Sends a request repeatedly until an answer arrives, up to a maximum number of attempts.
     pub(super) fn request_answer<T>(
         &self,
         poll_frame: &Frame,
@@ -93,15 +93,16 @@ impl<'a> MotorQuery<'a> {
             }
         }
         let errors = self.errors.get();
-        // Not every controller's driver tells that frames are not acknowledged; all tell what their counters come to by that.
+        // Not every controller's driver reports unacknowledged frames, but all report the resulting state of the
+        // error counters.
         Err(self.fault(match errors.n_unacknowledged + errors.n_passive + errors.n_bus_off {
-            0 => format!("no answer to {MAX_ATTEMPTS} questions; is the motor powered and its number right?"),
-            _ => "nobody acknowledges frames: the others are off, at another bit rate, or the bus is cut or not terminated"
+            0 => format!("no answer to {MAX_ATTEMPTS} requests; check that the motor is powered and its id is correct"),
+            _ => "no node acknowledges frames: the other nodes are off or use another bit rate, or the bus is cut or not terminated"
                 .to_owned(),
         }))
     }
 
-    /// What a register of a Damiao motor holds.
+    /// Reads a register of a Damiao motor.
     pub(super) fn register(&self, motor: u16, feedback: u16, register: Register) -> Result<damiao::Value, Error> {
         let poll_frame = RegisterMessage { motor, access: Access::Read(register) };
         let poll_frame = self.map_error(damiao::encode_register(&poll_frame, None))?;
@@ -121,7 +122,7 @@ impl<'a> MotorQuery<'a> {
         self.send(robstride::encode_request(ROBSTRIDE_HOST, motor, request, limits))
     }
 
-    /// What a parameter of a Robstride motor holds.
+    /// Reads a parameter of a Robstride motor.
     pub(super) fn parameter(
         &self,
         motor: u8,
@@ -139,7 +140,7 @@ impl<'a> MotorQuery<'a> {
         })
     }
 
-    /// What an `ODrive` axis answers to a question.
+    /// Sends a request to an `ODrive` axis, and returns its answer.
     pub(super) fn axis<T>(
         &self,
         node: odrive::Node,
@@ -153,7 +154,7 @@ impl<'a> MotorQuery<'a> {
         })
     }
 
-    /// What an object of a CANopen node holds; its upper bytes are 0 where it is shorter.
+    /// Reads an object of a CANopen node; the upper bytes are 0 if it is shorter.
     pub(super) fn get(&self, node: canopen::Node, object: Object) -> Result<u32, Error> {
         let answer =
             self.request_answer(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
@@ -168,7 +169,7 @@ impl<'a> MotorQuery<'a> {
         self.map_error(answer)
     }
 
-    /// Sets an object of a CANopen node and reads it back.
+    /// Writes an object of a CANopen node and verifies it.
     pub(super) fn set_and_check(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
         self.set(node, object, value)?;
         let bits = u32::MAX >> (32 - 8 * u32::from(object.n_bytes));
@@ -176,19 +177,19 @@ impl<'a> MotorQuery<'a> {
         match i64::from(reported) == value & i64::from(bits) {
             true => Ok(()),
             false => Err(self.fault(format!(
-                "object {:#06x}:{:02x} was set to {value} and reads back as {reported:#x}",
+                "object {:#06x}:{:02x} was set to {value} but reads back as {reported:#x}",
                 object.index, object.subindex
             ))),
         }
     }
 
-    /// Sets an object of a CANopen node.
+    /// Writes an object of a CANopen node.
     pub(super) fn set(&self, node: canopen::Node, object: Object, value: i64) -> Result<(), Error> {
         let answer = self.try_set(node, object, value)?;
         self.map_error(answer)
     }
 
-    /// The same, where the node may refuse it.
+    /// Like [`MotorQuery::set`], but returns a refusal of the node as the inner error.
     pub(super) fn try_set(
         &self,
         node: canopen::Node,

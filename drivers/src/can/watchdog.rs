@@ -1,15 +1,17 @@
-//! What motors do by themselves once nothing comes from us any more, how they are told to, and what they cannot do.
+//! What motors do on their own when our commands stop, how this is configured, and what they cannot do.
 //!
-//! - Damiao: register `TIMEOUT`; the motor leaves the enabled state and tells "communication lost". Source: Damiao DM-J4310-2EC manual
-//!   V1.0, as in `jia-xie/python-damiao-driver` `docs/concept/`.
-//! - Robstride: parameter `canTimeout`; the motor goes to its reset mode. The damping of its parameter `damper` is against surges of
-//!   motors without power, and cannot be relied on. Source: RS00 to RS06 user manuals, sections 4.2 and 4.3.5.
+//! - Damiao: register `TIMEOUT`; the motor leaves the enabled state and reports "communication lost". Source: Damiao
+//!   DM-J4310-2EC manual V1.0, as in `jia-xie/python-damiao-driver` `docs/concept/`.
+//! - Robstride: parameter `canTimeout`; the motor goes to its reset mode. The damping of its parameter `damper`
+//!   protects unpowered motors against surges, and cannot be relied on. Source: RS00 to RS06 user manuals, sections
+//!   4.2 and 4.3.5.
 //! - ODrive: `axis0.config.watchdog_timeout` and `enable_watchdog`; the axis is disarmed. Source: ODrive documentation, error
 //!   `WATCHDOG_TIMER_EXPIRED`.
-//! - CiA 402: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): a quick stop that stays stopped (`0x605A` = 6),
-//!   or voltage off. Source: CiA 301, section 7.5.2.20; CiA 402-2, objects 6007h and 605Ah. What the drive does on faults of its own
-//!   (`0x605E`) is left as it was set.
-//! - T-Motor AK: nothing; the last command is obeyed for ever. Source: CubeMars AK Series Module Product Manual, MIT mode.
+//! - CiA 402: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): either a quick stop after
+//!   which the drive stays stopped (`0x605A` = 6), or voltage off. Source: CiA 301, section 7.5.2.20; CiA 402-2,
+//!   objects 6007h and 605Ah. The reaction of the drive to its own faults (`0x605E`) is left unchanged.
+//! - T-Motor AK: nothing; the motor executes its last command forever. Source: CubeMars AK Series Module Product
+//!   Manual, MIT mode.
 
 use super::config::{Family, MotorConfig};
 use super::query::MotorQuery;
@@ -23,22 +25,22 @@ use crate::wire::can::odrive::{self, Endpoints};
 use crate::wire::can::robstride::{self, Parameter};
 use std::time::Duration;
 
-/// What all motors of an arm are set to.
+/// Watchdog configuration of all motors of an arm.
 #[derive(Clone, Debug)]
 pub(super) struct WatchdogPlan {
     pub(super) on_loss: OnLoss,
     pub(super) timeout: Duration,
     pub(super) accept_no_watchdog: bool,
-    /// Numbers of `ODrive`'s endpoints, without which its watchdog cannot be set.
+    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
     pub(super) endpoints: Option<Endpoints>,
-    /// Our own number among CANopen nodes, whose heartbeat is missed.
+    /// Our CANopen node number, whose heartbeat the drives monitor.
     pub(super) host: canopen::Node,
-    /// From cycle to cycle.
+    /// Cycle period.
     pub(super) period: Duration,
 }
 
 impl WatchdogPlan {
-    /// Whether a motor notices by itself that nothing comes any more.
+    /// Whether a motor detects missing commands.
     pub(super) fn has_watchdog(&self, family: &Family) -> bool {
         match family {
             Family::TMotor { .. } => false,
@@ -47,17 +49,19 @@ impl WatchdogPlan {
         }
     }
 
-    /// Whether a motor may be moved as planned; said before anything is sent to it.
+    /// Checks whether a motor may be moved as planned, before anything is sent to it.
     pub(super) fn check(&self, config: &MotorConfig, interface: &str) -> Result<(), Error> {
         let fault = |reason| Err(Error::Motor { joint: config.joint.clone(), interface: interface.to_owned(), reason });
         let has_watchdog = self.has_watchdog(&config.family);
         if !has_watchdog && !self.accept_no_watchdog {
             let what = match config.family {
-                Family::Odrive { .. } => "without arm.motion.odrive_endpoints its watchdog cannot be set, and it",
+                Family::Odrive { .. } => {
+                    "without arm.motion.odrive_endpoints the watchdog of this axis cannot be set: it"
+                }
                 _ => "a motor of this family has no watchdog: it",
             };
             return fault(format!(
-                "{what} would go on with its last command for ever if this computer fell silent; it is moved only with \
+                "{what} would execute its last command forever if this computer stopped sending; it is moved only with \
                  arm.motion.accept_no_watchdog = true"
             ));
         }
@@ -65,21 +69,22 @@ impl WatchdogPlan {
         if !can.contains(&self.on_loss) {
             let can: Vec<_> = can.iter().map(|can| format!("{:?}", can.name())).collect();
             let requested = self.on_loss.name();
-            return fault(format!("arm.motion.on_loss is {requested:?}, and this motor can only {}", can.join(" or ")));
+            return fault(format!("arm.motion.on_loss is {requested:?}, but this motor can only {}", can.join(" or ")));
         }
         if config.gains.is_none() && has_gains(&config.family) {
-            return fault("moving it needs its stiffness_nm_rad and damping_nm_s_rad".to_owned());
+            return fault("to move this motor, set its stiffness_nm_rad and damping_nm_s_rad".to_owned());
         }
         Ok(())
     }
 }
 
-/// Whether each command carries how stiffly the joint is held.
+/// Whether each command includes the stiffness and damping.
 fn has_gains(family: &Family) -> bool {
     matches!(family, Family::Damiao { .. } | Family::Robstride { .. } | Family::TMotor { .. })
 }
 
-/// What motors do by their own watchdogs; or, without one, what they can be told while there still is somebody to tell it.
+/// Actions that a motor's own watchdog supports; without a watchdog, the actions that this computer can command while
+/// it is still running.
 fn supported_actions(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
     match (family, has_watchdog) {
         (Family::Cia402 { .. }, _) | (Family::Odrive { .. }, false) => &[OnLoss::Hold, OnLoss::Release],
@@ -88,12 +93,16 @@ fn supported_actions(family: &Family, has_watchdog: bool) -> &'static [OnLoss] {
     }
 }
 
-/// Sets the watchdog of a motor that is switched off, and reads it back; one that reads back otherwise is an error.
+/// Sets and verifies the watchdog of a disabled motor.
+///
+/// # Errors
+/// If a value reads back differently.
 pub(super) fn set(query: &MotorQuery<'_>, family: &Family, limits: &Limits, plan: &WatchdogPlan) -> Result<(), Error> {
     let seconds = plan.timeout.as_secs_f64();
     let mismatch = |reported: String| {
-        Err(query
-            .fault(format!("its timeout was set to {seconds} s and reads back as {reported}; it is not switched on")))
+        Err(query.fault(format!(
+            "its timeout was set to {seconds} s but reads back as {reported}; the motor is not enabled"
+        )))
     };
     match *family {
         Family::Damiao { motor, feedback } => {
@@ -134,7 +143,8 @@ pub(super) fn set(query: &MotorQuery<'_>, family: &Family, limits: &Limits, plan
     }
 }
 
-/// The watchdog of an `ODrive` axis, after its firmware was found to be that of the endpoints: other numbers set other things.
+/// Sets the watchdog of an `ODrive` axis, after checking that the endpoint numbers are those of its firmware: the
+/// numbers depend on it.
 fn set_axis(
     query: &MotorQuery<'_>,
     node: odrive::Node,
@@ -149,11 +159,11 @@ fn set_axis(
     })?;
     if !endpoints.match_versions(hardware, firmware) {
         return Err(query.fault(format!(
-            "it runs firmware {firmware:?} on hardware {hardware:?}, and arm.motion.odrive_endpoints is of firmware {} on hardware {}",
+            "it runs firmware {firmware:?} on hardware {hardware:?}, but arm.motion.odrive_endpoints is for firmware {} on hardware {}",
             endpoints.firmware, endpoints.hardware
         )));
     }
-    // A flag is one byte; what is behind it in an answer means nothing.
+    // A flag is one byte; the bytes after it in an answer are undefined.
     let settings = [
         (endpoints.watchdog_timeout, timeout.as_secs_f32().to_le_bytes(), 4),
         (endpoints.enable_watchdog, [1, 0, 0, 0], 1),
@@ -237,7 +247,7 @@ mod tests {
         }
         let endpoints = Some(super::super::emulated::endpoints());
         assert_eq!(reported(odrive, OnLoss::Release, false, endpoints.clone()), None);
-        assert!(reported(odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog only lets go");
+        assert!(reported(odrive, OnLoss::Hold, true, endpoints).is_some(), "its watchdog can only release");
         assert_eq!(reported(odrive, OnLoss::Hold, true, None), None);
     }
 }

@@ -1,4 +1,4 @@
-//! An arm that is read: a thread takes the robot's states, the caller gets them as joint states.
+//! A read-only arm. A thread receives the robot's states; the caller gets them as joint states.
 
 #[cfg(any(test, fuzzing))]
 pub(crate) mod fuzz;
@@ -18,29 +18,30 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// States that may wait for a slow caller, one second of them; then the oldest goes.
+/// Capacity of the queue of states for a slow caller: one second. When it is full, the oldest state is dropped.
 const MAX_WAITING: usize = 1000;
-/// A robot that says nothing for so long is lost.
+/// A robot that sends nothing for this long counts as lost.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
-/// Where our forward kinematics and the robot's own differ by more, one of them is of another robot.
+/// Maximum difference between our forward kinematics and the robot's own. Beyond it, the description is of another
+/// robot.
 const MAX_POSE_ERROR_M: f64 = 2e-3;
 const MAX_POSE_ERROR_RAD: f64 = 0.5 / 180.0 * std::f64::consts::PI;
 const NANOS_PER_STATE: i64 = 1_000_000;
-/// A robot that was not answered for so long has given up: what came meanwhile is not answered any more.
+/// A robot that got no answer for this long has given up. States that arrived in the meantime are not answered.
 const MAX_RESPONSE_GAP: Duration = Duration::from_millis(20);
 
-/// An arm as the rig file has it.
+/// Configuration of an arm from the rig file.
 #[derive(Clone, Debug)]
 pub struct ArmConfig {
-    /// Host of the controller, with a port where that is not 1337.
+    /// Host of the controller, with the port if it is not 1337.
     pub address: String,
     /// The seven joints, from the base to the flange.
     pub joint_names: Vec<String>,
-    /// From the link that the first joint turns against to the flange.
+    /// Chain from the parent link of the first joint to the flange.
     pub chain: Chain,
 }
 
-/// A Franka arm that is read; nothing here moves it. Dropping it frees the robot's interface.
+/// A read-only Franka arm. Nothing here moves it. Dropping it frees the robot's interface.
 #[derive(Debug)]
 pub struct FrankaArm {
     device: String,
@@ -56,7 +57,7 @@ struct Shared {
     arrived: Condvar,
 }
 
-/// What lies between the thread and the caller.
+/// State shared by the thread and the caller.
 #[derive(Debug, Default)]
 struct StateQueue {
     queue: VecDeque<JointState>,
@@ -66,12 +67,12 @@ struct StateQueue {
 }
 
 impl FrankaArm {
-    /// Connects, checks that the rig file describes this robot, and starts to read.
+    /// Connects, checks that the rig file describes this robot, and starts reading.
     pub fn open(config: &ArmConfig) -> Result<Self, Error> {
         Self::open_with(config, |_, _| Ok(None))
     }
 
-    /// The same, with what moves the arm by its states, made once there is one.
+    /// Like [`FrankaArm::open`], with a motion loop that is created from the first state and then moves the arm.
     pub(super) fn open_with(
         config: &ArmConfig,
         motion_loop: impl FnOnce(&Arc<Session>, &RobotState) -> Result<Option<MotionLoop>, String>,
@@ -80,7 +81,7 @@ impl FrankaArm {
         let fault = |reason| Error::Fci { address: address.clone(), reason };
         let n = config.joint_names.len();
         if n != N_JOINTS || config.chain.n_joints() != N_JOINTS {
-            return Err(fault(format!("the rig file names {n} joints of the arm, which has {N_JOINTS}")));
+            return Err(fault(format!("the rig file names {n} joints, but the arm has {N_JOINTS}")));
         }
         let session = Arc::new(Session::open(address)?);
         let Session { network, version } = &*session;
@@ -88,14 +89,14 @@ impl FrankaArm {
         let deadline = clock::now() + MAX_SILENCE;
         let mut buffer = [0; MAX_STATE_BYTES];
         let first = loop {
-            // Whatever went wrong, a state may still come.
+            // After a receive error a state may still arrive.
             let n = network.udp.blocking_receive(&mut buffer).unwrap_or(0);
             match decode(version, &buffer[..n]) {
                 Some(first) => break first.state,
                 None if clock::now() < deadline => {}
                 None => {
                     return Err(fault(format!(
-                        "it sends no states: do UDP datagrams to port {} of this computer pass its firewall?",
+                        "it sends no states; check that this computer's firewall lets UDP datagrams to port {} pass",
                         network.udp.port()
                     )));
                 }
@@ -111,16 +112,16 @@ impl FrankaArm {
         let name = "franka".to_owned();
         let thread = std::thread::Builder::new().name(name).spawn(move || reader.run(&session, &reading));
         let thread = thread.map_err(|source| Error::Thread { device: device.clone(), source })?;
-        log::info!("{device}: speaks version {} of FCI", if version == FciVersion::V5 { 5 } else { 10 });
+        log::info!("{device}: uses FCI version {}", if version == FciVersion::V5 { 5 } else { 10 });
         Ok(Self { device, names: config.joint_names.clone(), version, shared, thread: Some(thread) })
     }
 
-    /// The version that the controller speaks.
+    /// FCI version of the controller.
     pub fn version(&self) -> FciVersion {
         self.version
     }
 
-    /// What became of the states so far.
+    /// Statistics of the states so far.
     pub fn statistics(&self) -> StateStatistics {
         self.shared.lock().statistics.clone()
     }
@@ -131,7 +132,8 @@ impl Arm for FrankaArm {
         &self.names
     }
 
-    /// Stamped by the robot's own clock, mapped to ours; efforts are the measured torques at the links, gravity among them.
+    /// States are stamped by the robot's clock, mapped to ours. Efforts are the measured link-side torques, including
+    /// gravity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
         let mut state = self.shared.lock();
@@ -155,21 +157,21 @@ impl Drop for FrankaArm {
     fn drop(&mut self) {
         self.shared.lock().stop = true;
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has said so.
+            // A thread that panicked has already printed the panic message.
             let _ = thread.join();
         }
         log::info!("{}: {}", self.device, self.statistics());
     }
 }
 
-/// Compares the flange's pose by the rig file with that by the robot.
+/// Compares the flange pose according to the rig file with the one that the robot reports.
 fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String> {
     let chain = &config.chain;
     let chain_error = |error: kinematics::Error| error.to_string();
     let sequence = chain.order_in(&config.joint_names).map_err(chain_error)?;
     let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
     let ours = chain.forward(&q).map_err(chain_error)?;
-    let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is no pose: {error}"));
+    let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"));
     let (base_from_ee, flange_from_ee) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
     let reported = base_from_ee * flange_from_ee.inverse();
     let (error_m, error_rad) = difference(&ours, &reported);
@@ -180,17 +182,17 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
     let tip = chain.tip_link();
     let likely_cause = if ee_error_m <= MAX_POSE_ERROR_M && ee_error_rad <= MAX_POSE_ERROR_RAD {
         format!(
-            "{tip:?} is where the robot has its end effector: arm.flange_link must name the flange, F_T_EE lies between them"
+            "{tip:?} is at the robot's end effector: arm.flange_link must name the flange, which differs from it by F_T_EE"
         )
     } else {
         format!(
-            "usual causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk since, \
-             arm.joints has another order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
+            "likely causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk, \
+             arm.joints is in the wrong order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
             format_difference(ee_error_m, ee_error_rad)
         )
     };
     Err(format!(
-        "the rig file puts {tip:?} at {}, the robot its flange (O_T_EE without F_T_EE) at {}, {} away; {likely_cause}",
+        "the rig file puts {tip:?} at {}, but the robot reports its flange (O_T_EE without F_T_EE) at {}, {} away; {likely_cause}",
         format_pose(&ours),
         format_pose(&reported),
         format_difference(error_m, error_rad)
@@ -213,7 +215,7 @@ fn format_pose(pose: &Transform) -> String {
     format!("({x:.4}, {y:.4}, {z:.4}) m, roll {roll:.2}, pitch {pitch:.2}, yaw {yaw:.2} degrees")
 }
 
-/// What the reading thread keeps between states.
+/// State of the reading thread.
 struct StateReader {
     address: String,
     version: FciVersion,
@@ -238,11 +240,11 @@ impl StateReader {
         }
     }
 
-    /// Takes states until it is told to stop; the reason why none come any more is an error.
+    /// Receives states until asked to stop. Returns the reason if no more states can be received.
     fn read(&mut self, session: &Session, shared: &Shared) -> Result<(), String> {
         let network = &session.network;
         let mut buffer = [0; MAX_STATE_BYTES];
-        // What waited meanwhile arrives at once, and says nothing on the robot's clock.
+        // States that queued up meanwhile arrive at once, so they are useless for estimating the robot's clock.
         while let Ok(Some(_)) = network.udp.try_receive(&mut buffer) {}
         let mut last_received = clock::now();
         loop {
@@ -251,7 +253,7 @@ impl StateReader {
             let is_fresh = at.duration_since(last_received) <= MAX_RESPONSE_GAP;
             let mut newest = None;
             while let Some(n) = received {
-                // From anywhere else it is no state.
+                // Datagrams from other addresses are rejected.
                 let from = network.udp_peer().filter(|peer| peer.ip() == network.server_ip);
                 let state = from.zip(decode(self.version, &buffer[..n]));
                 if !self.handle_datagram(shared, state, at, &mut newest) {
@@ -274,12 +276,12 @@ impl StateReader {
             network.tcp.throw_if_connection_closed().map_err(|error| error_text(&error))?;
             let silence = at.duration_since(last_received);
             if silence > MAX_SILENCE {
-                return Err(format!("it has sent no state for {silence:.1?}"));
+                return Err(format!("it has sent no states for {silence:.1?}"));
             }
         }
     }
 
-    /// Takes a datagram, or counts it as no state; whether to go on.
+    /// Processes a datagram, or counts it as rejected. Returns whether to continue.
     fn handle_datagram(
         &mut self,
         shared: &Shared,
@@ -299,7 +301,7 @@ impl StateReader {
         !state_queue.stop
     }
 
-    /// Puts a state into the queue, if it is later than all before; when it was told, by our clock.
+    /// Queues a state if it is later than all before it, and returns its stamp on our clock.
     fn take(&mut self, state_queue: &mut StateQueue, numbered: &NumberedState, at: Stamp) -> Option<Stamp> {
         let NumberedState { number, state } = numbered;
         let statistics = &mut state_queue.statistics;
@@ -311,7 +313,7 @@ impl StateReader {
                 return None;
             }
         }
-        // The robot counts its states by its own clock, one a millisecond.
+        // The robot numbers its states by its own clock, one per millisecond.
         let stamp_nanos = i64::try_from(*number).unwrap_or(i64::MAX).saturating_mul(NANOS_PER_STATE);
         let header = DatagramHeader { seq: *number, clock: Clock::Device, stamp_nanos };
         let Some(stamp) = self.sequence.stamp(&header, at) else {
@@ -332,7 +334,7 @@ impl StateReader {
         Some(stamp)
     }
 
-    /// Logs what the robot is doing whenever that changes.
+    /// Logs the robot's mode whenever it changes.
     fn log_mode(&mut self, state: &RobotState) {
         if state.robot_mode == self.mode {
             return;
@@ -350,7 +352,7 @@ impl StateReader {
 }
 
 impl Shared {
-    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    /// Locks the state. A poisoned lock is used anyway, because the queue is always in a consistent state.
     fn lock(&self) -> MutexGuard<'_, StateQueue> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }

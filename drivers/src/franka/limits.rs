@@ -1,4 +1,4 @@
-//! What a robot lets a motion do, and how much of that is asked of it.
+//! Motion limits of a robot, and the fraction of them that we use.
 
 use super::N_JOINTS;
 use super::reference::Reference;
@@ -6,20 +6,21 @@ use crate::motion::{JointTarget, MotionLimits};
 use franka::joint_velocity_limits::JointVelocityLimitsConfig;
 use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
-/// Seconds from command to command.
+/// Seconds between commands.
 pub(super) const STEP_SECS: f64 = rate_limiting::DELTA_T;
-/// Of the robot's largest speed and acceleration so much is asked at most: the rest is for commands that do not arrive.
+/// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for lost commands.
 const LIMIT_FRAC: f64 = 0.5;
-/// And of its largest jerk: a command that is missed without being noticed makes the next one look like four times its jerk.
+/// Fraction of its maximum jerk. After a command is lost unnoticed, the next one appears to the robot with four times
+/// its jerk.
 const JERK_LIMIT_FRAC: f64 = 0.25 * LIMIT_FRAC;
-/// Targets stay so far inside a joint's range.
+/// Distance of targets from the ends of a joint's range.
 const MARGIN_RAD: f64 = 5e-3;
-/// Taken off the speed that is left near the end of a range, beside what the robot takes off.
+/// Margin subtracted from the velocity near the end of a range, in addition to the robot's own.
 const SPEED_MARGIN_RAD_S: f64 = 1e-2;
-/// A command that the limits change by less is as it was: rounding.
+/// Smaller changes by the rate limiter are rounding errors.
 const UNCHANGED_RAD: f64 = 1e-9;
 
-/// The limits of one robot.
+/// Limits of one robot.
 #[derive(Clone, Debug)]
 pub(super) struct RobotLimits {
     position_rad: [[f64; 2]; N_JOINTS],
@@ -28,17 +29,17 @@ pub(super) struct RobotLimits {
     speed: SpeedLimits,
 }
 
-/// How fast joints may be.
+/// Velocity limits of the joints.
 #[derive(Clone, Debug)]
 enum SpeedLimits {
-    /// As fast everywhere.
+    /// The same everywhere.
     Constant([f64; N_JOINTS]),
-    /// Slower towards the ends of their ranges.
+    /// Lower towards the ends of their ranges.
     PositionDependent(Box<JointVelocityLimitsConfig>),
 }
 
 impl RobotLimits {
-    /// A Panda's. Source: `rate_limiting.h` of libfranka 0.9.2, `franka_description`.
+    /// Limits of a Panda. Source: `rate_limiting.h` of libfranka 0.9.2, `franka_description`.
     pub(super) fn panda() -> Self {
         let (lower, upper) = fer::JOINT_POSITION_LIMITS;
         Self {
@@ -49,10 +50,11 @@ impl RobotLimits {
         }
     }
 
-    /// Of an FR3 by the description that it serves of itself; acceleration and jerk by `rate_limiting.h` of libfranka 0.21.2.
+    /// Limits of an FR3: position and velocity from the URDF that it serves, acceleration and jerk from
+    /// `rate_limiting.h` of libfranka 0.21.2.
     pub(super) fn of_description(urdf: &str) -> Result<Self, String> {
         let speed = JointVelocityLimitsConfig::from_urdf(urdf)
-            .map_err(|error| format!("its description of itself cannot be read: {error}"))?;
+            .map_err(|error| format!("cannot parse the robot description that it serves: {error}"))?;
         let range = |ix: usize| [speed[ix].lower_position_limit, speed[ix].upper_position_limit];
         Ok(Self {
             position_rad: std::array::from_fn(range),
@@ -62,15 +64,15 @@ impl RobotLimits {
         })
     }
 
-    /// What is asked of the robot at most: no more than wanted, and no more than its share of what the robot can.
+    /// Limits for our motions: at most the requested ones, and at most our fraction of the robot's.
     ///
-    /// A joint that brakes with `a` for the end of its way is `sqrt(2 a d)` fast where `d` is left. An FR3 allows
-    /// `sqrt(2 D (d + m)) - o` there, `m` the way from the target to the end of the range; with `a` no more than `LIMIT_FRAC` of `D`
-    /// that is enough everywhere if `m` is at least `o² / (2 D (1 - LIMIT_FRAC))`.
+    /// A joint that decelerates with `a` towards its target has the velocity `sqrt(2 a d)` at the distance `d`. An
+    /// FR3 allows `sqrt(2 D (d + m)) - o` there, where `m` is the distance from the target to the end of the range.
+    /// If `a` is at most `LIMIT_FRAC * D`, this suffices everywhere if `m` is at least `o² / (2 D (1 - LIMIT_FRAC))`.
     pub(super) fn allowed(&self, requested: &[MotionLimits]) -> Result<Vec<MotionLimits>, String> {
         let n = requested.len();
         if n != N_JOINTS {
-            return Err(format!("the limits are of {n} joints, the arm has {N_JOINTS}"));
+            return Err(format!("limits are given for {n} joints, but the arm has {N_JOINTS}"));
         }
         let allowed = |(ix, requested): (usize, &MotionLimits)| {
             let (max_speed, deceleration, offset) = match &self.speed {
@@ -87,7 +89,7 @@ impl RobotLimits {
             if position[0] >= position[1] {
                 let [min, max] = requested.position;
                 return Err(format!(
-                    "joint {} may be at {min} to {max} rad by the rig file, at {lower} to {upper} rad by the robot",
+                    "the ranges of joint {} do not overlap: {min} to {max} rad in the rig file, {lower} to {upper} rad in the robot",
                     ix + 1
                 ));
             }
@@ -101,9 +103,11 @@ impl RobotLimits {
         requested.iter().enumerate().map(allowed).collect()
     }
 
-    /// A position to be sent, held back where the robot would stop for it; the flag tells whether it was.
+    /// Limits the rates of a position to be sent, so that the robot does not trigger a reflex. Returns the position
+    /// and whether it was changed.
     ///
-    /// This is libfranka's rate limiter. Its low-pass filter is left out: setpoints are smooth, and it would only make them late.
+    /// This is libfranka's rate limiter. We leave out its low-pass filter: our setpoints are smooth, and the filter
+    /// would only delay them.
     pub(super) fn limited(
         &self,
         requested_rad: [f64; N_JOINTS],
@@ -113,7 +117,7 @@ impl RobotLimits {
             SpeedLimits::Constant(max_speed) => (*max_speed, max_speed.map(|max_speed| -max_speed)),
             SpeedLimits::PositionDependent(joints) => {
                 let at = &reference.position_rad;
-                // Beyond the end of its range a joint may still stand.
+                // A joint beyond the end of its range may still stand still.
                 (joints.upper_limits(at).map(|max| max.max(0.0)), joints.lower_limits(at).map(|min| min.min(0.0)))
             }
         };
@@ -134,14 +138,14 @@ impl RobotLimits {
     }
 }
 
-/// A target brought into the joints' ranges.
+/// Clamps a target to the joints' ranges.
 pub(super) fn clamp_to_range(target: &JointTarget, limits: &[MotionLimits]) -> Result<JointTarget, String> {
     let n = target.position.len();
     if n != limits.len() {
-        return Err(format!("the target has {n} joints, the arm {}", limits.len()));
+        return Err(format!("the target has {n} joints, but the arm has {}", limits.len()));
     }
     if let Some(ix) = target.position.iter().position(|position| !position.is_finite()) {
-        return Err(format!("the target of joint {} is no number: {}", ix + 1, target.position[ix]));
+        return Err(format!("the target of joint {} is not a finite number: {}", ix + 1, target.position[ix]));
     }
     let joints = target.position.iter().zip(limits);
     Ok(JointTarget {

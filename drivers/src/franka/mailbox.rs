@@ -1,4 +1,4 @@
-//! What lies between whoever commands an arm and the thread that moves it.
+//! Exchanges orders and results between the caller that commands an arm and the thread that moves it.
 
 use super::MotionStatistics;
 use crate::motion::{JointTarget, Motion};
@@ -6,7 +6,7 @@ use franka::RobotMode;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Orders go to the thread, what came of them comes back.
+/// Orders to the thread, and its results.
 #[derive(Debug)]
 pub(super) struct MotionMailbox {
     mailbox_state: Mutex<MailboxState>,
@@ -15,17 +15,17 @@ pub(super) struct MotionMailbox {
 
 #[derive(Debug)]
 pub(super) struct MailboxState {
-    /// The newest order that the thread has not taken.
+    /// The newest order that the thread has not processed yet.
     pub(super) order: Option<MotionOrder>,
-    /// Number of a motion that the robot let begin and the thread has not taken.
+    /// ID of a motion that the robot has accepted and the thread has not processed yet.
     pub(super) started_motion: Option<u32>,
-    /// Whether one runs, or is about to, that takes orders.
+    /// Whether a motion that accepts orders is active or about to start.
     pub(super) accepts_orders: bool,
-    /// Whether none runs, and the next may begin.
+    /// Whether no motion is active and the next one may start.
     pub(super) is_idle: bool,
-    /// Whether a motion ends as soon as the arm is at rest.
+    /// Whether the motion should end as soon as the arm is at rest.
     pub(super) is_shutting_down: bool,
-    /// Whether the robot was lost, for good.
+    /// Whether the connection to the robot is permanently lost.
     pub(super) is_lost: bool,
     pub(super) motion: Motion,
     pub(super) mode: RobotMode,
@@ -56,18 +56,18 @@ impl Default for MotionMailbox {
 }
 
 impl MotionMailbox {
-    /// The board, also after a thread panicked while it held it: no order is left half written.
+    /// Locks the state. A poisoned lock is used anyway, because the state is always consistent.
     pub(super) fn lock(&self) -> MutexGuard<'_, MailboxState> {
         self.mailbox_state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes what the thread tells, and wakes who waits for that.
+    /// Changes the state, and wakes up all waiting callers.
     pub(super) fn update(&self, change: impl FnOnce(&mut MailboxState)) {
         change(&mut self.lock());
         self.changed.notify_all();
     }
 
-    /// Waits until something is so; `None` where that takes too long.
+    /// Waits until a condition holds; `None` if the timeout expires first.
     pub(super) fn wait(
         &self,
         timeout: Duration,

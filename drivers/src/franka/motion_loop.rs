@@ -1,4 +1,5 @@
-//! The part of an arm's thread that moves it: in comes a state, out goes where the joints are to be a millisecond later.
+//! The part of an arm's thread that moves it: for each state that arrives, it sends the joint positions for the next
+//! millisecond.
 
 use super::limits::RobotLimits;
 use super::mailbox::{MotionMailbox, MotionOrder};
@@ -15,16 +16,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 const STEP: Duration = Duration::from_millis(1);
-/// A motion that has been at rest for so many states ends, so that a person may guide the arm by hand.
+/// Number of states at rest after which a motion ends, so that a person may guide the arm by hand.
 const MAX_AT_REST: u32 = 1000;
-/// States after which a motion must have begun. Source: FCI documentation.
+/// Number of states within which a motion must start. Source: FCI documentation.
 const MAX_STATES_UNTIL_START: u32 = 1000;
-/// States within which a robot says why a motion is over.
+/// Number of states within which a robot reports why a motion ended.
 const MAX_STATES_UNTIL_RESPONSE: u32 = 100;
-/// The robot tells how many of its last 100 commands came in time: not before so many states.
+/// The robot reports the success rate of its last 100 commands, so it is valid only after this many states.
 const N_SUCCESS_WINDOW: u64 = 100;
 
-/// Moves an arm by its states.
+/// Moves an arm in response to its states.
 #[derive(Debug)]
 pub(super) struct MotionLoop {
     device: String,
@@ -36,25 +37,25 @@ pub(super) struct MotionLoop {
     mode: RobotMode,
 }
 
-/// A state that came in order, and when it was told by our clock.
+/// A state that arrived in order, with its stamp on our clock.
 pub(super) struct StampedState<'a> {
     pub(super) numbered: &'a NumberedState,
     pub(super) stamp: Stamp,
     pub(super) from: SocketAddr,
-    /// Whether it just came; otherwise it may be from before the robot gave up on us, and is not answered.
+    /// Whether it has just arrived. Otherwise it may be from before the robot gave up on us, and is not answered.
     pub(super) is_fresh: bool,
 }
 
 #[derive(Debug)]
 enum MotionState {
     Idle,
-    /// The robot let a motion begin; no state says so yet.
+    /// The robot accepted a motion, but no state reports it yet.
     Beginning {
         id: u32,
         n_waited: u32,
     },
     ActiveMotion(Box<ActiveMotion>),
-    /// A motion is over by the robot's states; what it says of that is still to come.
+    /// A motion has ended according to the states; the robot's reply is still to come.
     Ending {
         id: u32,
         n_waited: u32,
@@ -69,7 +70,7 @@ struct ActiveMotion {
     reference: Reference,
     /// Number of the newest state.
     number: u64,
-    /// What it was answered.
+    /// The position sent in answer to it.
     sent: Option<[f64; super::N_JOINTS]>,
     n_cycles: u64,
     n_at_rest: u32,
@@ -87,7 +88,7 @@ impl MotionLoop {
         Self { device, session, mailbox, robot, limits, motion_state: MotionState::Idle, mode: RobotMode::Other }
     }
 
-    /// One state: the newest that came.
+    /// Processes the newest state.
     pub(super) fn cycle(&mut self, stamped: &StampedState<'_>) {
         let state = &stamped.numbered.state;
         self.take_mode(state);
@@ -106,14 +107,15 @@ impl MotionLoop {
         };
     }
 
-    /// The robot is lost: it stops by itself.
+    /// Handles the loss of the connection; the robot stops on its own.
     pub(super) fn handle_disconnect(&mut self, reason: &str) {
         self.motion_state = MotionState::Idle;
         self.mailbox.update(|mailbox_state| mailbox_state.is_lost = true);
-        self.stop_because(format!("lost: {reason}"));
+        self.stop_because(format!("connection lost: {reason}"));
     }
 
-    /// Tells a mode that stops the arm outside of any motion, once; in a motion its end tells more.
+    /// Records the robot's mode, and reports one that stops the arm outside of a motion. During a motion, its end
+    /// gives more details.
     pub(super) fn take_mode(&mut self, state: &RobotState) {
         let mode = state.robot_mode;
         if mode == self.mode {
@@ -133,9 +135,11 @@ impl MotionLoop {
         if numbered.state.robot_mode != RobotMode::Move {
             return match request::outcome(&self.session, id) {
                 Ok(None) if n_waited < MAX_STATES_UNTIL_START => MotionState::Beginning { id, n_waited: n_waited + 1 },
-                Ok(None) => self.halt(id, "it let a motion begin that did not".to_owned()),
+                Ok(None) => self.halt(id, "it accepted a motion but did not start it".to_owned()),
                 Ok(Some(MotionResponse::Rejected(why))) => self.finish(cause(&numbered.state).or(Some(why))),
-                Ok(Some(_)) => self.finish(cause(&numbered.state).or(Some("it ended a motion by itself".to_owned()))),
+                Ok(Some(_)) => {
+                    self.finish(cause(&numbered.state).or(Some("it ended a motion before it started".to_owned())))
+                }
                 Err(why) => self.finish(Some(why)),
             };
         }
@@ -158,7 +162,7 @@ impl MotionLoop {
         self.run(Box::new(active), stamped)
     }
 
-    /// A millisecond of a motion.
+    /// Runs one millisecond of a motion.
     fn run(&mut self, mut active: Box<ActiveMotion>, stamped: &StampedState<'_>) -> MotionState {
         let NumberedState { number, state } = stamped.numbered;
         let n_states = number.saturating_sub(active.number);
@@ -178,7 +182,7 @@ impl MotionLoop {
         MotionState::ActiveMotion(active)
     }
 
-    /// Counts the state, takes the order that there is, and tells whether the arm is at rest.
+    /// Updates the statistics, takes the pending order, and updates whether the arm is at rest.
     fn take_order(
         &self,
         active: &mut ActiveMotion,
@@ -210,7 +214,7 @@ impl MotionLoop {
         order
     }
 
-    /// Where the joints are to be next.
+    /// Computes the next joint positions.
     fn next_position(
         &self,
         active: &mut ActiveMotion,
@@ -223,12 +227,12 @@ impl MotionLoop {
             Some(MotionOrder::Stop) => generator.stop(),
             None => {}
         }
-        // At rest the robot stays where it is, whatever was lost.
+        // At rest the robot stays where it is, even if commands were lost.
         if fate != CommandFate::Followed && !generator.is_at_rest() {
             generator.resume(&reference.setpoint())?;
         }
         let desired = generator.step()?.position;
-        let desired = desired.try_into().map_err(|_| "the setpoint is of another arm".to_owned())?;
+        let desired = desired.try_into().map_err(|_| "the setpoint has the wrong number of joints".to_owned())?;
         let (position_rad, is_limited) = self.robot.limited(desired, reference)?;
         if is_limited {
             generator.resume(&reference.sent(position_rad).setpoint())?;
@@ -245,12 +249,12 @@ impl MotionLoop {
                 active.sent = Some(position_rad);
                 self.mailbox.lock().statistics.count(clock::now().duration_since(stamped.stamp));
             }
-            // As good as lost on the way: the robot goes on without.
-            Err(error) => log::debug!("{}: a command did not go out: {}", self.device, error_text(&error)),
+            // Like a lost datagram: the robot extrapolates without it.
+            Err(error) => log::debug!("{}: a command could not be sent: {}", self.device, error_text(&error)),
         }
     }
 
-    /// Has the robot brake.
+    /// Makes the robot brake.
     fn halt(&self, id: u32, reason: String) -> MotionState {
         let reason = match request::halt(&self.session) {
             Ok(()) => reason,
@@ -260,7 +264,7 @@ impl MotionLoop {
         MotionState::Ending { id, n_waited: 0, reason: Some(reason) }
     }
 
-    /// Takes what the robot says of a motion that is over.
+    /// Waits for the robot's reply about a motion that has ended.
     fn conclude(&self, id: u32, n_waited: u32, reason: Option<String>) -> MotionState {
         let reason = match request::outcome(&self.session, id) {
             Ok(None) if n_waited < MAX_STATES_UNTIL_RESPONSE => {
@@ -271,14 +275,14 @@ impl MotionLoop {
                 Some(reason.map_or(why.clone(), |reason| format!("{reason} ({why})")))
             }
             Ok(None | Some(MotionResponse::Started)) => {
-                Some(reason.unwrap_or_else(|| "it ended a motion and does not say why".to_owned()))
+                Some(reason.unwrap_or_else(|| "it ended a motion without giving a reason".to_owned()))
             }
             Err(why) => Some(reason.unwrap_or(why)),
         };
         self.finish(reason)
     }
 
-    /// No motion runs any more; with a reason it stopped by itself.
+    /// No motion is active any more. A reason means that it stopped because of a problem.
     fn finish(&self, reason: Option<String>) -> MotionState {
         match reason {
             Some(reason) => self.stop_because(reason),
@@ -293,14 +297,14 @@ impl MotionLoop {
     fn stop_because(&self, reason: String) {
         log::warn!("{}: {reason}", self.device);
         self.mailbox.update(|mailbox_state| {
-            // An order from before is not for an arm that was recovered.
+            // An order from before the stop must not be executed after the recovery.
             (mailbox_state.is_idle, mailbox_state.accepts_orders, mailbox_state.order) = (true, false, None);
             mailbox_state.motion = Motion::Stopped { reason };
         });
     }
 }
 
-/// Why a robot does not move as it was told, by its state; `None` where it is ready.
+/// Why a robot does not follow commands, according to its state; `None` if it is ready.
 fn cause(state: &RobotState) -> Option<String> {
     match state.robot_mode {
         RobotMode::Reflex => {

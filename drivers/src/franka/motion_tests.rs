@@ -1,4 +1,4 @@
-//! The arm that is moved, over real sockets of the loopback interface, against played robots that enforce their limits.
+//! Tests of the movable arm over loopback sockets, against emulated robots that enforce their limits.
 
 use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use super::tests::{FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, ideal_joints, robot};
@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-/// Set in the child that [`suspended_program_triggers_reflex_and_sends_nothing_stale`] stops and lets go on.
+/// Set in the child process that [`suspended_program_triggers_reflex_and_sends_nothing_stale`] suspends and resumes.
 const CHILD: &str = "FIELDRIG_TEST_FCI";
 
 fn motion() -> MotionConfig {
@@ -28,7 +28,7 @@ fn open(address: SocketAddr) -> MovableFrankaArm {
     MovableFrankaArm::open(&config(address), &motion(), &ContactConfig::default()).unwrap()
 }
 
-/// Joints that are where they are wanted, and a look at that.
+/// Joints that follow their commands perfectly, and the last command.
 fn recording_joints() -> (JointSimulator, Arc<Mutex<CommandedJoints>>) {
     let mut follow_command = ideal_joints();
     let last_command = Arc::new(Mutex::new(CommandedJoints::default()));
@@ -44,22 +44,23 @@ fn offset_from_rest(by_rad: [f64; N_JOINTS]) -> JointTarget {
     JointTarget { position: REST_RAD.iter().zip(by_rad).map(|(rest, by)| rest + by).collect() }
 }
 
-/// Waits until the arm is at rest, or stopped by itself: then why.
+/// Waits until the arm is at rest. Returns the reason if it stopped.
 fn settle(arm: &MovableFrankaArm) -> Result<(), String> {
     let deadline = Instant::now() + TEST_TIMEOUT;
     loop {
         match arm.motion() {
             Motion::Holding => return Ok(()),
             Motion::Stopped { reason } => return Err(reason),
-            Motion::Moving => assert!(Instant::now() < deadline, "it never comes to rest"),
+            Motion::Moving => assert!(Instant::now() < deadline, "the arm never comes to rest"),
         }
         std::thread::sleep(Duration::from_millis(2));
     }
 }
 
-/// Does it, and whatever it takes to have the arm at rest afterwards.
+/// Performs an action and waits until the arm is at rest.
 ///
-/// On a machine so busy that the arm's thread is not woken for 20 ms the robot stops, as it should; then it begins anew.
+/// On a machine so busy that the arm's thread is not woken for 20 ms, the robot triggers a reflex, as it should; the
+/// action is then retried.
 fn retry_until_settled(arm: &mut MovableFrankaArm, mut act: impl FnMut(&mut MovableFrankaArm) -> Result<(), String>) {
     const MAX_ATTEMPTS: usize = 5;
     for _ in 0..MAX_ATTEMPTS {
@@ -76,7 +77,7 @@ fn command_target(arm: &mut MovableFrankaArm, target: &JointTarget) -> Result<()
     arm.command(target).map(drop).map_err(|error| error.to_string())
 }
 
-/// Heads for a target until something stops the arm on its way: what it says of that.
+/// Commands a target until something stops the arm on its way, and returns the reason.
 fn move_until_stopped(arm: &mut MovableFrankaArm, target: &JointTarget) -> String {
     loop {
         command_target(arm, target).unwrap();
@@ -136,7 +137,7 @@ fn retargeting_and_stopping_respect_robot_limits() {
         });
         let CommandedJoints { position_rad, velocity_rad_s, .. } = *last_command.lock().unwrap();
         let remaining = far.position.iter().zip(position_rad).map(|(far, is)| (far - is).abs()).fold(0.0, f64::max);
-        assert!(remaining > 0.1, "{version:?}: it did not stop on its way: {remaining} rad");
+        assert!(remaining > 0.1, "{version:?}: the arm did not stop before its target: {remaining} rad");
         assert!(velocity_rad_s.iter().all(|velocity| velocity.abs() < 1e-3), "{velocity_rad_s:?}");
     }
 }
@@ -155,7 +156,7 @@ fn targets_are_clamped_and_range_end_reached_slowly() {
     }
     move_and_settle(&mut arm, &out_of_range);
     assert!((last_command.lock().unwrap().position_rad[1] - accepted.position[1]).abs() < 1e-4);
-    for (wrong, text) in [(vec![0.0; 6], "6 joints"), (vec![f64::NAN; N_JOINTS], "joint 1 is no number")] {
+    for (wrong, text) in [(vec![0.0; 6], "6 joints"), (vec![f64::NAN; N_JOINTS], "joint 1 is not a finite number")] {
         let open_error = arm.command(&JointTarget { position: wrong }).unwrap_err().to_string();
         assert!(open_error.contains(text), "{open_error}");
     }
@@ -178,7 +179,7 @@ fn robot_can_be_hand_guided_between_motions() {
     let emulated = robot(FciVersion::V10, joint_simulator);
     let mut arm = open(emulated.address());
     move_and_settle(&mut arm, &offset_from_rest([0.1; N_JOINTS]));
-    assert!(last_command.lock().unwrap().is_moving, "it is held for a while");
+    assert!(last_command.lock().unwrap().is_moving, "the motion stays active for a while");
     let deadline = Instant::now() + TEST_TIMEOUT;
     while last_command.lock().unwrap().is_moving {
         assert!(Instant::now() < deadline, "the motion never ends");
@@ -192,7 +193,7 @@ fn robot_can_be_hand_guided_between_motions() {
         std::thread::sleep(Duration::from_millis(5));
     }
     *hand_position.lock().unwrap() = None;
-    // From there, without a jump: that would be a reflex.
+    // The motion must start there without a jump, which would trigger a reflex.
     let target = offset_from_rest([0.0; N_JOINTS]);
     move_and_settle(&mut arm, &target);
     assert!((last_command.lock().unwrap().position_rad[0] - target.position[0]).abs() < 1e-4);
@@ -223,7 +224,7 @@ fn contact_triggers_reflex_until_recovery() {
         let open_error = arm.command(&start).unwrap_err().to_string();
         assert!(open_error.contains("recovered") && open_error.contains("joint_reflex"), "{open_error}");
         *contact_nm.lock().unwrap() = 0.0;
-        assert!(matches!(arm.motion(), Motion::Stopped { .. }), "nobody recovered it");
+        assert!(matches!(arm.motion(), Motion::Stopped { .. }), "the arm has not been recovered");
         arm.recover().unwrap();
         assert_eq!(arm.motion(), Motion::Holding);
         move_and_settle(&mut arm, &start);
@@ -271,7 +272,7 @@ fn unsupported_fail_safe_is_rejected() {
     assert!(open_error(&other).contains("joint 4"));
 }
 
-/// What lies between a client and a robot: a network that loses datagrams, or all of them for a while.
+/// A relay between a client and a robot that simulates a network losing some or all datagrams.
 struct Relay {
     address: SocketAddr,
     faults: Arc<Faults>,
@@ -285,7 +286,7 @@ struct Faults {
 }
 
 impl Relay {
-    /// Between one client and the robot there.
+    /// Starts a relay between one client and the robot at this address.
     fn start(robot: SocketAddr) -> Self {
         const DROP_FRAC: f64 = 0.05;
         let listener = TcpListener::bind(FREE_PORT).unwrap();
@@ -306,7 +307,7 @@ impl Relay {
             }
             let (mut from_client, mut to_robot) = (client.try_clone().unwrap(), upstream.try_clone().unwrap());
             std::thread::spawn(move || {
-                // Either may hang up at any time.
+                // Either side may disconnect at any time.
                 let _ = std::io::copy(&mut from_client, &mut to_robot);
                 let _ = to_robot.shutdown(std::net::Shutdown::Both);
             });
@@ -328,7 +329,7 @@ impl Relay {
                     || (is_dropped_randomly && relay_faults.drops_some.load(Ordering::Relaxed));
                 let to = if is_command { robot_states } else { Some(client_states) };
                 if let Some(to) = to.filter(|_| !is_dropped) {
-                    // A client that is gone takes nothing.
+                    // Ignore send errors: the client may be gone.
                     let _ = udp.send_to(&buffer[..n], to);
                 }
             }
@@ -350,8 +351,8 @@ fn lossy_network_is_reported_and_motions_complete() {
         assert!(error.abs() < 1e-4, "{error}");
     }
     let statistics = arm.motion_statistics();
-    eprintln!("a twentieth lost either way: {statistics}");
-    // 0.95, and of those 0.95 again; a busy machine loses more.
+    eprintln!("5 % loss in each direction: {statistics}");
+    // 0.95 for our rate and 0.95 squared for the robot's; a busy machine loses more.
     let [mean, least] = statistics.robot_success_frac().unwrap();
     assert!((0.88..0.97).contains(&statistics.success_frac()), "{statistics}");
     assert!((0.78..0.93).contains(&mean) && least < mean && statistics.n_missed > 20, "{statistics}");
@@ -368,14 +369,14 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
     std::thread::sleep(Duration::from_millis(500));
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
     std::thread::sleep(Duration::from_millis(300));
-    assert!(!last_command.lock().unwrap().is_moving, "the robot stops by itself");
+    assert!(!last_command.lock().unwrap().is_moving, "the robot stops on its own");
     relay.faults.is_disconnected.store(false, Ordering::Relaxed);
     let reason = settle(&arm).unwrap_err();
     assert!(reason.contains("communication_constraints_violation"), "{reason}");
-    assert!(arm.command(&far).is_err(), "nobody recovered it");
+    assert!(arm.command(&far).is_err(), "the arm has not been recovered");
     arm.recover().unwrap();
     move_and_settle(&mut arm, &far);
-    // For good this time.
+    // Permanent this time.
     relay.faults.is_disconnected.store(true, Ordering::Relaxed);
     let deadline = Instant::now() + TEST_TIMEOUT;
     while !matches!(arm.motion(), Motion::Stopped { .. }) {
@@ -387,7 +388,7 @@ fn disconnect_triggers_reflex_and_arm_recovers() {
 }
 
 #[test]
-#[ignore = "the program that the test below stops and lets go on"]
+#[ignore = "child process of the test below"]
 fn child_program_moves_arm() {
     let Ok(address) = std::env::var(CHILD) else { return };
     let print_line = |text: &str| std::io::stdout().write_all(format!("\narm: {text}\n").as_bytes()).unwrap();
@@ -396,7 +397,7 @@ fn child_program_moves_arm() {
     command_target(&mut arm, &target).unwrap();
     print_line("moving");
     print_line(&settle(&arm).unwrap_err());
-    // Long enough for anything old to go out, and for who counts it.
+    // Long enough for stale commands to be sent and counted.
     std::thread::sleep(Duration::from_millis(300));
     print_line("quiet");
     std::thread::sleep(Duration::from_millis(300));
@@ -418,7 +419,7 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
         .unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     let signal = |name: &str| {
-        // The shell's own `kill`: a bare system has no other.
+        // Use the shell's builtin `kill`: a minimal system has no other.
         assert!(Command::new("sh").args(["-c", &format!("kill {name} {}", child.id())]).status().unwrap().success());
     };
     let mut text = || {
@@ -430,14 +431,14 @@ fn suspended_program_triggers_reflex_and_sends_nothing_stale() {
     signal("-STOP");
     std::thread::sleep(Duration::from_millis(300));
     let stopped_at = *last_command.lock().unwrap();
-    assert!(!stopped_at.is_moving, "the robot stops by itself");
+    assert!(!stopped_at.is_moving, "the robot stops on its own");
     let n_commands = relay.faults.n_commands.load(Ordering::Relaxed);
     assert!(n_commands > 50, "{n_commands}");
     signal("-CONT");
     let reason = text();
     assert!(reason.contains("reflex") && reason.contains("communication_constraints_violation"), "{reason}");
     assert_eq!(text(), "quiet");
-    assert_eq!(relay.faults.n_commands.load(Ordering::Relaxed), n_commands, "it sent something old");
+    assert_eq!(relay.faults.n_commands.load(Ordering::Relaxed), n_commands, "it sent a stale command");
     assert_eq!(text(), "held");
     assert!(child.wait().unwrap().success());
     assert!((last_command.lock().unwrap().position_rad[0] - REST_RAD[0]).abs() < 1e-4);

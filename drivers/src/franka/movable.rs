@@ -1,4 +1,4 @@
-//! An arm that is moved: motions begin with the first target and end a second after the arm came to rest.
+//! A movable arm. A motion starts with the first target and ends a second after the arm came to rest.
 
 use super::limits::{RobotLimits, clamp_to_range};
 use super::mailbox::{MailboxState, MotionMailbox, MotionOrder};
@@ -13,17 +13,18 @@ use kinematics::JointState;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-/// A robot stops by itself after 20 ms without a command.
+/// A robot stops on its own after 20 ms without a command.
 const ROBOT_TIMEOUT: Duration = Duration::from_millis(20);
-/// How long an arm may take to come to rest and end its motion.
+/// Maximum time for an arm to come to rest and end its motion.
 const STOP_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long states may say otherwise after the robot answered.
+/// Maximum time until the states agree with the robot's reply.
 const SETTLE_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A Franka arm that is moved by joint positions, under the robot's own joint impedance controller.
 ///
-/// A motion of the robot runs from the first target until the arm has been at rest for a second; in between the robot holds
-/// the arm by itself and lets a person guide it by hand. Dropping it brings the arm to rest and frees the robot's interface.
+/// A motion of the robot lasts from the first target until the arm has been at rest for a second. Between motions the
+/// robot holds the arm, and a person may guide it by hand. Dropping this brings the arm to rest and frees the robot's
+/// interface.
 #[derive(Debug)]
 pub struct MovableFrankaArm {
     address: String,
@@ -36,27 +37,28 @@ pub struct MovableFrankaArm {
 }
 
 impl MovableFrankaArm {
-    /// Checks what can be checked without the robot; why it cannot be moved so is told.
+    /// Checks what can be checked without the robot. The error is the reason why the arm cannot be moved as
+    /// configured.
     pub fn check(motion: &MotionConfig) -> Result<(), String> {
         if motion.on_loss != OnLoss::Hold {
-            let reason = "when its commands cease it brakes and holds by itself, and cannot be told to do otherwise: \
-                          arm.motion.on_loss = \"hold\" is the one that it does";
+            let reason = "without commands it brakes and holds, which cannot be changed: \
+                          set arm.motion.on_loss = \"hold\"";
             return Err(reason.to_owned());
         }
         if motion.timeout < ROBOT_TIMEOUT {
             let timeout = motion.timeout;
             return Err(format!(
-                "it notices missing commands after {ROBOT_TIMEOUT:?}, which cannot be set; arm.motion.timeout_millis asks for {timeout:?}"
+                "it detects missing commands after {ROBOT_TIMEOUT:?}, which cannot be changed; arm.motion.timeout_millis is {timeout:?}, set a longer one"
             ));
         }
         Ok(())
     }
 
-    /// Connects as [`FrankaArm::open`] does, and prepares to move; nothing moves, and nothing is set, before the first target.
+    /// Connects like [`FrankaArm::open`], and prepares to move. Nothing moves or is set before the first target.
     ///
-    /// `motion.limits` are in the order of the joints. They are brought within half of what the robot allows (of its jerk an
-    /// eighth), and a little into its joints' ranges. A Franka arm brakes and holds when it is not commanded for 20 ms, whatever it is told: other wishes are
-    /// refused.
+    /// `motion.limits` are in the order of the joints. They are reduced to at most half of the robot's limits (an
+    /// eighth for the jerk), and to slightly less than its joint ranges. A Franka arm always brakes and holds after
+    /// 20 ms without a command; other fail-safe settings are rejected.
     pub fn open(config: &ArmConfig, motion: &MotionConfig, contact: &ContactConfig) -> Result<Self, Error> {
         let address = config.address.clone();
         Self::check(motion).map_err(|reason| Error::Fci { address: address.clone(), reason })?;
@@ -79,17 +81,17 @@ impl MovableFrankaArm {
         Ok(Self { address, arm, session, mailbox, contact: contact.clone(), limits, is_set: false })
     }
 
-    /// What became of the states so far.
+    /// Statistics of the states so far.
     pub fn statistics(&self) -> StateStatistics {
         self.arm.statistics()
     }
 
-    /// What became of the commands so far.
+    /// Statistics of the commands so far.
     pub fn motion_statistics(&self) -> MotionStatistics {
         self.mailbox.lock().statistics.clone()
     }
 
-    /// What is asked of the joints at most, in their order.
+    /// Limits of the commanded motions, in the order of the joints.
     pub fn limits(&self) -> &[MotionLimits] {
         &self.limits
     }
@@ -98,11 +100,11 @@ impl MovableFrankaArm {
         Error::Fci { address: self.address.clone(), reason: reason.into() }
     }
 
-    /// Begins a motion that heads for a target.
+    /// Starts a motion towards a target.
     fn start_motion(&mut self, target: &JointTarget) -> Result<(), Error> {
-        // A motion that is just ending ends first.
+        // Wait for a motion that is just ending.
         let Some(mailbox_state) = self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle) else {
-            return Err(self.fault("a motion before this does not end"));
+            return Err(self.fault("the previous motion does not end"));
         };
         let mode = mailbox_state.mode;
         let refusal = refusal(&mailbox_state);
@@ -115,7 +117,7 @@ impl MovableFrankaArm {
             self.is_set = true;
         }
         let id = request::start_motion(&self.session);
-        let id = id.map_err(|why| self.fault(format!("it lets no motion begin: {why}")))?;
+        let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
         self.mailbox.update(|mailbox_state| {
             (mailbox_state.started_motion, mailbox_state.accepts_orders, mailbox_state.is_idle) =
                 (Some(id), true, false);
@@ -126,10 +128,10 @@ impl MovableFrankaArm {
     }
 }
 
-/// Why an arm takes no target.
+/// Why an arm accepts no target.
 fn refusal(mailbox_state: &MailboxState) -> Option<String> {
     match &mailbox_state.motion {
-        Motion::Stopped { reason } => Some(format!("it takes no target before it is recovered: {reason}")),
+        Motion::Stopped { reason } => Some(format!("it accepts no target before it is recovered: {reason}")),
         Motion::Holding | Motion::Moving => None,
     }
 }
@@ -174,12 +176,13 @@ impl MovableArm for MovableFrankaArm {
         Ok(())
     }
 
-    /// Clears the reflex where one stopped it; a person has to release a user stop or unlock joints first, and is told so.
+    /// Clears the reflex, if one stopped the arm. A user stop or locked joints must be released by a person first;
+    /// the error says so.
     fn recover(&mut self) -> Result<(), Error> {
         let Some(mailbox_state) =
             self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)
         else {
-            return Err(self.fault("a motion runs"));
+            return Err(self.fault("a motion is active"));
         };
         let (mode, is_lost, motion) = (mailbox_state.mode, mailbox_state.is_lost, mailbox_state.motion.clone());
         drop(mailbox_state);
@@ -195,11 +198,11 @@ impl MovableArm for MovableFrankaArm {
             }
             (Motion::Holding | Motion::Moving, _) => return Ok(()),
         }
-        // States from before may still be on their way.
+        // States from before the recovery may still be in flight.
         let Some(mut mailbox_state) =
             self.mailbox.wait(SETTLE_TIMEOUT, |mailbox_state| mailbox_state.mode == RobotMode::Idle)
         else {
-            return Err(self.fault("it says that it recovered, and is not ready"));
+            return Err(self.fault("it reported a successful recovery but is not ready"));
         };
         mailbox_state.motion = Motion::Holding;
         Ok(())
@@ -213,7 +216,7 @@ impl Drop for MovableFrankaArm {
             mailbox_state.order = mailbox_state.accepts_orders.then_some(MotionOrder::Stop);
         });
         if self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost).is_none() {
-            log::warn!("arm at {}: its motion does not end", self.address);
+            log::warn!("arm at {}: the motion did not end", self.address);
         }
         let statistics = self.motion_statistics();
         if statistics.n_motions > 0 {

@@ -1,15 +1,15 @@
-//! Asks the kernel to wake a thread in time.
+//! Requests real-time scheduling for a thread.
 
 use franka::realtime::set_current_thread_scheduler_priority;
 use rustix::mm::{MlockAllFlags, mlockall};
 
-/// Above all ordinary threads and those of interrupts (50), below the kernel's own watchdogs (99).
+/// Above all ordinary threads and interrupt threads (50), below the kernel's watchdogs (99).
 const PRIORITY: i32 = 80;
 
-/// Gives the calling thread a real-time priority and keeps what memory the program has now from being swapped out.
+/// Gives the calling thread a real-time priority, and locks the memory that the program currently uses.
 ///
-/// Memory that it asks for later stays as it is: images and models are large, and nothing at 1 kHz waits for them. What is not
-/// allowed is logged, and the thread works without.
+/// Memory allocated later is not locked: images and models are large, and nothing at 1 kHz waits for them. A denied
+/// request is logged, and the thread continues without it.
 pub(super) fn request_realtime(device: &str) {
     let mut denied = Vec::new();
     if let Err(reason) = set_current_thread_scheduler_priority(PRIORITY) {
@@ -20,8 +20,6 @@ pub(super) fn request_realtime(device: &str) {
     }
     if !denied.is_empty() {
         let denied = denied.join(" and ");
-        log::warn!(
-            "{device}: works without {denied}; states may be read late. `fieldrig doctor` tells what mends that"
-        );
+        log::warn!("{device}: works without {denied}; states may be read late. Run `fieldrig doctor` for a fix");
     }
 }

@@ -1,20 +1,24 @@
-//! Where a robot wants its joints, by what it was sent and by what it told.
+//! Tracks the robot's commanded joint state from the positions that we sent and the states that it reported.
 
 use super::N_JOINTS;
 use super::limits::STEP_SECS;
 use crate::motion::Setpoint;
 use franka::RobotState;
 
-/// A robot that is wanted further from where we think it is, is wanted elsewhere; below this is what FCI 10 rounds off, up to 8 rad.
+/// Maximum difference between our reference and the robot's, in rad. Smaller ones are rounding of FCI 10, up to 8
+/// rad.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;
-/// The same of rates, up to 8 rad/s.
+/// The same for velocities, up to 8 rad/s.
 const VELOCITY_TOLERANCE_RAD_S: f64 = 1e-6;
-/// A robot may tell where it was wanted so many steps ago: `franka-sim` tells what its joints' own thread has taken.
+/// Maximum number of steps by which a reported reference may be behind: `franka-sim` reports what its joint thread
+/// has processed.
 const MAX_BEHIND: f64 = 3.0;
-/// After so many commands that do not come in a row the robot stops. Source: FCI documentation, "Real-time control commands".
+/// Number of consecutive missing commands after which the robot stops. Source: FCI documentation, "Real-time control
+/// commands".
 const MAX_MISSED: u64 = 20;
 
-/// Where the joints are wanted, rad, with their rates by differences from millisecond to millisecond, as the robot takes them.
+/// Commanded joint positions, rad, with velocities and accelerations as differences per millisecond, as the robot
+/// computes them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Reference {
     pub(super) position_rad: [f64; N_JOINTS],
@@ -22,19 +26,19 @@ pub(super) struct Reference {
     pub(super) acceleration_rad_s2: [f64; N_JOINTS],
 }
 
-/// What became of a command, by the states after it.
+/// Outcome of a command, according to the states after it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CommandFate {
-    /// The robot follows it.
+    /// The robot followed it.
     Followed,
-    /// The robot went on without so many of them.
+    /// The robot extrapolated over this many missing commands.
     Missed(u64),
-    /// The robot is wanted elsewhere.
+    /// The robot's reference is elsewhere.
     Unknown,
 }
 
 impl Reference {
-    /// At rest where a robot tells that it is wanted.
+    /// A reference at rest at the position that the robot reports as commanded.
     pub(super) fn at_rest(state: &RobotState) -> Self {
         Self { position_rad: state.q_d, velocity_rad_s: [0.0; N_JOINTS], acceleration_rad_s2: [0.0; N_JOINTS] }
     }
@@ -43,7 +47,7 @@ impl Reference {
         Self { position_rad: state.q_d, velocity_rad_s: state.dq_d, acceleration_rad_s2: state.ddq_d }
     }
 
-    /// A millisecond later, where it was sent a position.
+    /// The reference a millisecond later, after a position was sent.
     pub(super) fn sent(&self, position_rad: [f64; N_JOINTS]) -> Self {
         let velocity_rad_s: [f64; N_JOINTS] =
             std::array::from_fn(|ix| (position_rad[ix] - self.position_rad[ix]) / STEP_SECS);
@@ -51,7 +55,7 @@ impl Reference {
         Self { position_rad, velocity_rad_s, acceleration_rad_s2 }
     }
 
-    /// A millisecond later, where nothing came: the robot keeps the acceleration.
+    /// The reference a millisecond later without a command: the robot keeps the acceleration.
     fn missed(&self) -> Self {
         let velocity_rad_s: [f64; N_JOINTS] =
             std::array::from_fn(|ix| self.velocity_rad_s[ix] + self.acceleration_rad_s2[ix] * STEP_SECS);
@@ -62,12 +66,13 @@ impl Reference {
         }
     }
 
-    /// So many states later than this one, of which the first was answered with `sent`, and what became of that.
+    /// Advances the reference by `n_states`, of which the first was answered with `sent`, and returns the outcome of
+    /// that command.
     ///
-    /// Our own numbers are kept where the robot's are the same but for their rounding: differences of rounded ones are rough. Where
-    /// a command that did not arrive is within that rounding, the rates that the robot tells say so: of them it is seen a thousand
-    /// times better. Rates that are still those of before prove nothing: `franka-sim` tells those of its joints, which are at rest
-    /// for a while after their target is not.
+    /// Keeps our own numbers if they match the robot's up to rounding, because differences of rounded numbers are
+    /// inaccurate. If the effect of a missing command is within that rounding, the reported velocities decide: it
+    /// shows in them a thousand times more clearly. Velocities that still match the earlier reference prove nothing:
+    /// `franka-sim` reports those of its joints, which start to move some time after their target does.
     pub(super) fn advance(
         &self,
         sent: Option<[f64; N_JOINTS]>,
@@ -106,7 +111,7 @@ impl Reference {
         }
     }
 
-    /// Whether each joint may have been there a few steps ago.
+    /// Whether each joint may have been at the reported position a few steps ago.
     fn is_shortly_after(&self, reported: &Self) -> bool {
         let joints = self.position_rad.into_iter().zip(self.velocity_rad_s).zip(reported.position_rad);
         joints.into_iter().all(|((own, velocity), robot)| {
@@ -114,7 +119,7 @@ impl Reference {
         })
     }
 
-    /// As a motion without steps: a difference is the rate half a millisecond before.
+    /// Converts to a continuous motion: a difference is the velocity half a millisecond earlier.
     pub(super) fn setpoint(&self) -> Setpoint {
         let velocity = self.velocity_rad_s.iter().zip(self.acceleration_rad_s2);
         Setpoint {
@@ -129,7 +134,7 @@ impl Reference {
 mod tests {
     use super::*;
 
-    /// The state of a robot of FCI 10 that is wanted there: rounded to floats.
+    /// State of an FCI 10 robot with this reference, rounded to floats.
     #[expect(clippy::cast_possible_truncation, reason = "FCI 10 sends floats")]
     fn state(reference: &Reference) -> RobotState {
         let rounded = |numbers: [f64; N_JOINTS]| numbers.map(|number| f64::from(number as f32));
@@ -140,7 +145,7 @@ mod tests {
         state
     }
 
-    /// In motion, and where it goes next with such a jerk.
+    /// A moving reference, and its next position with the given jerk.
     fn moving(jerk_rad_s3: f64) -> (Reference, [f64; N_JOINTS]) {
         let reference = Reference {
             position_rad: [1.9; N_JOINTS],
@@ -175,7 +180,7 @@ mod tests {
         assert!((followed.position_rad[0] - missed.position_rad[0]).abs() < POSITION_TOLERANCE_RAD);
         assert_eq!(reference.advance(Some(next), 1, &state(&missed)), (missed, CommandFate::Missed(1)));
         assert_eq!(reference.advance(Some(next), 1, &state(&followed)), (followed, CommandFate::Followed));
-        // A robot whose rates are none of ours is taken to follow, as its position says.
+        // A robot whose velocities match neither prediction counts as following, according to its position.
         let mut smoothed = followed;
         smoothed.velocity_rad_s = [0.29; N_JOINTS];
         assert_eq!(reference.advance(Some(next), 1, &state(&smoothed)), (followed, CommandFate::Followed));

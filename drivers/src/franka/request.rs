@@ -1,4 +1,4 @@
-//! What is asked of a controller over TCP and of a motion over UDP, in either version of FCI.
+//! Requests to a controller over TCP and motion commands over UDP, in both versions of FCI.
 
 use super::N_JOINTS;
 use super::session::{Session, answer, error_text};
@@ -9,23 +9,24 @@ use std::time::Duration;
 use zerocopy::IntoBytes;
 use zerocopy::little_endian::U64;
 
-/// Settings and descriptions are answered within milliseconds.
+/// Maximum time for answers; settings and descriptions are answered within milliseconds.
 const MAX_ANSWER: Duration = Duration::from_secs(2);
-/// A recovery opens brakes.
+/// Maximum time for a recovery, which releases brakes.
 const MAX_RECOVERY: Duration = Duration::from_secs(10);
-/// How far a motion may be from what was commanded, m, rad and rad of the elbow: as libfranka has it, anything.
+/// Maximum deviation of a motion from the command: m, rad, and rad of the elbow. As in libfranka, this allows
+/// anything.
 const ANY_DEVIATION: (f64, f64, f64) = (10.0, 3.12, std::f64::consts::TAU);
 
-/// What a robot treats as a collision, and how stiff it is.
+/// Collision thresholds and stiffness of a robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ContactConfig {
-    /// Torques from outside at which it stops, Nm, from the base to the flange.
+    /// External torques at which it stops, Nm, from the base to the flange.
     pub torque_nm: [f64; N_JOINTS],
-    /// Forces from outside at its end effector at which it stops, along x, y and z of its base, N.
+    /// External forces at its end effector at which it stops, along x, y and z of its base, N.
     pub force_n: [f64; 3],
-    /// Moments at which it stops, about the same axes, Nm.
+    /// External moments at which it stops, about the same axes, Nm.
     pub moment_nm: [f64; 3],
-    /// Stiffness of its joints, Nm/rad; `None` leaves it as the robot has it.
+    /// Stiffness of its joints, Nm/rad; `None` leaves it unchanged.
     pub stiffness_nm_rad: Option<[f64; N_JOINTS]>,
 }
 
@@ -41,7 +42,7 @@ impl Default for ContactConfig {
     }
 }
 
-/// What became of a motion that a robot let begin, or did not.
+/// Response of the robot to a motion request.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum MotionResponse {
     Started,
@@ -49,23 +50,24 @@ pub(super) enum MotionResponse {
     Rejected(String),
 }
 
-/// The description that a robot of FCI 10 serves of itself, a URDF.
+/// The URDF that an FCI 10 robot serves.
 pub(super) fn description(session: &Session) -> Result<String, String> {
     let payload = ask(session, v10::Command::GetRobotModel.to_u32(), &[], MAX_ANSWER)?;
     match payload.split_first() {
         Some((0, text)) => Ok(String::from_utf8_lossy(text).into_owned()),
-        Some((status, _)) => {
-            Err(format!("it does not describe itself: {}", status_text(v10::CommandStatus::from_u8(*status))))
-        }
-        None => Err("its answer to the question for its description is empty".to_owned()),
+        Some((status, _)) => Err(format!(
+            "it refused to send its robot description: {}",
+            status_text(v10::CommandStatus::from_u8(*status))
+        )),
+        None => Err("its answer to the request for the robot description is empty".to_owned()),
     }
 }
 
-/// Sets what counts as a collision and how stiff the joints are; each answer is looked at.
+/// Sets the collision thresholds and the stiffness, and checks each answer.
 pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), String> {
     let ([x, y, z], [about_x, about_y, about_z]) = (contact.force_n, contact.moment_nm);
     let (torque, force) = (&contact.torque_nm, &[x, y, z, about_x, about_y, about_z]);
-    // Lower thresholds are only told; a robot that speeds up or brakes is judged as one that does not.
+    // Lower thresholds are only reported. The same thresholds apply with and without acceleration.
     let collision = v10::SetCollisionBehaviorRequest::new(torque, torque, torque, torque, force, force, force, force);
     let number = |v5: v5::Command, v10: v10::Command| match session.version {
         FciVersion::V5 => v5.to_u32(),
@@ -84,13 +86,14 @@ pub(super) fn set(session: &Session, contact: &ContactConfig) -> Result<(), Stri
         }
     };
     let command = number(v5::Command::SetCollisionBehavior, v10::Command::SetCollisionBehavior);
-    set("it does not take the thresholds of collisions", command, collision.as_bytes())?;
+    set("it rejected the collision thresholds", command, collision.as_bytes())?;
     let Some(stiffness) = &contact.stiffness_nm_rad else { return Ok(()) };
     let command = number(v5::Command::SetJointImpedance, v10::Command::SetJointImpedance);
-    set("it does not take the stiffness", command, v10::SetJointImpedanceRequest::new(stiffness).as_bytes())
+    set("it rejected the joint stiffness", command, v10::SetJointImpedanceRequest::new(stiffness).as_bytes())
 }
 
-/// Asks for a motion by joint positions under the robot's own joint impedance; its number, once the robot lets it begin.
+/// Requests a joint position motion under the robot's joint impedance controller. Returns its ID once the robot has
+/// accepted it.
 pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     let (translation, rotation, elbow) = ANY_DEVIATION;
     let deviation = || v10::Deviation::new(translation, rotation, elbow);
@@ -108,7 +111,7 @@ pub(super) fn start_motion(session: &Session) -> Result<u32, String> {
     let id = send(session, v10::Command::Move.to_u32(), &request)?;
     match decode_response(session.version, &wait(session, id, MAX_ANSWER)?) {
         MotionResponse::Started => Ok(id),
-        MotionResponse::Finished => Err("it ended the motion before it began".to_owned()),
+        MotionResponse::Finished => Err("it ended the motion before it started".to_owned()),
         MotionResponse::Rejected(why) => Err(why),
     }
 }
@@ -118,7 +121,7 @@ pub(super) fn halt(session: &Session) -> Result<(), String> {
     send(session, v10::Command::StopMove.to_u32(), &[]).map(drop)
 }
 
-/// What became of a motion, if the robot has said so.
+/// Outcome of a motion, if the robot has reported it.
 pub(super) fn outcome(session: &Session, id: u32) -> Result<Option<MotionResponse>, String> {
     let message = session.network.tcp.try_receive_response(id).map_err(|error| error_text(&error))?;
     Ok(message.map(|message| decode_response(session.version, message_payload(HeaderLayout::Robot, &message))))
@@ -136,10 +139,10 @@ pub(super) fn recover(session: &Session) -> Result<(), String> {
         (FciVersion::V5, status) => status_text(v5::AutomaticErrorRecoveryStatus::from_u8(status)),
         (FciVersion::V10, status) => status_text(v10::AutomaticErrorRecoveryStatus::from_u8(status)),
     };
-    Err(format!("it does not recover: {why}"))
+    Err(format!("the recovery failed: {why}"))
 }
 
-/// Where the joints are to be a millisecond after a state, as a datagram.
+/// Encodes the joint positions for the millisecond after a state as a datagram.
 pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_JOINTS], is_last: bool) -> Vec<u8> {
     let (message_id, q_c, motion_generation_finished) =
         (U64::new(number), f64s_to_wire(position_rad), u8::from(is_last));
@@ -155,25 +158,25 @@ pub(super) fn command(version: FciVersion, number: u64, position_rad: &[f64; N_J
     }
 }
 
-/// Why a robot in that mode lets no motion begin, and what a person does about it; `None` where it is ready.
+/// Why a robot in this mode accepts no motion, and what to do; `None` if it is ready.
 pub(super) fn blocking_reason(mode: RobotMode) -> Option<&'static str> {
     match mode {
         RobotMode::Idle => None,
-        RobotMode::Guiding => Some("it is guided by hand: let go of the buttons at its hand"),
+        RobotMode::Guiding => Some("it is guided by hand: release the buttons at its hand"),
         RobotMode::UserStopped => {
-            Some("its user stop is pressed: release it, for an FR3 also unlock the joints in Desk")
+            Some("its user stop is pressed: release it; for an FR3 also unlock the joints in Desk")
         }
         RobotMode::Reflex => Some("it is stopped by a reflex: look at the arm, then recover"),
         RobotMode::AutomaticErrorRecovery => Some("it is recovering from a reflex"),
-        RobotMode::Move => Some("a motion runs"),
+        RobotMode::Move => Some("a motion is active"),
         RobotMode::Other => Some("it is not ready: unlock its joints and activate FCI in Desk"),
     }
 }
 
-/// What the status of a motion stands for.
+/// Meaning of the status of a motion.
 fn decode_response(version: FciVersion, payload: &[u8]) -> MotionResponse {
     let Some(status) = payload.first() else {
-        return MotionResponse::Rejected("its answer to a motion is empty".to_owned());
+        return MotionResponse::Rejected("its answer to the motion request is empty".to_owned());
     };
     let name = match version {
         FciVersion::V5 => v5::MoveStatus::from_u8(*status).map(|status| format!("{status:?}")),
@@ -196,10 +199,10 @@ fn send(session: &Session, command: u32, payload: &[u8]) -> Result<u32, String> 
     session.network.tcp.send_request(command, payload).map_err(|error| error_text(&error))
 }
 
-/// The payload of the answer.
+/// Waits for the payload of the answer.
 fn wait(session: &Session, id: u32, timeout: Duration) -> Result<Vec<u8>, String> {
     let response = answer(&session.network, id, timeout).map_err(|error: FrankaError| error_text(&error))?;
-    let message = response.ok_or_else(|| format!("it does not answer within {timeout:?}"))?;
+    let message = response.ok_or_else(|| format!("it did not answer within {timeout:?}"))?;
     Ok(message_payload(HeaderLayout::Robot, &message).to_vec())
 }
 
@@ -207,21 +210,21 @@ fn first(payload: &[u8]) -> Result<u8, String> {
     payload.first().copied().ok_or_else(|| "its answer is empty".to_owned())
 }
 
-/// A status by libfranka's name for it, in words.
+/// A status as text, from libfranka's name for it.
 fn status_text<T: std::fmt::Debug>(status: Option<T>) -> String {
     status.map_or_else(|| "an unknown status".to_owned(), |status| split_words(&format!("{status:?}")))
 }
 
 /// `CommandNotPossibleRejected` as "command not possible rejected".
 fn split_words(name: &str) -> String {
-    let mut split_words = String::new();
+    let mut words = String::new();
     for letter in name.chars() {
-        if letter.is_uppercase() && !split_words.is_empty() {
-            split_words.push(' ');
+        if letter.is_uppercase() && !words.is_empty() {
+            words.push(' ');
         }
-        split_words.extend(letter.to_lowercase());
+        words.extend(letter.to_lowercase());
     }
-    split_words
+    words
 }
 
 #[cfg(test)]

@@ -1,22 +1,22 @@
-//! What a robot's controller tells a thousand times a second, in either version of FCI.
+//! Decodes the states that a controller sends at 1 kHz, in both versions of FCI.
 
 use franka::wire::robot::{v5, v10};
 use franka::{FciVersion, RobotState};
 use kinematics::{Transform, transform};
 use zerocopy::FromBytes;
 
-/// Longer than the longest state, so that one that is too long is seen to be.
+/// One byte more than the longest state, so that datagrams that are too long are detected.
 pub(super) const MAX_STATE_BYTES: usize = size_of::<v5::RobotState>() + 1;
-/// Joints turn less far from zero than this; beyond it a number is noise.
+/// Maximum angle of any joint; larger numbers are invalid.
 const MAX_RAD: f64 = 10.0;
 
-/// A state, with its number: one more with every millisecond of the robot's clock.
+/// A state with its number, which increases by one per millisecond of the robot's clock.
 pub(super) struct NumberedState {
     pub(super) number: u64,
     pub(super) state: RobotState,
 }
 
-/// Length of a state.
+/// Length of a state in bytes.
 #[cfg(any(test, fuzzing))]
 pub(super) fn n_bytes(version: FciVersion) -> usize {
     match version {
@@ -25,7 +25,7 @@ pub(super) fn n_bytes(version: FciVersion) -> usize {
     }
 }
 
-/// Reads a datagram; `None` where it is none of that version, or its joints are no angles.
+/// Decodes a datagram; `None` if it is not a state of this version, or its numbers are implausible.
 pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState> {
     let (number, state) = match version {
         FciVersion::V5 => {
@@ -42,12 +42,12 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState>
     (are_angles && are_numbers).then_some(NumberedState { number, state })
 }
 
-/// A pose that is told as a 4x4 matrix, column major.
+/// Decodes a pose from a 4x4 matrix in column-major order.
 pub(super) fn pose(columns: &[f64; 16]) -> Result<Transform, kinematics::Error> {
     transform::from_rows(&std::array::from_fn(|at| columns[(at % 4) * 4 + at / 4]))
 }
 
-/// The matrix of a pose, column major.
+/// Matrix of a pose in column-major order.
 pub(super) fn columns(pose: &Transform) -> [f64; 16] {
     let rows = transform::to_rows(pose);
     std::array::from_fn(|at| rows[(at % 4) * 4 + at / 4])

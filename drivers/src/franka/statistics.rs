@@ -1,32 +1,32 @@
-//! How well the states of an arm came through, and the commands of its motions.
+//! Statistics of the received states of an arm, and of the commands of its motions.
 
 use std::time::Duration;
 
-/// Width of a bin of delays.
+/// Width of a histogram bin.
 const BIN_WIDTH: Duration = Duration::from_micros(20);
-/// Bins; longer delays count in the last.
+/// Number of bins; longer delays count in the last bin.
 const N_BINS: usize = 2000;
 
-/// What became of the states of one arm since it was opened.
+/// Statistics of the states of one arm since it was opened.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct StateStatistics {
-    /// That came, and were told.
+    /// States that were received in order.
     pub n_received: u64,
-    /// Whose numbers were passed over.
+    /// States that never arrived, counted by gaps in their numbers.
     pub n_lost: u64,
-    /// That came twice, or after a later one.
+    /// States that arrived twice, or after a later one.
     pub n_late: u64,
-    /// Datagrams that are no state of this robot, or at an impossible time.
+    /// Datagrams that are not states of this robot, or whose time is impossible.
     pub n_rejected: u64,
-    /// That gave way to newer ones because nobody took them.
+    /// States dropped from a full queue because the caller did not read them.
     pub n_dropped: u64,
-    /// How often the robot's clock began anew.
+    /// Number of restarts of the robot's clock.
     pub n_restarts: u64,
     delays: Delays,
 }
 
 impl StateStatistics {
-    /// Share of the robot's states that were received in order, 0 to 1; 1 before the first.
+    /// Fraction of the robot's states that were received in order, 0 to 1; 1 before the first.
     pub fn success_frac(&self) -> f64 {
         match self.n_received + self.n_lost {
             0 => 1.0,
@@ -34,19 +34,19 @@ impl StateStatistics {
         }
     }
 
-    /// How late states came against the quickest ones: no later than this did a share of them.
+    /// Quantile of the delay of states relative to the fastest ones.
     ///
-    /// Told to 20 us, and up to 40 ms; the latest of all is [`StateStatistics::max_delay`].
+    /// The resolution is 20 us, up to 40 ms. [`StateStatistics::max_delay`] is the maximum.
     pub fn delay(&self, frac: f64) -> Duration {
         self.delays.at(frac)
     }
 
-    /// How late the latest state came against the quickest ones.
+    /// Maximum delay of a state relative to the fastest ones.
     pub fn max_delay(&self) -> Duration {
         self.delays.max_delay
     }
 
-    /// Counts a state that came so late.
+    /// Counts a state with its delay.
     pub(super) fn count(&mut self, delay: Duration) {
         self.n_received += 1;
         self.delays.count(delay);
@@ -59,39 +59,39 @@ impl std::fmt::Display for StateStatistics {
         let [median, p99, max] = self.delays.summary();
         write!(
             f,
-            "{n_received} states, {:.2} % of those sent ({n_lost} lost, {n_late} late or twice, {n_rejected} refused); half of them \
-             came at most {median} us after the quickest, 99 % at most {p99} us, all at most {max} us",
+            "{n_received} states, {:.2} % of those sent ({n_lost} lost, {n_late} late or duplicate, {n_rejected} rejected); delay relative to \
+             the fastest: median {median} us, 99 % {p99} us, maximum {max} us",
             100.0 * self.success_frac()
         )?;
         if *n_dropped + *n_restarts > 0 {
-            write!(f, "; {n_dropped} gave way to newer ones, the robot's clock began anew {n_restarts} times")?;
+            write!(f, "; {n_dropped} dropped from a full queue, {n_restarts} restarts of the robot's clock")?;
         }
         Ok(())
     }
 }
 
-/// What became of the commands of all motions of one arm.
+/// Statistics of the commands of all motions of one arm.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MotionStatistics {
-    /// Motions that the robot let begin.
+    /// Motions that the robot accepted.
     pub n_motions: u64,
-    /// States that came while one ran.
+    /// States that arrived during motions.
     pub n_cycles: u64,
-    /// Of these, that were answered with a command.
+    /// States of these that were answered with a command.
     pub n_answered: u64,
-    /// That came too late to be answered: the robot had gone on without.
+    /// States that arrived too late to be answered: the robot had already extrapolated.
     pub n_stale: u64,
-    /// States that never came, or together with a newer one.
+    /// States that never arrived, or arrived together with a newer one.
     pub n_lost: u64,
-    /// Commands that the robot was seen to go on without, by where it is wanted next; where the jerk is small that is not seen.
+    /// Commands that the robot missed, according to its reported reference. With a small jerk this is not detectable.
     pub n_missed: u64,
-    /// Commands that were held back so that the robot's own limits were kept.
+    /// Commands that were changed to keep the robot's own limits.
     pub n_limited: u64,
     delays: Delays,
-    summary: ReportedSuccess,
+    reported_success: ReportedSuccess,
 }
 
-/// What the robot told of commands that reached it in time.
+/// Success rate of commands as reported by the robot.
 #[derive(Clone, Debug, Default, PartialEq)]
 struct ReportedSuccess {
     n: u64,
@@ -100,7 +100,7 @@ struct ReportedSuccess {
 }
 
 impl MotionStatistics {
-    /// Share of the robot's states during motions that were answered, 0 to 1; 1 before the first.
+    /// Fraction of the robot's states during motions that were answered, 0 to 1; 1 before the first.
     pub fn success_frac(&self) -> f64 {
         match self.n_cycles + self.n_lost {
             0 => 1.0,
@@ -108,27 +108,27 @@ impl MotionStatistics {
         }
     }
 
-    /// The robot's own `control_command_success_rate`, 0 to 1: on average, and the least of any 100 commands in a row; `None` where
-    /// no motion was so long.
+    /// The robot's own `control_command_success_rate`, 0 to 1: the mean, and the minimum over any 100 consecutive
+    /// commands. `None` if no motion was long enough.
     pub fn robot_success_frac(&self) -> Option<[f64; 2]> {
-        let ReportedSuccess { n, sum_frac, min_frac } = self.summary;
+        let ReportedSuccess { n, sum_frac, min_frac } = self.reported_success;
         (n > 0).then(|| [sum_frac / n as f64, min_frac])
     }
 
-    /// How long after the quickest state could have come commands were sent: a share of them no later than this; 1 is all of them.
+    /// Quantile of the delay of commands relative to the fastest possible arrival of their states; 1 is the maximum.
     pub fn delay(&self, frac: f64) -> Duration {
         self.delays.at(frac)
     }
 
-    /// Counts a command that went so late.
+    /// Counts a command with its delay.
     pub(super) fn count(&mut self, delay: Duration) {
         self.n_answered += 1;
         self.delays.count(delay);
     }
 
-    /// Counts what the robot tells of its last 100 commands.
+    /// Counts the success rate that the robot reports for its last 100 commands.
     pub(super) fn count_robot_success(&mut self, frac: f64) {
-        let ReportedSuccess { n, sum_frac, min_frac } = &mut self.summary;
+        let ReportedSuccess { n, sum_frac, min_frac } = &mut self.reported_success;
         *min_frac = if *n == 0 { frac } else { min_frac.min(frac) };
         *n += 1;
         *sum_frac += frac;
@@ -141,22 +141,22 @@ impl std::fmt::Display for MotionStatistics {
         let [median, p99, max] = delays.summary();
         write!(
             f,
-            "{n_motions} motions of {n_cycles} cycles, {:.2} % answered ({n_lost} states lost, {n_stale} too late), half of them within \
-             {median} us of the quickest state, 99 % within {p99} us, all within {max} us",
+            "{n_motions} motions, {n_cycles} cycles, {:.2} % answered ({n_lost} states lost, {n_stale} too late); delay: median \
+             {median} us, 99 % {p99} us, maximum {max} us",
             100.0 * self.success_frac()
         )?;
         if let Some([mean, min]) = self.robot_success_frac() {
             let [mean, min] = [mean, min].map(|frac| 100.0 * frac);
-            write!(f, "; the robot took {mean:.2} % in time, of any 100 at least {min:.0} %")?;
+            write!(f, "; the robot received {mean:.2} % in time, of any 100 at least {min:.0} %")?;
         }
         if *n_missed + *n_limited > 0 {
-            write!(f, "; it was seen to go on without {n_missed} of them, {n_limited} were held back by its limits")?;
+            write!(f, "; it missed {n_missed} of them, {n_limited} were limited")?;
         }
         Ok(())
     }
 }
 
-/// How many delays were how long.
+/// Histogram of delays.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Delays {
     n: u64,
@@ -178,7 +178,7 @@ impl Delays {
         self.bins[bin.min(N_BINS - 1)] += 1;
     }
 
-    /// No longer than this is a share of them, to a bin's width; 1 is the longest.
+    /// Quantile, rounded up to a bin's width; 1 is the maximum.
     fn at(&self, frac: f64) -> Duration {
         if frac >= 1.0 {
             return self.max_delay;
@@ -188,11 +188,11 @@ impl Delays {
             n_left -= *n as f64;
             n_left <= 0.0
         });
-        let ix = u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("there are few bins");
+        let ix = u32::try_from(bin.unwrap_or(N_BINS - 1)).expect("the number of bins fits in 32 bits");
         (BIN_WIDTH * (ix + 1)).min(self.max_delay)
     }
 
-    /// Half of them, 99 % of them, all of them, us.
+    /// Median, 99 % quantile and maximum, us.
     fn summary(&self) -> [u128; 3] {
         [0.5, 0.99, 1.0].map(|frac| self.at(frac).as_micros())
     }
@@ -209,7 +209,7 @@ mod tests {
         for micros in 0..1000 {
             statistics.count(Duration::from_micros(micros));
         }
-        let within = |summary: Duration, micros: u128| summary.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros();
+        let within = |delay: Duration, micros: u128| delay.as_micros().abs_diff(micros) <= BIN_WIDTH.as_micros();
         assert!(within(statistics.delay(0.5), 500), "{statistics}");
         assert!(within(statistics.delay(0.99), 990), "{statistics}");
         statistics.count(Duration::from_secs(7));

@@ -1,4 +1,4 @@
-//! Over real sockets of the loopback interface: our driver, and franka-rs as a client that moves, against played robots.
+//! Tests over loopback sockets: our driver, and franka-rs as a client that moves, against emulated robots.
 
 use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Limits, RobotConfig};
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 const URDF: &str = include_str!("../../../kinematics/tests/data/panda.urdf");
 pub(super) const FREE_PORT: &str = "127.0.0.1:0";
-/// Long, as a busy machine may be slow; nothing waits so long where all is well.
+/// Long, because a busy machine may be slow. A successful test does not wait this long.
 pub(super) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(super) const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
 pub(super) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
@@ -37,7 +37,7 @@ pub(super) fn config(address: SocketAddr) -> ArmConfig {
     ArmConfig { address: address.to_string(), joint_names: chain.joint_names().to_vec(), chain }
 }
 
-/// Joints that swing by themselves; what they do is a function of the time.
+/// Joints that swing; their motion is a function of time.
 fn swinging_joints_at(stamp: Stamp) -> Joints {
     const RATE_RAD_S: f64 = 2.0;
     let phase = RATE_RAD_S * (stamp.0 as f64 * 1e-9);
@@ -49,7 +49,7 @@ fn swinging_joints_at(stamp: Stamp) -> Joints {
     }
 }
 
-/// Joints that are where they are wanted.
+/// Joints that follow their commands perfectly.
 pub(super) fn ideal_joints() -> JointSimulator {
     let mut is_first = true;
     Box::new(move |_, commanded: &CommandedJoints| {
@@ -60,9 +60,9 @@ pub(super) fn ideal_joints() -> JointSimulator {
 
 #[test]
 fn ten_thousand_states_are_received_in_both_versions() {
-    // Loopback loses nothing; what is missing is what a busy machine did not get to send or take in time.
+    // Loopback loses nothing; a busy machine may fail to send or receive some states in time.
     const MIN_FRAC: f64 = 0.99;
-    // Where the swing is, told by stamps that are late by at most the wake-up of one thread.
+    // Maximum delay of a stamp, from the wake-up latency of one thread.
     const MAX_LATE_SECS: f64 = 5e-3;
     for version in VERSIONS {
         let emulated = robot(version, Box::new(|stamp, _| swinging_joints_at(stamp)));
@@ -95,7 +95,7 @@ fn second_client_is_rejected_with_advice() {
     let second_client = FrankaArm::open(&config(emulated.address())).unwrap_err().to_string();
     assert!(second_client.contains("one client") && second_client.contains("arm.driver = \"udp\""), "{second_client}");
     drop(first);
-    // The controller notices within a millisecond or a few.
+    // The controller detects the disconnect within a few milliseconds.
     let deadline = Instant::now() + TEST_TIMEOUT;
     while let Err(error) = FrankaArm::open(&config(emulated.address())) {
         assert!(Instant::now() < deadline, "{error}");
@@ -136,7 +136,7 @@ fn flange_mismatch_reports_both_poses() {
     let with_tip = |tip| ArmConfig { chain: chain(tip), ..config(emulated.address()) };
     let wrong_tip = FrankaArm::open(&with_tip("link7")).unwrap_err().to_string();
     for part in ["\"link7\"", "107.0 mm", "arm.flange_link", "F_T_EE", "yaw"] {
-        assert!(wrong_tip.contains(part), "{part} is missing: {wrong_tip}");
+        assert!(wrong_tip.contains(part), "{part:?} is missing in: {wrong_tip}");
     }
     let mut swapped = config(emulated.address());
     swapped.joint_names.swap(1, 3);
@@ -162,14 +162,15 @@ fn lost_robot_is_an_error() {
     assert!(matches!(arm.read(Duration::from_millis(1)), Err(Error::NoJoints { .. })));
 }
 
-/// A smooth way by `by_rad` of one joint in `secs`, as a share of the time (a quintic, at rest at both ends).
+/// A smooth motion by `by_rad`, as a function of the fraction of the time (a quintic, at rest at both ends).
 fn quintic(frac: f64, by_rad: f64) -> f64 {
     by_rad * frac.powi(3) * (10.0 - 15.0 * frac + 6.0 * frac * frac)
 }
 
-/// Moves the fourth joint with franka-rs, which is libfranka's loop; without its limits and filters.
+/// Moves the fourth joint with franka-rs, which implements libfranka's loop, without its limits and filters.
 ///
-/// On a machine so busy that the client is not woken for 20 ms the robot stops, as it should; then the motion begins anew.
+/// On a machine so busy that the client is not woken for 20 ms, the robot triggers a reflex, as it should; the motion
+/// is then retried.
 fn move_to(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError> {
     const MAX_ATTEMPTS: usize = 5;
     let mut result = Ok(());
@@ -207,7 +208,7 @@ fn move_once(client: &Robot, goal_rad: f64, secs: f64) -> Result<(), FrankaError
     )
 }
 
-/// Clears a reflex, and waits for a state that says so: those from before may still be on their way.
+/// Clears a reflex, and waits for a state that confirms it: earlier states may still be in flight.
 fn recover(client: &Robot) {
     client.automatic_error_recovery().unwrap();
     let deadline = Instant::now() + TEST_TIMEOUT;
@@ -230,7 +231,7 @@ fn motion_beyond_limits_triggers_reflex_until_recovery() {
         let arrived = client.read_once().unwrap();
         assert!((arrived.q[3] - (REST_RAD[3] + 0.1)).abs() < 1e-6, "{:?}", arrived.q);
         assert_eq!(arrived.robot_mode, RobotMode::Idle);
-        // Half a radian in a fifth of a second takes up to 72 rad/s².
+        // Half a radian within a fifth of a second takes up to 72 rad/s².
         let stopped = match move_to(&client, REST_RAD[3] + 0.6, 0.2) {
             Err(FrankaError::Control(stopped)) => stopped,
             other => panic!("{other:?}"),
@@ -242,7 +243,7 @@ fn motion_beyond_limits_triggers_reflex_until_recovery() {
         let state = client.read_once().unwrap();
         assert_eq!(state.robot_mode, RobotMode::Reflex);
         assert!(reports_discontinuity(&state.current_errors));
-        assert!(move_to(&client, REST_RAD[3], 1.0).is_err(), "no motion before the recovery");
+        assert!(move_to(&client, REST_RAD[3], 1.0).is_err(), "no motion is accepted before the recovery");
         recover(&client);
         move_to(&client, REST_RAD[3], 1.0).unwrap();
     }
@@ -281,7 +282,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
         random.to_le_bytes()[3]
     };
     let emulated = robot(FciVersion::V10, ideal_joints());
-    // Commands: headers of all kinds, with lengths that fit and do not, cut anywhere.
+    // Requests: headers of all kinds, with valid and invalid lengths, truncated anywhere.
     for ix in 0..300_u32 {
         let mut stream = TcpStream::connect(emulated.address()).unwrap();
         let n = usize::from(byte()) * 2;
@@ -293,7 +294,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
             let header = [(ix % 16).to_le_bytes(), [byte(); 4], size.to_le_bytes()].concat();
             bytes = [hello, header, bytes].concat();
         }
-        // It may hang up in the middle, and while another is there it does so at once.
+        // The robot may disconnect in the middle, and does so at once while another client is connected.
         let _ = stream.write_all(&bytes);
     }
     let deadline = Instant::now() + TEST_TIMEOUT;
@@ -305,7 +306,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
     };
     arm.read(TEST_TIMEOUT).unwrap();
     drop(arm);
-    // Commands of motions: a client that gets states sends junk to where they come from.
+    // Motion commands: a client that receives states sends junk to their source address.
     let (stream, states) = raw_client(&emulated);
     let mut state = [0; 2000];
     let (n_bytes, from) = states.recv_from(&mut state).unwrap();
@@ -316,7 +317,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
     }
     states.recv_from(&mut state).unwrap();
     drop((stream, emulated));
-    // States: a controller that sends junk between good ones.
+    // States: a controller that sends junk between valid ones.
     let listener = std::net::TcpListener::bind(FREE_PORT).unwrap();
     let address = listener.local_addr().unwrap();
     let good = state[..n_bytes].to_vec();
@@ -347,7 +348,7 @@ fn malformed_bytes_stop_neither_robot_nor_client() {
     thread.join().unwrap();
 }
 
-/// A client that says hello and nothing more; the second socket gets states.
+/// A client that only sends the connection request; the second socket receives states.
 fn raw_client(emulated: &EmulatedRobot) -> (TcpStream, UdpSocket) {
     let states = UdpSocket::bind(FREE_PORT).unwrap();
     states.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
@@ -355,7 +356,7 @@ fn raw_client(emulated: &EmulatedRobot) -> (TcpStream, UdpSocket) {
     let hello = [&[0; 8][..], &16_u32.to_le_bytes(), &10_u16.to_le_bytes(), &port].concat();
     let deadline = Instant::now() + TEST_TIMEOUT;
     loop {
-        // Until the one before is gone it sends us away.
+        // The robot rejects us until the previous client is gone.
         let mut stream = TcpStream::connect(emulated.address()).unwrap();
         let mut answer = [0; 15];
         if stream.write_all(&hello).and_then(|()| stream.read_exact(&mut answer)).is_ok() {
@@ -379,7 +380,7 @@ fn invalid_states_are_rejected() {
             let bytes: Vec<u8> = good.iter().copied().chain([0]).cycle().take(n).collect();
             assert_eq!(decode(version, &bytes).is_some(), n == good.len(), "{n} bytes");
         }
-        // All ones are no numbers, wherever they stand in joints.
+        // Bytes of all ones are not numbers.
         let mut bytes = good.clone();
         bytes[8..].fill(0xFF);
         assert!(decode(version, &bytes).is_none());

@@ -1,7 +1,7 @@
-//! Setpoints on the way to a target, from any motion, limited in speed, acceleration and jerk.
+//! Generates setpoints towards a target from any state of motion, with limited velocity, acceleration and jerk.
 //!
-//! Source: Berscheid and Kröger 2021, "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States"; the maths is that
-//! of the crate `rsruckig`.
+//! Source: Berscheid and Kröger 2021, "Jerk-limited Real-time Trajectory Generation with Arbitrary Target States", as
+//! implemented in the crate `rsruckig`.
 
 use super::{JointTarget, MotionLimits};
 use rsruckig::prelude::{
@@ -10,14 +10,14 @@ use rsruckig::prelude::{
 };
 use std::time::Duration;
 
-/// How far outside its range a joint may be found, radians or metres: by play, by an encoder's offset, or by a motion that went on
-/// without us and is too fast to stop before the end of the range.
+/// How far outside its range a joint may be, radians or meters. Causes are backlash, an encoder offset, or a motion
+/// that continued without us and is too fast to stop before the end of the range.
 const MAX_OVERSHOOT: f64 = 0.02;
 
-/// Shares of jerk that are tried to be done without where no way is found with all of it.
+/// Fractions by which the jerk is reduced if no trajectory is found with the full jerk.
 const JERK_REDUCTIONS: [f64; 3] = [1e-6, 1e-4, 1e-2];
 
-/// Where joints are to be at an instant, in their order; radians or metres, and seconds.
+/// Setpoint of all joints at an instant, in their order; radians or meters, and seconds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Setpoint {
     /// Positions.
@@ -28,7 +28,7 @@ pub struct Setpoint {
     pub acceleration: Vec<f64>,
 }
 
-/// Makes a setpoint a cycle. All joints arrive at the same time.
+/// Generates one setpoint per cycle. All joints arrive at the same time.
 pub struct TrajectoryGenerator {
     ruckig: Ruckig<0, ThrowErrorHandler>,
     input: InputParameter<0>,
@@ -39,17 +39,18 @@ pub struct TrajectoryGenerator {
 
 impl std::fmt::Debug for TrajectoryGenerator {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Generator")
+        f.debug_struct("TrajectoryGenerator")
             .field("limits", &self.limits)
-            .field("is_held", &self.is_at_rest)
+            .field("is_at_rest", &self.is_at_rest)
             .finish_non_exhaustive()
     }
 }
 
 impl TrajectoryGenerator {
-    /// At rest at `position`; a joint a little outside its range may stay there and come back.
+    /// Creates a generator at rest at `position`. A joint slightly outside its range may stay there and come back.
     ///
-    /// A joint far outside its range, a limit that is not above 0 and finite, and numbers of other arms are told as reasons.
+    /// # Errors
+    /// If a joint is far outside its range, a limit is not positive and finite, or the number of positions is wrong.
     pub fn new(limits: &[MotionLimits], position: &[f64], period: Duration) -> Result<Self, String> {
         let n = limits.len();
         check(position, n)?;
@@ -64,7 +65,7 @@ impl TrajectoryGenerator {
             }
             if [joint.velocity, joint.acceleration, joint.jerk].iter().any(|limit| !limit.is_finite() || *limit <= 0.0)
             {
-                return Err(format!("the limits of joint {} are not all above 0 and finite: {joint:?}", ix + 1));
+                return Err(format!("the limits of joint {} must be positive and finite: {joint:?}", ix + 1));
             }
             joint.position = [lower.min(*position), upper.max(*position)];
         }
@@ -79,7 +80,8 @@ impl TrajectoryGenerator {
         Ok(Self { ruckig, input, output: OutputParameter::new(Some(n)), limits, is_at_rest: true })
     }
 
-    /// Heads for a target, brought into the joints' ranges, which is returned; one of another arm or not of numbers changes nothing.
+    /// Sets a target, clamped to the joints' ranges, and returns the clamped target. A target that is not finite or
+    /// has the wrong number of joints is an error and changes nothing.
     pub fn set_target(&mut self, target: &JointTarget) -> Result<JointTarget, String> {
         check(&target.position, self.limits.len())?;
         let clamp_to_range =
@@ -93,7 +95,7 @@ impl TrajectoryGenerator {
         Ok(JointTarget { position })
     }
 
-    /// Each joint comes to rest as soon as its limits allow, whatever the others do.
+    /// Stops each joint as soon as its limits allow, independently of the others.
     pub fn stop(&mut self) {
         if !self.is_at_rest {
             self.input.control_interface = ControlInterface::Velocity;
@@ -101,7 +103,8 @@ impl TrajectoryGenerator {
         }
     }
 
-    /// Goes on from another motion than its own towards where it was headed for: where the arm was found to be wanted elsewhere.
+    /// Continues towards the target from a different state of motion, for use if the arm's reference was found to be
+    /// elsewhere.
     pub fn resume(&mut self, from: &Setpoint) -> Result<(), String> {
         for values in [&from.position, &from.velocity, &from.acceleration] {
             check(values, self.limits.len())?;
@@ -114,19 +117,19 @@ impl TrajectoryGenerator {
         Ok(())
     }
 
-    /// The ways from here on stay in the ranges.
+    /// Keeps future trajectories within the ranges.
     fn keep_in_range(&mut self) {
         self.input.min_position = Some(data_array(self.limits.iter().map(|joint| joint.position[0])));
         self.input.max_position = Some(data_array(self.limits.iter().map(|joint| joint.position[1])));
     }
 
-    /// Whether it is at rest where it was headed for.
+    /// Whether the joints are at rest at the end of their trajectory.
     pub fn is_at_rest(&self) -> bool {
         self.is_at_rest
     }
 
-    /// A step on a way with a little less jerk: `rsruckig` finds none where a joint comes to its full acceleration for no time at all,
-    /// as it does for some round distances.
+    /// Tries a step with slightly reduced jerk. `rsruckig` finds no trajectory if a joint reaches its full
+    /// acceleration for zero time, which happens for some round distances.
     fn update_with_less_jerk(&mut self) -> Option<RuckigResult> {
         let full = self.input.max_jerk.clone();
         let result = JERK_REDUCTIONS.iter().find_map(|reduction| {
@@ -137,8 +140,8 @@ impl TrajectoryGenerator {
         result
     }
 
-    /// A step on a way that leaves the ranges a little and comes back, where none stays inside; `None` where that is no help.
-    /// A stop is as short as it can be, wherever it ends.
+    /// Tries a trajectory that leaves the ranges slightly and comes back, if none stays inside; `None` if that fails,
+    /// too. A stop is as short as possible, wherever it ends.
     fn update_with_overshoot(&mut self) -> Option<RuckigResult> {
         let position_bounds = (self.input.min_position.take(), self.input.max_position.take());
         let result = self.ruckig.update(&self.input, &mut self.output);
@@ -157,7 +160,7 @@ impl TrajectoryGenerator {
         }
     }
 
-    /// Where the joints are to be a cycle later.
+    /// Returns the setpoint of the next cycle.
     pub fn step(&mut self) -> Result<Setpoint, String> {
         if !self.is_at_rest {
             let result = match self.ruckig.update(&self.input, &mut self.output) {
@@ -170,7 +173,7 @@ impl TrajectoryGenerator {
             self.output.pass_to_input(&mut self.input);
             if result == RuckigResult::Finished {
                 self.is_at_rest = true;
-                // The end of a way is met to within a rounding error, and no motion is left.
+                // The end is reached up to a rounding error; remove the remaining motion.
                 self.input.current_velocity = data_array(self.limits.iter().map(|_| 0.0));
                 self.input.current_acceleration = data_array(self.limits.iter().map(|_| 0.0));
             }
@@ -184,13 +187,13 @@ impl TrajectoryGenerator {
     }
 }
 
-/// One number a joint, all of them numbers.
+/// Checks that there is one finite number per joint.
 fn check(position: &[f64], n: usize) -> Result<(), String> {
     if position.len() != n {
         return Err(format!("{} positions are given for {n} joints", position.len()));
     }
     match position.iter().position(|position| !position.is_finite()) {
-        Some(ix) => Err(format!("the position of joint {} is no number: {}", ix + 1, position[ix])),
+        Some(ix) => Err(format!("the position of joint {} is not a finite number: {}", ix + 1, position[ix])),
         None => Ok(()),
     }
 }
@@ -200,11 +203,11 @@ fn data_array(values: impl Iterator<Item = f64>) -> DataArrayOrVec<f64, 0> {
 }
 
 fn describe(error: &RuckigError) -> String {
-    // What follows is what it was asked.
-    let describe = error.to_string();
+    // The rest of the message repeats the input.
+    let message = error.to_string();
     format!(
-        "no way to the target was found: {}",
-        describe.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
+        "found no trajectory to the target: {}",
+        message.lines().next().unwrap_or_default().trim_end_matches("input: ").trim()
     )
 }
 
@@ -223,13 +226,13 @@ mod tests {
         TrajectoryGenerator::new(&limits(), &[0.0, 0.2], PERIOD).unwrap()
     }
 
-    /// Steps until it is held, and checks every limit by differences from cycle to cycle.
+    /// Steps until the joints are at rest, and checks every limit by differences between cycles.
     fn run_until_at_rest(generator: &mut TrajectoryGenerator) -> Vec<Setpoint> {
         let secs = PERIOD.as_secs_f64();
         let mut trajectory = vec![generator.step().unwrap()];
         while !generator.is_at_rest() {
             trajectory.push(generator.step().unwrap());
-            assert!(trajectory.len() < 20_000, "it never arrives");
+            assert!(trajectory.len() < 20_000, "it does not arrive");
         }
         for pair in trajectory.windows(2) {
             for (ix, joint) in limits().iter().enumerate() {
@@ -257,7 +260,7 @@ mod tests {
         let before = &trajectory[trajectory.len() - 20];
         assert!(
             (0..2).all(|ix| (before.position[ix] - target.position[ix]).abs() > 1e-9),
-            "both are still on their way"
+            "both joints are still moving"
         );
     }
 
@@ -276,8 +279,8 @@ mod tests {
         let trajectory = run_until_at_rest(&mut generator);
         let last = trajectory.last().unwrap();
         assert_eq!(last.velocity, [0.0, 0.0]);
-        assert!(last.position[0] > -0.9, "it did not go on to its target");
-        assert_eq!(generator.step().unwrap(), *last, "it stays");
+        assert!(last.position[0] > -0.9, "it stopped before its target");
+        assert_eq!(generator.step().unwrap(), *last, "it stays at rest");
     }
 
     #[test]
@@ -309,7 +312,7 @@ mod tests {
         generator.resume(&measured).unwrap();
         let trajectory = run_until_at_rest(&mut generator);
         assert!((trajectory[0].position[0] - 0.2003).abs() < 1e-5, "{:?}", trajectory[0]);
-        assert!((trajectory[trajectory.len() - 1].position[0] - 0.9).abs() < 1e-9, "it heads for its target as before");
+        assert!((trajectory[trajectory.len() - 1].position[0] - 0.9).abs() < 1e-9, "it still moves to its target");
         let too_short = Setpoint { velocity: vec![0.0], ..measured };
         assert!(generator.resume(&too_short).unwrap_err().contains("1 "));
     }
@@ -334,7 +337,7 @@ mod tests {
         assert!((trajectory[trajectory.len() - 1].position[0] - 1.0).abs() < 1e-9);
         assert!(trajectory.iter().all(|setpoint| setpoint.acceleration[0].abs() < 2.0001));
         generator.resume(&setpoint_at(0.999)).unwrap();
-        assert!(generator.step().unwrap_err().contains("no way"), "it would go too far");
+        assert!(generator.step().unwrap_err().contains("no trajectory"), "it would overshoot too far");
         generator.stop();
         while !generator.is_at_rest() {
             generator.step().unwrap();
@@ -357,7 +360,7 @@ mod tests {
                     let jerk_now = (now.acceleration[0] - before.acceleration[0]) / PERIOD.as_secs_f64();
                     assert!(jerk_now.abs() <= jerk * 1.0001 && now.acceleration[0].abs() <= acceleration * 1.0001);
                 }
-                // Four times as long as it takes to come to full acceleration.
+                // Four times the time to reach full acceleration.
                 assert!((trajectory.len() as f64 - 400.0).abs() < 3.0, "{}", trajectory.len());
                 assert!((trajectory[trajectory.len() - 1].position[0] - target).abs() < 1e-9);
             }
@@ -372,7 +375,7 @@ mod tests {
         let before = generator.step().unwrap();
         assert!(generator.set_target(&JointTarget { position: vec![0.0] }).unwrap_err().contains("1 positions"));
         assert!(generator.set_target(&JointTarget { position: vec![f64::NAN, 0.0] }).unwrap_err().contains("joint 1"));
-        assert!(generator.step().unwrap().position[1] > before.position[1], "it is on its way as before");
+        assert!(generator.step().unwrap().position[1] > before.position[1], "it still moves to its previous target");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Arms that may be moved: where to, how fast at most, and what becomes of them when their computer falls silent.
+//! Arms that may be moved: targets, motion limits, and fail-safe behavior if this computer stops sending.
 
 mod generator;
 
@@ -8,59 +8,63 @@ use crate::{Arm, Error};
 use kinematics::urdf::JointLimits;
 use std::time::Duration;
 
-/// Where joints are to come to rest.
+/// Positions at which the joints should come to rest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointTarget {
-    /// Radians or metres, in the order of [`Arm::joint_names`].
+    /// Radians or meters, in the order of [`Arm::joint_names`].
     pub position: Vec<f64>,
 }
 
-/// What a movable arm does.
+/// Motion state of a movable arm.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Motion {
-    /// It is held where it was last sent, or where it was found.
+    /// The arm holds its last commanded position, or the one at which it was found.
     Holding,
-    /// It is on its way.
+    /// The arm is moving to its target.
     Moving,
-    /// It stopped by itself or was lost, and takes no target before [`MovableArm::recover`].
+    /// The arm stopped because of a fault or was lost. It accepts no target before [`MovableArm::recover`].
     Stopped {
-        /// What stopped it, in words.
+        /// Why it stopped.
         reason: String,
     },
 }
 
-/// An arm that may also be moved.
+/// An arm that can also be moved.
 ///
-/// It is opened only after what stops its motors when this computer falls silent was set and read back. Whoever holds it may move
-/// it; programs that only watch hold an [`Arm`].
+/// Before an arm is opened, the reaction of its motors to missing commands is set and verified. The owner of this
+/// trait object may move the arm; programs that only read use an [`Arm`].
 pub trait MovableArm: Arm {
-    /// Heads for a target from wherever it is, in whatever motion it is, within the limits of [`MotionConfig`]; a later target
+    /// Moves to a target from any position and state of motion, within the limits of [`MotionConfig`]. A later target
     /// replaces it.
     ///
-    /// Returns the target that is headed for: inside the joints' ranges. A target of another arm, one that is no number, and any
-    /// target while the arm is [`Motion::Stopped`], are errors and change nothing.
+    /// Returns the accepted target, clamped to the joints' ranges.
+    ///
+    /// # Errors
+    /// If the target is not finite or has the wrong number of joints, or the arm is [`Motion::Stopped`]. The arm's
+    /// motion does not change.
     fn command(&mut self, target: &JointTarget) -> Result<JointTarget, Error>;
-    /// What it does now.
+    /// Current motion state.
     fn motion(&self) -> Motion;
-    /// Comes to rest within its limits, wherever that is.
+    /// Brings the arm to rest within its limits, as soon as possible.
     fn stop(&mut self) -> Result<(), Error>;
-    /// Switches an arm that stopped on again, held where it is now: for a person who looked at it to ask for, never for a loop.
+    /// Enables a stopped arm again, holding its current position. Call this only at the request of a person who has
+    /// checked the arm, never automatically.
     fn recover(&mut self) -> Result<(), Error>;
 }
 
-/// What motors do by themselves once their computer falls silent.
+/// What motors do when commands from this computer stop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OnLoss {
-    /// Stop and keep their places.
+    /// Stop and hold their positions.
     Hold,
-    /// Resist being moved, without keeping a place.
+    /// Resist motion without holding a position.
     Damp,
-    /// Let go: an arm without brakes falls.
+    /// Release the joints: an arm without brakes falls.
     Release,
 }
 
 impl OnLoss {
-    /// As rig files have it.
+    /// Name in rig files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Hold => "hold",
@@ -70,35 +74,35 @@ impl OnLoss {
     }
 }
 
-/// How an arm may be moved, as the rig file has it.
+/// How an arm may be moved, as configured in the rig file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MotionConfig {
-    /// Of each joint.
+    /// Limits of each joint.
     pub limits: Vec<MotionLimits>,
-    /// What motors are set to do when this computer falls silent; an arm that cannot is not moved.
+    /// What motors are configured to do when commands stop. An arm that does not support it is not moved.
     pub on_loss: OnLoss,
-    /// After how long a silence.
+    /// Time without commands after which they do it.
     pub timeout: Duration,
-    /// Whether motors that cannot notice the silence are moved all the same.
+    /// Whether to move motors that cannot detect missing commands.
     pub accept_no_watchdog: bool,
 }
 
-/// How a joint may be moved; radians or metres, and seconds.
+/// Motion limits of a joint; radians or meters, and seconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MotionLimits {
-    /// Smallest and largest position; infinite where a joint turns without end.
+    /// Minimum and maximum position; infinite for a joint without limits.
     pub position: [f64; 2],
-    /// Largest speed.
+    /// Maximum velocity.
     pub velocity: f64,
-    /// Largest acceleration.
+    /// Maximum acceleration.
     pub acceleration: f64,
-    /// Largest jerk.
+    /// Maximum jerk.
     pub jerk: f64,
 }
 
 impl MotionLimits {
-    /// Of a joint by its description, no faster than `max_speed`, reached within `acceleration_secs` from rest at full acceleration,
-    /// which is reached within `jerk_secs`.
+    /// Limits of a joint from its description, with the velocity reduced to at most `max_speed`. From rest, full
+    /// acceleration is reached in `jerk_secs`, and the maximum velocity in `acceleration_secs` at full acceleration.
     pub fn new(joint: &JointLimits, max_speed: f64, acceleration_secs: f64, jerk_secs: f64) -> Self {
         let velocity = joint.velocity.min(max_speed);
         let acceleration = velocity / acceleration_secs;

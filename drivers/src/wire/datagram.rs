@@ -1,4 +1,5 @@
-//! What arms, range scanners and bases send over UDP: one JSON object a datagram, every field in `docs/reference/udp.md`.
+//! UDP datagrams of arms, range scanners and bases: one JSON object per datagram. `docs/reference/udp.md` documents
+//! the fields.
 
 use super::Malformed;
 use crate::RangePoint;
@@ -8,69 +9,72 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the format.
 pub const VERSION: u32 = 1;
-/// Most datagrams that one scan may be cut into.
+/// Maximum number of datagrams per scan.
 pub const MAX_PARTS: u32 = 64;
-/// Coordinates, ranges and what joints do beyond this are slips, metres or whatever their unit is.
+/// Maximum absolute value of coordinates, ranges and joint values in their units; larger ones are errors of the
+/// sender.
 const MAX_ABS_VALUE: f64 = 1e4;
-/// Angles beyond this are slips, rad.
+/// Maximum absolute angle, rad; larger ones are errors of the sender.
 const MAX_ANGLE_RAD: f64 = 100.0;
-/// Most characters of a parser's message that are told.
+/// Maximum number of characters of a parser message in an error.
 const MAX_ERROR_CHARS: usize = 200;
-/// How far the halves of a covariance may be from each other, as a share of what they may be at most; single precision does less.
+/// Maximum asymmetry of a covariance matrix, as a fraction of the maximum covariance. Single precision is more
+/// accurate.
 const SYMMETRY_TOLERANCE: f64 = 1e-4;
-/// How far from one the length of a quaternion may be.
+/// Maximum deviation of a quaternion's norm from 1.
 const UNIT_NORM_TOLERANCE: f64 = 1e-3;
 
-/// Which clock a stamp is on.
+/// Clock of a stamp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Clock {
-    /// `CLOCK_MONOTONIC` of the computer that receives: the sender runs on it too.
+    /// `CLOCK_MONOTONIC` of the receiving computer, on which the sender must run, too.
     Monotonic,
-    /// Any other that runs evenly; it is mapped by when datagrams arrive.
+    /// Any other clock with a steady rate. It is mapped to ours by the arrival times.
     Device,
 }
 
-/// What every datagram says.
+/// Fields of every datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DatagramHeader {
-    /// One more with every scan, pose or joint state.
+    /// Sequence number: increases by one with every scan, pose or joint state.
     pub seq: u64,
-    /// Which clock the stamp is on.
+    /// Clock of the stamp.
     pub clock: Clock,
-    /// When it was so, or when the turn began, nanoseconds.
+    /// Time of the measurement, or of the start of the scan's rotation, nanoseconds.
     pub stamp_nanos: i64,
 }
 
 /// A range scan, or a part of one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScanPart {
-    /// The same in all parts of a scan.
+    /// Equal in all parts of a scan.
     pub header: DatagramHeader,
     /// Name of the scanner in the rig file.
     pub frame: String,
-    /// Which part this is, from 0.
+    /// Index of this part, from 0.
     pub part: u32,
-    /// How many there are, 1 to [`MAX_PARTS`].
+    /// Number of parts, 1 to [`MAX_PARTS`].
     pub n_parts: u32,
-    /// Its echoes; directions without one have none.
+    /// The echoes. Directions without an echo are left out.
     pub points: Vec<RangePoint>,
 }
 
-/// Where a base was.
+/// Pose of a base.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseDatagram {
-    /// When.
+    /// Header.
     pub header: DatagramHeader,
     /// Pose of the base.
     pub world_from_base: Transform,
-    /// Covariance of the pose where the sender tells it, row by row: position along the world's axes, then small turns about them
-    /// (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m rad, rad².
+    /// Covariance of the pose if the sender reports it, row-major: position along the world's axes, then small
+    /// rotations about them (as in `geometry_msgs/PoseWithCovariance` of ROS); m², m rad, rad².
     pub covariance: Option<Box<[f64; 36]>>,
 }
 
 impl PoseDatagram {
-    /// How sure the sender is, where it tells: root mean squares of the position's error and of the turn's, metres and radians.
+    /// Reported uncertainty: root mean square errors of position in meters and rotation in radians; `None` without a
+    /// covariance.
     pub fn sigmas(&self) -> Option<[f64; 2]> {
         let covariance = self.covariance.as_ref()?;
         let trace = |first: usize| (first..first + 3).map(|ix| covariance[7 * ix]).sum::<f64>();
@@ -78,20 +82,20 @@ impl PoseDatagram {
     }
 }
 
-/// What an arm's joints did.
+/// State of an arm's joints.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointsDatagram {
-    /// When.
+    /// Header.
     pub header: DatagramHeader,
-    /// Radians or metres.
+    /// Radians or meters.
     pub position: Vec<f64>,
-    /// Radians or metres per second; empty where the sender does not tell.
+    /// Radians or meters per second; empty if the sender does not report it.
     pub velocity: Vec<f64>,
-    /// Newton metres or newtons; empty where the sender does not tell.
+    /// Newton meters or newtons; empty if the sender does not report it.
     pub effort: Vec<f64>,
 }
 
-/// What is looked at before anything else; other fields may be anything.
+/// The fields that are checked first. Other fields are ignored.
 #[derive(Deserialize)]
 struct Kind {
     kind: String,
@@ -168,7 +172,7 @@ fn default_parts() -> u32 {
     1
 }
 
-/// A part of a scan as a datagram; every bit of it comes back from [`decode_scan`].
+/// Encodes a part of a scan; [`decode_scan`] restores it exactly.
 pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
     let ScanPart { header, frame, part, n_parts, points } = part;
     let wire = WireScan {
@@ -191,7 +195,7 @@ pub fn encode_scan(part: &ScanPart) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// A base's pose as a datagram; every bit of it comes back from [`decode_pose`].
+/// Encodes a base pose; [`decode_pose`] restores it exactly.
 pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
     let PoseDatagram { header, world_from_base, covariance } = pose;
     let wire = WirePose {
@@ -209,7 +213,7 @@ pub fn encode_pose(pose: &PoseDatagram) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// The state of joints of these names as a datagram; every bit of it comes back from [`decode_joints`].
+/// Encodes the state of joints with these names; [`decode_joints`] restores it exactly.
 pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
     let JointsDatagram { header, position, velocity, effort } = joints;
     let wire = WireJoints {
@@ -226,20 +230,20 @@ pub fn encode_joints(joints: &JointsDatagram, names: &[String]) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// Reads a part of a scan.
+/// Decodes a part of a scan.
 pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
     check_kind(bytes, SCAN)?;
     let wire: WireScan = parse_json(bytes)?;
     if wire.parts == 0 || wire.parts > MAX_PARTS || wire.part >= wire.parts {
         return Err(invalid(format!(
-            "part is {} of {}, must be below parts, and parts 1 to {MAX_PARTS}",
+            "part is {} and parts {}; part must be below parts, and parts 1 to {MAX_PARTS}",
             wire.part, wire.parts
         )));
     }
     let echo_positions = echo_positions(&wire)?;
     let n = echo_positions.len();
     let check_length = |name, len: Option<usize>| match len {
-        Some(len) if len != n => Err(invalid(format!("{name} has {len} entries for {n} echoes"))),
+        Some(len) if len != n => Err(invalid(format!("{name} has {len} entries, but there are {n} points or ranges"))),
         _ => Ok(()),
     };
     check_length("rings", wire.rings.as_ref().map(Vec::len))?;
@@ -260,19 +264,19 @@ pub fn decode_scan(bytes: &[u8]) -> Result<ScanPart, Malformed> {
     })
 }
 
-/// Reads a base's pose.
+/// Decodes a base pose.
 pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
     check_kind(bytes, POSE)?;
     let wire: WirePose = parse_json(bytes)?;
     let Pose { xyz_m: [x, y, z], quat_xyzw: [i, j, k, w] } = wire.world_from_base;
     if ![x, y, z].iter().all(|coordinate| coordinate.abs() <= MAX_ABS_VALUE) {
-        return Err(invalid(format!("xyz_m has a number beyond {MAX_ABS_VALUE} m")));
+        return Err(invalid(format!("xyz_m has an absolute value above {MAX_ABS_VALUE} m")));
     }
     let quaternion = Quaternion::new(w, i, j, k);
-    // Written so that no number is no length.
+    // Written so that NaN is not a unit norm.
     let is_unit = (quaternion.norm() - 1.0).abs() <= UNIT_NORM_TOLERANCE;
     if !is_unit {
-        return Err(invalid("quat_xyzw has not the length 1".to_owned()));
+        return Err(invalid("quat_xyzw is not a unit quaternion".to_owned()));
     }
     let rotation = match (quaternion.norm() - 1.0).abs() < 1e-12 {
         true => UnitQuaternion::new_unchecked(quaternion),
@@ -288,7 +292,7 @@ pub fn decode_pose(bytes: &[u8]) -> Result<PoseDatagram, Malformed> {
 fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
     let n = numbers.len();
     let covariance: Box<[f64; 36]> =
-        numbers.try_into().map_err(|_| invalid(format!("covariance has {n} numbers, not 36")))?;
+        numbers.try_into().map_err(|_| invalid(format!("covariance has {n} numbers, expected 36")))?;
     if !(0..6).all(|ix| (0.0..=MAX_ABS_VALUE).contains(&covariance[7 * ix])) {
         return Err(invalid(format!("covariance has a variance outside 0 to {MAX_ABS_VALUE}")));
     }
@@ -299,26 +303,26 @@ fn covariance(numbers: Vec<f64>) -> Result<Box<[f64; 36]>, Malformed> {
             || lower.abs() > (1.0 + SYMMETRY_TOLERANCE) * max_covariance
         {
             return Err(invalid(format!(
-                "covariance: row {row}, column {column} (from 0) is not as its mirror image, or larger than the variances allow"
+                "covariance: row {row}, column {column} (from 0) differs from the transposed entry, or is larger than the variances allow"
             )));
         }
     }
     Ok(covariance)
 }
 
-/// Reads the state of joints of these names; a sender that names them must name the same in the same order.
+/// Decodes the state of joints with these names. If the datagram has names, they must be the same in the same order.
 pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, Malformed> {
     check_kind(bytes, JOINTS)?;
     let WireJoints { seq, clock, stamp_nanos, names: reported, position, velocity, effort, .. } = parse_json(bytes)?;
     if reported.is_some_and(|reported| reported != names) {
-        return Err(invalid("names are not those of arm.joints, in that order".to_owned()));
+        return Err(invalid("names must be those of arm.joints, in the same order".to_owned()));
     }
     let n = names.len();
     let check_length = |name, numbers: &[f64], may_be_empty: bool| match numbers.len() {
         0 if may_be_empty => Ok(()),
-        len if len != n => Err(invalid(format!("{name} has {len} numbers for {n} joints"))),
+        len if len != n => Err(invalid(format!("{name} has {len} numbers, expected {n}, one per joint"))),
         _ if numbers.iter().any(|number| number.abs() > MAX_ABS_VALUE) => {
-            Err(invalid(format!("{name} has a number beyond {MAX_ABS_VALUE}")))
+            Err(invalid(format!("{name} has an absolute value above {MAX_ABS_VALUE}")))
         }
         _ => Ok(()),
     };
@@ -328,23 +332,23 @@ pub fn decode_joints(bytes: &[u8], names: &[String]) -> Result<JointsDatagram, M
     Ok(JointsDatagram { header: DatagramHeader { seq, clock, stamp_nanos }, position, velocity, effort })
 }
 
-/// A place for each direction of a part, `None` without an echo.
+/// One entry per direction of a part; `None` if there was no echo.
 fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
     match (&wire.points_m, &wire.ranges_m) {
         (Some(numbers), None) => {
             let (points, rest) = numbers.as_chunks::<3>();
             if !rest.is_empty() {
-                return Err(invalid(format!("points_m has {} numbers, not three a point", numbers.len())));
+                return Err(invalid(format!("points_m has {} numbers, expected three per point", numbers.len())));
             }
             match points.iter().flatten().all(|coordinate| f64::from(coordinate.abs()) <= MAX_ABS_VALUE) {
                 true => Ok(points.iter().map(|point| Some(*point)).collect()),
-                false => Err(invalid(format!("points_m has a number beyond {MAX_ABS_VALUE} m"))),
+                false => Err(invalid(format!("points_m has an absolute value above {MAX_ABS_VALUE} m"))),
             }
         }
         (None, Some(ranges)) => {
             let angle = |name, angle: Option<f64>| match angle {
                 Some(angle) if angle.abs() <= MAX_ANGLE_RAD => Ok(angle),
-                _ => Err(invalid(format!("ranges_m needs {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"))),
+                _ => Err(invalid(format!("ranges_m requires {name} between -{MAX_ANGLE_RAD} and {MAX_ANGLE_RAD} rad"))),
             };
             let (first, step) = (angle("first_rad", wire.first_rad)?, angle("step_rad", wire.step_rad)?);
             let elevation = angle("elevation_rad", Some(wire.elevation_rad.unwrap_or(0.0)))?;
@@ -357,12 +361,12 @@ fn echo_positions(wire: &WireScan) -> Result<Vec<Option<[f32; 3]>>, Malformed> {
             };
             ranges.iter().enumerate().map(echo_position).collect()
         }
-        _ => Err(invalid("either points_m or ranges_m is needed, and not both".to_owned())),
+        _ => Err(invalid("expected either points_m or ranges_m, not both".to_owned())),
     }
 }
 
-/// Where an echo is whose azimuth counts from x towards y, and whose elevation from that plane towards z.
-#[expect(clippy::cast_possible_truncation, reason = "metres within 10 km")]
+/// Position of an echo. The azimuth is measured from x towards y, the elevation from that plane towards z.
+#[expect(clippy::cast_possible_truncation, reason = "meters within 10 km")]
 fn position_from_polar(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f32; 3] {
     let horizontal_m = range_m * elevation_rad.cos();
     [horizontal_m * azimuth_rad.cos(), horizontal_m * azimuth_rad.sin(), range_m * elevation_rad.sin()]
@@ -372,17 +376,17 @@ fn position_from_polar(range_m: f64, azimuth_rad: f64, elevation_rad: f64) -> [f
 fn check_kind(bytes: &[u8], expected: &'static str) -> Result<(), Malformed> {
     let Kind { kind, version } = parse_json(bytes)?;
     if kind != expected {
-        // Not the sender's own text, which may be of any length.
+        // The sender's own text is not repeated, because it may be of any length.
         return Err(invalid(format!("the kind is not {expected:?}")));
     }
     match version == VERSION {
         true => Ok(()),
-        false => Err(invalid(format!("version {version}, this program speaks {VERSION}"))),
+        false => Err(invalid(format!("version {version} is not supported, expected {VERSION}"))),
     }
 }
 
 fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, Malformed> {
-    // The parser may repeat the sender's text, which may be long and hold anything: it goes into logs.
+    // The parser may repeat the sender's text, which may be long and contain anything, and the message is logged.
     let reported = |error: serde_json::Error| {
         error.to_string().chars().take(MAX_ERROR_CHARS).map(|c| if c.is_control() { '?' } else { c }).collect()
     };
@@ -462,8 +466,8 @@ mod tests {
     #[test]
     fn invalid_fields_are_named() {
         for (fields, named) in [
-            (r#""points_m":[1,2,3,4]"#, "three a point"),
-            (r#""points_m":[1,2,1e5]"#, "beyond"),
+            (r#""points_m":[1,2,3,4]"#, "three per point"),
+            (r#""points_m":[1,2,1e5]"#, "absolute value above"),
             (r#""points_m":[1,2,1e39]"#, "out of range"),
             (r#""points_m":[1,2,null]"#, "null"),
             (r#""points_m":[1,2,3],"ranges_m":[1]"#, "not both"),
@@ -488,8 +492,8 @@ mod tests {
             (r#""kind":"base""#, r#""kind":"range""#, "base"),
             (r#""clock":"device""#, r#""clock":"sundial""#, "sundial"),
             (r#""stamp_nanos":"#, r#""stamp_nanos":1e99,"x":"#, "floating point"),
-            (r#""quat_xyzw":["#, r#""quat_xyzw":[0,0,0,0],"x":["#, "length 1"),
-            (r#""xyz_m":["#, r#""xyz_m":[0,-1e300,0],"x":["#, "beyond"),
+            (r#""quat_xyzw":["#, r#""quat_xyzw":[0,0,0,0],"x":["#, "unit quaternion"),
+            (r#""xyz_m":["#, r#""xyz_m":[0,-1e300,0],"x":["#, "absolute value above"),
             (r#""covariance":["#, r#""covariance":[1],"x":["#, "36"),
             (r#""covariance":["#, r#""covariance":[-1],"x":["#, "36"),
             (r#""covariance":[0.0001"#, r#""covariance":[-0.0001"#, "variance outside"),
@@ -509,7 +513,7 @@ mod tests {
             (r#"["a","b","c"]"#, r#"["b","a","c"]"#, "arm.joints"),
             (r#""position":["#, r#""position":[1,"#, "position has 4"),
             (r#""position":["#, r#""position":[],"x":["#, "position has 0"),
-            (r#""position":["#, r#""position":[0,1e5,0],"x":["#, "beyond"),
+            (r#""position":["#, r#""position":[0,1e5,0],"x":["#, "absolute value above"),
             (r#""position":["#, r#""position":[0,null,0],"x":["#, "null"),
             (r#""velocity":["#, r#""velocity":[1],"x":["#, "velocity has 1"),
             (r#""version":1"#, r#""version":1,"effort":[1,2]"#, "effort has 2"),

@@ -1,7 +1,7 @@
 //! Self-description of the protobuf messages in a recording, so that any MCAP viewer can read them.
 //!
 //! Source: `google/protobuf/descriptor.proto` for the encoding; the Foxglove schemas (docs.foxglove.dev/docs/sdk/schemas)
-//! for names and numbers. Fields from 1001 on are ours and keep what those schemas have no place for.
+//! for names and numbers. Fields from 1001 are our extensions.
 
 use super::protobuf::Message;
 
@@ -74,7 +74,7 @@ const QUATERNION: Schema = Schema {
     enums: &[],
 };
 
-/// A compressed colour image.
+/// A compressed color image.
 pub const COMPRESSED_IMAGE: Schema = Schema {
     name: "foxglove.CompressedImage",
     fields: &[
@@ -91,7 +91,7 @@ pub const COMPRESSED_IMAGE: Schema = Schema {
     enums: &[],
 };
 
-/// An uncompressed colour or depth image.
+/// An uncompressed color or depth image.
 pub const RAW_IMAGE: Schema = Schema {
     name: "foxglove.RawImage",
     fields: &[
@@ -111,7 +111,7 @@ pub const RAW_IMAGE: Schema = Schema {
     enums: &[],
 };
 
-/// Lens parameters of a camera.
+/// Intrinsics of a camera.
 pub const CAMERA_CALIBRATION: Schema = Schema {
     name: "foxglove.CameraCalibration",
     fields: &[
@@ -184,7 +184,7 @@ pub const POINT_CLOUD: Schema = Schema {
 };
 
 impl Schema {
-    /// The encoded `FileDescriptorSet`: this message's file after the files it needs.
+    /// The encoded `FileDescriptorSet`: the files that this message depends on, then its own file.
     pub fn file_descriptor_set(&self) -> Vec<u8> {
         let mut set = Message::default();
         for dependency in self.dependencies {

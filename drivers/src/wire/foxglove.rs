@@ -1,6 +1,7 @@
-//! Foxglove's messages for images, lenses and poses.
+//! Foxglove messages for images, intrinsics and poses.
 //!
-//! Colour keeps the device's own bytes and depth its raw counts; stamps are exact to the nanosecond, numbers to the bit.
+//! Color images keep the device's own bytes, and depth images their raw counts. Stamps are exact to the nanosecond,
+//! numbers to the bit.
 //! Field numbers are those of [`super::descriptor`].
 
 use super::protobuf::{Field, Message, fields};
@@ -17,14 +18,14 @@ const HEIGHT_PX: u32 = 1004;
 const METERS_PER_COUNT: u32 = 1005;
 const PSNR_CEILING: u32 = 1006;
 const YUV_COLORS: u32 = 1007;
-/// Values of that field.
+/// Values of field `YUV_COLORS`.
 const YUV_COLORS_NAMES: [(&str, YuvColors); 4] = [
     ("bt601-limited", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited }),
     ("bt601-full", YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Full }),
     ("bt709-limited", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited }),
     ("bt709-full", YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Full }),
 ];
-/// Foxglove's names of layouts: written is the first of a layout, read are all.
+/// Foxglove's names of layouts. The first name of a layout is written; all are accepted.
 const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
     ("yuyv", YuvLayout::Yuyv),
     ("uyvy", YuvLayout::Uyvy),
@@ -34,7 +35,7 @@ const YUV_LAYOUTS: [(&str, YuvLayout); 5] = [
 ];
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
-/// Which message carries images of this format.
+/// The message type for images of this format.
 pub fn schema_of(format: PixelFormat) -> descriptor::Schema {
     match format {
         PixelFormat::Jpeg | PixelFormat::Png => descriptor::COMPRESSED_IMAGE,
@@ -46,7 +47,7 @@ pub fn schema_of(format: PixelFormat) -> descriptor::Schema {
     }
 }
 
-/// An image as `CompressedImage` or `RawImage`, see [`schema_of`].
+/// Encodes an image as `CompressedImage` or `RawImage`, see [`schema_of`].
 pub fn encode_image(image: &Image) -> Vec<u8> {
     let mut message = Message::with_capacity(image.data.len() + 256);
     message.message(1, &timestamp(image.stamp));
@@ -75,7 +76,7 @@ pub fn encode_image(image: &Image) -> Vec<u8> {
     message.into_bytes()
 }
 
-/// The first name of a value in a table that has them all.
+/// The first name of a value in a table that contains all values.
 fn name_of<T: PartialEq>(names: &[(&'static str, T)], value: T) -> &'static str {
     names.iter().find(|(_, lookup)| *lookup == value).expect("the table names every value").0
 }
@@ -93,7 +94,7 @@ fn raw_image(message: &mut Message, image: &Image, encoding: &str) {
         .bytes(7, image.camera.as_bytes());
 }
 
-/// An image from the message that [`schema_of`] names.
+/// Decodes an image from the message type given by [`schema_of`].
 pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
     let compressed = schema == descriptor::COMPRESSED_IMAGE.name;
     let mut stamp = None;
@@ -123,7 +124,7 @@ pub fn decode_image(schema: &str, bytes: &[u8]) -> Result<Image, Malformed> {
             (N_SKIPPED, _) => image.n_skipped = field.varint()?,
             (YUV_COLORS, false) => colors = Some(field.text()?),
             (METERS_PER_COUNT, false) => meters_per_count = Some(field.double()?),
-            _ => {} // A newer writer may know more.
+            _ => {} // Unknown fields of a newer version.
         }
     }
     image.stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
@@ -150,7 +151,7 @@ fn yuv_colors(name: Option<&str>) -> Result<YuvColors, Malformed> {
     lookup(&YUV_COLORS_NAMES, name).ok_or_else(|| Malformed::PixelFormat { name: name.to_owned() })
 }
 
-/// Depth in metres as a `RawImage` of 32-bit floats.
+/// Encodes depth in meters as a `RawImage` of 32-bit floats.
 pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[f32]) -> Vec<u8> {
     let mut message = Message::with_capacity(depth_m.len() * 4 + 256);
     let data: Vec<u8> = depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
@@ -159,7 +160,7 @@ pub fn encode_depth_m(camera: &str, stamp: Stamp, size_px: [u32; 2], depth_m: &[
     message.into_bytes()
 }
 
-/// The metres that [`encode_depth_m`] wrote.
+/// Decodes the depth in meters that [`encode_depth_m`] encoded.
 pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
     for field in fields(bytes) {
         let field = field?;
@@ -171,7 +172,7 @@ pub fn decode_depth_m(bytes: &[u8]) -> Result<Arc<[f32]>, Malformed> {
     Err(Malformed::Missing { name: "data" })
 }
 
-/// Lens parameters as a `CameraCalibration`.
+/// Encodes intrinsics as a `CameraCalibration`.
 pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -> Vec<u8> {
     let [fx, fy] = intrinsics.focal_px;
     let [cx, cy] = intrinsics.principal_px;
@@ -191,7 +192,7 @@ pub fn encode_calibration(camera: &str, stamp: Stamp, intrinsics: &Intrinsics) -
     message.into_bytes()
 }
 
-/// A pose as a `FrameTransform`.
+/// Encodes a pose as a `FrameTransform`.
 pub fn encode_transform(parent: &str, child: &str, stamp: Stamp, parent_from_child: &Transform) -> Vec<u8> {
     let [x, y, z] = parent_from_child.translation.vector.into();
     let mut translation = Message::default();
@@ -205,7 +206,7 @@ pub fn encode_transform(parent: &str, child: &str, stamp: Stamp, parent_from_chi
     message.into_bytes()
 }
 
-/// Stamp and pose from a `FrameTransform`, bit for bit as they were encoded.
+/// Decodes stamp and pose from a `FrameTransform`, bit for bit.
 pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     let mut stamp = None;
     let mut translation = None;
@@ -221,13 +222,13 @@ pub fn decode_transform(bytes: &[u8]) -> Result<(Stamp, Transform), Malformed> {
     }
     let [x, y, z] = translation.ok_or(Malformed::Missing { name: "translation" })?;
     let [i, j, k, w] = rotation.ok_or(Malformed::Missing { name: "rotation" })?;
-    // Not normalised again: that would change the last bit.
+    // Do not normalize again: that would change the last bit.
     let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
     let stamp = stamp.ok_or(Malformed::Missing { name: "timestamp" })?;
     Ok((stamp, Transform::from_parts(Translation3::new(x, y, z), rotation)))
 }
 
-/// A true camera pose in the world, with the PSNR that noise leaves possible, dB.
+/// Encodes a true camera pose in the world, with the maximum PSNR that the image noise allows, dB.
 pub fn encode_true_pose(
     camera: &str,
     stamp: Stamp,
@@ -236,7 +237,7 @@ pub fn encode_true_pose(
 ) -> Vec<u8> {
     let mut bytes = encode_transform("world", camera, stamp, world_from_camera);
     if let Some(psnr_ceiling) = psnr_ceiling {
-        // Fields of a message may come in any order, so the encoded parts can simply follow each other.
+        // Fields of a message may be in any order, so the encoded parts can be concatenated.
         let mut ceiling = Message::default();
         ceiling.double(PSNR_CEILING, psnr_ceiling);
         bytes.extend(ceiling.into_bytes());
@@ -244,7 +245,7 @@ pub fn encode_true_pose(
     bytes
 }
 
-/// Pose and ceiling that [`encode_true_pose`] wrote.
+/// Decodes pose and PSNR ceiling that [`encode_true_pose`] encoded.
 pub fn decode_true_pose(bytes: &[u8]) -> Result<(Transform, Option<f64>), Malformed> {
     let (_, world_from_camera) = decode_transform(bytes)?;
     for field in fields(bytes) {
@@ -256,7 +257,7 @@ pub fn decode_true_pose(bytes: &[u8]) -> Result<(Transform, Option<f64>), Malfor
     Ok((world_from_camera, None))
 }
 
-/// The doubles 1 to `N` of a message that holds nothing else; absent ones are zero.
+/// The doubles 1 to `N` of a message that has no other fields; absent ones are zero.
 fn numbers<const N: usize>(field: &Field<'_>) -> Result<[f64; N], Malformed> {
     let mut numbers = [0.0; N];
     for inner in fields(field.bytes()?) {

@@ -1,4 +1,4 @@
-//! Joint readings as JSON with a schema of their own, since Foxglove has none that every version of its viewer opens.
+//! Joint states as JSON with our own schema, because Foxglove has none that every version of its viewer opens.
 
 use super::Malformed;
 use kinematics::{JointState, Stamp};
@@ -18,9 +18,9 @@ pub const SCHEMA: &str = r#"{
       "type": "object",
       "properties": { "sec": { "type": "integer" }, "nsec": { "type": "integer" } }
     },
-    "position": { "type": "array", "items": { "type": "number" }, "description": "radians or metres; null: not a number" },
-    "velocity": { "type": "array", "items": { "type": "number" }, "description": "radians or metres per second; empty: not told" },
-    "effort": { "type": "array", "items": { "type": "number" }, "description": "newton metres or newtons; empty: not told" }
+    "position": { "type": "array", "items": { "type": "number" }, "description": "radians or meters; null: not a number" },
+    "velocity": { "type": "array", "items": { "type": "number" }, "description": "radians or meters per second; empty: not reported" },
+    "effort": { "type": "array", "items": { "type": "number" }, "description": "newton meters or newtons; empty: not reported" }
   }
 }"#;
 
@@ -40,10 +40,10 @@ struct Timestamp {
 
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
-/// Joint readings as JSON; every finite number comes back to the bit, others as NaN.
+/// Encodes joint states as JSON. Finite numbers are restored bit for bit, others as NaN.
 pub fn encode(state: &JointState) -> Vec<u8> {
     let finite = |numbers: &[f64]| numbers.iter().map(|number| number.is_finite().then_some(*number)).collect();
-    let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC)).expect("below a thousand million");
+    let nsec = u32::try_from(state.stamp.0.rem_euclid(NANOS_PER_SEC)).expect("the remainder is below one billion");
     let wire = Wire {
         timestamp: Timestamp { sec: state.stamp.0.div_euclid(NANOS_PER_SEC), nsec },
         position: finite(&state.position),
@@ -53,7 +53,7 @@ pub fn encode(state: &JointState) -> Vec<u8> {
     serde_json::to_vec(&wire).expect("numbers and lists always serialize")
 }
 
-/// The joint readings that [`encode`] wrote.
+/// Decodes the joint state that [`encode`] encoded.
 pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
     let wire: Wire = serde_json::from_slice(bytes).map_err(|e| Malformed::Json { reason: e.to_string() })?;
     let stamp = wire

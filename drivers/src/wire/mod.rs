@@ -1,4 +1,4 @@
-//! Byte codecs: pure `encode` and `decode`, no sockets, no clocks.
+//! Byte codecs: pure `encode` and `decode` functions without sockets and clocks.
 
 pub mod can;
 pub mod datagram;
@@ -15,12 +15,12 @@ pub enum Malformed {
     /// The bytes end inside a field.
     #[error("the message ends inside a field")]
     Truncated,
-    /// A field has a type that protobuf does not know or that this field cannot have.
-    #[error("field {field} has wire type {wire_type}, which it cannot have")]
+    /// The wire type of a field is unknown or not allowed for this field.
+    #[error("wire type {wire_type} is not allowed for field {field}")]
     WireType {
         /// Number of the field.
         field: u32,
-        /// The type found.
+        /// The wire type found.
         wire_type: u8,
     },
     /// A number is outside its range.
@@ -29,28 +29,28 @@ pub enum Malformed {
         /// Number of the field.
         field: u32,
     },
-    /// A text is not UTF-8.
+    /// A string is not UTF-8.
     #[error("field {field} is not UTF-8 text")]
     Text {
         /// Number of the field.
         field: u32,
     },
-    /// A needed field is absent.
+    /// A required field is missing.
     #[error("the {name} is missing")]
     Missing {
         /// Name of the field.
         name: &'static str,
     },
-    /// A format of pixels that this program does not know.
+    /// The pixel format is unknown.
     #[error("the pixel format {name:?} is unknown")]
     PixelFormat {
-        /// The format's name.
+        /// Name of the pixel format.
         name: String,
     },
-    /// JSON that does not fit its schema.
+    /// JSON that does not match its schema.
     #[error("{reason}")]
     Json {
-        /// What the parser says.
+        /// Message of the parser.
         reason: String,
     },
 }

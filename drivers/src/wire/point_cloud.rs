@@ -1,7 +1,7 @@
 //! Range scans as Foxglove's `PointCloud`.
 //!
-//! A point is 20 bytes, little endian: x, y, z as f32 in metres, ring as u16 and two unused bytes, microseconds since the stamp as
-//! u32. Every bit comes back.
+//! A point is 20 bytes, little-endian: x, y, z as f32 in meters, ring as u16 and two unused bytes, microseconds since
+//! the stamp as u32. The encoding is lossless.
 
 use super::Malformed;
 use super::foxglove::{stamp_from, timestamp};
@@ -10,11 +10,11 @@ use crate::{RangePoint, RangeScan};
 use std::sync::Arc;
 
 const STRIDE: u32 = 20;
-/// Name, offset in the point, and Foxglove's number of the type: 3 is a u16, 5 a u32, 7 an f32.
+/// Name, offset in the point, and Foxglove's number of the type: 3 is u16, 5 u32, 7 f32.
 const FIELDS: [(&str, u32, u64); 5] =
     [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("ring", 12, 3), ("time_offset_micros", 16, 5)];
 
-/// A scan as the message [`super::descriptor::POINT_CLOUD`].
+/// Encodes a scan as the message [`super::descriptor::POINT_CLOUD`].
 pub fn encode(scan: &RangeScan) -> Vec<u8> {
     let mut data = Vec::with_capacity(scan.points.len() * STRIDE as usize);
     for point in scan.points.iter() {
@@ -35,7 +35,7 @@ pub fn encode(scan: &RangeScan) -> Vec<u8> {
     message.into_bytes()
 }
 
-/// The points are in the frame of the scanner itself.
+/// Identity pose: the points are in the frame of the scanner itself.
 fn identity() -> Message {
     let (mut position, mut orientation, mut pose) = (Message::default(), Message::default(), Message::default());
     position.double(1, 0.0).double(2, 0.0).double(3, 0.0);
@@ -44,7 +44,7 @@ fn identity() -> Message {
     pose
 }
 
-/// The scan that [`encode`] wrote; a cloud of another layout is refused.
+/// Decodes the scan that [`encode`] encoded. A cloud with another layout is an error.
 pub fn decode(bytes: &[u8]) -> Result<RangeScan, Malformed> {
     let (mut stamp, mut scanner, mut stride, mut points) = (None, Arc::from(""), None, None);
     for field in fields(bytes) {

@@ -1,6 +1,6 @@
-//! The protobuf wire format: fields in, fields out.
+//! The protobuf wire format.
 //!
-//! Source: Protocol Buffers documentation, "Encoding". Groups do not exist in proto3 and are refused.
+//! Source: Protocol Buffers documentation, "Encoding". Groups do not exist in proto3 and are errors.
 
 use super::Malformed;
 
@@ -9,38 +9,38 @@ const FIXED64: u8 = 1;
 const LENGTH: u8 = 2;
 const FIXED32: u8 = 5;
 
-/// Appends fields to a message.
+/// Encoder of a message.
 #[derive(Clone, Debug, Default)]
 pub struct Message(Vec<u8>);
 
 impl Message {
-    /// An empty message with room for `bytes`.
+    /// An empty message with capacity for `bytes`.
     pub fn with_capacity(bytes: usize) -> Self {
         Self(Vec::with_capacity(bytes))
     }
 
-    /// An integer; negative numbers of `int32` and `int64` as their 64-bit two's complement.
+    /// Appends an integer; negative numbers of `int32` and `int64` as their 64-bit two's complement.
     pub fn varint(&mut self, field: u32, value: u64) -> &mut Self {
         self.key(field, VARINT);
         self.raw_varint(value);
         self
     }
 
-    /// A `fixed32`.
+    /// Appends a `fixed32`.
     pub fn fixed32(&mut self, field: u32, value: u32) -> &mut Self {
         self.key(field, FIXED32);
         self.0.extend(value.to_le_bytes());
         self
     }
 
-    /// A `double`, bit for bit.
+    /// Appends a `double`, bit for bit.
     pub fn double(&mut self, field: u32, value: f64) -> &mut Self {
         self.key(field, FIXED64);
         self.0.extend(value.to_le_bytes());
         self
     }
 
-    /// `repeated double`, packed.
+    /// Appends a packed `repeated double`.
     pub fn doubles(&mut self, field: u32, values: &[f64]) -> &mut Self {
         self.key(field, LENGTH);
         self.raw_varint(values.len() as u64 * 8);
@@ -48,7 +48,7 @@ impl Message {
         self
     }
 
-    /// `bytes`, `string` or a finished message.
+    /// Appends `bytes`, a `string` or an encoded message.
     pub fn bytes(&mut self, field: u32, value: &[u8]) -> &mut Self {
         self.key(field, LENGTH);
         self.raw_varint(value.len() as u64);
@@ -56,7 +56,7 @@ impl Message {
         self
     }
 
-    /// A message inside this one.
+    /// Appends a nested message.
     pub fn message(&mut self, field: u32, inner: &Self) -> &mut Self {
         self.bytes(field, &inner.0)
     }
@@ -84,11 +84,11 @@ impl Message {
 pub struct Field<'a> {
     /// Number of the field.
     pub number: u32,
-    /// What it holds.
+    /// Its value.
     pub value: Value<'a>,
 }
 
-/// What a field holds on the wire.
+/// Value of a field on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Value<'a> {
     /// An integer.
@@ -150,11 +150,11 @@ impl<'a> Field<'a> {
     }
 }
 
-/// Walks the fields of a message; ends after the first error.
+/// Iterator over the fields of a message. It ends after the first error.
 #[derive(Clone, Debug)]
 pub struct Fields<'a>(&'a [u8]);
 
-/// The fields of an encoded message, in its order.
+/// Iterates over the fields of an encoded message, in their order.
 pub fn fields(message: &[u8]) -> Fields<'_> {
     Fields(message)
 }
@@ -223,7 +223,7 @@ mod tests {
 
     #[test]
     fn documented_examples_match_published_bytes() {
-        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 holds the first message.
+        // Protocol Buffers documentation: field 1 = 150; field 2 = "testing"; field 3 contains the first message.
         let mut inner = Message::default();
         inner.varint(1, 150);
         let mut outer = Message::default();

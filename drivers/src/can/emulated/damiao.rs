@@ -1,4 +1,4 @@
-//! A Damiao motor.
+//! An emulated Damiao motor.
 
 use super::{CELSIUS, EmulatedMotor, State};
 use crate::can::emulated::shaft::Actuation;
@@ -6,7 +6,7 @@ use crate::wire::can::damiao::{self, MIT_MODE, Register, Status};
 use crate::wire::can::{CanError, Frame, Id, mit};
 use std::time::Duration;
 
-/// Faults are told as they stand in the feedback.
+/// Faults, numbered as in the feedback.
 pub(super) const COMMUNICATION_LOST: u32 = Status::LostCommunication as u32;
 pub(super) const OVERLOAD: u32 = Status::Overload as u32;
 
@@ -57,7 +57,7 @@ impl EmulatedMotor {
             (Register::PositionLimit, (self.limits.position_rad as f32).to_bits()),
             (Register::VelocityLimit, (self.limits.velocity_rad_s as f32).to_bits()),
             (Register::TorqueLimit, (self.limits.torque_nm as f32).to_bits()),
-            // As it is shipped: no timeout, and another mode.
+            // Factory settings: no timeout, and a mode other than MIT.
             (Register::Timeout, 0),
             (Register::ControlMode, 2),
         ];

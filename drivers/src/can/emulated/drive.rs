@@ -1,4 +1,4 @@
-//! A CiA 402 drive with a cyclic synchronous position mode.
+//! An emulated CiA 402 drive with cyclic synchronous position mode.
 
 use super::shaft::Actuation;
 use super::{EmulatedMotor, State};
@@ -8,15 +8,15 @@ use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame, Id};
 use std::time::Duration;
 
-/// What [`cia402::SUPPORTED_MODES`] tells: profile position and the three cyclic modes.
+/// Value of [`cia402::SUPPORTED_MODES`]: profile position and the three cyclic modes.
 const SUPPORTED_MODES_MASK: u32 = 0b11_1000_0001;
 
-/// The place of an object among the settings.
+/// Key of an object in the settings.
 fn number(index: u16, subindex: u8) -> u32 {
     u32::from(index) << 8 | u32::from(subindex)
 }
 
-/// What a controlword orders; `None` where its bits mean nothing. Source: CiA 402-2, table of the controlword.
+/// Command of a controlword; `None` if its bits are no command. Source: CiA 402-2, table of the controlword.
 fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     if controlword & !before & 0x80 != 0 {
         return Some(StateCommand::ResetFault);
@@ -87,7 +87,7 @@ impl EmulatedMotor {
         }
     }
 
-    /// What an object holds.
+    /// Value of an object.
     fn reply(&self, index: u16, subindex: u8) -> u32 {
         let is_object = |object: Object| object.index == index;
         if is_object(cia402::STATUSWORD) {
@@ -101,7 +101,7 @@ impl EmulatedMotor {
         }
     }
 
-    /// Whether its first PDO brings controlword and target at every SYNC.
+    /// Whether the first PDO delivers controlword and target at every SYNC.
     fn accepts_targets(&self, node: Node) -> bool {
         let mapped = [cia402::CONTROLWORD, cia402::TARGET_POSITION].map(|object| Some(object.mapped()));
         let places = [1, 2].map(|place| self.object(Pdo::First.mapping(Direction::Receive, place)));
@@ -113,7 +113,7 @@ impl EmulatedMotor {
             && self.object(pdo.communication(direction, 2)) == Some(1)
     }
 
-    /// Takes an order, and a target where it obeys in cyclic position mode.
+    /// Applies a controlword, and a target if the drive is enabled in cyclic position mode.
     fn state_command(&mut self, controlword: u16, target: Option<Command>) {
         if let Some(state_command) = decode_controlword(controlword, self.last_controlword) {
             self.change_state(self.drive_state.after(state_command));
@@ -147,7 +147,7 @@ impl EmulatedMotor {
         };
     }
 
-    /// No heartbeat came for too long: what it does where it obeys.
+    /// Reaction of an enabled drive to a missing heartbeat.
     pub(super) fn time_out_drive(&mut self) {
         if self.state() != State::Enabled {
             return;
@@ -169,7 +169,7 @@ impl EmulatedMotor {
         canopen::encode_heartbeat(node, self.node_state)
     }
 
-    /// What waited takes effect; PDOs go out as they were mapped, where they were switched on for every SYNC.
+    /// Applies pending commands, and sends the mapped PDOs that are enabled for every SYNC.
     fn synchronous(&mut self, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
         if let Some((controlword, target)) = self.pending_command.take() {
             let position_rad = units.rad_from_raw(target);

@@ -1,8 +1,8 @@
-//! Motors as their bus sees them, for tests and simulators: they answer, report, obey, and stop by themselves when nothing comes, as
-//! the makers' documents say.
+//! Emulated motors for tests and simulators. They answer, report, follow commands, and stop when their watchdog
+//! expires, as the manufacturers' documents describe.
 //!
-//! Written against the same documents as the codecs, so it shows that the driver works, not that the documents were understood;
-//! only real motors do that.
+//! They were written from the same documents as the codecs. They therefore show that the driver works, but not that
+//! the documents were understood correctly; only real motors can show that.
 
 mod damiao;
 mod drive;
@@ -22,25 +22,25 @@ use shaft::{Actuation, Shaft};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-/// How often `ODrive` axes and Robstride motors report by themselves.
+/// Report interval of `ODrive` axes and Robstride motors.
 const REPORT: Duration = Duration::from_millis(10);
-/// How often drives and `ODrive` axes say that they live.
+/// Heartbeat interval of drives and `ODrive` axes.
 const HEARTBEAT: Duration = Duration::from_millis(100);
-/// Of windings and drives, degrees Celsius.
+/// Temperature of windings and drives, degrees Celsius.
 const CELSIUS: u8 = 30;
 
 /// What a motor does with its shaft.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// Nothing: it turns as it is pushed.
+    /// Disabled: the shaft turns freely.
     Free,
-    /// What it was commanded last.
+    /// Executes its last command.
     Enabled,
-    /// It stopped by itself, or by a quick stop, and keeps its place.
+    /// Stopped by its watchdog or a quick stop, and holds its position.
     Holding,
 }
 
-/// A motor.
+/// An emulated motor.
 #[derive(Debug)]
 pub struct EmulatedMotor {
     family: Family,
@@ -48,30 +48,31 @@ pub struct EmulatedMotor {
     shaft: Shaft,
     actuation: Actuation,
     now: Option<Stamp>,
-    /// Time up to which its shaft has turned by itself.
+    /// Time up to which the shaft has been simulated.
     simulated_until: Option<Stamp>,
-    /// Registers, parameters, endpoints or objects that were set, by number.
+    /// Registers, parameters, endpoints or objects that were written, by number.
     settings: BTreeMap<u32, u32>,
     ignores_timeout: bool,
-    /// When its watchdog was quieted last, and when it acted.
+    /// When the watchdog was last reset, and when it last expired.
     watchdog_reset_at: Option<Stamp>,
     timed_out_at: Option<Stamp>,
-    /// What is wrong, as the family counts it.
+    /// Fault bits in the numbering of the family.
     faults: u32,
     target: Option<Command>,
-    /// Whether it reports by itself.
+    /// Whether it sends unsolicited reports.
     reports: bool,
     last_report: Option<Stamp>,
     last_heartbeat: Option<Stamp>,
     node_state: NodeState,
     drive_state: cia402::State,
-    /// Of a drive: the controlword and the target that take effect at the next SYNC.
+    /// For a drive: controlword and target that take effect at the next SYNC.
     pending_command: Option<(u16, i32)>,
     last_controlword: u16,
 }
 
 impl EmulatedMotor {
-    /// A motor at rest at 0, switched off. `limits`: what a Damiao motor's registers tell; the others' follow from their models.
+    /// Creates a disabled motor at rest at 0. `limits` are the values of a Damiao motor's registers; the limits of
+    /// Robstride and T-Motor motors follow from their models.
     pub fn new(family: Family, limits: Limits) -> Self {
         let limits = match family {
             Family::Robstride { model, .. } => model.limits(),
@@ -101,18 +102,18 @@ impl EmulatedMotor {
         }
     }
 
-    /// What its shaft does; from there on it goes as its drive has it, unless it is set again.
+    /// Sets the motion of the shaft. From then on the drive determines it, unless it is set again.
     pub fn set_motion(&mut self, motion: Motion) {
         self.shaft.motion = motion;
         self.simulated_until = None;
     }
 
-    /// What its shaft does.
+    /// Current motion of the shaft.
     pub fn motion(&self) -> Motion {
         self.shaft.motion
     }
 
-    /// What it does with its shaft.
+    /// What the motor does with its shaft.
     pub fn state(&self) -> State {
         match self.actuation {
             Actuation::Free => State::Free,
@@ -121,27 +122,27 @@ impl EmulatedMotor {
         }
     }
 
-    /// The newest command that it obeyed; those of drives with their own position loop have no gains.
+    /// The last command that it followed. Commands of drives with their own position loop have no gains.
     pub fn target(&self) -> Option<Command> {
         self.target
     }
 
-    /// When something quieted its watchdog last.
+    /// When its watchdog was last reset.
     pub fn watchdog_reset_at(&self) -> Option<Stamp> {
         self.watchdog_reset_at
     }
 
-    /// When its watchdog stopped it last.
+    /// When its watchdog last stopped it.
     pub fn timed_out_at(&self) -> Option<Stamp> {
         self.timed_out_at
     }
 
-    /// From now on it takes no timeout, without saying so: older firmware does that.
+    /// From now on, ignores writes of the timeout without reporting an error, as older firmware does.
     pub fn ignore_timeout(&mut self) {
         self.ignores_timeout = true;
     }
 
-    /// Something breaks: it lets go, and tells a fault.
+    /// Simulates a failure: the motor releases its shaft and reports a fault.
     pub fn fail(&mut self) {
         self.actuation = Actuation::Free;
         match self.family {
@@ -153,8 +154,11 @@ impl EmulatedMotor {
         }
     }
 
-    /// What it sends because of a frame; nothing where that is not for it. What its protocol cannot say is an error. A frame comes at the
-    /// time of the last [`EmulatedMotor::report`].
+    /// Processes a frame at the time of the last [`EmulatedMotor::report`], and returns the answers; none if the
+    /// frame is not addressed to this motor.
+    ///
+    /// # Errors
+    /// If the protocol cannot encode an answer.
     pub fn take(&mut self, frame: &Frame) -> Result<Vec<Frame>, CanError> {
         match self.family {
             Family::Damiao { motor, feedback } => self.handle_damiao(frame, motor, feedback),
@@ -165,7 +169,7 @@ impl EmulatedMotor {
         }
     }
 
-    /// Lets time pass until now: its shaft turns, its watchdog looks; and gives what it sends unasked.
+    /// Advances the simulation of shaft and watchdog to `now`, and returns the unsolicited frames.
     pub fn report(&mut self, now: Stamp) -> Result<Vec<Frame>, CanError> {
         self.now = Some(now);
         if let Some(before) = self.simulated_until.replace(now) {
@@ -195,7 +199,7 @@ impl EmulatedMotor {
         Ok(sent)
     }
 
-    /// How long it waits before it stops by itself; `None` is for ever.
+    /// Timeout of the watchdog; `None` if it never expires.
     fn timeout(&self) -> Option<Duration> {
         match self.family {
             Family::Damiao { .. } => self.damiao_timeout(),
@@ -206,7 +210,7 @@ impl EmulatedMotor {
         }
     }
 
-    /// Nothing came for too long.
+    /// Applies the expiry of the watchdog.
     fn time_out(&mut self, now: Stamp) {
         self.watchdog_reset_at = None;
         if self.state() == State::Enabled {
@@ -221,12 +225,12 @@ impl EmulatedMotor {
         self.actuation = Actuation::Free;
     }
 
-    /// Its watchdog is quiet from now on.
+    /// Resets the watchdog.
     fn reset_watchdog(&mut self) {
         self.watchdog_reset_at = self.now;
     }
 
-    /// Obeys a command of MIT mode, where it obeys.
+    /// Follows an MIT-mode command if the motor is enabled.
     fn obey(&mut self, command: Command) {
         if self.state() == State::Enabled {
             self.actuation = Actuation::Mit(command);
@@ -235,7 +239,7 @@ impl EmulatedMotor {
         }
     }
 
-    /// Sets a setting, unless it is a timeout and those are ignored.
+    /// Writes a setting, unless it is a timeout and timeouts are ignored.
     fn set(&mut self, number: u32, value: u32, is_timeout: bool) {
         if !(is_timeout && self.ignores_timeout) {
             self.settings.insert(number, value);
@@ -246,14 +250,14 @@ impl EmulatedMotor {
         self.settings.get(&number).copied()
     }
 
-    /// Takes hold of the shaft where it is.
+    /// Enables the motor, holding the current position.
     fn switch_on(&mut self) {
         self.actuation = Actuation::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
         self.reset_watchdog();
     }
 }
 
-/// Whether so long has passed since the last time, which is then now.
+/// Whether `interval` has passed since `last`; if so, sets `last` to now.
 fn is_due(last: &mut Option<Stamp>, now: Stamp, interval: Duration) -> bool {
     let due = last.is_none_or(|last| now.duration_since(last) >= interval);
     if due {
@@ -272,11 +276,11 @@ mod tests {
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
     const MILLIS: i64 = 1_000_000;
 
-    /// Lets time pass, and gives it frames at the end.
+    /// Advances the time, then sends the frames to the motor.
     fn advance_and_send(motor: &mut EmulatedMotor, at_millis: i64, frames: &[Result<Frame, CanError>]) {
-        motor.report(Stamp(at_millis * MILLIS)).expect("it fits");
+        motor.report(Stamp(at_millis * MILLIS)).expect("the values can be encoded");
         for frame in frames {
-            motor.take(frame.as_ref().expect("a frame")).expect("it fits");
+            motor.take(frame.as_ref().expect("a frame")).expect("the answer can be encoded");
         }
     }
 
@@ -299,14 +303,14 @@ mod tests {
         let set_up = [write(dm::Register::Timeout, 2000), write(dm::Register::ControlMode, dm::MIT_MODE)];
         advance_and_send(&mut motor, 0, &set_up);
         advance_and_send(&mut motor, 1, &[dm::encode_command(1, &command, &LIMITS)]);
-        assert_eq!((motor.state(), motor.target()), (State::Free, None), "it is off");
+        assert_eq!((motor.state(), motor.target()), (State::Free, None), "it is disabled");
         let enable = || dm::encode_state_command(1, dm::StateCommand::Enable);
         advance_and_send(&mut motor, 2, &[enable(), dm::encode_command(1, &command, &LIMITS)]);
         advance_and_send(&mut motor, 10, &[dm::encode_command(1, &command, &LIMITS)]);
         assert!(motor.motion().position_rad > 0.0);
         assert_times_out_between(&mut motor, 10, 100);
         advance_and_send(&mut motor, 200, &[enable()]);
-        assert_eq!(motor.state(), State::Free, "its error stands");
+        assert_eq!(motor.state(), State::Free, "its error has not been cleared");
         advance_and_send(&mut motor, 201, &[dm::encode_state_command(1, dm::StateCommand::ClearError), enable()]);
         assert_eq!(motor.state(), State::Enabled);
     }

@@ -1,4 +1,4 @@
-//! An `ODrive` axis. It follows positions with a loop of its own, and its watchdog looks also while it is idle.
+//! An emulated `ODrive` axis. It follows positions with its own loop. Its watchdog also runs while it is idle.
 
 use super::shaft::Actuation;
 use super::{EmulatedMotor, State};
@@ -8,14 +8,14 @@ use crate::wire::can::{CanError, Frame};
 use std::f64::consts::TAU;
 use std::time::Duration;
 
-/// A bit of its errors.
+/// One of its error bits.
 pub(super) const CURRENT_LIMIT: u32 = 1 << 12;
 const HARDWARE: [u8; 3] = [4, 4, 58];
 const FIRMWARE: [u8; 3] = [0, 6, 9];
 const WATCHDOG_TIMEOUT: u16 = 218;
 const ENABLE_WATCHDOG: u16 = 219;
 
-/// Numbers of the endpoints of played axes.
+/// Endpoint numbers of emulated axes.
 pub fn endpoints() -> Endpoints {
     let dotted = |version: [u8; 3]| version.map(|part| part.to_string()).join(".");
     Endpoints {
@@ -45,7 +45,7 @@ impl EmulatedMotor {
             match frame.data() {
                 [1, 0, 0, 0] => self.actuation = Actuation::Free,
                 [8, 0, 0, 0] if self.faults == 0 => {
-                    // It begins with where it is, whatever was asked for before.
+                    // It starts at its current position, whatever was requested before.
                     let position_rad = self.shaft.motion.position_rad;
                     self.actuation = Actuation::Follow(Command { position_rad, ..Command::default() });
                 }
@@ -74,7 +74,7 @@ impl EmulatedMotor {
                 return Ok(vec![odrive::encode_answer(node, &Answer::Endpoint(number, value))?]);
             }
         }
-        // Whatever comes to it quiets its watchdog.
+        // Any frame to the axis resets its watchdog.
         self.reset_watchdog();
         Ok(Vec::new())
     }

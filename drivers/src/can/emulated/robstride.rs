@@ -1,4 +1,4 @@
-//! A Robstride motor.
+//! An emulated Robstride motor.
 
 use super::shaft::Actuation;
 use super::{CELSIUS, EmulatedMotor, State};
@@ -8,7 +8,7 @@ use crate::wire::can::{CanError, Frame, Id};
 use std::time::Duration;
 
 pub(super) const OVERLOAD: u32 = Faults::OVERLOAD as u32;
-/// Counts of its timeout a second.
+/// Ticks of its timeout per second.
 const TICKS_HZ: f64 = 20_000.0;
 
 impl EmulatedMotor {

@@ -1,35 +1,35 @@
-//! The shaft of a played motor: inertia, friction, and what its drive does with it.
+//! The shaft of an emulated motor: inertia, friction, and the action of its drive.
 
 use crate::wire::can::mit::{Command, Limits, Motion};
 
-/// Of the shaft and what hangs on it, kg m2.
+/// Inertia of the shaft and its load, kg m2.
 const INERTIA_KG_M2: f64 = 0.05;
-/// Viscous, N m s / rad.
+/// Viscous friction, N m s / rad.
 const FRICTION_NM_S_RAD: f64 = 0.25;
-/// How fast a drive with its own position loop closes in on its target, 1 / s, and how fast it turns at most, rad / s.
+/// Gain with which a drive's position loop approaches its target, 1 / s, and its maximum velocity, rad / s.
 const FOLLOWING_HZ: f64 = 60.0;
 const MAX_FOLLOWING_RAD_S: f64 = 40.0;
-/// On the quick-stop ramp, rad / s2.
+/// Deceleration of the quick-stop ramp, rad / s2.
 const QUICK_STOP_RAD_S2: f64 = 30.0;
-/// The physics goes in steps of this length at most, s.
+/// Maximum length of a simulation step, s.
 const STEP_SECS: f64 = 2.5e-4;
-/// A bench that stood still for longer goes on from there, s.
+/// Maximum time to simulate at once, s; after a longer stall the rest is skipped.
 const MAX_SECS: f64 = 1.0;
 
 /// What a drive does with its shaft.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Actuation {
-    /// Nothing.
+    /// Releases it.
     Free,
-    /// The law of MIT mode.
+    /// Applies the torque law of MIT mode.
     Mit(Command),
-    /// Its own position loop.
+    /// Runs its own position loop.
     Follow(Command),
-    /// It stops, and keeps its place.
+    /// Stops it and holds its position.
     Stop,
 }
 
-/// Turns with what works on it.
+/// A shaft that moves under the torque of its drive and friction.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Shaft {
     pub(super) motion: Motion,
@@ -40,7 +40,7 @@ impl Shaft {
         Self { motion: Motion { position_rad: 0.0, velocity_rad_s: 0.0, torque_nm: 0.0 } }
     }
 
-    /// Lets time pass.
+    /// Advances the simulation by `secs`.
     pub(super) fn advance(&mut self, secs: f64, actuation: &Actuation, limits: &Limits) {
         let mut remaining = secs.clamp(0.0, MAX_SECS);
         while remaining > 0.0 {
@@ -108,7 +108,7 @@ mod tests {
         free.advance(0.2, &Actuation::Free, &LIMITS);
         stopped.advance(0.2, &Actuation::Stop, &LIMITS);
         assert!(free.motion.position_rad > 0.3 && free.motion.velocity_rad_s > 1.0, "{:?}", free.motion);
-        // Half of 3 rad/s for a tenth of a second.
+        // 3 rad/s fall to 0 within a tenth of a second: half of 3 rad/s times 0.1 s.
         assert!((stopped.motion.position_rad - 0.15).abs() < 1e-3, "{:?}", stopped.motion);
         assert_eq!(stopped.motion.velocity_rad_s, 0.0);
     }

@@ -1,4 +1,4 @@
-//! A T-Motor AK motor in MIT mode.
+//! An emulated T-Motor AK motor in MIT mode.
 
 use super::shaft::Actuation;
 use super::{CELSIUS, EmulatedMotor};
@@ -8,7 +8,7 @@ use crate::wire::can::{CanError, Frame, Id, mit};
 pub(super) const OVER_CURRENT: u32 = Fault::OverCurrent as u32;
 
 impl EmulatedMotor {
-    /// It answers every frame.
+    /// Processes a frame. The motor answers every frame that is addressed to it.
     pub(super) fn handle_tmotor(&mut self, frame: &Frame, motor: u8) -> Result<Vec<Frame>, CanError> {
         let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return Ok(Vec::new()) };
         if frame.id() != Id::standard(motor.into())? {

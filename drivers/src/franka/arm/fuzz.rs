@@ -1,4 +1,4 @@
-//! State datagrams from anyone.
+//! Fuzz target: arbitrary state datagrams.
 
 use super::{MAX_STATE_BYTES, StateQueue, StateReader, decode};
 use crate::fuzz::take;
@@ -6,22 +6,22 @@ use franka::FciVersion;
 use kinematics::Stamp;
 use std::time::Duration;
 
-/// When the first datagram arrives.
+/// Arrival time of the first datagram.
 const START_TIME: Stamp = Stamp(1_000_000_000_000);
-/// No joint of these arms is further from zero, rad.
+/// Maximum angle of any joint, rad.
 const MAX_RAD: f64 = 10.0;
 
-/// Datagrams one behind the other, a millisecond apart, each with its length before it in two bytes, little-endian; read as
-/// both versions of FCI, as they are and filled up to the length of a state.
+/// Decodes concatenated datagrams, a millisecond apart. Each is preceded by its length in two bytes, little-endian.
+/// All are decoded in both FCI versions, as they are and padded to the length of a state.
 ///
-/// What an arm would be told of them grows in time, and its joints are angles.
+/// Checks that the stamps of the resulting states increase and that their positions are plausible angles.
 pub fn states(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
         decode_positions(version, bytes);
     }
 }
 
-/// Angles of all joints that an arm would tell of the datagrams, see [`states`].
+/// Positions of all joints in the states that an arm would return for the datagrams, see [`states`].
 pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec<f64>> {
     let mut reader = StateReader::new("it".to_owned(), version, None);
     let mut state_queue = StateQueue::default();
@@ -60,7 +60,7 @@ pub(crate) mod tests {
 
     pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
-    /// Datagrams as [`states`] takes them.
+    /// Encodes datagrams in the format of [`states`].
     pub(crate) fn with_length_prefixes(datagrams: &[Vec<u8>]) -> Vec<u8> {
         let length = |datagram: &[u8]| u16::try_from(datagram.len()).unwrap().to_le_bytes();
         datagrams.iter().flat_map(|datagram| [&length(datagram)[..], datagram].concat()).collect()
@@ -73,7 +73,11 @@ pub(crate) mod tests {
             let expected = decode_positions(version, &with_length_prefixes(&datagrams));
             assert_eq!(expected.len(), 8, "{version:?}");
             let doubled: Vec<_> = datagrams.iter().flat_map(|one| [one.clone(), one.clone()]).collect();
-            assert_eq!(decode_positions(version, &with_length_prefixes(&doubled)), expected, "the second is no news");
+            assert_eq!(
+                decode_positions(version, &with_length_prefixes(&doubled)),
+                expected,
+                "a duplicate is not a new state"
+            );
             let mut random = Random(3);
             for _ in 0..20 {
                 let mut shuffled = datagrams.clone();

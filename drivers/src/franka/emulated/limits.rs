@@ -1,9 +1,9 @@
-//! What a motion may ask of the joints.
+//! The limits that the emulated robot enforces on motions.
 
 use super::super::N_JOINTS;
 use super::CommandedJoints;
 
-/// Seconds from command to command.
+/// Seconds between commands.
 pub(super) const STEP_SECS: f64 = 1e-3;
 /// Positions are rounded to 4e-16 rad; the third difference of eight such roundings over (1 ms)³ is 3e-6 rad/s³.
 const ROUNDING: f64 = 1e-5;
@@ -11,31 +11,31 @@ const ROUNDING: f64 = 1e-5;
 /// Limits of the joints of one robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Limits {
-    /// Least and greatest angle, rad.
+    /// Minimum and maximum angle, rad.
     pub position_rad: [[f64; 2]; N_JOINTS],
-    /// Greatest rate either way, rad/s.
+    /// Maximum velocity in either direction, rad/s.
     pub velocity_rad_s: [f64; N_JOINTS],
-    /// And its rate, rad/s².
+    /// Maximum acceleration, rad/s².
     pub acceleration_rad_s2: [f64; N_JOINTS],
-    /// And its rate, rad/s³.
+    /// Maximum jerk, rad/s³.
     pub jerk_rad_s3: [f64; N_JOINTS],
-    /// How a joint must be slower towards the end of its range; without, it may be fast everywhere.
+    /// Velocity limits near the ends of the range; `None` if the velocity limits are constant.
     pub braking: Option<[BrakingLimit; N_JOINTS]>,
 }
 
 /// Near the end of its range a joint must be slow enough to stop with `deceleration_rad_s2`:
-/// `velocity <= sqrt(2 * deceleration * way remaining) - margin`.
+/// `velocity <= sqrt(2 * deceleration * remaining distance) - margin`.
 ///
 /// Source: libfranka 0.21.2, `joint_velocity_limits.h`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BrakingLimit {
-    /// Deceleration that is counted with, rad/s².
+    /// Assumed deceleration, rad/s².
     pub deceleration_rad_s2: f64,
-    /// Taken off the rate, rad/s.
+    /// Margin subtracted from the velocity, rad/s.
     pub margin_rad_s: f64,
 }
 
-/// What is wrong with a step, by libfranka's names (`errors.rs` of franka-rs).
+/// A limit violation, with libfranka's names (`errors.rs` of franka-rs).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Violation {
     StartPose,
@@ -99,7 +99,7 @@ impl Limits {
         }
     }
 
-    /// Least and greatest rate of a joint at an angle, rad/s.
+    /// Minimum and maximum velocity of a joint at an angle, rad/s.
     fn velocity_range(&self, ix: usize, position_rad: f64) -> [f64; 2] {
         let [min, max] = self.position_rad[ix];
         let max_rate = self.velocity_rad_s[ix];
@@ -113,7 +113,7 @@ impl Limits {
         [-towards(position_rad - min), towards(max - position_rad)]
     }
 
-    /// Checks a step from where joints were wanted to where they are wanted now.
+    /// Checks the step from the previous commanded joints to the current ones.
     pub(super) fn check(&self, before: &CommandedJoints, now: &CommandedJoints) -> Result<(), Violation> {
         let exceeds = |number: f64, max_rate: f64| number.is_nan() || number.abs() > max_rate + ROUNDING;
         for ix in 0..N_JOINTS {
@@ -142,7 +142,7 @@ impl Limits {
 mod tests {
     use super::*;
 
-    /// At rest in the middle of all ranges, where an FR3 may be as fast as anywhere; one joint changed.
+    /// Joints at rest in the middle of their ranges, where an FR3 allows full velocity, with one joint changed.
     fn commanded_with(limits: &Limits, ix: usize, change: impl Fn(&mut CommandedJoints, usize)) -> CommandedJoints {
         let position_rad = limits.position_rad.map(|[min, max]| 0.5 * (min + max));
         let mut commanded = CommandedJoints { position_rad, is_moving: true, ..CommandedJoints::default() };
@@ -215,7 +215,7 @@ mod tests {
         // sqrt(2 * 2.585 * 0.1) - 0.2 = 0.519
         assert_eq!(at(1.6918, 0.51), Ok(()));
         assert_eq!(at(1.6918, 0.53), Err(Violation::Velocity));
-        assert_eq!(at(1.6918, -2.6), Ok(()), "away from it");
+        assert_eq!(at(1.6918, -2.6), Ok(()), "moving away from the range end");
         assert_eq!(at(-1.6918, -0.53), Err(Violation::Velocity));
     }
 }

@@ -1,4 +1,4 @@
-//! What clients and a controller say to each other over TCP, and what a client wants of a motion over UDP.
+//! TCP messages between client and controller, and the client's motion commands over UDP.
 
 use super::super::N_JOINTS;
 use franka::FciVersion;
@@ -6,7 +6,7 @@ use franka::wire::robot::{v5, v10};
 use franka::wire::{HeaderLayout, f64s_to_f64};
 use zerocopy::FromBytes;
 
-/// What a client asks for.
+/// A request of a client.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Request {
     Connect,
@@ -19,7 +19,7 @@ pub(super) enum Request {
     Set(Setting),
 }
 
-/// What a client may set.
+/// A setting that a client can change.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Setting {
     Collision,
@@ -32,7 +32,7 @@ pub(super) enum Setting {
     Filters,
 }
 
-/// What a client wants of a motion, in answer to one state.
+/// Motion command of a client in answer to one state.
 pub(super) struct Command {
     pub(super) number: u64,
     pub(super) position_rad: [f64; N_JOINTS],
@@ -48,7 +48,7 @@ pub(super) struct Reply {
 }
 
 impl Reply {
-    /// With its header.
+    /// Encodes the message with its header.
     pub(super) fn bytes(&self) -> Vec<u8> {
         let mut bytes = HeaderLayout::Robot.encode_header(self.command, self.command_id, self.payload.len());
         bytes.extend(&self.payload);
@@ -57,7 +57,7 @@ impl Reply {
 }
 
 impl Request {
-    /// What a number stands for; `None` where that version has no such command.
+    /// The request of a command number; `None` if the version has no such command.
     pub(super) fn from_number(version: FciVersion, number: u32) -> Option<Self> {
         Some(match version {
             FciVersion::V5 => match v5::Command::from_u32(number)? {
@@ -95,7 +95,7 @@ impl Request {
 }
 
 impl Setting {
-    /// Length of what comes with it.
+    /// Payload length.
     pub(super) fn n_bytes(self) -> usize {
         match self {
             Self::Collision => size_of::<v10::SetCollisionBehaviorRequest>(),
@@ -111,7 +111,7 @@ impl Setting {
 }
 
 impl Command {
-    /// Reads a datagram; `None` where it is no command of that version.
+    /// Decodes a datagram; `None` if it is not a command of this version.
     pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<Self> {
         let (number, q_c, dq_c, is_last) = match version {
             FciVersion::V5 => {

@@ -1,12 +1,14 @@
-//! A robot's controller as its clients see it, for tests and simulators: commands over TCP, states at 1 kHz and motions over UDP.
+//! An emulated robot controller for tests and simulators: commands over TCP, states at 1 kHz and motions over UDP.
 //!
-//! `robot` is what the controller does, without sockets, `limits` what a motion may do; `message` and `state` are its bytes, `server`
-//! moves them. Where the joints
-//! truly are, an owner says once a millisecond: a simulator, or a few lines in a test. Written against the same documents as the
-//! driver; that both understood them alike is shown by the tests with libfranka itself and with somebody else's server.
+//! `robot` implements the controller without sockets, `limits` checks motions, `model` has the robot description,
+//! `message` and `state` encode and decode, `server` has the sockets. A callback of the owner, such as a simulator or
+//! a test, returns the actual joint states once per millisecond.
 //!
-//! Joint positions and joint velocities are taken as motions; Cartesian ones and torques are refused, and of the thresholds of
-//! collisions those of joint torques are heeded.
+//! It was written from the same documents as the driver. Tests with libfranka itself and with an independent server
+//! show that both interpret them correctly.
+//!
+//! It accepts joint position and joint velocity motions, and rejects Cartesian and torque motions. Of the collision
+//! thresholds it evaluates only the joint torques.
 
 mod limits;
 mod message;
@@ -25,46 +27,47 @@ use franka::FciVersion;
 use kinematics::{Chain, Stamp, Transform};
 use std::net::SocketAddr;
 
-/// A robot to play.
+/// Configuration of an emulated robot.
 #[derive(Clone, Debug)]
 pub struct RobotConfig {
-    /// Where commands are taken: libfranka connects to port 1337 of whatever address; port 0 takes a free one.
+    /// Address to listen on. libfranka always connects to port 1337; port 0 chooses a free one.
     pub address: SocketAddr,
-    /// Version of FCI.
+    /// FCI version.
     pub version: FciVersion,
-    /// From the robot's base to its flange.
+    /// Chain from the robot's base to its flange.
     pub chain: Chain,
-    /// The end effector that is set in Desk, `F_T_NE`.
+    /// The end effector set in Desk, `F_T_NE`.
     pub flange_from_ee: Transform,
-    /// What motions may do.
+    /// Limits for motions.
     pub limits: Limits,
 }
 
-/// What the joints do at one instant.
+/// Measured joint states at one instant.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Joints {
     /// Angles, rad.
     pub position_rad: [f64; N_JOINTS],
-    /// Their rates, rad/s.
+    /// Velocities, rad/s.
     pub velocity_rad_s: [f64; N_JOINTS],
-    /// Torques measured at the links, gravity among them, Nm.
+    /// Torques measured at the links, including gravity, Nm.
     pub torque_nm: [f64; N_JOINTS],
-    /// What of them comes from outside: contacts, Nm.
+    /// External torques (contacts) included in them, Nm.
     pub external_torque_nm: [f64; N_JOINTS],
 }
 
-/// Where a client wants the joints to be at one instant; where they were last wanted while no motion runs.
+/// Commanded joint states at one instant; the last ones while no motion is active.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CommandedJoints {
     /// Angles, rad.
     pub position_rad: [f64; N_JOINTS],
-    /// Their rates, rad/s.
+    /// Velocities, rad/s.
     pub velocity_rad_s: [f64; N_JOINTS],
-    /// And theirs, rad/s².
+    /// Accelerations, rad/s².
     pub acceleration_rad_s2: [f64; N_JOINTS],
-    /// Whether a motion runs.
+    /// Whether a motion is active.
     pub is_moving: bool,
 }
 
-/// Who says where the joints are: asked once for each millisecond, in order, with where they are wanted.
+/// Callback that returns the actual joint states. It is called once per millisecond, in order, with the commanded
+/// ones.
 pub type JointSimulator = Box<dyn FnMut(Stamp, &CommandedJoints) -> Joints + Send>;

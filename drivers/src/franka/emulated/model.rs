@@ -1,9 +1,9 @@
-//! The description that a controller of FCI 10 serves of its robot.
+//! The robot description that an FCI 10 controller serves.
 
 use super::Limits;
 use std::fmt::Write;
 
-/// Each joint's place after the one before it: x, y, z in metres, and the turn about x in quarter turns.
+/// Origin of each joint relative to the one before: x, y, z in meters, and the rotation about x in quarter turns.
 ///
 /// Source: `franka_description`; the FR3 has the Panda's lengths.
 const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
@@ -16,7 +16,7 @@ const JOINT_ORIGINS: [(f64, f64, f64, f64); 7] = [
     (0.088, 0.0, 0.0, 1.0),
 ];
 
-/// A URDF of the joints with the limits that clients look for; no bodies.
+/// URDF of the joints with the limits that clients read, without link geometry.
 pub(super) fn urdf(limits: &Limits) -> String {
     let mut text = String::from("<?xml version=\"1.0\"?>\n<robot name=\"fr3\">\n<link name=\"fr3_link0\"/>\n");
     for (ix, (x, y, z, quarters)) in JOINT_ORIGINS.into_iter().enumerate() {
@@ -35,7 +35,7 @@ pub(super) fn urdf(limits: &Limits) -> String {
              <position_based_velocity_limits deceleration_limit=\"{}\" velocity_offset=\"{}\"/>\n</joint>\n",
             braking.0, braking.1
         )
-        .expect("a string takes all");
+        .expect("writing to a string cannot fail");
     }
     text.push_str(
         "<link name=\"fr3_link8\"/>\n<joint name=\"fr3_joint8\" type=\"fixed\">\n<origin rpy=\"0 0 0\" xyz=\"0 0 0.107\"/>\n\
@@ -59,7 +59,7 @@ mod tests {
         let q = [0.3, -0.7, 0.2, -2.1, 0.4, 1.9, -0.8];
         let error = ours.forward(&q).unwrap().inverse() * panda.forward(&q).unwrap();
         assert!(error.translation.vector.norm() < 1e-9 && error.rotation.angle() < 1e-9, "{error}");
-        // What a client makes of it lies just inside of what is checked here.
+        // The limits that a client computes from it lie just inside the limits checked here.
         let parsed_limits = JointVelocityLimitsConfig::from_urdf(&text).unwrap().upper_limits(&q);
         assert!((parsed_limits[1] - 2.62).abs() < 1e-2, "{parsed_limits:?}");
     }

@@ -1,4 +1,4 @@
-//! What a controller does: answers commands, follows motions within their limits, stops by reflex, recovers.
+//! The controller's behavior: answers requests, follows motions within their limits, triggers reflexes, recovers.
 
 use super::super::N_JOINTS;
 use super::super::state::pose;
@@ -13,15 +13,17 @@ use std::collections::VecDeque;
 use zerocopy::FromBytes;
 use zerocopy::little_endian::F64;
 
-/// More answers missing in a row than this end a motion. Source: FCI documentation, "Real-time control commands".
+/// Maximum number of consecutive missing answers in a motion. Source: FCI documentation, "Real-time control
+/// commands".
 const MAX_MISSED: u32 = 20;
-/// States after which a motion must have begun.
+/// Number of states within which a motion must start.
 const MAX_UNTIL_FIRST: u32 = 1000;
-/// Over so many states the share of answered ones is told.
+/// Number of states over which the success rate is computed.
 const N_SUCCESS_WINDOW: usize = 100;
-/// A robot at rest is wanted where it was put; further off it was moved otherwise, and is wanted where it is.
+/// Maximum deviation of a robot at rest from its commanded position. A greater one means that it was moved by hand; the
+/// commanded position then follows.
 const MAX_SAG_RAD: f64 = 0.01;
-/// Torques from outside that end a motion until a client sets others, Nm.
+/// External torques that end a motion, until a client sets other thresholds, Nm.
 const DEFAULT_CONTACT_NM: f64 = 20.0;
 
 /// The controller of one robot, without its sockets.
@@ -60,7 +62,7 @@ pub(super) enum TrajectoryGenerator {
 }
 
 impl Robot {
-    /// At rest where its owner says.
+    /// Creates a robot at rest with these joints.
     pub(super) fn new(config: RobotConfig, joints: Joints) -> Self {
         let commanded = CommandedJoints { position_rad: joints.position_rad, ..CommandedJoints::default() };
         Self {
@@ -76,7 +78,7 @@ impl Robot {
         }
     }
 
-    /// Does what a client asks for, but for connecting, and answers; ending a motion answers twice.
+    /// Executes a request other than connecting, and returns the replies; ending a motion gives two.
     pub(super) fn answer(&mut self, request: Request, command: u32, command_id: u32, payload: &[u8]) -> Vec<Reply> {
         let is_moving = matches!(self.mode, Mode::Move(_));
         let mut replies = Vec::new();
@@ -108,7 +110,7 @@ impl Robot {
         replies
     }
 
-    /// Begins a motion, if it can.
+    /// Starts a motion, if possible.
     fn begin(&mut self, command_id: u32, payload: &[u8]) -> MoveStatus {
         if !matches!(self.mode, Mode::Idle) {
             return MoveStatus::CommandNotPossibleRejected;
@@ -117,7 +119,7 @@ impl Robot {
             FciVersion::V5 => size_of::<v5::MoveRequest>(),
             FciVersion::V10 => size_of::<v10::MoveRequest>(),
         };
-        // Both begin with the controller and the motion generator.
+        // In both versions the payload starts with the controller and the motion generator.
         let (Ok((head, _)), true) = (<[[u8; 4]; 2]>::read_from_prefix(payload), payload.len() == n_bytes) else {
             return MoveStatus::InvalidArgumentRejected;
         };
@@ -166,9 +168,10 @@ impl Robot {
         v10::GetterSetterStatus::Success
     }
 
-    /// Follows the motion by a millisecond: by the client's answer to the newest state, or on as before without one.
+    /// Advances the motion by a millisecond: with the client's answer to the newest state, or by extrapolation
+    /// without one.
     ///
-    /// `could_answer` says whether the client could have answered: a player that is late itself asks too much.
+    /// `could_answer` is false if the client had no chance to answer because the emulator itself was late.
     pub(super) fn follow(&mut self, command: Option<&Command>, could_answer: bool) -> Option<Reply> {
         let Mode::Move(mut motion) = self.mode else { return None };
         if command.is_some() || (could_answer && motion.has_begun) {
@@ -204,7 +207,7 @@ impl Robot {
             self.mode = Mode::Move(Motion { has_begun: true, n_missed: 0, ..motion });
             return None;
         }
-        // It stands still from here on.
+        // From here on the joints stand still.
         let can_stop = |(velocity, max): (f64, f64)| velocity.abs() <= max * STEP_SECS;
         match now.velocity_rad_s.into_iter().zip(self.config.limits.acceleration_rad_s2).all(can_stop) {
             true => self.end(MoveStatus::Success),
@@ -212,7 +215,7 @@ impl Robot {
         }
     }
 
-    /// Takes what the joints do now; a contact ends a motion.
+    /// Updates the actual joint states. A contact ends the motion.
     pub(super) fn observe(&mut self, joints: Joints) -> Option<Reply> {
         self.joints = joints;
         let Mode::Move(_) = self.mode else {
@@ -226,13 +229,13 @@ impl Robot {
         if has_contact { self.trigger_reflex("joint_reflex") } else { None }
     }
 
-    /// The client is gone.
+    /// The client disconnected.
     pub(super) fn abandon(&mut self) {
-        // Nobody is there to be told.
+        // No client is left to receive the reply.
         let _ = self.end(MoveStatus::Aborted);
     }
 
-    /// Share of the last states of a motion that were answered in time, 0 to 1; 0 without one.
+    /// Fraction of the last states of a motion that were answered in time, 0 to 1; 0 if there is none.
     pub(super) fn success_frac(&self) -> f64 {
         let n_answered = self.answered.iter().filter(|is_answered| **is_answered).count();
         n_answered as f64 / self.answered.len().max(1) as f64
@@ -244,11 +247,11 @@ impl Robot {
         let reply = self.end(MoveStatus::ReflexAborted);
         self.mode = Mode::Reflex;
         self.reflex_reason = reasons;
-        log::info!("played robot: stopped by a reflex: {reason}");
+        log::info!("emulated robot: stopped by a reflex: {reason}");
         reply
     }
 
-    /// Ends the motion where one runs, and answers what began it.
+    /// Ends the active motion, if any, and returns the reply to the request that started it.
     fn end(&mut self, status: MoveStatus) -> Option<Reply> {
         let Mode::Move(Motion { command_id, .. }) = self.mode else { return None };
         self.mode = Mode::Idle;
@@ -256,7 +259,7 @@ impl Robot {
         Some(Reply { command: v10::Command::Move.to_u32(), command_id, payload: vec![self.move_byte(status)] })
     }
 
-    /// A status as its version numbers it.
+    /// A status as numbered in the robot's FCI version.
     fn move_byte(&self, status: MoveStatus) -> u8 {
         match (self.config.version, status) {
             (FciVersion::V10, _) => status.to_u8(),
@@ -271,7 +274,7 @@ impl Robot {
     }
 }
 
-/// Where joints are wanted a millisecond later, with rates by joint and place.
+/// Commanded joints a millisecond later. `rate` returns the velocity for a joint index and position.
 fn next_commanded(before: &CommandedJoints, rate: impl Fn(usize, f64) -> f64) -> CommandedJoints {
     let velocity_rad_s: [f64; N_JOINTS] = std::array::from_fn(|ix| rate(ix, before.position_rad[ix]));
     CommandedJoints {

@@ -1,4 +1,4 @@
-//! The sockets of a played robot, and the thread that moves bytes between them and the robot a thousand times a second.
+//! The sockets of an emulated robot, and the thread that serves them a thousand times per second.
 
 #[cfg(any(test, fuzzing))]
 pub(crate) mod fuzz;
@@ -19,16 +19,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// From state to state.
+/// Interval between states.
 const STEP: Duration = Duration::from_millis(1);
-/// States that are sent later rather than not at all where the player was not woken in time; longer gaps stay.
+/// If the thread was not woken in time, states up to this lag are sent late; longer gaps are skipped.
 const MAX_LAG: Duration = Duration::from_millis(100);
-/// No client asks for more in one message.
+/// Maximum message size. Real clients stay far below it.
 const MAX_MESSAGE_BYTES: usize = 1 << 16;
-/// No command is longer; what is longer is none.
+/// Maximum command size; longer datagrams are not commands.
 const MAX_COMMAND_BYTES: usize = 512;
 
-/// A robot that takes clients, one at a time, until it is dropped.
+/// An emulated robot that serves clients, one at a time, until it is dropped.
 #[derive(Debug)]
 pub struct EmulatedRobot {
     address: SocketAddr,
@@ -37,12 +37,12 @@ pub struct EmulatedRobot {
 }
 
 impl EmulatedRobot {
-    /// Listens, and asks the owner where the joints are from now on.
+    /// Starts listening. From now on `joint_simulator` is asked for the joint states.
     pub fn start(config: RobotConfig, mut joint_simulator: JointSimulator) -> Result<Self, Error> {
-        let device = "played robot".to_owned();
+        let device = "emulated robot".to_owned();
         let n = config.chain.n_joints();
         if n != N_JOINTS {
-            let reason = format!("its chain has {n} joints, a Franka arm has {N_JOINTS}");
+            let reason = format!("its chain has {n} joints, but a Franka arm has {N_JOINTS}");
             return Err(Error::Fci { address: config.address.to_string(), reason });
         }
         let bind = || {
@@ -69,7 +69,7 @@ impl EmulatedRobot {
         Ok(Self { address, stop, thread: Some(thread) })
     }
 
-    /// Where it takes clients.
+    /// Address on which it accepts clients.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -79,7 +79,7 @@ impl Drop for EmulatedRobot {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has said so.
+            // A thread that panicked has already printed the panic message.
             let _ = thread.join();
         }
     }
@@ -97,21 +97,21 @@ struct Server {
 struct Client {
     stream: TcpStream,
     ip: IpAddr,
-    /// Where states go, once it has said so.
+    /// Destination of the states, once the client has sent it.
     states_to: Option<SocketAddr>,
-    /// What came of a message that is not complete.
+    /// Received bytes of an incomplete message.
     buffer_in: Vec<u8>,
 }
 
-/// The client has to go: it hung up, or talks nonsense.
+/// The client must be dropped: it disconnected, or sent an invalid message.
 struct Disconnected;
 
 impl Server {
     fn run(&mut self) {
-        realtime::request_realtime("played robot");
+        realtime::request_realtime("emulated robot");
         let start_time = clock::now();
         let mut n_steps: u32 = 0;
-        // The robot has been on for a while.
+        // Start as if the robot had been on for a while.
         let mut number = 1_000_000;
         while !self.stop.load(Ordering::Relaxed) {
             let due = start_time + STEP * n_steps;
@@ -123,13 +123,13 @@ impl Server {
                 continue;
             }
             std::thread::sleep(due.duration_since(now));
-            // Before the last of several overdue states nobody can have answered.
+            // If several states are overdue, only the last one can have been answered.
             self.step(due, number, lag < STEP);
             (n_steps, number) = (n_steps.saturating_add(1), number + 1);
         }
     }
 
-    /// One millisecond: hears what clients want, moves on, tells the state.
+    /// Simulates one millisecond: handles requests, advances the motion, sends the state.
     fn step(&mut self, due: Stamp, number: u64, could_answer: bool) {
         if let Some(mut client) = self.client.take() {
             match client.read_requests(&mut self.robot) {
@@ -150,17 +150,17 @@ impl Server {
                 return;
             }
             if let Some(states_to) = client.states_to {
-                // A state that does not go out is a lost one.
+                // A state that cannot be sent counts as lost.
                 let _ = self.states.send_to(&self.robot.state(number), states_to);
             }
         }
     }
 
-    /// Takes a client where there is none; others are sent away.
+    /// Accepts a client if there is none; rejects others.
     fn accept_client(&mut self) {
         while let Ok((stream, peer)) = self.listener.accept() {
             if self.client.is_some() {
-                log::info!("played robot: {peer} is sent away, another client is there");
+                log::info!("emulated robot: rejected {peer}, another client is connected");
                 continue;
             }
             if stream.set_nonblocking(true).and_then(|()| stream.set_nodelay(true)).is_ok() {
@@ -169,7 +169,7 @@ impl Server {
         }
     }
 
-    /// The client's answer to the state with that number, if it has come.
+    /// The client's answer to the state with this number, if it has arrived.
     fn newest_command(&self, number: u64) -> Option<Command> {
         let mut answer = None;
         let mut buffer = [0; MAX_COMMAND_BYTES];
@@ -180,7 +180,7 @@ impl Server {
                     let command = Command::decode(self.robot.config.version, &buffer[..n]);
                     answer = command.filter(|command| is_from_client && command.number == number).or(answer);
                 }
-                // Where a client closed its port a send before this one is told here.
+                // If a client has closed its port, the error of an earlier send is reported here.
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => {}
                 Err(_) => return answer,
             }
@@ -189,7 +189,7 @@ impl Server {
 }
 
 impl Client {
-    /// Reads what has come and answers.
+    /// Reads and answers the available requests.
     fn read_requests(&mut self, robot: &mut Robot) -> Result<(), Disconnected> {
         let mut buffer = [0; 4096];
         loop {

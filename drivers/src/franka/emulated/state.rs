@@ -1,4 +1,4 @@
-//! The state of a played robot as its datagram.
+//! Encodes the state of an emulated robot as a datagram.
 
 use super::super::N_JOINTS;
 use super::super::state::columns;
@@ -11,7 +11,7 @@ use zerocopy::little_endian::{F32, F64, U64};
 
 const GRAVITY_M_S2: f64 = -9.81;
 
-/// The state of a robot, in one version's layout; both have the fields that are set here.
+/// State of a robot in one version's layout. Both versions have the fields that are set here.
 macro_rules! state {
     ($robot:expr, $number:expr, $version:ident) => {{
         let robot: &Robot = $robot;
@@ -57,7 +57,7 @@ macro_rules! state {
 }
 
 impl Robot {
-    /// The state with that number, as a datagram.
+    /// Encodes the state with this number as a datagram.
     pub(super) fn state(&self, number: u64) -> Vec<u8> {
         match self.config.version {
             FciVersion::V5 => state!(self, number, v5).as_bytes().to_vec(),

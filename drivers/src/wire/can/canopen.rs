@@ -1,21 +1,21 @@
-//! CANopen: starting nodes, heartbeats, SYNC, expedited SDO transfers, and how objects are laid into PDOs.
+//! CANopen: network management, heartbeats, SYNC, expedited SDO transfers, and PDO mapping.
 //!
 //! Source: CiA 301 (CANopen application layer and communication profile) 4.2.0: sections 7.2.2 (PDO), 7.2.4 (SDO and its abort
-//! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Transfers in segments and blocks
-//! are refused: no object that a drive needs is longer than four bytes.
+//! codes), 7.2.8 (NMT, heartbeat), 7.5.2 (objects); the same bytes in christiansandberg/canopen. Segmented and block
+//! transfers are not supported: no object that a drive needs is longer than four bytes.
 
 use super::{CanError, Frame, Id, decode_enum};
 
-/// How messages are called in errors.
+/// Names of messages in errors.
 const SDO: &str = "SDO answer";
 const HEARTBEAT: &str = "CANopen heartbeat";
 
-/// Number of a node, 1 to 127.
+/// Node ID, 1 to 127.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Node(u8);
 
 impl Node {
-    /// A node of its number.
+    /// Creates a node ID.
     pub fn new(number: u8) -> Result<Self, CanError> {
         match number {
             1..=127 => Ok(Self(number)),
@@ -23,39 +23,39 @@ impl Node {
         }
     }
 
-    /// Its number.
+    /// The number.
     pub fn number(self) -> u8 {
         self.0
     }
 }
 
-/// What a node is told about its state.
+/// An NMT command, which requests a node state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Nmt {
-    /// Send and take PDOs.
+    /// Operational: send and accept PDOs.
     Start = 0x01,
-    /// Only heartbeats and orders like this one.
+    /// Stopped: only heartbeats and NMT commands.
     Stop = 0x02,
-    /// SDO but no PDO.
+    /// Pre-operational: SDOs but no PDOs.
     EnterPreOperational = 0x80,
-    /// Begin again.
+    /// Restart the node.
     ResetNode = 0x81,
-    /// Begin the communication again.
+    /// Restart the communication.
     ResetCommunication = 0x82,
 }
 
-/// What a node's heartbeat tells.
+/// Node state reported by a heartbeat.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum NodeState {
-    /// It has just begun.
+    /// The node has just started.
     BootUp = 0x00,
-    /// Only heartbeats.
+    /// Only heartbeats and NMT commands.
     Stopped = 0x04,
-    /// It sends and takes PDOs.
+    /// The node sends and accepts PDOs.
     Operational = 0x05,
-    /// SDO but no PDO.
+    /// SDOs but no PDOs.
     PreOperational = 0x7F,
 }
 
@@ -66,19 +66,20 @@ pub struct Object {
     pub index: u16,
     /// Subindex.
     pub subindex: u8,
-    /// Bytes of its value: 1, 2 or 4.
+    /// Length of its value in bytes: 1, 2 or 4.
     pub n_bytes: u8,
 }
 
-/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds below; what makes a drive stop when the host is gone.
+/// Consumer heartbeat time, entry 1: node in bits 16 to 22, milliseconds in bits 0 to 15. It makes a drive stop when
+/// the host's heartbeat is missing.
 pub const CONSUMER_HEARTBEAT: Object = Object { index: 0x1016, subindex: 1, n_bytes: 4 };
-/// Producer heartbeat time, milliseconds; 0 is none.
+/// Producer heartbeat time, milliseconds; 0 disables it.
 pub const PRODUCER_HEARTBEAT: Object = Object { index: 0x1017, subindex: 0, n_bytes: 2 };
 
-/// Which of a node's four pairs of PDOs.
+/// Number of a PDO. A node has four in each direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
-#[expect(missing_docs, reason = "they are numbers")]
+#[expect(missing_docs, reason = "the names are ordinal numbers")]
 pub enum Pdo {
     First = 0,
     Second = 1,
@@ -86,7 +87,7 @@ pub enum Pdo {
     Fourth = 3,
 }
 
-/// Which way a PDO goes, seen from the node.
+/// Direction of a PDO, from the node's point of view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
     /// To the node.
@@ -96,16 +97,16 @@ pub enum Direction {
 }
 
 impl Pdo {
-    /// Identifier as CiA 301 gives it out at first.
+    /// Default identifier according to CiA 301.
     pub fn id(self, direction: Direction, node: Node) -> Id {
         let base = match direction {
             Direction::Receive => 0x200,
             Direction::Transmit => 0x180,
         };
-        Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0)).expect("at most 0x57F")
+        Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0)).expect("the identifier is at most 0x57F")
     }
 
-    /// The object that says what is in it, entry `place` from 1; entry 0 is how many there are.
+    /// The mapping object: entry `place`, from 1, is one mapped object; entry 0 is their number.
     pub fn mapping(self, direction: Direction, place: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1600,
@@ -114,7 +115,7 @@ impl Pdo {
         Object { index: base + self as u16, subindex: place, n_bytes: if place == 0 { 1 } else { 4 } }
     }
 
-    /// The object that says how it is sent: entry 1 its identifier (bit 31 switches it off), entry 2 when.
+    /// The communication object: entry 1 is its identifier (bit 31 disables the PDO), entry 2 the transmission type.
     pub fn communication(self, direction: Direction, entry: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1400,
@@ -125,12 +126,12 @@ impl Pdo {
 }
 
 impl Object {
-    /// How it stands in a PDO's mapping: index, subindex, bits.
+    /// Its entry in a PDO mapping: index, subindex, length in bits.
     pub fn mapped(self) -> u32 {
         u32::from(self.index) << 16 | u32::from(self.subindex) << 8 | (8 * u32::from(self.n_bytes))
     }
 
-    /// Reads an entry of a PDO's mapping; only whole bytes, 1, 2 or 4.
+    /// Decodes an entry of a PDO mapping. Only lengths of 1, 2 or 4 whole bytes are supported.
     pub fn from_mapped(entry: u32) -> Result<Self, CanError> {
         let [high, low, subindex, n_bits] = entry.to_be_bytes();
         match n_bits {
@@ -140,27 +141,28 @@ impl Object {
     }
 }
 
-/// The value of [`CONSUMER_HEARTBEAT`]: the drive misses `host` after so many milliseconds without a heartbeat of it; 0 never.
+/// The value of [`CONSUMER_HEARTBEAT`] with which a drive reacts after `millis` without a heartbeat of `host`; 0
+/// disables this.
 pub fn consumer_heartbeat(host: Node, millis: u16) -> u32 {
     u32::from(host.0) << 16 | u32::from(millis)
 }
 
-/// An order about the state of a node, or of all.
+/// Encodes an NMT command to one node, or to all nodes.
 pub fn encode_nmt(state_command: Nmt, node: Option<Node>) -> Frame {
     data_frame(0, &[state_command as u8, node.map_or(0, Node::number)])
 }
 
-/// The beat at which nodes send and take their cyclic PDOs.
+/// Encodes the SYNC at which nodes send and accept their cyclic PDOs.
 pub fn encode_sync() -> Frame {
     data_frame(0x80, &[])
 }
 
-/// A heartbeat: the host's own, so that drives stop without it, or that of a simulated node.
+/// Encodes a heartbeat: the host's own, without which drives stop, or that of an emulated node.
 pub fn encode_heartbeat(node: Node, state: NodeState) -> Frame {
     data_frame(0x700 + u32::from(node.0), &[state as u8])
 }
 
-/// Reads a heartbeat.
+/// Decodes a heartbeat.
 pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
     let (node, bytes) = from_node(frame, 0x700, HEARTBEAT)?;
     let &[state] = bytes else {
@@ -170,13 +172,16 @@ pub fn decode_heartbeat(frame: &Frame) -> Result<(Node, NodeState), CanError> {
     Ok((node, decode_enum("the state of the node", state.into(), &states, |known| known as u32)?))
 }
 
-/// Asks a node for an object.
+/// Encodes a request to read an object of a node.
 pub fn encode_read(node: Node, object: Object) -> Frame {
     let [low, high] = object.index.to_le_bytes();
     data_frame(0x600 + u32::from(node.0), &[0x40, low, high, object.subindex, 0, 0, 0, 0])
 }
 
-/// Sets an object of a node; a value that has more bytes than the object is refused. Negative values go as two's complement.
+/// Encodes a request to write an object of a node. Negative values are encoded as two's complement.
+///
+/// # Errors
+/// If the value does not fit into the object.
 pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, CanError> {
     let n_bits = 8 * u32::from(object.n_bytes);
     let command = match object.n_bytes {
@@ -187,7 +192,7 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
     };
     let (lower, upper) = (-(1_i64 << (n_bits - 1)), (1_i64 << n_bits) - 1);
     if !(lower..=upper).contains(&value) {
-        #[expect(clippy::cast_precision_loss, reason = "only told")]
+        #[expect(clippy::cast_precision_loss, reason = "only for the error message")]
         let [value, lower, upper] = [value, lower, upper].map(|number| number as f64);
         return Err(CanError::Range { field: "the value of an object", value, lower, upper });
     }
@@ -198,32 +203,32 @@ pub fn encode_write(node: Node, object: Object, value: i64) -> Result<Frame, Can
     Ok(data_frame(0x600 + u32::from(node.0), &bytes))
 }
 
-/// What a node answers about an object.
+/// Answer of a node to an SDO request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SdoAnswer {
-    /// It is set.
+    /// The object was written.
     Written {
         /// Index of the object.
         index: u16,
         /// Subindex of the object.
         subindex: u8,
     },
-    /// What it holds; `n_bytes` is 4 where the node does not tell.
+    /// Value of an object; `n_bytes` is 4 if the node does not report the length.
     Value {
-        /// The object, with the length that the node tells.
+        /// The object, with the length that the node reports.
         object: Object,
-        /// Its bytes, the upper ones 0; [`signed`] for those that may be negative.
+        /// Its bytes; the upper ones are 0. Use [`signed`] for values that may be negative.
         raw: u32,
     },
 }
 
-/// The number of a two's complement of so many bytes: 1, 2 or 4.
+/// Interprets the lower `n_bytes` (1, 2 or 4) as two's complement.
 pub fn signed(raw: u32, n_bytes: u8) -> i32 {
     let n_unused_bits = 32 - 8 * u32::from(n_bytes.clamp(1, 4));
     (raw << n_unused_bits).cast_signed() >> n_unused_bits
 }
 
-/// Reads a node's answer about an object; a transfer that the node broke off or wants to do in segments is an error.
+/// Decodes a node's answer to an SDO request. An aborted or segmented transfer is an error.
 pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     let (node, bytes) = from_node(frame, 0x580, SDO)?;
     let &[command, low, high, subindex, a, b, c, d] = bytes else {
@@ -231,7 +236,8 @@ pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     };
     let index = u16::from_le_bytes([low, high]);
     let value = u32::from_le_bytes([a, b, c, d]);
-    // The upper three bits say what it is; then, in answers to a read: bytes unused, expedited, length told.
+    // The upper three bits are the command. In answers to a read, the others are: number of unused bytes, expedited,
+    // length given.
     match (command >> 5, command & 0b10 != 0, command & 0b01 != 0) {
         (3, ..) => Ok((node, SdoAnswer::Written { index, subindex })),
         (4, ..) => Err(CanError::Aborted { index, subindex, code: value }),
@@ -245,7 +251,7 @@ pub fn decode_sdo(frame: &Frame) -> Result<(Node, SdoAnswer), CanError> {
     }
 }
 
-/// What an abort code means.
+/// Meaning of an SDO abort code.
 pub fn abort_text(code: u32) -> &'static str {
     match code {
         0x0503_0000 => "toggle bit not alternated",
@@ -277,11 +283,11 @@ pub fn abort_text(code: u32) -> &'static str {
 }
 
 fn data_frame(id: u32, bytes: &[u8]) -> Frame {
-    let id = Id::standard(id).expect("at most 0x700 and 127");
+    let id = Id::standard(id).expect("the identifier is at most 0x700 plus 127");
     Frame::classic(id, bytes).expect("at most eight bytes")
 }
 
-/// The node and the bytes of a data frame whose identifier is `base` and a node.
+/// Returns the node and the bytes of a data frame whose identifier is `base` plus the node ID.
 fn from_node<'a>(frame: &'a Frame, base: u32, message: &'static str) -> Result<(Node, &'a [u8]), CanError> {
     let id = frame.id().value();
     let node = id.checked_sub(base).and_then(|number| Node::new(u8::try_from(number).ok()?).ok());
@@ -351,7 +357,7 @@ mod tests {
         assert!(aborted.expect_err("aborted").to_string().ends_with("0x06090011 (no such subindex)"));
         let name = read(&[0x41, 0x08, 0x10, 0, 0x1A, 0, 0, 0]);
         assert_eq!(name, Err(CanError::Segmented { index: 0x1008, subindex: 0 }));
-        assert!(name.expect_err("segmented").to_string().contains("0x1008:00 comes in segments"));
+        assert!(name.expect_err("segmented").to_string().contains("0x1008:00 uses a segmented transfer"));
         let states = [NodeState::BootUp, NodeState::Stopped, NodeState::Operational, NodeState::PreOperational];
         for state in states {
             assert_eq!(decode_heartbeat(&encode_heartbeat(NODE, state)), Ok((NODE, state)));

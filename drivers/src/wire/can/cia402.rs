@@ -1,63 +1,64 @@
-//! CiA 402: the drive behind a CANopen node, its state machine and its objects.
+//! CiA 402: the drive profile of CANopen, with its state machine and objects.
 //!
 //! Source: CiA 402-2 (IEC 61800-7-201) section "Controlling the power drive system": figure of the states, tables of
-//! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in `ros-industrial/ros_canopen`. Positions,
-//! velocities and torques are in units that each drive defines: [`Units`].
+//! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in
+//! `ros-industrial/ros_canopen`. Positions, velocities and torques are in units that each drive defines: [`Units`].
 
 use super::CanError;
 use super::canopen::Object;
 use std::f64::consts::TAU;
 
-/// What the drive does when the host is gone: 0 nothing, 1 fault, 2 switch off, 3 quick stop.
+/// Reaction of the drive to a missing host heartbeat: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop.
 pub const ABORT_CONNECTION: Object = Object { index: 0x6007, subindex: 0, n_bytes: 2 };
-/// What it does at a quick stop: 0 let go, 1 to 3 stop and let go, 5 to 7 stop and stay, [`STAY_STOPPED`] by its quick-stop ramp.
+/// Behavior at a quick stop: 0 releases, 1 to 3 stop and release, 5 to 7 stop and stay stopped; [`STAY_STOPPED`] does
+/// so on the quick-stop ramp.
 pub const QUICK_STOP_OPTION: Object = Object { index: 0x605A, subindex: 0, n_bytes: 2 };
 /// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in [`State::QuickStopActive`].
 pub const STAY_STOPPED: i64 = 6;
-/// Value of [`ABORT_CONNECTION`]: the order [`StateCommand::DisableVoltage`].
+/// Value of [`ABORT_CONNECTION`]: as after [`StateCommand::DisableVoltage`].
 pub const ABORT_BY_DISABLING: i64 = 2;
-/// Value of [`ABORT_CONNECTION`]: the order [`StateCommand::QuickStop`].
+/// Value of [`ABORT_CONNECTION`]: as after [`StateCommand::QuickStop`].
 pub const ABORT_BY_QUICK_STOP: i64 = 3;
-/// Modes that it has, a bit each: [`Mode`] `n` is bit `n - 1`.
+/// Supported modes, one bit each: [`Mode`] `n` is bit `n - 1`.
 pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes: 4 };
-/// How often targets come in a cyclic mode, in units of ten to the power of [`INTERPOLATION_EXPONENT`] seconds.
+/// Interval of targets in a cyclic mode, in units of ten to the power of [`INTERPOLATION_EXPONENT`] seconds.
 pub const INTERPOLATION_PERIOD: Object = Object { index: 0x60C2, subindex: 1, n_bytes: 1 };
 /// See [`INTERPOLATION_PERIOD`]; -3 is milliseconds.
 pub const INTERPOLATION_EXPONENT: Object = Object { index: 0x60C2, subindex: 2, n_bytes: 1 };
-/// Orders, [`StateCommand::controlword`].
+/// State commands, see [`StateCommand::controlword`].
 pub const CONTROLWORD: Object = Object { index: 0x6040, subindex: 0, n_bytes: 2 };
-/// State, [`State::from_statusword`].
+/// State, see [`State::from_statusword`].
 pub const STATUSWORD: Object = Object { index: 0x6041, subindex: 0, n_bytes: 2 };
-/// Mode asked for, [`Mode`].
+/// Requested mode, see [`Mode`].
 pub const MODE: Object = Object { index: 0x6060, subindex: 0, n_bytes: 1 };
-/// Mode that it is in.
+/// Active mode.
 pub const MODE_DISPLAY: Object = Object { index: 0x6061, subindex: 0, n_bytes: 1 };
-/// Where it is, signed counts.
+/// Measured position, signed counts.
 pub const POSITION: Object = Object { index: 0x6064, subindex: 0, n_bytes: 4 };
-/// How fast, signed counts a second.
+/// Measured velocity, signed counts per second.
 pub const VELOCITY: Object = Object { index: 0x606C, subindex: 0, n_bytes: 4 };
-/// Torque asked for, signed thousandths of the rated one.
+/// Target torque, signed thousandths of the rated torque.
 pub const TARGET_TORQUE: Object = Object { index: 0x6071, subindex: 0, n_bytes: 2 };
 /// Rated torque, mN m.
 pub const RATED_TORQUE: Object = Object { index: 0x6076, subindex: 0, n_bytes: 4 };
-/// Torque, signed thousandths of the rated one.
+/// Measured torque, signed thousandths of the rated torque.
 pub const TORQUE: Object = Object { index: 0x6077, subindex: 0, n_bytes: 2 };
-/// Where to, signed counts.
+/// Target position, signed counts.
 pub const TARGET_POSITION: Object = Object { index: 0x607A, subindex: 0, n_bytes: 4 };
-/// How fast it shall be, signed counts a second.
+/// Target velocity, signed counts per second.
 pub const TARGET_VELOCITY: Object = Object { index: 0x60FF, subindex: 0, n_bytes: 4 };
 
-/// What the targets mean.
+/// Mode of operation, which determines the meaning of the targets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i8)]
 pub enum Mode {
-    /// To a position with the drive's own ramps.
+    /// A position, with the drive's own ramps.
     ProfilePosition = 1,
-    /// A velocity with the drive's own ramps.
+    /// A velocity, with the drive's own ramps.
     ProfileVelocity = 3,
-    /// A torque with the drive's own ramp.
+    /// A torque, with the drive's own ramp.
     ProfileTorque = 4,
-    /// Look for zero.
+    /// Homing: finds the zero position.
     Homing = 6,
     /// A position at every SYNC.
     CyclicPosition = 8,
@@ -70,25 +71,25 @@ pub enum Mode {
 /// State of a drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
-    /// It begins.
+    /// The drive is starting.
     NotReadyToSwitchOn,
-    /// Nothing is on.
+    /// Switched off.
     SwitchOnDisabled,
-    /// Power may come.
+    /// Ready for power.
     ReadyToSwitchOn,
-    /// Power is there, the shaft is free.
+    /// Powered, with the shaft free.
     SwitchedOn,
-    /// It obeys.
+    /// Enabled: the drive follows its targets.
     OperationEnabled,
-    /// It stops by itself.
+    /// Executing a quick stop.
     QuickStopActive,
-    /// It stops because of a fault.
+    /// Stopping because of a fault.
     FaultReactionActive,
-    /// The shaft is free because of a fault.
+    /// Stopped by a fault, with the shaft free.
     Fault,
 }
 
-/// An order to a drive.
+/// A command that changes the state of a drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StateCommand {
     /// To [`State::ReadyToSwitchOn`].
@@ -99,16 +100,17 @@ pub enum StateCommand {
     EnableOperation,
     /// Back to [`State::SwitchedOn`].
     DisableOperation,
-    /// To [`State::SwitchOnDisabled`] at once, the shaft free.
+    /// To [`State::SwitchOnDisabled`] at once, with the shaft free.
     DisableVoltage,
     /// To [`State::QuickStopActive`].
     QuickStop,
-    /// From [`State::Fault`] to [`State::SwitchOnDisabled`]; counts when bit 7 rises, so another order must come before.
+    /// From [`State::Fault`] to [`State::SwitchOnDisabled`]. It takes effect on the rising edge of bit 7, so another
+    /// command must precede it.
     ResetFault,
 }
 
 impl Mode {
-    /// Whether [`SUPPORTED_MODES`] has it.
+    /// Whether the value of [`SUPPORTED_MODES`] includes this mode.
     pub fn is_in(self, supported: u32) -> bool {
         supported >> (self as i8 - 1) & 1 == 1
     }
@@ -129,9 +131,9 @@ impl StateCommand {
 }
 
 impl State {
-    /// The state that a statusword tells; bits of modes and makers may be anything.
+    /// Decodes the state in a statusword. Mode-specific and manufacturer-specific bits are ignored.
     pub fn from_statusword(statusword: u16) -> Result<Self, CanError> {
-        // Bit 5 (quick stop, low when active) belongs to the state only where power may be.
+        // Bit 5 (quick stop, active low) is part of the state only in powered or ready states.
         match (statusword & 0x4F, statusword & 0x20 != 0) {
             (0x00, _) => Ok(Self::NotReadyToSwitchOn),
             (0x40, _) => Ok(Self::SwitchOnDisabled),
@@ -145,9 +147,10 @@ impl State {
         }
     }
 
-    /// The order that brings a drive one state nearer to obeying; `None` where it obeys or must be waited for.
+    /// The command that advances a drive by one state towards enabled; `None` if it is enabled, or the next
+    /// transition is its own.
     ///
-    /// A fault is only reset when that is allowed: what caused it may still be there.
+    /// A fault is reset only if `may_reset_fault`, because its cause may persist.
     pub fn next_enabling_command(self, may_reset_fault: bool) -> Option<StateCommand> {
         match self {
             Self::SwitchOnDisabled => Some(StateCommand::Shutdown),
@@ -159,9 +162,9 @@ impl State {
         }
     }
 
-    /// The state after an order; the same where the order does nothing there.
+    /// The state after a command; unchanged if the command has no effect in this state.
     ///
-    /// The drive's own transitions (0, 1, 12 by itself, 13, 14) are not orders.
+    /// The drive's own transitions (0, 1, automatic 12, 13, 14) are not commands.
     pub fn after(self, state_command: StateCommand) -> Self {
         match (self, state_command) {
             (Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled, StateCommand::Shutdown) => {
@@ -180,7 +183,7 @@ impl State {
         }
     }
 
-    /// A statusword that tells it, for drives that are simulated.
+    /// A statusword for this state, for emulated drives.
     pub fn statusword(self) -> u16 {
         match self {
             Self::NotReadyToSwitchOn => 0x00,
@@ -195,43 +198,49 @@ impl State {
     }
 }
 
-/// What a drive's counts are worth: its objects' factors, or a rig's.
+/// Units of a drive's raw values, from its objects or the rig file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Units {
-    /// Counts of [`POSITION`] in a turn of the output shaft; [`VELOCITY`] is as many a second.
+    /// Counts of [`POSITION`] per turn of the output shaft, and of [`VELOCITY`] per turn per second.
     pub counts_per_turn: f64,
-    /// What 1000 counts of [`TORQUE`] are, N m at the output shaft.
+    /// Torque of 1000 counts of [`TORQUE`], N m at the output shaft.
     pub rated_torque_nm: f64,
 }
 
 impl Units {
-    /// Angle of a count of [`POSITION`], rad; or velocity of one of [`VELOCITY`], rad/s.
+    /// Converts counts of [`POSITION`] to rad, or of [`VELOCITY`] to rad/s.
     pub fn rad_from_raw(&self, raw: i32) -> f64 {
         f64::from(raw) * TAU / self.counts_per_turn
     }
 
-    /// The nearest count; what 32 bits do not hold is refused, for a position cannot be clamped without meaning another.
+    /// Converts to the nearest count.
+    ///
+    /// # Errors
+    /// If it does not fit into 32 bits. Positions are not clamped, because that would change the target.
     pub fn raw_from_rad(&self, field: &'static str, value: f64) -> Result<i32, CanError> {
         let count = (value * self.counts_per_turn / TAU).round();
         let range = (f64::from(i32::MIN), f64::from(i32::MAX));
         checked_count(field, count, range, value, TAU / self.counts_per_turn)
     }
 
-    /// Torque of a count of [`TORQUE`], N m.
+    /// Converts counts of [`TORQUE`] to N m.
     pub fn nm_from_raw(&self, raw: i16) -> f64 {
         f64::from(raw) * self.rated_torque_nm / 1000.0
     }
 
-    /// The nearest count of [`TARGET_TORQUE`]; what 16 bits do not hold is refused.
+    /// Converts to the nearest count of [`TARGET_TORQUE`].
+    ///
+    /// # Errors
+    /// If it does not fit into 16 bits.
     pub fn raw_from_nm(&self, value: f64) -> Result<i16, CanError> {
         let count = (value * 1000.0 / self.rated_torque_nm).round();
         let range = (f64::from(i16::MIN), f64::from(i16::MAX));
         let raw = checked_count("the torque", count, range, value, self.rated_torque_nm / 1000.0)?;
-        Ok(i16::try_from(raw).expect("within 16 bits by the check"))
+        Ok(i16::try_from(raw).expect("the count was checked to fit into 16 bits"))
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "within the ends, which are within 32 bits")]
+#[expect(clippy::cast_possible_truncation, reason = "within the range, which fits into 32 bits")]
 fn checked_count(field: &'static str, count: f64, range: (f64, f64), value: f64, unit: f64) -> Result<i32, CanError> {
     match (range.0..=range.1).contains(&count) {
         true => Ok(count as i32),
@@ -258,7 +267,7 @@ mod tests {
 
     #[test]
     fn statuswords_match_standard() {
-        // xxxx xxxx x0xx 0000 and so on, x of both kinds; the last two as drives in the field send them.
+        // Bit patterns like xxxx xxxx x0xx 0000, with x as 0 and 1; the last two are from drives in the field.
         for (statusword, state) in [
             (0x0000, State::NotReadyToSwitchOn),
             (0xFFB0, State::NotReadyToSwitchOn),
@@ -283,7 +292,7 @@ mod tests {
             assert_eq!(State::from_statusword(state.statusword()), Ok(state));
         }
         let n_defined = (0..=u16::MAX).filter(|word| State::from_statusword(*word).is_ok()).count();
-        // Of the 64 values of bits 0 to 3, 5 and 6: four states leave bit 5 open, four do not.
+        // Of the 64 values of bits 0 to 3, 5 and 6: four states ignore bit 5, four do not.
         assert_eq!(n_defined, (4 * 2 + 4) * 65_536 / 64);
         assert!(State::from_statusword(0x0003).is_err() && State::from_statusword(0x0067).is_err());
     }

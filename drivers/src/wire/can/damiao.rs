@@ -1,26 +1,26 @@
-//! Damiao (DM) motors: orders, MIT commands, feedback, registers.
+//! Damiao (DM) motors: state commands, MIT commands, feedback, registers.
 //!
-//! Sources: `cmjang/DM_Control_Python` `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao DM-J4310-2EC
-//! manual V1.0, as told in `jia-xie/python-damiao-driver` `docs/concept/` (status nibble, clearing errors, registers, TIMEOUT in
-//! ticks of 50 us). Commands go to the motor's number, registers and refresh requests to `0x7FF`; all answers come under the
-//! motor's feedback identifier (register `MST_ID`).
+//! Sources: `cmjang/DM_Control_Python` `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao
+//! DM-J4310-2EC manual V1.0, as described in `jia-xie/python-damiao-driver` `docs/concept/` (status nibble, clearing
+//! errors, registers, TIMEOUT in ticks of 50 us). Commands have the motor's ID as identifier, register and refresh
+//! requests `0x7FF`. All answers have the motor's feedback identifier (register `MST_ID`).
 
 use super::mit::{self, Command, Limits, Motion};
 use super::{CanError, Frame, Id, decode_enum, eight_bytes};
 
-/// Identifier of what is about registers.
+/// Identifier of register messages.
 const REGISTER_ID: u32 = 0x7FF;
-/// Seconds of one count of register `TIMEOUT`.
+/// Length of a tick of register `TIMEOUT`, seconds.
 const TIMEOUT_TICK_SECS: f64 = 50e-6;
-/// Value of [`Register::ControlMode`] in which commands are those of MIT mode.
+/// Value of [`Register::ControlMode`] for MIT mode.
 pub const MIT_MODE: u32 = 1;
-/// How messages that come from a motor are called in errors.
+/// Names of messages from a motor in errors.
 const FEEDBACK: &str = "feedback of a Damiao motor";
 const REGISTER: &str = "register message of a Damiao motor";
 
-/// A model whose limits are known as the maker ships them; registers `PMAX`, `VMAX` and `TMAX` hold what is true.
+/// A model with known factory limits. The actual limits are in the registers `PMAX`, `VMAX` and `TMAX`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(missing_docs, reason = "they are the names on the motors")]
+#[expect(missing_docs, reason = "the names are those on the motors")]
 pub enum Model {
     Dm4310,
     Dm4310At48V,
@@ -37,7 +37,7 @@ pub enum Model {
 }
 
 impl Model {
-    /// What its counts cover as it is shipped.
+    /// Factory ranges of its raw values.
     pub const fn limits(self) -> Limits {
         match self {
             Self::Dm4310 => Limits::of(12.5, 30.0, 10.0),
@@ -55,39 +55,39 @@ impl Model {
     }
 }
 
-/// An order without numbers: seven bytes `FF` and this one.
+/// A state command: seven bytes `FF` and this one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StateCommand {
-    /// Forget the error that stopped the motor.
+    /// Clear the error that stopped the motor.
     ClearError = 0xFB,
-    /// Obey commands from now on.
+    /// Enable the motor.
     Enable = 0xFC,
-    /// Let the shaft go.
+    /// Disable the motor; the shaft is free.
     Disable = 0xFD,
-    /// Take the present position as zero.
+    /// Set the current position as zero.
     SetZero = 0xFE,
 }
 
-/// The upper half of a feedback's first byte.
+/// Status in the upper half of a feedback's first byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Status {
     /// The shaft is free.
     Disabled = 0x0,
-    /// It obeys.
+    /// The motor follows commands.
     Enabled = 0x1,
-    /// Stopped: supply too high.
+    /// Stopped: supply voltage too high.
     OverVoltage = 0x8,
-    /// Stopped: supply too low.
+    /// Stopped: supply voltage too low.
     UnderVoltage = 0x9,
-    /// Stopped: too much current.
+    /// Stopped: overcurrent.
     OverCurrent = 0xA,
     /// Stopped: the drive is too hot.
     DriveOverTemperature = 0xB,
     /// Stopped: the windings are too hot.
     RotorOverTemperature = 0xC,
-    /// Stopped: nothing came for longer than register `TIMEOUT`.
+    /// Stopped: no command for longer than register `TIMEOUT`.
     LostCommunication = 0xD,
     /// Stopped: overloaded.
     Overload = 0xE,
@@ -107,42 +107,42 @@ impl Status {
     ];
 }
 
-/// What a motor answers to every command, order and refresh request.
+/// Answer of a motor to every command, state command and refresh request.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Feedback {
-    /// The lower four bits of the motor's number.
+    /// The lower four bits of the motor's ID.
     pub motor_low: u8,
-    /// How it is.
+    /// Status of the motor.
     pub status: Status,
-    /// What it does.
+    /// Measured motion.
     pub motion: Motion,
-    /// Of the power stage, whole degrees Celsius.
+    /// Temperature of the power stage, whole degrees Celsius.
     pub drive_celsius: u8,
-    /// Of the windings, whole degrees Celsius.
+    /// Temperature of the windings, whole degrees Celsius.
     pub rotor_celsius: u8,
 }
 
-/// A register that this program reads or writes.
+/// A register that we read or write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Register {
     /// Identifier of the motor's answers.
     FeedbackId = 7,
-    /// Number of the motor.
+    /// ID of the motor.
     MotorId = 8,
-    /// How long the motor obeys its last command when none follows, ticks of 50 us; 0 is for ever.
+    /// Time without commands after which the motor stops, in ticks of 50 us; 0 means never.
     Timeout = 9,
     /// 1 is MIT mode.
     ControlMode = 10,
-    /// Version of the firmware.
+    /// Firmware version.
     SoftwareVersion = 14,
-    /// `PMAX`: the ends of the position's counts, rad.
+    /// `PMAX`: maximum absolute position of its raw values, rad.
     PositionLimit = 21,
-    /// `VMAX`: the ends of the velocity's counts, rad/s.
+    /// `VMAX`: maximum absolute velocity of its raw values, rad/s.
     VelocityLimit = 22,
-    /// `TMAX`: the ends of the torque's counts, N m.
+    /// `TMAX`: maximum absolute torque of its raw values, N m.
     TorqueLimit = 23,
-    /// Code of the bit rate.
+    /// Bit rate, as a numeric code.
     BitRate = 35,
 }
 
@@ -164,57 +164,58 @@ impl Register {
     }
 }
 
-/// What a register holds.
+/// Value of a register.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value {
-    /// In registers of numbers, codes and ticks.
+    /// Integer, for IDs, codes and ticks.
     Integer(u32),
-    /// In registers of SI values.
+    /// Floating-point number, for SI values.
     Float(f32),
 }
 
-/// A message about registers, to the motor or its answer.
+/// A register message to a motor, or its answer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RegisterMessage {
-    /// Number of the motor it goes to or comes from.
+    /// ID of the motor that it is sent to or comes from.
     pub motor: u16,
-    /// What it does.
+    /// Operation.
     pub access: Access,
 }
 
-/// What a message about registers does.
+/// Operation of a register message.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Access {
-    /// Asks for a register; the answer is [`Access::Reported`].
+    /// Reads a register; the answer is [`Access::Reported`].
     Read(Register),
-    /// Writes a register until the power goes; the answer repeats it.
+    /// Writes a register until power is lost; the answer repeats it.
     Write(Register, Value),
     /// The answer to [`Access::Read`].
     Reported(Register, Value),
-    /// Keeps all registers over a loss of power; only while disabled.
+    /// Stores all registers permanently; only possible while disabled.
     Store,
-    /// Asks for feedback without a command.
+    /// Requests feedback without a command.
     Refresh,
 }
 
-/// The count of register `TIMEOUT` for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
+/// Value of register `TIMEOUT` for a time, rounded up so that no motor stops too early; 0 disables the timeout.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
 pub fn timeout_ticks(timeout_secs: f64) -> Result<u32, CanError> {
     let upper = f64::from(u32::MAX) * TIMEOUT_TICK_SECS;
     match (0.0..=upper).contains(&timeout_secs) {
         true if timeout_secs == 0.0 => Ok(0),
-        // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
+        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which would disable the
+        // timeout.
         true => Ok((timeout_secs / TIMEOUT_TICK_SECS - 1e-6).ceil().max(1.0) as u32),
         false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
     }
 }
 
-/// The time that a count of register `TIMEOUT` stands for, seconds.
+/// Time of a value of register `TIMEOUT`, seconds.
 pub fn timeout_secs(ticks: u32) -> f64 {
     f64::from(ticks) * TIMEOUT_TICK_SECS
 }
 
-/// What the counts of a motor cover by its registers `PMAX`, `VMAX` and `TMAX`; all must be above zero.
+/// Ranges of a motor's raw values from its registers `PMAX`, `VMAX` and `TMAX`, which must be positive.
 pub fn limits_from_registers(p_max: f32, v_max: f32, t_max: f32) -> Result<Limits, CanError> {
     for (field, max) in [("PMAX", p_max), ("VMAX", v_max), ("TMAX", t_max)] {
         if !(max > 0.0 && max.is_finite()) {
@@ -224,17 +225,17 @@ pub fn limits_from_registers(p_max: f32, v_max: f32, t_max: f32) -> Result<Limit
     Ok(Limits::of(p_max.into(), v_max.into(), t_max.into()))
 }
 
-/// The frame of a command in MIT mode; values outside the limits are clamped.
+/// Encodes an MIT-mode command. Values outside the limits are clamped.
 pub fn encode_command(motor: u16, command: &Command, limits: &Limits) -> Result<Frame, CanError> {
     Frame::classic(Id::standard(motor.into())?, &mit::encode(command, limits)?)
 }
 
-/// The frame of an order.
+/// Encodes a state command.
 pub fn encode_state_command(motor: u16, state_command: StateCommand) -> Result<Frame, CanError> {
     Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
 }
 
-/// The frame of a message about registers, as it goes to a motor; an answer bears the motor's feedback identifier instead.
+/// Encodes a register message to a motor, or, with `answer_id`, the answer of a motor with this feedback identifier.
 pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Result<Frame, CanError> {
     let (code, register, value) = match message.access {
         Access::Read(register) => (0x33, register as u8, [0; 4]),
@@ -248,7 +249,7 @@ pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Resu
     Frame::classic(answer_id.map_or_else(|| Id::standard(REGISTER_ID), Ok)?, &[low, high, code, register, a, b, c, d])
 }
 
-/// Reads a motor's answer about a register.
+/// Decodes a motor's register answer.
 pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     let [low, high, code, number, a, b, c, d] = eight_bytes(frame, REGISTER, false)?;
     let register = || decode_enum("the register", number.into(), &Register::ALL, |known| known as u32);
@@ -264,7 +265,7 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     Ok(RegisterMessage { motor: u16::from_le_bytes([low, high]), access })
 }
 
-/// Reads a motor's feedback. An answer about a register comes under the same identifier: the caller knows whether it asked.
+/// Decodes a motor's feedback. Register answers have the same identifier: the caller must distinguish them.
 pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanError> {
     let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight_bytes(frame, FEEDBACK, false)?;
     Ok(Feedback {
@@ -276,7 +277,7 @@ pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanEr
     })
 }
 
-/// A motor's feedback, for motors that are simulated.
+/// Encodes the feedback of an emulated motor.
 pub fn encode_feedback(answer_id: Id, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
     let [a, b, c, d, e] = mit::encode_motion(&feedback.motion, limits)?;
     let head = (feedback.status as u8) << 4 | (feedback.motor_low & 0xF);
@@ -285,7 +286,7 @@ pub fn encode_feedback(answer_id: Id, feedback: &Feedback, limits: &Limits) -> R
 
 fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
     match (register.is_integer(), value) {
-        (true, Value::Integer(complete)) => Ok(complete.to_le_bytes()),
+        (true, Value::Integer(integer)) => Ok(integer.to_le_bytes()),
         (false, Value::Float(real)) if real.is_finite() => Ok(real.to_le_bytes()),
         _ => Err(CanError::Undefined { field: "the kind of value of the register", raw: register as u32 }),
     }

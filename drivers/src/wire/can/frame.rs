@@ -1,4 +1,4 @@
-//! A CAN frame as plain data, and how long the bus is busy with it.
+//! A CAN frame as plain data, and the time it takes on the bus.
 //!
 //! Sources: Robert Bosch, CAN Specification 2.0 (1991), parts A and B; ISO 11898-1:2015 (FD frames and their fixed stuff
 //! bits), field by field as in Linux's `include/linux/can/length.h`. Worst stuffing of classic frames: Davis, Burns, Bril and
@@ -6,12 +6,12 @@
 
 use super::CanError;
 
-/// Lengths that an FD frame can have beyond eight bytes.
+/// Payload lengths of FD frames above eight bytes.
 const FD_LENGTHS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
-/// Acknowledge slot and delimiter, end of frame, and the pause before the next frame may begin.
+/// Acknowledge slot and delimiter, end of frame, and interframe space.
 const TAIL_BITS: u32 = 2 + 7 + 3;
 
-/// Identifier of a frame; the lower one wins the bus.
+/// Identifier of a frame. Lower ones have priority on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Id {
     value: u32,
@@ -46,7 +46,7 @@ impl Id {
     }
 }
 
-/// What a frame is besides its identifier and its bytes.
+/// Format of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     Classic,
@@ -72,7 +72,8 @@ impl Frame {
         }
     }
 
-    /// A request for the data frame of the same identifier; `n_bytes` is the length that the answer shall have.
+    /// A remote frame: a request for the data frame with the same identifier. `n_bytes` is the expected length of the
+    /// answer.
     pub fn remote(id: Id, n_bytes: usize) -> Result<Self, CanError> {
         match n_bytes {
             0..=8 => Ok(Self { id, kind: Kind::Remote, n_bytes, bytes: [0; 64] }),
@@ -80,7 +81,8 @@ impl Frame {
         }
     }
 
-    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes; `switched` when its data are sent at the second bit rate.
+    /// An FD frame of 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes. `switched`: whether the data phase uses the data
+    /// bit rate.
     pub fn fd(id: Id, data: &[u8], switched: bool) -> Result<Self, CanError> {
         match data.len() {
             n if n <= 8 || FD_LENGTHS.contains(&n) => Ok(Self::with_data(id, Kind::Fd { switched }, data)),
@@ -99,7 +101,7 @@ impl Frame {
         self.id
     }
 
-    /// The bytes; none in a remote frame.
+    /// The payload; empty in a remote frame.
     pub fn data(&self) -> &[u8] {
         match self.kind {
             Kind::Remote => &[],
@@ -107,12 +109,12 @@ impl Frame {
         }
     }
 
-    /// Bytes it has, or asks for when it is a remote frame.
+    /// Length of the payload, or the requested length of a remote frame.
     pub fn n_bytes(&self) -> usize {
         self.n_bytes
     }
 
-    /// Whether it asks for data instead of bringing them.
+    /// Whether it is a remote frame, which requests data.
     pub fn is_remote(&self) -> bool {
         self.kind == Kind::Remote
     }
@@ -122,15 +124,16 @@ impl Frame {
         matches!(self.kind, Kind::Fd { .. })
     }
 
-    /// Whether its data are sent at the second bit rate.
+    /// Whether its data phase uses the data bit rate.
     pub fn is_switched(&self) -> bool {
         matches!(self.kind, Kind::Fd { switched: true })
     }
 
-    /// Bits from its first to the first that the next frame may have, errors and retries left out.
+    /// Length in bits from the start of frame to the earliest start of the next frame, without errors and
+    /// retransmissions.
     ///
-    /// An FD frame's fixed stuff bits are always in. The bits in which the rate switches (bit rate switch and CRC delimiter) are
-    /// split between the rates on the wire; they count at the first, slower one here.
+    /// The fixed stuff bits of FD frames are always included. The two bits in which the rate switches (bit rate
+    /// switch and CRC delimiter) are sent partly at each rate; they are counted at the slower nominal rate here.
     pub fn bits(&self, stuffing: Stuffing) -> Bits {
         let n_data = u32::try_from(8 * self.data().len()).expect("at most 64 bytes");
         let n_stuff_bits = |n_bits: u32| match stuffing {
@@ -138,11 +141,12 @@ impl Frame {
             Stuffing::Worst => (n_bits - 1) / 4,
         };
         let Kind::Fd { switched } = self.kind else {
-            // Start, identifier, control and CRC: these and the data are stuffed, what follows is not.
+            // Start of frame, identifier, control, data and CRC are stuffed; the rest is not.
             let stuffed = if self.id.extended { 54 } else { 34 } + n_data;
             return Bits { nominal: stuffed + n_stuff_bits(stuffed) + 1 + TAIL_BITS, data: 0 };
         };
-        // Start to bit rate switch; then error state, length and data; then stuff count, CRC and their fixed stuff bits.
+        // From the start of frame to the bit rate switch; then error state, length and data; then stuff count, CRC
+        // and their fixed stuff bits.
         let head = if self.id.extended { 36 } else { 17 };
         let body = 5 + n_data;
         let check = if n_data <= 8 * 16 { 4 + 17 + 6 } else { 4 + 21 + 7 };
@@ -155,41 +159,41 @@ impl Frame {
     }
 }
 
-/// Which stuff bits are counted besides an FD frame's fixed ones.
+/// Stuff bits to count in addition to an FD frame's fixed ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stuffing {
-    /// None: the shortest that a frame of its length can be.
+    /// None: the minimum length.
     None,
-    /// One after every four bits: no frame of its length is longer.
+    /// One after every four bits: the maximum length.
     Worst,
 }
 
-/// Bits on the bus, by the rate they are sent at.
+/// Number of bits at each bit rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Bits {
-    /// At the first rate, that of arbitration and of classic frames.
+    /// At the nominal rate, used for arbitration and classic frames.
     pub nominal: u32,
-    /// At the second rate; 0 unless the frame switches.
+    /// At the data rate; 0 unless the frame switches the rate.
     pub data: u32,
 }
 
-/// The two rates of a bus.
+/// The bit rates of a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BitRates {
-    /// First rate, bits a second.
+    /// Nominal bit rate, bit/s.
     pub nominal_hz: f64,
-    /// Second rate, bits a second; the first one again on a classic bus.
+    /// Data bit rate, bit/s; equal to the nominal one on a classic bus.
     pub data_hz: f64,
 }
 
 impl Bits {
-    /// How long they keep the bus busy, seconds.
+    /// Duration on the bus, seconds.
     pub fn seconds(self, rates: BitRates) -> f64 {
         f64::from(self.nominal) / rates.nominal_hz + f64::from(self.data) / rates.data_hz
     }
 }
 
-/// Share of the time that a bus is busy, 0 to 1 and above 1 if it cannot be, with frames and how often each comes in a second.
+/// Fraction of the bus capacity taken by frames with these rates in Hz; above 1 if the bus is overloaded.
 pub fn load_frac(traffic: impl IntoIterator<Item = (Bits, f64)>, rates: BitRates) -> f64 {
     traffic.into_iter().map(|(bits, rate_hz)| bits.seconds(rates) * rate_hz).sum()
 }
@@ -224,13 +228,13 @@ mod tests {
 
     #[test]
     fn fd_frame_lengths_match_linux() {
-        // can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h, by hand.
+        // Computed by hand from can_frame_bits(true, is_eff, bitstuffing, true, n) of linux/can/length.h.
         let cases = [(0, false, 62, 67), (8, false, 126, 147), (16, false, 190, 227), (20, false, 227, 272)];
         let extended = [(64, false, 579, 712), (0, true, 81, 91), (16, true, 209, 251), (64, true, 598, 736)];
-        for (n_bytes, is_extended, non_finite, worst) in cases.into_iter().chain(extended) {
+        for (n_bytes, is_extended, unstuffed, worst) in cases.into_iter().chain(extended) {
             let id = if is_extended { Id::extended(5) } else { Id::standard(5) }.expect("small");
             let frame = |switched| Frame::fd(id, &[0; 64][..n_bytes], switched).expect("an FD length");
-            for (stuffing, expected) in [(Stuffing::None, non_finite), (Stuffing::Worst, worst)] {
+            for (stuffing, expected) in [(Stuffing::None, unstuffed), (Stuffing::Worst, worst)] {
                 let Bits { nominal, data } = frame(true).bits(stuffing);
                 assert_eq!(nominal + data, expected, "{n_bytes} {is_extended} {stuffing:?}");
                 assert_eq!(frame(false).bits(stuffing), Bits { nominal: expected, data: 0 });
@@ -243,7 +247,7 @@ mod tests {
     #[test]
     fn bus_load_is_frame_time_times_rate() {
         let rates = BitRates { nominal_hz: 1e6, data_hz: 5e6 };
-        // Six motors, a command and an answer each, 500 times a second: 135 us a frame.
+        // Six motors with one command and one answer each, 500 times per second: 135 us per frame.
         let bits = standard(8).bits(Stuffing::Worst);
         let load = load_frac([(bits, 6.0 * 500.0), (bits, 6.0 * 500.0)], rates);
         assert!((load - 0.81).abs() < 1e-12, "{load}");

@@ -1,34 +1,35 @@
 //! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
 //!
 //! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `cmjang/DM_Control_Python`
-//! `DM_CAN.py` and `neurobionics/TMotorCANControl` `mit_can.py`. The drive does
-//! `torque = kp (position - measured) + kd (velocity - measured) + torque`. Values outside the limits are clamped, as there.
+//! `DM_CAN.py` and `neurobionics/TMotorCANControl` `mit_can.py`. The drive applies `torque = kp (position - measured)
+//! + kd (velocity - measured) + torque`. As in these sources, values outside the limits are clamped.
 
 use super::CanError;
 use super::scale::Scale;
 
-/// The ranges that the counts of a motor cover: all but the gains from the negative to the positive number.
+/// Ranges of a motor's raw values. Gains range from 0 to these limits, everything else from the negative to the
+/// positive limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
-    /// Of the output shaft, rad.
+    /// Maximum position of the output shaft, rad.
     pub position_rad: f64,
-    /// Of the output shaft, rad/s.
+    /// Maximum velocity of the output shaft, rad/s.
     pub velocity_rad_s: f64,
-    /// At the output shaft, N m.
+    /// Maximum torque at the output shaft, N m.
     pub torque_nm: f64,
-    /// From 0, N m / rad.
+    /// Maximum stiffness, N m / rad.
     pub kp_nm_rad: f64,
-    /// From 0, N m s / rad.
+    /// Maximum damping, N m s / rad.
     pub kd_nm_s_rad: f64,
 }
 
 impl Limits {
-    /// Limits with the gains that most motors have: up to 500 N m / rad and 5 N m s / rad.
+    /// Limits with the gain limits of most motors: 500 N m / rad and 5 N m s / rad.
     pub const fn of(position_rad: f64, velocity_rad_s: f64, torque_nm: f64) -> Self {
         Self { position_rad, velocity_rad_s, torque_nm, kp_nm_rad: 500.0, kd_nm_s_rad: 5.0 }
     }
 
-    /// The command that is really sent: every number within its limits; no number stays none.
+    /// The command as it is sent, with every number clamped to its limits; NaN stays NaN.
     pub fn clamped(&self, command: &Command) -> Command {
         let clamp_symmetric = |value: f64, max: f64| value.clamp(-max, max);
         Command {
@@ -41,33 +42,33 @@ impl Limits {
     }
 }
 
-/// What a motor shall do.
+/// A command in MIT mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Command {
-    /// Where to, rad.
+    /// Target position, rad.
     pub position_rad: f64,
-    /// How fast, rad/s.
+    /// Target velocity, rad/s.
     pub velocity_rad_s: f64,
     /// Stiffness towards the position, N m / rad.
     pub kp_nm_rad: f64,
     /// Damping towards the velocity, N m s / rad.
     pub kd_nm_s_rad: f64,
-    /// Torque on top, N m.
+    /// Feedforward torque, N m.
     pub torque_nm: f64,
 }
 
-/// What a motor does.
+/// Measured motion of a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
-    /// Of the output shaft, rad.
+    /// Position of the output shaft, rad.
     pub position_rad: f64,
-    /// Of the output shaft, rad/s.
+    /// Velocity of the output shaft, rad/s.
     pub velocity_rad_s: f64,
-    /// At the output shaft by the drive's estimate, N m.
+    /// Torque at the output shaft as estimated by the drive, N m.
     pub torque_nm: f64,
 }
 
-/// How the numbers of a command are cut into counts.
+/// Conversion of the numbers of a command to raw values.
 pub(super) struct Scales {
     pub(super) position: Scale,
     pub(super) velocity: Scale,
@@ -77,12 +78,12 @@ pub(super) struct Scales {
 }
 
 impl Scales {
-    /// Of MIT mode.
+    /// Scales of MIT mode.
     fn of(limits: &Limits) -> Self {
         Self::with_bits(limits, 12)
     }
 
-    /// A position of 16 bits, and all else of so many.
+    /// Scales with 16 bits for the position and `n_bits` for everything else.
     pub(super) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
         Self {
             position: Scale::symmetric(limits.position_rad, 16),
@@ -94,7 +95,10 @@ impl Scales {
     }
 }
 
-/// A command as the eight bytes of its frame; values outside the limits are clamped, no number is refused.
+/// Encodes a command. Values outside the limits are clamped.
+///
+/// # Errors
+/// If a value is NaN.
 pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     let scales = Scales::of(limits);
     let position = scales.position.raw_from_value("the position", command.position_rad)?;
@@ -106,7 +110,7 @@ pub fn encode(command: &Command, limits: &Limits) -> Result<[u8; 8], CanError> {
     Ok(fields.iter().fold(0_u64, |bits, (raw, n_bits)| bits << n_bits | u64::from(*raw)).to_be_bytes())
 }
 
-/// Reads a command: what a simulated motor gets.
+/// Decodes a command, for emulated motors.
 pub fn decode(bytes: &[u8; 8], limits: &Limits) -> Command {
     let scales = Scales::of(limits);
     let [p1, p0, v1, v0_kp1, kp0, kd1, kd0_t1, t0] = *bytes;
@@ -119,7 +123,7 @@ pub fn decode(bytes: &[u8; 8], limits: &Limits) -> Command {
     }
 }
 
-/// The five bytes of a motion, as they follow the motor's number in every maker's feedback.
+/// Encodes the five bytes of a motion that follow the motor's number in the feedback of all manufacturers.
 pub fn encode_motion(motion: &Motion, limits: &Limits) -> Result<[u8; 5], CanError> {
     let scales = Scales::of(limits);
     let [p1, p0] = scales.position.raw_from_value("the position", motion.position_rad)?.to_be_bytes();
@@ -129,7 +133,7 @@ pub fn encode_motion(motion: &Motion, limits: &Limits) -> Result<[u8; 5], CanErr
     Ok([p1, p0, b2, b3, b4])
 }
 
-/// Reads the five bytes of a motion.
+/// Decodes the five bytes of a motion.
 pub fn decode_motion(bytes: [u8; 5], limits: &Limits) -> Motion {
     let scales = Scales::of(limits);
     let [p1, p0, v1, v0_t1, t0] = bytes;
@@ -140,12 +144,12 @@ pub fn decode_motion(bytes: [u8; 5], limits: &Limits) -> Motion {
     }
 }
 
-/// Twelve bits that end in the middle of their second byte.
+/// Twelve bits that end in the middle of the second byte.
 fn high_twelve(first: u8, second: u8) -> u16 {
     u16::from_be_bytes([first, second]) >> 4
 }
 
-/// Twelve bits that begin in the middle of their first byte.
+/// Twelve bits that start in the middle of the first byte.
 fn low_twelve(first: u8, second: u8) -> u16 {
     u16::from_be_bytes([first, second]) & 0xFFF
 }
@@ -159,7 +163,8 @@ mod tests {
 
     #[test]
     fn commands_match_manufacturer_sample_bytes() {
-        // DM_CAN.py, controlMIT with the limits of a DM4310: nothing, all ends, and kp = 50, kd = 1, q = 1, dq = -3, tau = 2.5.
+        // DM_CAN.py, controlMIT with the limits of a DM4310: zeros, both ends of the ranges, and kp = 50, kd = 1, q =
+        // 1, dq = -3, tau = 2.5.
         let command = |kp_nm_rad, kd_nm_s_rad, position_rad, velocity_rad_s, torque_nm| Command {
             position_rad,
             velocity_rad_s,
@@ -171,7 +176,7 @@ mod tests {
             (command(0.0, 0.0, 0.0, 0.0, 0.0), [0x7F, 0xFF, 0x7F, 0xF0, 0x00, 0x00, 0x07, 0xFF]),
             (command(500.0, 5.0, 12.5, 30.0, 10.0), [0xFF; 8]),
             (command(0.0, 0.0, -12.5, -30.0, -10.0), [0x00; 8]),
-            // 35388.9, 1842.75, 409.5, 819, 2559.375: the nearest counts, and 409 of the two next to 409.5.
+            // 35388.9, 1842.75, 409.5, 819, 2559.375 are rounded to the nearest integer, and 409.5 to 409.
             (command(50.0, 1.0, 1.0, -3.0, 2.5), [0x8A, 0x3D, 0x73, 0x31, 0x99, 0x33, 0x39, 0xFF]),
         ];
         for (command, bytes) in cases {

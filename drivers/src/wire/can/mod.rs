@@ -1,7 +1,8 @@
-//! Motors on a CAN bus: frames as plain data and the protocols of four families.
+//! Motors on a CAN bus: frames as plain data, and the protocols of several motor families.
 //!
-//! Every codec is pure: a [`Frame`] in, SI out, and back. Numbers that a field cannot hold are clamped where the makers' own
-//! samples clamp (MIT packing, Robstride, ODrive's feed-forward) and refused everywhere else; no number is refused always.
+//! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of a field are
+//! clamped where the manufacturers' own examples clamp (MIT packing, Robstride, ODrive's feedforward), and are errors
+//! everywhere else. NaN is always an error.
 
 pub mod canopen;
 pub mod cia402;
@@ -15,11 +16,11 @@ pub mod tmotor;
 
 pub use frame::{Frame, Id};
 
-/// A frame that cannot be made, or one that does not follow its protocol.
+/// An invalid frame, or one that does not follow its protocol.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CanError {
-    /// A number too large for its kind of identifier.
+    /// The number is too large for this kind of identifier.
     #[error("identifier {id:#x} does not fit into {bits} bits")]
     IdRange {
         /// The number.
@@ -27,56 +28,56 @@ pub enum CanError {
         /// 11 or 29.
         bits: u8,
     },
-    /// A payload of a length that no frame of its format has.
-    #[error("no {format} frame has {got_bytes} bytes")]
+    /// The frame format does not allow this payload length.
+    #[error("invalid payload length for frame format {format}: {got_bytes} bytes")]
     PayloadLength {
         /// "classic" or "FD".
         format: &'static str,
-        /// Bytes asked for.
+        /// Requested length in bytes.
         got_bytes: usize,
     },
-    /// A frame that is no message of this kind: its identifier or its kind is another's.
-    #[error("the frame {id:#x} is no {message}")]
+    /// A frame that is not a message of the expected kind, according to its identifier or format.
+    #[error("expected {message}, found a frame with identifier {id:#x}")]
     UnexpectedFrame {
-        /// What was looked for.
+        /// Expected message.
         message: &'static str,
         /// Identifier of the frame.
         id: u32,
     },
-    /// A message with too few or too many bytes.
+    /// A message of the wrong length.
     #[error("{message}: {got_bytes} bytes, expected {expected_bytes}")]
     Length {
         /// Which message.
         message: &'static str,
-        /// Bytes there.
+        /// Actual length in bytes.
         got_bytes: usize,
-        /// Bytes needed.
+        /// Expected length in bytes.
         expected_bytes: usize,
     },
-    /// A field has a value that its protocol does not define.
+    /// A field has a value that the protocol does not define.
     #[error("{field} is {raw:#x}, which the protocol does not define")]
     Undefined {
         /// Which field.
         field: &'static str,
-        /// What it holds.
+        /// Its value.
         raw: u32,
     },
-    /// A number that is none, or infinite where that means nothing.
+    /// NaN, or infinity in a field that does not allow it.
     #[error("{field} is not a finite number")]
     NotFinite {
         /// Which field.
         field: &'static str,
     },
-    /// A number outside what its field can hold.
+    /// A number outside the range of its field.
     #[error("{field} is {value}, must be {lower} to {upper}")]
     Range {
         /// Which field.
         field: &'static str,
         /// The number.
         value: f64,
-        /// Least allowed.
+        /// Minimum.
         lower: f64,
-        /// Most allowed.
+        /// Maximum.
         upper: f64,
     },
     /// The device refused to read or write a parameter.
@@ -85,8 +86,8 @@ pub enum CanError {
         /// Index of the parameter.
         parameter: u32,
     },
-    /// The device broke off a transfer of an object.
-    #[error("the device broke off the transfer of object {index:#06x}:{subindex:02x} with code {code:#010x} ({})", canopen::abort_text(*code))]
+    /// The device aborted an SDO transfer.
+    #[error("the device aborted the transfer of object {index:#06x}:{subindex:02x} with code {code:#010x} ({})", canopen::abort_text(*code))]
     Aborted {
         /// Index of the object.
         index: u16,
@@ -95,9 +96,9 @@ pub enum CanError {
         /// The abort code of CiA 301.
         code: u32,
     },
-    /// The device answers with a transfer in segments: the object is longer than four bytes.
+    /// The device answered with a segmented transfer: the object is longer than four bytes.
     #[error(
-        "object {index:#06x}:{subindex:02x} comes in segments, only expedited transfers (up to 4 bytes) are spoken"
+        "object {index:#06x}:{subindex:02x} uses a segmented transfer, but only expedited transfers (up to 4 bytes) are supported"
     )]
     Segmented {
         /// Index of the object.
@@ -107,12 +108,12 @@ pub enum CanError {
     },
 }
 
-/// The one of `all` whose number a field holds.
+/// Finds the variant in `all` whose number is `raw`.
 fn decode_enum<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
     all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
 }
 
-/// The eight bytes of a data frame with an 11-bit or 29-bit identifier; anything else is refused.
+/// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is an error.
 fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() != extended {
@@ -126,7 +127,7 @@ fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[
 mod testing {
     use super::{Frame, Id};
 
-    /// Random numbers from a seed: Knuth's linear congruence, upper half.
+    /// Random numbers from a seed: the upper half of Knuth's linear congruential generator.
     pub(super) struct Random(pub(super) u64);
 
     impl Random {
@@ -141,7 +142,7 @@ mod testing {
         }
     }
 
-    /// Frames of random kind, identifier, length and bytes; every fourth bears `id`.
+    /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
     pub(super) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
         let mut random = Random(seed);
         (0..20_000).map(move |round| {
@@ -149,7 +150,7 @@ mod testing {
                 0 => Id::standard(random.next() & 0x7FF),
                 _ => Id::extended(random.next() & 0x1FFF_FFFF),
             };
-            let id = if round % 4 == 0 { id } else { identifier.expect("masked") };
+            let id = if round % 4 == 0 { id } else { identifier.expect("the identifier is masked to 11 or 29 bits") };
             let bytes: Vec<u8> = (0..64).map(|_| random.next().to_le_bytes()[0]).collect();
             let len = usize::try_from(random.next() % 9).expect("small");
             match random.next() % 8 {
@@ -158,16 +159,16 @@ mod testing {
                 2..5 => Frame::classic(id, &bytes[..8]),
                 _ => Frame::classic(id, &bytes[..len]),
             }
-            .expect("lengths of their formats")
+            .expect("the lengths are valid for the formats")
         })
     }
 
-    /// The same frame with every other length from 0 to 8, and twice as long as an FD frame: all must be refused.
+    /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these must be rejected.
     pub(super) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
-        let identifier = frame.data().len();
-        let cut = (0..identifier).map(|len| Frame::classic(frame.id(), &bytes[..len]));
-        let doubled = (identifier == 8).then(|| Frame::fd(frame.id(), &bytes, false));
-        cut.chain(doubled).map(|built| built.expect("a length of its format")).collect()
+        let n_bytes = frame.data().len();
+        let cut = (0..n_bytes).map(|len| Frame::classic(frame.id(), &bytes[..len]));
+        let doubled = (n_bytes == 8).then(|| Frame::fd(frame.id(), &bytes, false));
+        cut.chain(doubled).map(|built| built.expect("the length is valid for the format")).collect()
     }
 }

@@ -1,8 +1,9 @@
-//! ODrive's CANSimple: six bits of node and five of command in an 11-bit identifier, little-endian numbers in the bytes.
+//! ODrive's CANSimple: an 11-bit identifier with six bits node ID and five bits command; little-endian numbers in the
+//! payload.
 //!
 //! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol page and DBC of
-//! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. What a node tells
-//! comes by itself at the rates set in its `can.config` or `axis.config.can`, or when asked with a remote frame.
+//! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. Nodes
+//! send their messages at the rates set in `can.config` or `axis.config.can`, or in answer to a remote frame.
 
 mod endpoints;
 
@@ -11,21 +12,21 @@ pub use endpoints::{Endpoints, EndpointsError};
 use super::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
 
-/// First byte of `Get_Version`'s answer.
+/// First byte of the answer to `Get_Version`.
 const PROTOCOL_VERSION: u8 = 2;
-/// How frames of a node are called in errors.
+/// Name of a node's frames in errors.
 const MESSAGE: &str = "ODrive message";
-/// Feed-forward counts: thousandths of a turn a second, and of a newton metre.
+/// Unit of feedforward values: thousandths of a turn per second, and of a newton meter.
 const FEED_FORWARD: f64 = 1e-3;
-/// Bit of [`Answer::Heartbeat`]'s errors: no command came for longer than the axis' watchdog allows.
+/// Error bit of [`Answer::Heartbeat`]: no command arrived within the timeout of the axis' watchdog.
 pub const WATCHDOG_TIMER_EXPIRED: u32 = 1 << 24;
 
-/// Number of an axis on the bus, 0 to 62; 63 is a node without one.
+/// ID of an axis on the bus, 0 to 62; 63 means that none is assigned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Node(u8);
 
 impl Node {
-    /// A node of its number.
+    /// Creates a node ID.
     pub fn new(number: u8) -> Result<Self, CanError> {
         match number {
             0..=63 => Ok(Self(number)),
@@ -33,13 +34,13 @@ impl Node {
         }
     }
 
-    /// Its number.
+    /// The number.
     pub fn number(self) -> u8 {
         self.0
     }
 }
 
-/// The lower five bits of an identifier.
+/// Command in the lower five bits of an identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Code {
@@ -53,7 +54,7 @@ pub enum Code {
     Errors = 0x03,
     /// `RxSdo`: reads or writes an endpoint.
     EndpointRequest = 0x04,
-    /// `TxSdo`: the answer to that.
+    /// `TxSdo`: the answer to `RxSdo`.
     EndpointAnswer = 0x05,
     /// `Set_Axis_State`.
     SetState = 0x07,
@@ -75,9 +76,9 @@ pub enum Code {
     Torques = 0x1C,
 }
 
-/// What an axis is at.
+/// State of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(missing_docs, reason = "they are ODrive's names")]
+#[expect(missing_docs, reason = "the names are ODrive's")]
 #[repr(u8)]
 pub enum State {
     Undefined = 0,
@@ -117,9 +118,9 @@ impl State {
     ];
 }
 
-/// What is controlled.
+/// The controlled quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(missing_docs, reason = "they are ODrive's names")]
+#[expect(missing_docs, reason = "the names are ODrive's")]
 #[repr(u8)]
 pub enum Control {
     Voltage = 0,
@@ -128,93 +129,93 @@ pub enum Control {
     Position = 3,
 }
 
-/// What a host sends. Numbers that are none are refused, feed-forward is clamped to what its 16 bits hold.
+/// A message to a node. Values that are not finite are errors; feedforward is clamped to its 16 bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Request {
-    /// Asks for a message of a node with a remote frame.
+    /// Requests a message of a node with a remote frame.
     Ask(Code),
-    /// Lets the shaft go at once.
+    /// Stops at once; the shaft is free.
     EmergencyStop,
-    /// Forgets the errors.
+    /// Clears the errors.
     ClearErrors,
-    /// Goes to a state.
+    /// Changes the state of the axis.
     SetState(State),
-    /// What is controlled, passed through without ramp or filter (input mode 1).
+    /// Sets the controlled quantity, with input passed through without ramp or filter (input mode 1).
     SetMode(Control),
-    /// Where to.
+    /// Sets the target position.
     SetPosition {
-        /// Of the motor, rad.
+        /// Position of the motor, rad.
         position_rad: f64,
-        /// Feed-forward in thousandths of a turn a second, up to 205 rad/s.
+        /// Feedforward, in steps of a thousandth of a turn per second, up to 205 rad/s.
         velocity_rad_s: f64,
-        /// Feed-forward in mN m, up to 32 N m.
+        /// Feedforward, in steps of 1 mN m, up to 32 N m.
         torque_nm: f64,
     },
-    /// How fast.
+    /// Sets the target velocity.
     SetVelocity {
-        /// Of the motor, rad/s.
+        /// Velocity of the motor, rad/s.
         velocity_rad_s: f64,
-        /// Feed-forward, N m.
+        /// Feedforward, N m.
         torque_nm: f64,
     },
-    /// How strong, N m.
+    /// Sets the target torque, N m.
     SetTorque(f64),
-    /// Tell an endpoint, by its number in the firmware's `flat_endpoints.json`.
+    /// Reads an endpoint, by its number in the firmware's `flat_endpoints.json`.
     ReadEndpoint(u16),
-    /// Set an endpoint, for instance the axis' watchdog; bytes as its type has them.
+    /// Writes an endpoint, for instance the axis' watchdog timeout; the bytes are encoded according to its type.
     WriteEndpoint(u16, [u8; 4]),
 }
 
-/// What a node sends.
+/// A message from a node.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Answer {
-    /// What it is and what runs on it.
+    /// Versions of hardware and firmware.
     Version {
         /// Product line, version and variant.
         hardware: [u8; 3],
         /// Major, minor and revision.
         firmware: [u8; 3],
     },
-    /// That it lives.
+    /// Heartbeat.
     Heartbeat {
-        /// What is wrong, bits of the firmware's `ODrive.Error`.
+        /// Active errors, bits of the firmware's `ODrive.Error`.
         errors: u32,
-        /// What it is at.
+        /// State of the axis.
         state: State,
     },
-    /// What is wrong and what stopped it, bits of the firmware's `ODrive.Error`.
+    /// Active errors and the reason of the last disarming, bits of the firmware's `ODrive.Error`.
     Errors {
-        /// At present; firmware 0.5 tells the motor's errors here.
+        /// Active errors; firmware 0.5 reports the motor's errors here.
         active: u32,
-        /// When it let the shaft go.
+        /// Errors that disarmed the axis.
         disarm_reason: u32,
     },
-    /// Where the motor is.
+    /// Measured motion of the motor.
     Motion {
-        /// Rad.
+        /// Position, rad.
         position_rad: f64,
-        /// Rad/s.
+        /// Velocity, rad/s.
         velocity_rad_s: f64,
     },
-    /// Current that makes torque, A.
+    /// Torque-generating current, A.
     Current {
-        /// Asked for.
+        /// Target.
         target_a: f64,
         /// Measured.
         measured_a: f64,
     },
     /// Torque, N m.
     Torques {
-        /// Asked for.
+        /// Target.
         target_nm: f64,
         /// Estimated.
         estimate_nm: f64,
     },
-    /// What an endpoint holds; bytes as its type has them.
+    /// Value of an endpoint; the bytes are encoded according to its type.
     Endpoint(u16, [u8; 4]),
 }
 
-/// The frame of a request to a node.
+/// Encodes a request to a node.
 pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> {
     let data = |code: Code, bytes: &[u8]| Frame::classic(id_of(node, code)?, bytes);
     let endpoint = |opcode: u8, endpoint: u16, value: [u8; 4]| {
@@ -243,7 +244,7 @@ pub fn encode_request(node: Node, request: &Request) -> Result<Frame, CanError> 
     }
 }
 
-/// Reads what a node sends.
+/// Decodes a message from a node.
 pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() {
@@ -288,7 +289,7 @@ pub fn decode_answer(frame: &Frame) -> Result<(Node, Answer), CanError> {
     Ok((Node(number), answer))
 }
 
-/// The frame of what a node sends, for axes that are simulated.
+/// Encodes a message from an emulated axis.
 pub fn encode_answer(node: Node, answer: &Answer) -> Result<Frame, CanError> {
     let (code, halves) = match *answer {
         Answer::Version { hardware: [b, c, d], firmware: [e, f, g] } => {
@@ -318,13 +319,13 @@ fn id_of(node: Node, code: Code) -> Result<Id, CanError> {
     Id::standard(u32::from(node.0) << 5 | u32::from(code as u8))
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "what does not fit becomes infinite and is refused")]
+#[expect(clippy::cast_possible_truncation, reason = "values out of range become infinite and are rejected")]
 fn encode_f32(field: &'static str, value: f64) -> Result<[u8; 4], CanError> {
     let single = value as f32;
     if single.is_finite() { Ok(single.to_le_bytes()) } else { Err(CanError::NotFinite { field }) }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the cast clamps, which is meant")]
+#[expect(clippy::cast_possible_truncation, reason = "the cast clamps, as intended")]
 fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanError> {
     match value.is_nan() {
         true => Err(CanError::NotFinite { field }),
@@ -346,7 +347,7 @@ mod tests {
     #[test]
     fn requests_match_published_bytes() {
         let sent = |request| encode_request(NODE, &request).expect("numbers");
-        // The example of odrive-can-protocol: -2.5 turns a second and 0.25 N m to node 1.
+        // The example of odrive-can-protocol: -2.5 turns per second and 0.25 N m to node 1.
         let velocity = Request::SetVelocity { velocity_rad_s: -2.5 * TAU, torque_nm: 0.25 };
         assert_eq!(sent(velocity), frame(0x02D, &[0x00, 0x00, 0x20, 0xC0, 0x00, 0x00, 0x80, 0x3E]));
         let position = Request::SetPosition { position_rad: TAU, velocity_rad_s: -0.5 * TAU, torque_nm: 99.0 };
@@ -385,7 +386,7 @@ mod tests {
             assert_eq!(decode_answer(&bytes), Ok((NODE, expected)));
             assert_eq!(encode_answer(NODE, &expected), Ok(bytes));
         }
-        // Firmware 0.6 puts the result of the last procedure and a flag behind the state.
+        // Firmware 0.6 appends the result of the last procedure and a flag after the state.
         assert!(decode_answer(&frame(0x021, &[0, 0, 0, 0, 1, 3, 1, 0])).is_ok());
     }
 

@@ -1,9 +1,10 @@
-//! Robstride motors in their private protocol: 29-bit identifiers that carry a communication type, two numbers and flags.
+//! Robstride motors with their private protocol: 29-bit identifiers with a communication type, two IDs and flags.
 //!
 //! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to RS06 user
-//! manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 counts a second, 0 for never). The scalings are those of
-//! the manuals; the table of the Python package `robstride_dynamics` differs for RS00, RS03, RS05 and RS06 and gives torques of an
-//! RS05 three times too high (motorbridge/motorbridge pull request 11). RS02 firmware up to 0.2.2.11 counts 12.5 rad as the end.
+//! manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 ticks per second, 0 for never). The
+//! scalings are those of the manuals. The table of the Python package `robstride_dynamics` differs for RS00, RS03,
+//! RS05 and RS06, and gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull request
+//! 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
 
 mod parameter;
 
@@ -13,18 +14,18 @@ use super::mit::{Command, Limits, Motion, Scales};
 use super::{CanError, Frame, Id, decode_enum, eight_bytes};
 use std::f64::consts::PI;
 
-/// How frames that come from a motor are called in errors.
+/// Name of a motor's frames in errors.
 const MESSAGE: &str = "answer of a Robstride motor";
-/// Value of [`Parameter::RunMode`] in which [`Request::Move`] is obeyed.
+/// Value of [`Parameter::RunMode`] for motion mode, in which [`Request::Move`] is followed.
 pub const MOTION_MODE: u32 = 0;
-/// What some orders carry so that nothing else is taken for them.
+/// Fixed bytes in some requests, which protect against executing other data.
 const MAGIC: [u8; 6] = [1, 2, 3, 4, 5, 6];
-/// The number that a motor's answer to [`Request::Identify`] goes to.
+/// Destination of a motor's answer to [`Request::Identify`].
 const BROADCAST: u8 = 0xFE;
 
-/// A model.
+/// A motor model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[expect(missing_docs, reason = "they are the names on the motors")]
+#[expect(missing_docs, reason = "the names are those on the motors")]
 pub enum Model {
     Rs00,
     Rs01,
@@ -36,7 +37,7 @@ pub enum Model {
 }
 
 impl Model {
-    /// What its counts cover.
+    /// Ranges of its raw values.
     pub const fn limits(self) -> Limits {
         match self {
             Self::Rs00 => Limits::of(4.0 * PI, 33.0, 14.0),
@@ -49,12 +50,12 @@ impl Model {
     }
 }
 
-/// Limits of the large motors, whose gains count further.
+/// Limits of the large motors, whose gains have larger ranges.
 const fn large(velocity_rad_s: f64, torque_nm: f64) -> Limits {
     Limits { position_rad: 4.0 * PI, velocity_rad_s, torque_nm, kp_nm_rad: 5000.0, kd_nm_s_rad: 100.0 }
 }
 
-/// Bits 24 to 28 of the identifier.
+/// Communication type in bits 24 to 28 of the identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 enum Communication {
@@ -71,113 +72,113 @@ enum Communication {
     ActiveReport = 24,
 }
 
-/// What a host sends.
+/// A request to a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Request {
-    /// Type 0: who are you?
+    /// Type 0: request the serial number.
     Identify,
-    /// Type 1: move; clamped to the limits.
+    /// Type 1: motion command; clamped to the limits.
     Move(Command),
-    /// Type 3: obey from now on.
+    /// Type 3: enable the motor.
     Enable,
-    /// Type 4: let the shaft go, and forget the fault if so asked.
+    /// Type 4: disable the motor, and optionally clear its fault.
     Stop {
-        /// Whether the fault is forgotten.
+        /// Whether to clear the fault.
         clear_fault: bool,
     },
-    /// Type 6: the present position is zero.
+    /// Type 6: set the current position as zero.
     SetZero,
-    /// Type 17: tell a parameter.
+    /// Type 17: read a parameter.
     Read(Parameter),
-    /// Type 18: set a parameter until the power goes.
+    /// Type 18: write a parameter until power is lost.
     Write(Parameter, Value),
-    /// Type 22: keep all parameters over a loss of power.
+    /// Type 22: store all parameters permanently.
     Store,
-    /// Type 24: report every [`Parameter::ReportInterval`] unasked, or stop it.
+    /// Type 24: start or stop reporting every [`Parameter::ReportInterval`].
     ReportActively(bool),
 }
 
-/// Bits 22 and 23 of a feedback's identifier.
+/// Mode in bits 22 and 23 of a feedback's identifier.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Mode {
     /// The shaft is free.
     Reset = 0,
-    /// It measures its encoder.
+    /// The encoder is being calibrated.
     Calibration = 1,
-    /// It obeys.
+    /// The motor follows commands.
     Run = 2,
 }
 
-/// Bits 16 to 21 of a feedback's identifier.
+/// Fault bits in bits 16 to 21 of a feedback's identifier.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Faults(pub u8);
 
 impl Faults {
-    /// Supply too low.
+    /// Supply voltage too low.
     pub const UNDER_VOLTAGE: u8 = 1;
-    /// Too much current in a phase.
+    /// Phase overcurrent.
     pub const OVER_CURRENT: u8 = 1 << 1;
-    /// Too hot.
+    /// Overtemperature.
     pub const OVER_TEMPERATURE: u8 = 1 << 2;
-    /// The magnetic encoder fails.
+    /// Failure of the magnetic encoder.
     pub const ENCODER: u8 = 1 << 3;
-    /// Blocked or overloaded.
+    /// Stalled or overloaded.
     pub const OVERLOAD: u8 = 1 << 4;
-    /// The encoder was never measured.
+    /// The encoder is not calibrated.
     pub const UNCALIBRATED: u8 = 1 << 5;
 }
 
-/// What a motor sends.
+/// A message from a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Answer {
     /// Type 0: its serial number.
     Identity {
-        /// Number of the motor.
+        /// ID of the motor.
         motor: u8,
-        /// Of its processor.
+        /// Serial number of its processor.
         serial: [u8; 8],
     },
-    /// Type 2, to every request but reads; or type 24, unasked.
+    /// Type 2: answer to every request except reads; type 24: unsolicited report.
     Feedback(Feedback),
     /// Type 17: a parameter.
     Parameter {
-        /// Number of the motor.
+        /// ID of the motor.
         motor: u8,
-        /// Which.
+        /// The parameter.
         parameter: Parameter,
-        /// What it holds.
+        /// Its value.
         value: Value,
     },
     /// Type 21: its fault and warning words.
     Fault {
-        /// Number of the motor.
+        /// ID of the motor.
         motor: u8,
-        /// What is wrong, bits as in the manual.
+        /// Fault bits, see the manual.
         faults: u32,
-        /// What soon is, bits as in the manual.
+        /// Warning bits, see the manual.
         warnings: u32,
     },
 }
 
-/// How a motor is and what it does.
+/// State and motion of a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Feedback {
-    /// Number of the motor.
+    /// ID of the motor.
     pub motor: u8,
-    /// Whether it came unasked (type 24).
+    /// Whether it is an unsolicited report (type 24).
     pub is_unsolicited: bool,
-    /// What it obeys.
+    /// Mode.
     pub mode: Mode,
-    /// What is wrong.
+    /// Fault bits.
     pub faults: Faults,
-    /// What it does.
+    /// Measured motion.
     pub motion: Motion,
-    /// Of the windings, tenths of a degree on the wire.
+    /// Temperature of the windings, degrees Celsius; tenths of a degree on the wire.
     pub winding_celsius: f64,
 }
 
-/// The frame of a request from host number `host` to motor `motor`.
+/// Encodes a request from the host ID `host` to the motor ID `motor`.
 pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -> Result<Frame, CanError> {
     let host_only = u16::from(host);
     let with_magic = |last: u8| [MAGIC[0], MAGIC[1], MAGIC[2], MAGIC[3], MAGIC[4], MAGIC[5], last, 8];
@@ -205,7 +206,7 @@ pub fn encode_request(host: u8, motor: u8, request: &Request, limits: &Limits) -
     Frame::classic(id_of(kind, middle, motor)?, &bytes)
 }
 
-/// Reads a request to move that is for motor `motor`: what a simulated motor gets.
+/// Decodes a motion command to the motor ID `motor`, for emulated motors.
 pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command> {
     let [a, b, c, d, e, f, g, h] = eight_bytes(frame, MESSAGE, true).ok()?;
     let [kind, t1, t0, to] = frame.id().value().to_be_bytes();
@@ -222,7 +223,7 @@ pub fn decode_move(frame: &Frame, motor: u8, limits: &Limits) -> Option<Command>
     })
 }
 
-/// Reads what a motor sends to host number `host`.
+/// Decodes a message from a motor to the host ID `host`.
 pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer, CanError> {
     let bytes = eight_bytes(frame, MESSAGE, true)?;
     let [kind, flags, motor, to] = frame.id().value().to_be_bytes();
@@ -266,7 +267,7 @@ pub fn decode_answer(frame: &Frame, host: u8, limits: &Limits) -> Result<Answer,
     Err(CanError::Undefined { field: "the communication type", raw: kind.into() })
 }
 
-/// The frame of a feedback to host number `host`, for motors that are simulated; the temperature must be 0 to 6553.5.
+/// Encodes the feedback of an emulated motor to the host ID `host`. The temperature must be 0 to 6553.5.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be within 16 bits first")]
 pub fn encode_feedback(host: u8, feedback: &Feedback, limits: &Limits) -> Result<Frame, CanError> {
     let scales = Scales::with_bits(limits, 16);
@@ -332,8 +333,8 @@ mod tests {
         let command =
             Command { position_rad: 1.5, velocity_rad_s: -3.0, kp_nm_rad: 60.0, kd_nm_s_rad: 1.25, torque_nm: 0.5 };
         let sent = encode_request(HOST, 5, &Request::Move(command), &LIMITS).expect("numbers");
-        let got = decode_move(&sent, 5, &LIMITS).expect("it is for it");
-        // Half a count of 16 bits each.
+        let got = decode_move(&sent, 5, &LIMITS).expect("the command is addressed to this motor");
+        // Half a raw unit of 16 bits each.
         assert!((got.position_rad - 1.5).abs() < 2e-4 && (got.velocity_rad_s + 3.0).abs() < 6e-4);
         assert!((got.kp_nm_rad - 60.0).abs() < 4e-3 && (got.kd_nm_s_rad - 1.25).abs() < 4e-5);
         assert!((got.torque_nm - 0.5).abs() < 3e-4);

@@ -1,39 +1,39 @@
-//! The linear map between SI and unsigned counts that MIT packing and Robstride share.
+//! Linear map between SI values and unsigned integers, shared by MIT packing and Robstride.
 //!
-//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`: count 0 is the
-//! lower end, the highest count the upper. Their samples cut the fraction off; we take the nearest count, of two equally near the
-//! lower one, so that 0 in a symmetric range is sent as the same bytes as theirs.
+//! Source: `float_to_uint` and `uint_to_float` of Ben Katz's mini cheetah firmware, as in `cmjang/DM_Control_Python`:
+//! 0 is the lower end of the range, the maximum integer the upper end. Their examples truncate. We round to the
+//! nearest integer, and halves down, so that 0 in a symmetric range has the same bytes as theirs.
 
 use super::CanError;
 
-/// What a field holds: a range and how many bits it is cut into.
+/// Range of a field, and the number of bits that encode it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Scale {
-    /// Value of count 0.
+    /// Value of raw 0.
     pub lower: f64,
-    /// Value of the highest count.
+    /// Value of the maximum raw integer.
     pub upper: f64,
-    /// Bits of the count, at most 16.
+    /// Number of bits, at most 16.
     pub n_bits: u32,
 }
 
 impl Scale {
-    /// A range that is as wide below zero as above.
+    /// A range that is symmetric about zero.
     pub const fn symmetric(max: f64, n_bits: u32) -> Self {
         Self { lower: -max, upper: max, n_bits }
     }
 
-    /// A range that begins at zero.
+    /// A range that starts at zero.
     pub const fn positive(max: f64, n_bits: u32) -> Self {
         Self { lower: 0.0, upper: max, n_bits }
     }
 
-    /// What one count more is worth.
+    /// Value of one raw unit.
     pub fn step(&self) -> f64 {
         (self.upper - self.lower) / self.max_raw()
     }
 
-    /// The nearest count; values outside are clamped, no number is refused in the name of `field`.
+    /// Converts to the nearest raw value. Values outside the range are clamped; NaN is an error that names `field`.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to at most 16 bits first")]
     pub fn raw_from_value(&self, field: &'static str, value: f64) -> Result<u16, CanError> {
         if value.is_nan() {
@@ -43,7 +43,7 @@ impl Scale {
         Ok((unit_interval * self.max_raw() - 0.5).ceil().clamp(0.0, self.max_raw()) as u16)
     }
 
-    /// The value of a count.
+    /// Converts a raw value.
     pub fn value_from_raw(&self, raw: u16) -> f64 {
         self.lower + f64::from(raw) * self.step()
     }
@@ -69,7 +69,7 @@ mod tests {
                 for _ in 0..10_000 {
                     let value = scale.lower + random.unit_interval() * (scale.upper - scale.lower);
                     let back = scale.value_from_raw(scale.raw_from_value("x", value).expect("a number"));
-                    // Half a step and the rounding of doubles.
+                    // Half a step, plus the rounding of doubles.
                     assert!((back - value).abs() <= scale.step() * (0.5 + 1e-9), "{value} {back}");
                 }
             }

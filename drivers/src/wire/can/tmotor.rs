@@ -1,13 +1,13 @@
 //! CubeMars (T-Motor) AK motors in MIT mode.
 //!
 //! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module Product Manual,
-//! MIT mode (feedback, temperature less 40). The limits belong to the firmware: newer ones list others for some models, so they
-//! are data and a rig may give its own.
+//! MIT mode (feedback, temperature offset of 40). The limits depend on the firmware: newer versions have others for
+//! some models.
 
 use super::mit::{self, Command, Limits, Motion};
 use super::{CanError, Frame, Id, decode_enum};
 
-/// A model whose limits are known.
+/// A model with known limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Model {
     /// AK10-9.
@@ -25,7 +25,7 @@ pub enum Model {
 }
 
 impl Model {
-    /// What its counts cover.
+    /// Ranges of its raw values.
     pub const fn limits(self) -> Limits {
         match self {
             Self::Ak10x9 => Limits::of(12.5, 50.0, 65.0),
@@ -38,35 +38,35 @@ impl Model {
     }
 }
 
-/// An order without numbers: seven bytes `FF` and this one.
+/// A state command: seven bytes `FF` and this one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StateCommand {
-    /// Obey commands from now on.
+    /// Enable the motor.
     Enable = 0xFC,
-    /// Let the shaft go.
+    /// Disable the motor; the shaft is free.
     Disable = 0xFD,
-    /// Take the present position as zero; the motor is deaf for about a second.
+    /// Set the current position as zero; the motor does not respond for about a second.
     SetZero = 0xFE,
 }
 
-/// What is wrong with a motor.
+/// Fault reported by a motor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Fault {
-    /// Nothing.
+    /// No fault.
     None = 0,
-    /// Too hot.
+    /// Overtemperature.
     OverTemperature = 1,
-    /// Too much current.
+    /// Overcurrent.
     OverCurrent = 2,
-    /// Supply too high.
+    /// Supply voltage too high.
     OverVoltage = 3,
-    /// Supply too low.
+    /// Supply voltage too low.
     UnderVoltage = 4,
-    /// The encoder fails.
+    /// Encoder failure.
     Encoder = 5,
-    /// The phases' currents differ; the hardware may be damaged.
+    /// Unbalanced phase currents; the hardware may be damaged.
     PhaseUnbalance = 6,
 }
 
@@ -82,46 +82,46 @@ impl Fault {
     ];
 }
 
-/// How a firmware counts its temperature.
+/// Encoding of the temperature, which depends on the firmware.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Thermometer {
-    /// Count 40 is 0 degrees Celsius: the manual.
+    /// The raw value is degrees Celsius plus 40, as in the manual.
     Offset40,
-    /// The count is degrees Celsius: what TMotorCANControl reads.
+    /// The raw value is degrees Celsius, as in TMotorCANControl.
     Plain,
 }
 
-/// The last two bytes of a feedback frame; firmware of 2020 and before leaves them out.
+/// The last two bytes of a feedback frame. Firmware of 2020 and earlier omits them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Health {
-    /// Of the drive, degrees Celsius.
+    /// Temperature of the drive, degrees Celsius.
     pub drive_celsius: f64,
-    /// What is wrong.
+    /// The fault.
     pub fault: Fault,
 }
 
-/// What a motor answers to every frame.
+/// Answer of a motor to every frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Feedback {
-    /// Number of the motor.
+    /// ID of the motor.
     pub motor: u8,
-    /// What it does.
+    /// Measured motion.
     pub motion: Motion,
-    /// How it is, where the firmware tells.
+    /// Temperature and fault, if the firmware reports them.
     pub health: Option<Health>,
 }
 
-/// The frame of a command to motor `motor`.
+/// Encodes a command to a motor.
 pub fn encode_command(motor: u8, command: &Command, limits: &Limits) -> Result<Frame, CanError> {
     Frame::classic(Id::standard(motor.into())?, &mit::encode(command, limits)?)
 }
 
-/// The frame of an order to motor `motor`.
+/// Encodes a state command to a motor.
 pub fn encode_state_command(motor: u8, state_command: StateCommand) -> Result<Frame, CanError> {
     Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
 }
 
-/// Reads a motor's answer, of six or eight bytes.
+/// Decodes a motor's answer of six or eight bytes.
 pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer) -> Result<Feedback, CanError> {
     const MESSAGE: &str = "feedback of an AK motor";
     if frame.is_remote() || frame.id().is_extended() {
@@ -142,7 +142,7 @@ pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer)
     Ok(Feedback { motor, motion: mit::decode_motion(motion, limits), health })
 }
 
-/// A motor's answer, for motors that are simulated; it goes to the host's identifier `host`, 0 by default.
+/// Encodes the answer of an emulated motor. Its identifier is the host's `host`, by default 0.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be 0 to 255 first")]
 pub fn encode_feedback(
     host: u8,
@@ -213,8 +213,8 @@ mod tests {
         }
         let undefined = CanError::Undefined { field: "the error code", raw: 7 };
         assert_eq!(read(&frame(&[1, 0, 0, 0, 0, 0, 0, 7])), Err(undefined));
-        let identifier = Frame::remote(complete.id(), 8).expect("classic");
-        assert!(matches!(read(&identifier), Err(CanError::UnexpectedFrame { .. })));
+        let remote = Frame::remote(complete.id(), 8).expect("classic");
+        assert!(matches!(read(&remote), Err(CanError::UnexpectedFrame { .. })));
         let too_hot = Feedback {
             health: Some(Health { drive_celsius: 216.0, fault: Fault::None }),
             ..read(&complete).expect("whole")

@@ -1,4 +1,4 @@
-//! Messages and motion commands from anyone, to a played robot.
+//! Fuzz target: arbitrary messages and motion commands to an emulated robot.
 
 use super::super::{CommandedJoints, JointSimulator, Joints, Limits, RobotConfig};
 use super::{Client, N_JOINTS, Robot, Server};
@@ -12,25 +12,25 @@ use std::time::Duration;
 
 static CHAIN: LazyLock<Chain> = LazyLock::new(|| {
     let urdf = include_str!("../../../../../kinematics/tests/data/panda.urdf");
-    Chain::from_urdf(urdf, "link0", "link8").expect("a robot's description")
+    Chain::from_urdf(urdf, "link0", "link8").expect("the URDF is valid")
 });
 const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
 /// Number of the first state.
 pub(crate) const FIRST: u64 = 1_000_000;
-/// So many milliseconds may pass in all where nothing is sent: a step takes 0.1 ms.
+/// Maximum number of milliseconds to simulate without a client action; a step takes 0.1 ms.
 const MAX_STEPS: u16 = 500;
 
-/// What a client does, one record behind the other: a byte that says what, a length in two, little-endian, and as many bytes.
+/// Executes concatenated client actions. Each starts with one byte kind and two bytes length, little-endian.
 ///
-/// Kind 0 goes over TCP, kind 1 is a motion command over UDP, of kind 2 the length is how many milliseconds pass. Wherever the
-/// joints are wanted, they got there within their limits.
+/// Kind 0 sends that many bytes over TCP. Kind 1 sends them as a motion command over UDP. Kind 2 lets `length`
+/// milliseconds pass. Checks that every commanded joint position was reached within the limits.
 pub fn client(bytes: &[u8]) {
     for version in [FciVersion::V5, FciVersion::V10] {
         commanded(version, bytes);
     }
 }
 
-/// Where the joints are wanted after that, see [`client`]; at first they rest at angles of their own.
+/// Commanded joints before and after the actions, see [`client`].
 pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoints, CommandedJoints) {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
     let mut server = server(version, limits.clone());
@@ -47,7 +47,7 @@ pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoin
         } else {
             let (sent, rest) = bytes.split_at(bytes.len().min(length.into()));
             bytes = rest;
-            // A server that has hung up, or will not have more, is what a client has to live with.
+            // Writes may fail if the server disconnected or its buffers are full, as for any client.
             let _ = match kind % 3 {
                 0 => stream.write(sent),
                 _ => commands.send(sent),
@@ -64,7 +64,7 @@ pub(crate) fn commanded(version: FciVersion, mut bytes: &[u8]) -> (CommandedJoin
     (first, server.robot.commanded)
 }
 
-/// A robot whose joints are where they are wanted.
+/// A robot whose joints follow their commands perfectly.
 fn server(version: FciVersion, limits: Limits) -> Server {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
     let states = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
@@ -80,7 +80,7 @@ fn server(version: FciVersion, limits: Limits) -> Server {
     Server { listener, states, robot, joint_simulator, client: None, stop: Arc::default() }
 }
 
-/// A client that the server has taken, and its socket for commands.
+/// A client accepted by the server, and its socket for commands.
 fn connect(server: &mut Server) -> Option<(TcpStream, UdpSocket)> {
     let stream = TcpStream::connect(server.listener.local_addr().ok()?).ok()?;
     stream.set_nonblocking(true).ok()?;
@@ -96,7 +96,7 @@ fn connect(server: &mut Server) -> Option<(TcpStream, UdpSocket)> {
     None
 }
 
-/// Takes what the server sent, so that its answers find room.
+/// Reads what the server sent, so that its replies do not fill the buffer.
 fn drain(stream: &mut TcpStream) {
     let mut buffer = [0; 4096];
     loop {
@@ -108,7 +108,7 @@ fn drain(stream: &mut TcpStream) {
     }
 }
 
-/// Angles are numbers, and no further on than a joint may turn in a millisecond.
+/// Checks that positions are finite and change no more than the velocity limits allow in a millisecond.
 fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
     for ix in 0..N_JOINTS {
         let moved_rad = (now.position_rad[ix] - before.position_rad[ix]).abs();
@@ -125,7 +125,7 @@ pub(crate) mod tests {
     use zerocopy::IntoBytes;
     use zerocopy::little_endian::{F64, U64};
 
-    /// States of a robot whose joints turn a little from each to the next.
+    /// States of a robot whose joints move a little from each state to the next.
     pub(crate) fn state_datagrams(version: FciVersion, n: u32) -> Vec<Vec<u8>> {
         let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
         let mut server = server(version, limits);
@@ -148,7 +148,8 @@ pub(crate) mod tests {
         record(0, &bytes)
     }
 
-    /// A client that connects, sets a threshold, moves the joints a little and says goodbye: records as [`client`] takes them.
+    /// A client that connects, sets a threshold, moves the joints a little and waits: records in the format of
+    /// [`client`].
     pub(crate) fn example_traffic(version: FciVersion) -> Vec<Vec<u8>> {
         let (number, connect, collision, begin, n_begin) = match version {
             FciVersion::V5 => (
@@ -168,10 +169,10 @@ pub(crate) mod tests {
         };
         let mut records = vec![message(connect, &[number.to_le_bytes(), [1, 2]].concat())];
         records.push(message(collision, &[0x40; size_of::<v10::SetCollisionBehaviorRequest>()]));
-        // Joint impedance and joint positions are the first of their kinds in both versions.
+        // Joint impedance and joint positions have number 0 in both versions.
         records.push(message(begin, &vec![0; n_begin]));
         for step in 0..12_u32 {
-            // Within the jerk that both allow: a third of a microradian a cube of milliseconds.
+            // Within the jerk limits of both robots: a third of a microradian per cubic millisecond.
             let offset_rad = 3e-7 * f64::from(step.pow(3)) / 6.0;
             records.push(record(1, &command(version, FIRST + 2 + u64::from(step), offset_rad)));
         }
@@ -201,8 +202,8 @@ pub(crate) mod tests {
         for version in crate::franka::fuzz::tests::VERSIONS {
             let records = example_traffic(version);
             let (first, last) = commanded(version, &records.concat());
-            assert_ne!(first.position_rad, last.position_rad, "the motion that is spoilt below: {version:?}");
-            // Without the record that begins the motion, in any order, cut off or doubled.
+            assert_ne!(first.position_rad, last.position_rad, "the motion that is corrupted below: {version:?}");
+            // Without the record that starts the motion: in any order, truncated or duplicated.
             for round in 0..30 {
                 let mut corrupted: Vec<_> = records.iter().filter(|record| **record != records[2]).cloned().collect();
                 random.shuffle(&mut corrupted);

@@ -1,4 +1,5 @@
-//! Numbers of the endpoints that set an axis' watchdog: they differ by firmware, and the maker publishes a file for each.
+//! Numbers of the endpoints that configure an axis' watchdog. They depend on the firmware; ODrive publishes a file
+//! for each version.
 //!
 //! Source: ODrive CAN protocol page, "Arbitrary parameter access"; `odriverobotics/ODriveResources` `can_restore_config.py`, which
 //! compares `fw_version` and `hw_version` of `flat_endpoints.json` with the axis' own (`Get_Version`) before it writes anything.
@@ -6,28 +7,28 @@
 use serde::Deserialize;
 use std::collections::BTreeMap;
 
-/// What of a firmware's `flat_endpoints.json` is needed to move an axis.
+/// The endpoints of a firmware's `flat_endpoints.json` that are needed to move an axis.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Endpoints {
-    /// Version of the firmware that it is of, "0.6.10" for instance.
+    /// Firmware version, for instance "0.6.10".
     pub firmware: String,
-    /// Version of the hardware that it is of: product line, version and variant.
+    /// Hardware version: product line, version and variant.
     pub hardware: String,
-    /// Seconds without a command until the axis lets go, a real number.
+    /// Endpoint of the watchdog timeout in seconds, a float.
     pub watchdog_timeout: u16,
-    /// Whether it does so at all, one byte.
+    /// Endpoint that enables the watchdog, one byte.
     pub enable_watchdog: u16,
 }
 
-/// A text that is not such a file.
+/// The text is not a valid `flat_endpoints.json`.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum EndpointsError {
-    /// It is another kind of text.
-    #[error("it is no flat_endpoints.json of ODrive: {0}")]
+    /// The text is not JSON of the expected form.
+    #[error("not a flat_endpoints.json of ODrive: {0}")]
     Malformed(#[from] serde_json::Error),
-    /// An endpoint is not in it, or has another type.
-    #[error("it has no endpoint {name:?} of the type {kind}")]
+    /// An endpoint is missing, or has another type.
+    #[error("endpoint {name:?} of type {kind} is missing")]
     Missing {
         /// Path of the endpoint.
         name: &'static str,
@@ -51,7 +52,7 @@ struct Endpoint {
 }
 
 impl Endpoints {
-    /// Reads the text of a `flat_endpoints.json`.
+    /// Parses the text of a `flat_endpoints.json`.
     pub fn parse(text: &str) -> Result<Self, EndpointsError> {
         let flat: Flat = serde_json::from_str(text)?;
         let number = |name: &'static str, kind: &'static str| {
@@ -63,7 +64,7 @@ impl Endpoints {
         Ok(Self { firmware: flat.fw_version, hardware: flat.hw_version, watchdog_timeout, enable_watchdog })
     }
 
-    /// Whether they are of an axis that tells these versions.
+    /// Whether the endpoints are valid for an axis that reports these versions.
     pub fn match_versions(&self, hardware: [u8; 3], firmware: [u8; 3]) -> bool {
         let dotted = |version: [u8; 3]| version.map(|part| part.to_string()).join(".");
         self.firmware == dotted(firmware) && self.hardware == dotted(hardware)

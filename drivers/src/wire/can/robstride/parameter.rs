@@ -1,32 +1,32 @@
-//! Parameters of Robstride motors: their table, and the bytes that hold them.
+//! Parameters of Robstride motors and the encoding of their values.
 //!
-//! Sources: as of the frames, in the module above.
+//! Sources: see the parent module.
 
 use super::super::{CanError, decode_enum};
 
-/// Counts of `canTimeout` a second.
+/// Ticks of `canTimeout` per second.
 const TIMEOUT_TICKS_HZ: f64 = 20_000.0;
-/// A parameter that this program reads or writes.
+/// A parameter that we read or write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u16)]
 pub enum Parameter {
-    /// `run_mode`: 0 obeys motion commands.
+    /// `run_mode`: 0 is motion mode.
     RunMode = 0x7005,
     /// `limit_torque`, N m.
     TorqueLimit = 0x700B,
     /// `limit_cur`, A.
     CurrentLimit = 0x7018,
-    /// `mechPos`: the output shaft, rad; read only.
+    /// `mechPos`: position of the output shaft, rad; read only.
     Position = 0x7019,
-    /// `mechVel`: the output shaft, rad/s; read only.
+    /// `mechVel`: velocity of the output shaft, rad/s; read only.
     Velocity = 0x701B,
-    /// `VBUS`: supply, V; read only.
+    /// `VBUS`: supply voltage, V; read only.
     Supply = 0x701C,
     /// `loc_kp`: stiffness of the motor's own position mode.
     PositionGain = 0x701E,
-    /// `EPScan_time`: how often the motor reports by itself, 1 is every 10 ms and each more 5 ms longer.
+    /// `EPScan_time`: interval of unsolicited reports. 1 is 10 ms; each further unit adds 5 ms.
     ReportInterval = 0x7026,
-    /// `canTimeout`: how long it obeys its last command, 20 000 a second; 0 is for ever.
+    /// `canTimeout`: time without commands after which the motor stops, 20 000 ticks per second; 0 means never.
     Timeout = 0x7028,
 }
 
@@ -43,7 +43,7 @@ impl Parameter {
         Self::Timeout,
     ];
 
-    /// How many bytes of a whole number it holds; `None` where it is a real one.
+    /// Size of an integer value in bytes; `None` for floating-point values.
     fn integer_bytes(self) -> Option<usize> {
         match self {
             Self::RunMode => Some(1),
@@ -53,12 +53,12 @@ impl Parameter {
         }
     }
 
-    /// The parameter of an index.
+    /// The parameter with this index.
     pub(super) fn of_index(index: u16) -> Result<Self, CanError> {
         decode_enum("the parameter", index.into(), &Self::ALL, |known| known as u32)
     }
 
-    /// What the last four bytes of a message about it hold.
+    /// Decodes the value in the last four bytes of a message.
     pub(super) fn value(self, [a, b, c, d]: [u8; 4]) -> Value {
         match self.integer_bytes() {
             Some(1) => Value::Integer(a.into()),
@@ -68,7 +68,7 @@ impl Parameter {
         }
     }
 
-    /// The last four bytes of a message that sets it.
+    /// Encodes a value as the last four bytes of a message.
     pub(super) fn value_bytes(self, value: Value) -> Result<[u8; 4], CanError> {
         match (self.integer_bytes(), value) {
             (Some(n_bytes), Value::Integer(whole)) if n_bytes == 4 || whole < 1 << (8 * n_bytes) => {
@@ -79,29 +79,30 @@ impl Parameter {
         }
     }
 
-    /// A message about it.
+    /// Payload of a message about this parameter.
     pub(super) fn bytes(self, [a, b, c, d]: [u8; 4]) -> [u8; 8] {
         let [low, high] = (self as u16).to_le_bytes();
         [low, high, 0, 0, a, b, c, d]
     }
 }
 
-/// What a parameter holds.
+/// Value of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value {
-    /// In parameters of codes and ticks.
+    /// Integer, for codes and ticks.
     Integer(u32),
-    /// In parameters of SI values.
+    /// Floating-point number, for SI values.
     Float(f32),
 }
 
-/// The value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops earlier than asked for; 0 never stops it.
+/// Value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops too early; 0 disables the timeout.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
 pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
     let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;
     match (0.0..=upper).contains(&timeout_secs) {
         true if timeout_secs == 0.0 => Ok(Value::Integer(0)),
-        // Less a hair, so that whole ticks stay what they are; never 0, which would be for ever.
+        // Subtract a small amount so that rounding errors do not add a tick. Never return 0, which would disable the
+        // timeout.
         true => Ok(Value::Integer((timeout_secs * TIMEOUT_TICKS_HZ - 1e-6).ceil().max(1.0) as u32)),
         false => Err(CanError::Range { field: "the timeout in seconds", value: timeout_secs, lower: 0.0, upper }),
     }
