@@ -18,7 +18,7 @@ impl std::fmt::Display for RecordedSpan {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.n_samples {
             0 => f.write_str("no samples were saved"),
-            n_samples => write!(f, "which keeps the first {:.1} s ({n_samples} samples)", self.seconds),
+            n_samples => write!(f, "the first {:.1} s ({n_samples} samples) are saved", self.seconds),
         }
     }
 }
@@ -84,7 +84,7 @@ pub enum Error {
         waited: Duration,
     },
     /// An arm did not deliver joint states in time.
-    #[error("arm: no joint readings within {waited:?}")]
+    #[error("arm: no joint states within {waited:?}")]
     NoJoints {
         /// Time spent waiting.
         waited: Duration,
@@ -132,7 +132,7 @@ pub enum Error {
         reason: String,
     },
     /// An arm cannot be moved, or not as requested.
-    #[error("the arm is not moved: {reason}")]
+    #[error("the arm cannot be moved: {reason}")]
     Motion {
         /// Description of the problem.
         reason: String,
@@ -244,7 +244,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// A recording without samples of a rig.
-    #[error("the recording {path:?} holds no images or joint readings of this program")]
+    #[error("the recording {path:?} contains no images or joint states recorded by this program")]
     EmptyRecording {
         /// The file.
         path: PathBuf,
@@ -256,7 +256,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// Writing a recording failed, for example because the disk is full.
-    #[error("cannot write the recording {path:?}, {recorded}")]
+    #[error("cannot write the recording {path:?}: {recorded}")]
     Record {
         /// The file.
         path: PathBuf,

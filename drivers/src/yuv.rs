@@ -340,7 +340,7 @@ mod tests {
                 std::hint::black_box(rgb(layout, colors, [1920, 1080], std::hint::black_box(&data)));
                 began.elapsed()
             });
-            eprintln!("{layout:?} 1920x1080: {:.2?} at best", best.min().expect("20 runs"));
+            eprintln!("{layout:?} 1920x1080: minimum {:.2?}", best.min().expect("20 runs"));
         }
     }
 }

@@ -97,14 +97,14 @@ impl Bench {
                         torque_nm: 0.0,
                     });
                     if let Some((_, BusEvent::Frame(frame))) = &arrived {
-                        sent.extend(motor.take(frame).expect("the swing fits"));
+                        sent.extend(motor.take(frame).expect("the motion is within range"));
                     }
-                    sent.extend(motor.report(now).expect("the swing fits"));
+                    sent.extend(motor.report(now).expect("the motion is within range"));
                     if let Family::TMotor { motor: number, model } = config.family
                         && commanded.contains(&number)
                     {
                         let command = tmotor::encode_command(number, &MitCommand::default(), &model.limits());
-                        sent.extend(motor.take(&command.expect("zeros")).expect("the swing fits"));
+                        sent.extend(motor.take(&command.expect("zeros")).expect("the motion is within range"));
                     }
                 }
                 for frame in sent {
@@ -230,7 +230,7 @@ fn joints_are_read_from_motors_of_all_families() {
         for (ix, half_count) in half_counts.iter().enumerate() {
             let error_rad = (state.position[ix] - rest_rad(ix)).abs();
             min_error[ix] = min_error[ix].min(error_rad);
-            assert!(error_rad < half_count + MAX_EXTRAPOLATED_RAD, "{}: off by {error_rad} rad", motors[ix].joint);
+            assert!(error_rad < half_count + MAX_EXTRAPOLATED_RAD, "{}: error {error_rad} rad", motors[ix].joint);
         }
     }
     for (ix, error_rad) in min_error.iter().enumerate() {

@@ -508,7 +508,7 @@ mod tests {
                 std::hint::black_box(alignment.align(std::hint::black_box(&depth)).expect("depth"));
                 began.elapsed()
             });
-            eprintln!("640x480 to {color_px:?}, {lens:?}: {:.2?} at best", best.min().expect("50 runs"));
+            eprintln!("640x480 to {color_px:?}, {lens:?}: minimum {:.2?}", best.min().expect("50 runs"));
         }
     }
 }

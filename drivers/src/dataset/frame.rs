@@ -84,7 +84,7 @@ impl DatasetFrame {
         let DynamicImage::ImageLuma16(counts) = decode_file(&file.path)? else {
             return Err(Error::NotDepth { path: file.path.clone() });
         };
-        #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
+        #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
         let meters_from_count = |count: &u16| (f64::from(*count) * file.meters_per_count) as f32;
         Ok(DepthImage {
             intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),

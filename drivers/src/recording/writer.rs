@@ -365,7 +365,7 @@ mod tests {
         let error = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
         let Error::Record { recorded, .. } = error else { panic!("{error}") };
         let expected_end =
-            format!("run.mcap\", which keeps the first {:.1} s ({} samples)", recorded.seconds, recorded.n_samples);
+            format!("run.mcap\": the first {:.1} s ({} samples) are saved", recorded.seconds, recorded.n_samples);
         assert!(error.to_string().ends_with(&expected_end), "{error}");
         let io_error = std::error::Error::source(&error).map(ToString::to_string);
         assert!(io_error.is_some_and(|io_error| io_error.contains("no storage space")), "{error:?}");
