@@ -8,7 +8,7 @@ use std::ops::Range;
 
 /// Value of a pixel that no square covers: larger than any count minus one.
 pub(super) const NO_DEPTH: u16 = u16::MAX;
-/// Squares one, two, three and four columns wide each have a strip. Wider ones are rare and are written column by column.
+/// Squares one to four columns wide each have a strip. Wider ones are rare and are written column by column.
 const MAX_STRIPS: usize = 4;
 /// Padding before the first column of a strip.
 const PAD: usize = MAX_STRIPS;

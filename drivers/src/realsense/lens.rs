@@ -1,6 +1,7 @@
 //! Converts lens parameters from and to those of librealsense2.
 //!
-//! Source: `include/librealsense2/rsutil.h` of 2.56, functions `rs2_project_point_to_pixel` and `rs2_deproject_pixel_to_point`.
+//! Source: `include/librealsense2/rsutil.h` of 2.56, functions `rs2_project_point_to_pixel` and
+//! `rs2_deproject_pixel_to_point`.
 //! In the library, the center of the first pixel is (0, 0); here it is (0.5, 0.5).
 
 use super::Problem;

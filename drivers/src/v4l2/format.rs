@@ -183,8 +183,8 @@ pub(super) fn rank(format: V4l2Format) -> usize {
 /// USB bandwidth for one camera in bytes per second at the speed reported by sysfs: the largest isochronous transfer of
 /// an endpoint.
 ///
-/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in 125 us), USB 3.2 section 8.12.6
-/// (48 KiB in 125 us; twice that at 10 Gbit/s).
+/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in 125 us), USB 3.2
+/// section 8.12.6 (48 KiB in 125 us; twice that at 10 Gbit/s).
 pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     match mbits {
         mbits if mbits < 480.0 => 1023.0 * 1e3,

@@ -97,7 +97,7 @@ impl BagWriter {
     /// Starts a file. An existing file of that name is replaced.
     pub fn create(path: &Path, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
-        let _ = std::fs::remove_file(path); // Usually missing. If removal fails, the library reports that it cannot write.
+        let _ = std::fs::remove_file(path); // Usually missing. If removal fails, the library reports an error.
         let _guard = device_creation_lock();
         // SAFETY: the device is checked and then owned here; sensors and profiles live as long as the device.
         let device = unsafe {
