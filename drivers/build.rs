@@ -1,4 +1,5 @@
-//! Tells this crate's tests where a fetched RealSense library lies; binaries of other packages say it in their own build script.
+//! Sets the search path of a downloaded RealSense library for tests of this crate. Binaries of other packages do the
+//! same in their build scripts.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

@@ -98,8 +98,8 @@ class Trial:
             expect("No space left" in said, f"no recording: {said[-1500:]}")
             return "no room for a single sample"
         read = self.fieldrig("export", recording, "--to", "nerfstudio", "--out", self.folder / "read", codes=(0, 1, 3))
-        cut_off = re.search(r"cut off after (\d+) readable samples", read.stderr)
-        if "no keyframe to export" in read.stderr and "keeps the first" in said:
+        cut_off = re.search(r"truncated after (\d+) readable samples", read.stderr)
+        if "no keyframe to export" in read.stderr and "samples) are saved" in said:
             return "room for joint states, not for an image"
         if not cut_off:
             expect(read.returncode == 0, read.stderr[-1500:])

@@ -495,7 +495,7 @@ fn full_disk_during_recording_is_a_loss() {
         .expect("sh starts");
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(3), "{printed}");
-    assert!(printed.contains("cut.mcap\", which keeps the first") && printed.contains("too large"), "{printed}");
+    assert!(printed.contains("cut.mcap\": the first") && printed.contains("too large"), "{printed}");
 }
 
 #[test]

@@ -1,15 +1,15 @@
-//! The monotonic clock that all stamps are on.
+//! The monotonic clock of all stamps.
 
 use kinematics::Stamp;
 use std::time::Duration;
 
-/// Now, on the kernel's `CLOCK_MONOTONIC`: the clock of every program on this computer, and of V4L2's images.
+/// Current time of the kernel's `CLOCK_MONOTONIC`. All programs on this computer and V4L2 images use this clock.
 #[cfg(unix)]
 pub fn now() -> Stamp {
     read(rustix::time::ClockId::Monotonic)
 }
 
-/// Now, on a clock that also counts while the computer sleeps: for what must be noticed after that, and nothing else.
+/// Current time of a clock that includes suspend. Use it only to detect that the computer was suspended.
 #[cfg(target_os = "linux")]
 pub(crate) fn now_including_suspend() -> Stamp {
     read(rustix::time::ClockId::Boottime)
@@ -22,7 +22,7 @@ fn read(clock: rustix::time::ClockId) -> Stamp {
     Stamp(now.tv_sec.saturating_mul(NANOS_PER_SEC).saturating_add(now.tv_nsec))
 }
 
-/// How long processors have worked for this process so far; `None` where the system is not asked.
+/// CPU time that this process has used so far, or `None` on platforms where it is not implemented.
 #[cfg(unix)]
 pub fn process_cpu_time() -> Option<Duration> {
     let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
@@ -30,13 +30,13 @@ pub fn process_cpu_time() -> Option<Duration> {
     Some(Duration::from_secs(secs) + Duration::from_nanos(nanos))
 }
 
-/// How long processors have worked for this process so far; `None` where the system is not asked.
+/// CPU time that this process has used so far, or `None` on platforms where it is not implemented.
 #[cfg(not(unix))]
 pub fn process_cpu_time() -> Option<Duration> {
     None
 }
 
-/// Now, since this was first asked for: a clock of this program alone, where there is no other.
+/// Time since the first call. This clock is not shared with other programs.
 #[cfg(not(unix))]
 pub fn now() -> Stamp {
     static BEGAN: std::sync::OnceLock<std::time::Instant> = std::sync::OnceLock::new();

@@ -1,4 +1,4 @@
-//! From the bytes of a device to plain pixels and metres.
+//! Decodes device data to plain pixels and meters.
 
 use crate::{Error, Image, PixelFormat, jpeg, yuv};
 use image::error::{DecodingError, ImageFormatHint};
@@ -7,7 +7,7 @@ use std::borrow::Cow;
 use std::io::Cursor;
 
 impl PixelFormat {
-    /// Bytes of a row without padding, and how many rows of that length an image has; `None` for compressed ones.
+    /// Bytes per row without padding, and number of rows of that length; `None` for compressed formats.
     pub(crate) fn raw_size(self, size_px: [u32; 2]) -> Option<[usize; 2]> {
         let [width, height] = size_px.map(|side| side as usize);
         let bytes_per_pixel = match self {
@@ -27,7 +27,7 @@ impl Image {
         matches!(self.format, PixelFormat::DepthU16 { .. })
     }
 
-    /// Decodes a colour image to `[height, width, 3]`, sRGB; grey becomes equal parts of red, green and blue.
+    /// Decodes a color image to `[height, width, 3]`, sRGB. Gray images get equal red, green and blue.
     pub fn decode_rgb(&self) -> Result<Vec<u8>, Error> {
         match self.format {
             PixelFormat::Rgb8 => self.raw_bytes().map(<[u8]>::to_vec),
@@ -44,16 +44,13 @@ impl Image {
         }
     }
 
-    /// Decodes a depth image to `[height, width]`, metres along the camera's z axis; 0 where the sensor saw nothing. The
-    /// largest count says that the reading was larger still: nothing is known there either.
+    /// Decodes a depth image to `[height, width]`, meters along the camera's z axis; 0 if the depth is unknown. The
+    /// largest count means out of range and is also unknown.
     pub fn decode_depth_m(&self) -> Result<Vec<f32>, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = self.format else {
             return Err(self.wrong_kind("depth"));
         };
-        #[expect(
-            clippy::cast_possible_truncation,
-            reason = "16-bit counts keep more digits in f32 than the sensor has"
-        )]
+        #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than the sensor")]
         let meters_from_count = |count: &[u8]| match u16::from_le_bytes([count[0], count[1]]) {
             u16::MAX => 0.0,
             count => (f64::from(count) * meters_per_count) as f32,
@@ -61,10 +58,13 @@ impl Image {
         Ok(self.raw_bytes()?.chunks_exact(2).map(meters_from_count).collect())
     }
 
-    /// Takes the padding away that a device leaves behind each row and behind the last one.
+    /// Removes the padding that a device adds after each row and after the last one.
     ///
-    /// `bytes_per_line` is the distance between the starts of two rows (`bytesperline` of V4L2; rows of colour differences
-    /// lie as far apart). Fails when it is shorter than a row or the data ends before the last row does; compressed images stay.
+    /// `bytes_per_line` is the distance between the starts of two rows (`bytesperline` of V4L2; chroma rows have the
+    /// same stride). Compressed images are returned unchanged.
+    ///
+    /// # Errors
+    /// If `bytes_per_line` is shorter than a row, or the data ends before the last row.
     pub fn pack_rows(mut self, bytes_per_line: usize) -> Result<Self, Error> {
         let Some([row_bytes, n_rows]) = self.format.raw_size(self.size_px) else { return Ok(self) };
         let last_row = bytes_per_line.saturating_mul(n_rows.saturating_sub(1));
@@ -82,7 +82,7 @@ impl Image {
         Ok(self)
     }
 
-    /// The data of an uncompressed image once its length is checked.
+    /// Data of an uncompressed image, after checking its length.
     pub(crate) fn raw_bytes(&self) -> Result<&[u8], Error> {
         let expected_bytes = self
             .format
@@ -104,7 +104,7 @@ impl Image {
         let (camera, stamp) = (self.camera.to_string(), self.stamp);
         let decode = |expected_px: [u32; 2]| {
             let file = first_complete(&self.data, format)?;
-            // Looked at before: a few bytes can say that a picture is large, and take seconds.
+            // Check the size first: a few bytes can declare a huge image that takes seconds to decode.
             let got_px: [u32; 2] = ImageReader::with_format(Cursor::new(&*file), format).into_dimensions()?.into();
             let is_expected = got_px == expected_px;
             let rgb = is_expected.then(|| image::load_from_memory_with_format(&file, format)).transpose()?;
@@ -122,8 +122,8 @@ impl Image {
     }
 }
 
-/// Decodes an image of a format that is given or guessed. Of a JPEG the first whole image in the bytes is taken: one that is
-/// cut off is an error, where decoders fill up with grey.
+/// Decodes an image of a given or guessed format. From JPEG data, the first complete image is used; a truncated one is
+/// an error, whereas decoders fill the missing part with gray.
 pub(crate) fn decode_complete(bytes: &[u8], format: Option<ImageFormat>) -> Result<DynamicImage, ImageError> {
     let format = format.map_or_else(|| image::guess_format(bytes), Ok)?;
     image::load_from_memory_with_format(&first_complete(bytes, format)?, format)
@@ -133,7 +133,7 @@ fn first_complete(bytes: &[u8], format: ImageFormat) -> Result<Cow<'_, [u8]>, Im
     if format != ImageFormat::Jpeg {
         return Ok(bytes.into());
     }
-    let no_image = |why| ImageError::Decoding(DecodingError::new(ImageFormatHint::Exact(format), why));
+    let no_image = |reason| ImageError::Decoding(DecodingError::new(ImageFormatHint::Exact(format), reason));
     jpeg::first_image(bytes).map_err(no_image)
 }
 
@@ -158,7 +158,7 @@ mod tests {
     fn file_of(format: ImageFormat, [width, height]: [u32; 2], rgb: &[u8]) -> Vec<u8> {
         let mut file = std::io::Cursor::new(Vec::new());
         image::write_buffer_with_format(&mut file, rgb, width, height, image::ExtendedColorType::Rgb8, format)
-            .expect("a small picture");
+            .expect("a small image");
         file.into_inner()
     }
 
@@ -171,13 +171,13 @@ mod tests {
         let rgb: Vec<u8> = (0..3 * 64 * 64).map(|ix: u32| (ix * ix % 251) as u8).collect();
         let complete = file_of(ImageFormat::Jpeg, [64, 64], &rgb);
         let decode = |data: &[u8]| image(PixelFormat::Jpeg, [64, 64], data).decode_rgb();
-        assert_eq!(decode(&complete).expect("whole").len(), rgb.len());
-        assert!(decode(&[&complete[..], b"what a camera appends"].concat()).is_ok());
+        assert_eq!(decode(&complete).expect("complete").len(), rgb.len());
+        assert!(decode(&[&complete[..], b"bytes appended by a camera"].concat()).is_ok());
         for n_bytes in [complete.len() - 2, complete.len() * 9 / 10, complete.len() / 2, 20, 3, 0] {
-            let error = decode(&complete[..n_bytes]).expect_err("cut off");
+            let error = decode(&complete[..n_bytes]).expect_err("truncated");
             assert!(matches!(error, Error::Undecodable { .. }), "{n_bytes}: {error}");
         }
-        // A thumbnail among the first segments ends, the image does not.
+        // A thumbnail in the first segments has an end marker, but the image does not.
         let mut with_thumbnail = [&complete[..2], &[0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9], &complete[2..]].concat();
         assert!(decode(&with_thumbnail).is_ok());
         with_thumbnail.truncate(complete.len() - 100);
@@ -213,9 +213,9 @@ mod tests {
                     let bytes_per_line = row_bytes + padding;
                     let pack = |data: &[u8]| image(format, size_px, data).pack_rows(bytes_per_line);
                     assert_eq!(&*pack(&padded).expect("padded").data, tight, "{format:?} {size_px:?} {padding}");
-                    // Devices may leave the padding of the last row out, and may send more than they fill.
+                    // Devices may omit the padding of the last row, and may send more bytes than they fill.
                     assert_eq!(&*pack(&padded[..padded.len() - padding]).expect("no last padding").data, tight);
-                    assert_eq!(&*pack(&[&padded[..], &[0; 99]].concat()).expect("a page more").data, tight);
+                    assert_eq!(&*pack(&[&padded[..], &[0; 99]].concat()).expect("an extra page").data, tight);
                     let short = pack(&padded[..padded.len() - padding - 1]);
                     assert!(matches!(short, Err(Error::ImageLength { .. })), "{format:?} {size_px:?} {padding}");
                     let narrow = image(format, size_px, &padded).pack_rows(row_bytes - 1);
@@ -226,7 +226,7 @@ mod tests {
                 assert!(matches!(rejected, Some(Error::ImageLength { .. })), "{format:?} {size_px:?}");
             }
         }
-        assert_eq!(image(nv12, [5, 3], &[0; 30]).decode_rgb().expect("three rows and two of differences").len(), 45);
+        assert_eq!(image(nv12, [5, 3], &[0; 30]).decode_rgb().expect("three rows of luma and two of chroma").len(), 45);
     }
 
     #[test]
@@ -241,15 +241,16 @@ mod tests {
 
     #[test]
     fn broken_images_report_camera_and_cause() {
-        let cut = image(PixelFormat::Jpeg, [2, 1], &[0xff, 0xd8, 0xff]).decode_rgb().expect_err("cut off").to_string();
+        let cut =
+            image(PixelFormat::Jpeg, [2, 1], &[0xff, 0xd8, 0xff]).decode_rgb().expect_err("truncated").to_string();
         assert!(cut.contains("wrist") && cut.contains("does not decode"), "{cut}");
         let short = image(PixelFormat::Rgb8, [2, 1], &[1, 2, 3]).decode_rgb();
         assert!(matches!(short, Err(Error::ImageLength { got_bytes: 3, expected_bytes: 6, .. })));
         let other_size = image(PixelFormat::Png, [2, 2], &png_of([2, 1], &[0; 6])).decode_rgb();
         assert!(matches!(other_size, Err(Error::ImageSize { got_px: [2, 1], .. })));
-        // Only the first bytes of a picture that would take gigabytes.
+        // Only the header of an image that would take gigabytes.
         let mut huge = file_of(ImageFormat::Jpeg, [2, 1], &[0; 6]);
-        let frame = huge.windows(2).position(|pair| pair == [0xff, 0xc0]).expect("a frame");
+        let frame = huge.windows(2).position(|pair| pair == [0xff, 0xc0]).expect("a frame header");
         huge[frame + 5..frame + 9].copy_from_slice(&[0x3f, 0xff, 0x3f, 0xff]);
         let huge = image(PixelFormat::Jpeg, [2, 2], &huge).decode_rgb();
         assert!(matches!(huge, Err(Error::ImageSize { got_px: [16_383, 16_383], .. })), "{huge:?}");
@@ -260,10 +261,10 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "a measurement: prints milliseconds"]
+    #[ignore = "benchmark: prints milliseconds"]
     fn speed_of_jpeg_at_1080p() {
         let size_px = [1920, 1080];
-        // Edges, slopes and noise: as many bytes as a webcam sends of a room.
+        // Edges, gradients and noise, so that the size is that of a webcam image of a room.
         let pixel = |x: u32, y: u32| {
             let noise = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).to_le_bytes()[1] % 12;
             let gradient = ((x / 60 + y / 40) * 11 + x / 16).to_le_bytes()[0] / 2;
@@ -273,13 +274,13 @@ mod tests {
         let mut file = Vec::new();
         let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 85);
         image::ImageEncoder::write_image(encoder, &rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
-            .expect("a picture");
+            .expect("an image");
         let jpeg = image(PixelFormat::Jpeg, size_px, &file);
         let best = (0..20).map(|_| {
             let began = std::time::Instant::now();
-            std::hint::black_box(std::hint::black_box(&jpeg).decode_rgb().expect("a picture"));
+            std::hint::black_box(std::hint::black_box(&jpeg).decode_rgb().expect("an image"));
             began.elapsed()
         });
-        eprintln!("{} kB: {:.2?} at best", file.len() / 1000, best.min().expect("20 runs"));
+        eprintln!("{} kB: minimum {:.2?}", file.len() / 1000, best.min().expect("20 runs"));
     }
 }

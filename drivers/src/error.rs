@@ -1,180 +1,180 @@
-//! What can go wrong with a device or a recording.
+//! Errors of devices, recordings and datasets.
 
 use kinematics::Stamp;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// How much of a recording has reached the file.
+/// Part of a recording that was written to the file.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RecordedSpan {
-    /// Samples that can be read.
+    /// Number of readable samples.
     pub n_samples: u64,
-    /// From the first of their stamps to the last, seconds.
+    /// Time from the first to the last stamp, seconds.
     pub seconds: f64,
 }
 
 impl std::fmt::Display for RecordedSpan {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self.n_samples {
-            0 => f.write_str("nothing of it is kept"),
-            n_samples => write!(f, "which keeps the first {:.1} s ({n_samples} samples)", self.seconds),
+            0 => f.write_str("no samples were saved"),
+            n_samples => write!(f, "the first {:.1} s ({n_samples} samples) are saved", self.seconds),
         }
     }
 }
 
-/// Errors of devices, recordings and datasets.
+/// An error of a device, recording or dataset.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A camera stayed silent.
+    /// A camera did not deliver an image in time.
     #[error("camera {camera:?}: no image within {waited:?}")]
     NoImage {
         /// Name in the rig file.
         camera: String,
-        /// How long the call waited.
+        /// Time spent waiting.
         waited: Duration,
     },
-    /// A V4L2 camera cannot be opened, or was lost for good.
+    /// A V4L2 camera cannot be opened, or did not reconnect in time.
     #[cfg(target_os = "linux")]
     #[error("camera {camera:?}: {problem}")]
     V4l2 {
         /// Name in the rig file.
         camera: String,
-        /// What is wrong.
+        /// Description of the problem.
         problem: Box<crate::v4l2::Problem>,
     },
-    /// A RealSense camera or a file of one cannot be opened, or was lost for good.
+    /// A RealSense camera or one of its files cannot be opened, or the camera did not reconnect in time.
     #[error("camera {camera:?}: {problem}")]
     Realsense {
         /// Name in the rig file.
         camera: String,
-        /// What is wrong.
+        /// Description of the problem.
         problem: Box<crate::realsense::Problem>,
     },
-    /// The file that a camera was played from is at its end.
-    #[error("camera {camera:?}: its file is at the end")]
+    /// The file that a camera is played back from has ended.
+    #[error("camera {camera:?}: its file has ended")]
     Ended {
         /// Name in the rig file.
         camera: String,
     },
-    /// The next image of a file that a camera is played from is due later; asking again then gives it.
+    /// The next image of a file that is played back is due later. A later call returns it.
     #[error("camera {camera:?}: the next image of its file is due in {remaining:?}")]
     NotDue {
         /// Name in the rig file.
         camera: String,
-        /// From now on.
+        /// Time until the image is due.
         remaining: Duration,
     },
-    /// A camera read by nokhwa cannot be opened, or was lost for good.
+    /// A nokhwa camera cannot be opened, or did not reconnect in time.
     #[cfg(feature = "nokhwa")]
     #[error("camera {camera:?}: {problem}")]
     Nokhwa {
         /// Name in the rig file.
         camera: String,
-        /// What is wrong.
+        /// Description of the problem.
         problem: Box<crate::nokhwa::Problem>,
     },
-    /// A camera was lost and is looked for; asking again may find it.
-    #[error("camera {camera:?}: lost for {waited:?}, looking for it")]
+    /// A camera was disconnected and the driver is trying to reconnect. A later call may succeed.
+    #[error("camera {camera:?}: disconnected for {waited:?}, trying to reconnect")]
     Reconnecting {
         /// Name in the rig file.
         camera: String,
-        /// Since when.
+        /// Time since the camera was disconnected.
         waited: Duration,
     },
-    /// An arm stayed silent.
-    #[error("arm: no joint readings within {waited:?}")]
+    /// An arm did not deliver joint states in time.
+    #[error("arm: no joint states within {waited:?}")]
     NoJoints {
-        /// How long the call waited.
+        /// Time spent waiting.
         waited: Duration,
     },
-    /// A base stayed silent.
+    /// A base did not deliver a pose in time.
     #[error("base: no pose within {waited:?}")]
     NoBasePose {
-        /// How long the call waited.
+        /// Time spent waiting.
         waited: Duration,
     },
-    /// A range scanner stayed silent.
+    /// A range scanner did not deliver a scan in time.
     #[error("range scanner {scanner:?}: no scan within {waited:?}")]
     NoScan {
         /// Name of the scanner.
         scanner: String,
-        /// How long the call waited.
+        /// Time spent waiting.
         waited: Duration,
     },
-    /// A CAN interface is not set up as it must be.
+    /// A CAN interface is not configured as required.
     #[error("CAN interface {interface:?}: {problem}; fix it with: {command}")]
     CanLink {
         /// Name of the interface.
         interface: String,
-        /// What is wrong.
+        /// Description of the problem.
         problem: String,
-        /// What a person types to mend it.
+        /// Shell command that fixes the problem.
         command: String,
     },
-    /// A CAN interface could not be read or written, or does not exist.
+    /// A CAN interface does not exist, or reading or writing it failed.
     #[error("CAN interface {interface:?}: {reason}")]
     CanBus {
         /// Name of the interface.
         interface: String,
-        /// What the system said.
+        /// Error of the operating system.
         reason: std::io::Error,
     },
-    /// A motor does not answer, or not as it should.
+    /// A motor does not answer, or answers unexpectedly.
     #[error("joint {joint:?} on {interface:?}: {reason}")]
     Motor {
-        /// The joint that it moves.
+        /// Joint that the motor moves.
         joint: String,
-        /// The bus that it is on.
+        /// Name of its CAN interface.
         interface: String,
-        /// What is wrong, and what mends it.
+        /// Description of the problem and how to fix it.
         reason: String,
     },
-    /// An arm cannot be moved, or not so.
-    #[error("the arm is not moved: {reason}")]
+    /// An arm cannot be moved, or not as requested.
+    #[error("the arm cannot be moved: {reason}")]
     Motion {
-        /// Why.
+        /// Description of the problem.
         reason: String,
     },
-    /// A Franka arm does not let us in, is another than the rig file says, or was lost.
+    /// A Franka arm refused the connection, does not match the rig file, or was disconnected.
     #[error("arm at {address}: {reason}")]
     Fci {
-        /// Of its controller.
+        /// Address of the robot controller.
         address: String,
-        /// What is wrong, and what mends it.
+        /// Description of the problem and how to fix it.
         reason: String,
     },
     /// A simulated device failed.
     #[error("simulated rig: {reason}")]
     Simulation {
-        /// What the simulator says.
+        /// Error of the simulator.
         reason: String,
     },
-    /// The address of a device that sends over the network is not free, or not of this computer.
+    /// The address of a network device is in use, or does not belong to this computer.
     #[error("{device}: cannot listen on {address}")]
     Listen {
-        /// Which device.
+        /// Name of the device.
         device: String,
-        /// The address.
+        /// Address to listen on.
         address: SocketAddr,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// Nothing can be received any more.
-    #[error("{device}: the network broke off")]
+    /// Receiving from the network failed.
+    #[error("{device}: cannot receive from the network")]
     Network {
-        /// Which device.
+        /// Name of the device.
         device: String,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A thread that reads a device cannot be started.
+    /// The thread that reads a device cannot be started.
     #[error("cannot start the thread of {device}")]
     Thread {
-        /// Which device.
+        /// Name of the device.
         device: String,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// A file cannot be opened.
@@ -182,53 +182,53 @@ pub enum Error {
     Open {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A compressed image is broken.
+    /// A compressed image cannot be decoded.
     #[error("camera {camera:?}: the image at {} ns does not decode", stamp.0)]
     Undecodable {
         /// Name in the rig file.
         camera: String,
         /// Stamp of the image.
         stamp: Stamp,
-        /// Why.
+        /// Error of the decoder.
         source: image::ImageError,
     },
-    /// An image has another size than announced.
-    #[error("camera {camera:?}: the image at {} ns is {got_px:?} pixels, announced were {expected_px:?}", stamp.0)]
+    /// An image differs from the announced size.
+    #[error("camera {camera:?}: the image at {} ns has {got_px:?} pixels, expected {expected_px:?}", stamp.0)]
     ImageSize {
         /// Name in the rig file.
         camera: String,
         /// Stamp of the image.
         stamp: Stamp,
-        /// Size in the file.
+        /// Size in the data.
         got_px: [u32; 2],
-        /// Size announced.
+        /// Size announced by the device.
         expected_px: [u32; 2],
     },
     /// An uncompressed image has too few or too many bytes.
-    #[error("camera {camera:?}: the image at {} ns has {got_bytes} bytes, its size and format need {expected_bytes}", stamp.0)]
+    #[error("camera {camera:?}: the image at {} ns has {got_bytes} bytes, expected {expected_bytes} for its size and format", stamp.0)]
     ImageLength {
         /// Name in the rig file.
         camera: String,
         /// Stamp of the image.
         stamp: Stamp,
-        /// Bytes there.
+        /// Number of bytes found.
         got_bytes: usize,
-        /// Bytes needed.
+        /// Number of bytes expected.
         expected_bytes: usize,
     },
-    /// A device tells colours that are not decoded.
-    #[error("V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are decoded")]
+    /// A device uses a color encoding that is not supported.
+    #[error("V4L2 colorspace {colorspace} with Y'CbCr encoding {ycbcr_enc}: only BT.601 and BT.709 are supported")]
     YuvColors {
         /// `enum v4l2_colorspace`.
         colorspace: u32,
         /// `enum v4l2_ycbcr_encoding`.
         ycbcr_enc: u32,
     },
-    /// Colour was asked of a depth image or depth of a colour image.
-    #[error("camera {camera:?}: the image at {} ns holds no {expected}", stamp.0)]
+    /// Color was requested from a depth image, or depth from a color image.
+    #[error("camera {camera:?}: the image at {} ns contains no {expected}", stamp.0)]
     WrongKind {
         /// Name in the rig file.
         camera: String,
@@ -237,96 +237,96 @@ pub enum Error {
         /// "color" or "depth".
         expected: &'static str,
     },
-    /// A file that is no recording.
-    #[error("{path:?} is not a recording: it does not begin like an MCAP file")]
+    /// A file that is not a recording.
+    #[error("{path:?} is not a recording: it does not start with the MCAP magic bytes")]
     NotARecording {
         /// The file.
         path: PathBuf,
     },
-    /// A recording that holds no sample of a rig.
-    #[error("the recording {path:?} holds no images or joint readings of this program")]
+    /// A recording without samples of a rig.
+    #[error("the recording {path:?} contains no images or joint states recorded by this program")]
     EmptyRecording {
         /// The file.
         path: PathBuf,
     },
-    /// A recording was to be written over a file that is there.
-    #[error("{path:?} exists already: a recording only goes into a new file")]
+    /// The file for a new recording already exists.
+    #[error("{path:?} exists already: choose a new file for the recording")]
     Exists {
         /// The file.
         path: PathBuf,
     },
-    /// A recording cannot be written further, for instance because the disk is full.
-    #[error("cannot write the recording {path:?}, {recorded}")]
+    /// Writing a recording failed, for example because the disk is full.
+    #[error("cannot write the recording {path:?}: {recorded}")]
     Record {
         /// The file.
         path: PathBuf,
-        /// What of it can be read.
+        /// Part that can be read.
         recorded: RecordedSpan,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A recording cannot be read further for another reason than its end.
+    /// Reading a recording failed before its end.
     #[error("cannot read the recording {path:?}")]
     Replay {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A message of a recording does not decode.
-    #[error("the recording {path:?} holds a broken message on {topic:?}")]
+    /// A message of a recording cannot be decoded.
+    #[error("the recording {path:?} contains a malformed message on {topic:?}")]
     BrokenMessage {
         /// The file.
         path: PathBuf,
         /// Topic of the message.
         topic: String,
-        /// Why.
+        /// Error of the decoder.
         source: crate::wire::Malformed,
     },
-    /// A folder is no dataset.
-    #[error("{path:?} is not a dataset: it holds neither transforms.json (nerfstudio) nor rgb.txt (TUM RGB-D)")]
+    /// A folder is not a dataset.
+    #[error("{path:?} is not a dataset: expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it")]
     NotADataset {
         /// The folder.
         path: PathBuf,
     },
-    /// A file of a dataset does not say what it should.
+    /// A dataset file is malformed or has invalid contents.
     #[error("{path:?}: {reason}")]
     DatasetFile {
         /// The file.
         path: PathBuf,
-        /// What is wrong, with the frame or line.
+        /// Description of the problem, with the frame or line.
         reason: String,
     },
     /// No frame of a dataset can be used.
-    #[error("{path:?} holds no usable image: {n_missing} are not there, {n_unusable} cannot be used{first_reason}")]
+    #[error("{path:?} contains no usable image: {n_missing} are missing, {n_unusable} cannot be used{first_reason}")]
     EmptyDataset {
         /// The folder.
         path: PathBuf,
-        /// Images that are not there.
+        /// Number of missing images.
         n_missing: usize,
-        /// Images that are broken or have no pose.
+        /// Number of images that are broken or have no pose.
         n_unusable: usize,
-        /// The first of these and why, in brackets; empty when there is none.
+        /// First of these with its reason, in parentheses; empty if there is none.
         first_reason: String,
     },
-    /// Nothing tells the lens parameters of a TUM folder.
+    /// The lens parameters of a TUM folder are unknown.
     #[error(
-        "{path:?}: no lens parameters: put fx fy cx cy [k1 k2 p1 p2 k3] into calibration.txt, or keep freiburg1, 2 or 3 in the name"
+        "{path:?}: no lens parameters: write fx fy cx cy [k1 k2 p1 p2 k3] to calibration.txt, or keep freiburg1, 2 or 3 in the folder name"
     )]
     NoIntrinsics {
         /// The folder.
         path: PathBuf,
     },
-    /// An image of a dataset does not decode.
+    /// An image of a dataset cannot be decoded.
     #[error("{path:?} does not decode")]
     DatasetImage {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Error of the decoder.
         source: image::ImageError,
     },
-    /// An image of a dataset has another size than its frame.
-    #[error("{path:?} is {got_px:?} pixels, expected {expected_px:?}")]
+    /// The size of an image or mask differs from that of its frame.
+    #[error("{path:?} has {got_px:?} pixels, expected {expected_px:?}")]
     DatasetImageSize {
         /// The file.
         path: PathBuf,
@@ -335,8 +335,8 @@ pub enum Error {
         /// Size of the frame.
         expected_px: [u32; 2],
     },
-    /// A depth image is not 16 bits of grey.
-    #[error("{path:?} is no depth image: expected 16-bit grey")]
+    /// A depth image is not 16-bit grayscale.
+    #[error("{path:?} is not a depth image: expected 16-bit grayscale")]
     NotDepth {
         /// The file.
         path: PathBuf,

@@ -1,21 +1,22 @@
-//! Whole JPEG files out of what cameras send: without Huffman tables, cut off, doubled, with bytes behind.
+//! Extracts complete JPEG files from camera buffers, which may be truncated, hold two images, lack Huffman tables, or
+//! have extra bytes around the image.
 //!
-//! Source: ITU-T T.81, annex B (markers) and annex K.3 (the tables that motion JPEG leaves out).
+//! Source: ITU-T T.81, annex B (markers) and annex K.3 (the tables that motion JPEG omits).
 
 use std::borrow::Cow;
 
-/// Why a buffer holds no JPEG image.
+/// Why a buffer contains no complete JPEG image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum JpegError {
-    /// No image begins in it.
-    #[error("no JPEG begins in it")]
+    /// The buffer contains no start marker.
+    #[error("no JPEG start marker found")]
     NoStartMarker,
-    /// An image begins, and the buffer or another image comes before its end.
-    #[error("the JPEG is cut off")]
+    /// The buffer ends, or another image starts, before the end of the image.
+    #[error("the JPEG is truncated")]
     Truncated,
-    /// An image begins and ends without a picture.
-    #[error("the JPEG ends before its picture begins")]
+    /// The image ends without scan data.
+    #[error("the JPEG contains no scan data")]
     NoScanData,
 }
 
@@ -23,13 +24,14 @@ const START_OF_IMAGE: u8 = 0xd8;
 const END_OF_IMAGE: u8 = 0xd9;
 const START_OF_SCAN: u8 = 0xda;
 const HUFFMAN_TABLES: u8 = 0xc4;
-/// Baseline and extended sequential frames with Huffman codes: those that the standard tables can decode.
+/// Baseline and extended sequential frames with Huffman coding: the ones that the standard tables can decode.
 const SEQUENTIAL_FRAMES: [u8; 2] = [0xc0, 0xc1];
 
-/// The first whole image in a buffer, from its first marker to its last, with the standard Huffman tables where it has none.
+/// Returns the first complete image of a buffer, from its first marker to its last. Adds the standard Huffman tables if
+/// it has none.
 ///
-/// What comes before and behind it is left out, as is an image that another one cuts off. A thumbnail inside a segment is
-/// part of the image around it. The picture itself is not decoded here.
+/// Bytes before and after the image are dropped, as are images truncated by the start of another one. A thumbnail
+/// inside a segment is part of the surrounding image. The image data is not decoded.
 pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
     let mut reason = JpegError::NoStartMarker;
     let mut start = 0;
@@ -41,7 +43,8 @@ pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
             }
             Ok(ImageExtent { end, .. }) => return Ok(buffer[start..end].into()),
             Err((error, resume)) => {
-                // The first failure says most: what follows it are often only its remains.
+                // The first failure is the most informative. Later ones are often caused by the remains of the first
+                // image.
                 if reason == JpegError::NoStartMarker {
                     reason = error;
                 }
@@ -52,31 +55,32 @@ pub fn first_image(buffer: &[u8]) -> Result<Cow<'_, [u8]>, JpegError> {
     Err(reason)
 }
 
-/// Just behind the first whole image in a buffer; `None` where there is none.
+/// Index just after the first complete image of a buffer, or `None` if there is none.
 #[cfg(feature = "nokhwa")]
 pub(crate) fn first_image_end(buffer: &[u8]) -> Option<usize> {
     let starts = buffer.windows(2).enumerate().filter(|(_, pair)| *pair == [0xff, START_OF_IMAGE]);
     starts.map(|(start, _)| start).find_map(|start| scan_markers(buffer, start).ok()).map(|complete| complete.end)
 }
 
-/// Where an image lies in its buffer.
+/// Extent of an image in its buffer.
 struct ImageExtent {
-    /// Just behind its last marker.
+    /// Index just after its last marker.
     end: usize,
-    /// The marker of its first scan.
+    /// Index of the marker of its first scan.
     first_scan: usize,
-    /// No Huffman table comes before the first scan, and the standard ones fit.
+    /// Whether it lacks Huffman tables before the first scan and the standard ones fit.
     needs_tables: bool,
 }
 
-/// Goes from marker to marker of the image that begins at `start`; failing says why and where the next image may begin.
+/// Walks the markers of the image that starts at `start`. On failure, returns the reason and the index at which to
+/// search for the next image.
 fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, usize)> {
     let mut position = start + 2;
     let mut first_scan = None;
     let mut has_tables = false;
     let mut is_sequential = false;
     loop {
-        // Also steps over coded data, where a 0xff is followed by 0, and over bytes that belong to nothing.
+        // This also skips coded data, in which 0 follows each 0xff, and stray bytes.
         let (marker_at, marker) = next_marker(buffer, position).ok_or((JpegError::Truncated, buffer.len()))?;
         position = marker_at + 2;
         match (marker, first_scan) {
@@ -90,7 +94,7 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
             (frame, _) if SEQUENTIAL_FRAMES.contains(&frame) => is_sequential = true,
             _ => {}
         }
-        // The length counts its own two bytes.
+        // The length includes its own two bytes.
         let &[high, low, ..] = &buffer[position..] else { return Err((JpegError::Truncated, buffer.len())) };
         position += usize::from(u16::from_be_bytes([high, low])).max(2);
         if position > buffer.len() {
@@ -99,21 +103,21 @@ fn scan_markers(buffer: &[u8], start: usize) -> Result<ImageExtent, (JpegError, 
     }
 }
 
-/// Place and code of the next marker other than those without meaning here: restarts and the private 0x01.
+/// Index and code of the next marker, ignoring restart markers and the private marker 0x01.
 fn next_marker(buffer: &[u8], from: usize) -> Option<(usize, u8)> {
     let is_marker = |code: u8| !matches!(code, 0x00 | 0x01 | 0xd0..=0xd7 | 0xff);
     let offset = buffer[from..].windows(2).position(|pair| pair[0] == 0xff && is_marker(pair[1]))?;
     Some((from + offset, buffer[from + offset + 1]))
 }
 
-/// One segment with the tables of K.3: luminance and chrominance, DC and AC.
+/// One segment with the tables of annex K.3: luminance and chrominance, DC and AC.
 static STANDARD_TABLES: [u8; 420] = [
     0xff, 0xc4, 0x01, 0xa2, // Marker and length.
-    // K.3, DC of luminance.
+    // K.3, luminance DC.
     0x00, //
     0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, //
     0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, //
-    // K.5, AC of luminance.
+    // K.5, luminance AC.
     0x10, //
     0, 2, 1, 3, 3, 2, 4, 3, 5, 5, 4, 4, 0, 0, 1, 125, //
     0x01, 0x02, 0x03, 0x00, 0x04, 0x11, 0x05, 0x12, 0x21, 0x31, 0x41, 0x06, 0x13, 0x51, 0x61, 0x07, 0x22, 0x71, //
@@ -125,11 +129,11 @@ static STANDARD_TABLES: [u8; 420] = [
     0xa4, 0xa5, 0xa6, 0xa7, 0xa8, 0xa9, 0xaa, 0xb2, 0xb3, 0xb4, 0xb5, 0xb6, 0xb7, 0xb8, 0xb9, 0xba, 0xc2, 0xc3, //
     0xc4, 0xc5, 0xc6, 0xc7, 0xc8, 0xc9, 0xca, 0xd2, 0xd3, 0xd4, 0xd5, 0xd6, 0xd7, 0xd8, 0xd9, 0xda, 0xe1, 0xe2, //
     0xe3, 0xe4, 0xe5, 0xe6, 0xe7, 0xe8, 0xe9, 0xea, 0xf1, 0xf2, 0xf3, 0xf4, 0xf5, 0xf6, 0xf7, 0xf8, 0xf9, 0xfa, //
-    // K.4, DC of chrominance.
+    // K.4, chrominance DC.
     0x01, //
     0, 3, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, //
     0x00, 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x09, 0x0a, 0x0b, //
-    // K.6, AC of chrominance.
+    // K.6, chrominance AC.
     0x11, //
     0, 2, 1, 2, 4, 4, 3, 4, 7, 5, 4, 4, 0, 1, 2, 119, //
     0x00, 0x01, 0x02, 0x03, 0x11, 0x04, 0x05, 0x21, 0x31, 0x06, 0x12, 0x41, 0x51, 0x07, 0x61, 0x71, 0x13, 0x22, //
@@ -148,16 +152,16 @@ mod tests {
     use super::*;
     use image::{ExtendedColorType, ImageFormat};
 
-    /// A picture of 48x40 pixels with its segments as the encoder of the `image` crate writes them.
+    /// An image of 48x40 pixels with segments as written by the encoder of the `image` crate.
     fn jpeg() -> Vec<u8> {
         let rgb: Vec<u8> = (0..3 * 48 * 40).map(|ix: u32| (ix * ix % 251) as u8).collect();
         let mut file = std::io::Cursor::new(Vec::new());
         image::write_buffer_with_format(&mut file, &rgb, 48, 40, ExtendedColorType::Rgb8, ImageFormat::Jpeg)
-            .expect("a small picture");
+            .expect("a small image");
         file.into_inner()
     }
 
-    /// The file without its segments of one marker.
+    /// The file without its segments of the given marker.
     fn without_segments(jpeg: &[u8], marker: u8) -> Vec<u8> {
         let mut remaining = jpeg[..2].to_vec();
         let mut position = 2;
@@ -174,7 +178,7 @@ mod tests {
 
     fn pixels(jpeg: &[u8]) -> Vec<u8> {
         let decoded = image::load_from_memory_with_format(jpeg, ImageFormat::Jpeg);
-        decoded.expect("a whole file").into_rgb8().into_raw()
+        decoded.expect("a complete file").into_rgb8().into_raw()
     }
 
     #[test]
@@ -184,9 +188,9 @@ mod tests {
         assert!(complete.len() - without_tables.len() >= STANDARD_TABLES.len());
         assert!(
             image::load_from_memory_with_format(&without_tables, ImageFormat::Jpeg).is_err(),
-            "the tables are not missed"
+            "the image decodes without the tables"
         );
-        let repaired = first_image(&without_tables).expect("whole but for its tables");
+        let repaired = first_image(&without_tables).expect("complete except for its tables");
         assert_eq!(pixels(&repaired), pixels(&complete));
     }
 
@@ -198,7 +202,7 @@ mod tests {
             let buffer = [prefix, &complete, suffix].concat();
             assert!(matches!(first_image(&buffer), Ok(Cow::Borrowed(slice)) if slice == complete));
         }
-        // A restart marker and a stuffed 0xff among the coded data do not end it.
+        // Restart markers and stuffed 0xff bytes in the coded data do not end the image.
         let mut coded = complete.clone();
         coded.splice(complete.len() - 2..complete.len() - 2, [0xff, 0xd3, 0xff, 0x00, 0xff, 0xff]);
         assert_eq!(first_image(&coded).as_deref(), Ok(&coded[..]));
@@ -209,7 +213,7 @@ mod tests {
         let (first, second) = (jpeg(), without_segments(&jpeg(), 0xe0));
         assert_ne!(first, second);
         assert_eq!(first_image(&[&first[..], &second].concat()).as_deref(), Ok(&first[..]));
-        // Not inside a segment: its length would reach into the second image.
+        // Cuts inside a segment are not tested: its length would reach into the second image.
         for n_bytes in [2, 20, first.len() / 2, first.len() - 2] {
             let buffer = [&first[..n_bytes], &second].concat();
             assert_eq!(first_image(&buffer).as_deref(), Ok(&second[..]), "cut at {n_bytes}");
@@ -223,7 +227,7 @@ mod tests {
             let error = if n_bytes < 2 { JpegError::NoStartMarker } else { JpegError::Truncated };
             assert_eq!(first_image(&complete[..n_bytes]), Err(error), "{n_bytes} of {} bytes", complete.len());
         }
-        // Bytes lost at any place never panic, whatever is found.
+        // Missing bytes anywhere never cause a panic.
         for dropped_at in (0..complete.len()).step_by(97) {
             let _ =
                 first_image(&[&complete[..dropped_at], &complete[(dropped_at + 61).min(complete.len())..]].concat());

@@ -1,4 +1,4 @@
-//! Devices, recordings and datasets behind a few traits; what comes out is stamped samples.
+//! Devices, recordings and datasets as sources of stamped samples, behind a few traits.
 
 pub mod align;
 pub mod can;
@@ -42,16 +42,19 @@ use std::time::Duration;
 pub trait Camera: Send {
     /// Name in the rig file; also the name of its frame.
     fn name(&self) -> &str;
-    /// Lens parameters of the colour image.
+    /// Lens parameters of the color image.
     fn intrinsics(&self) -> &Intrinsics;
-    /// Waits for the next image this call has not returned yet, in stamp order; colour and depth are told apart by format.
+    /// Waits for the next image that was not returned yet, in stamp order. The format distinguishes color and depth.
     ///
-    /// A slow caller loses the oldest images; the loss is counted in [`Image::n_skipped`]. A camera that was unplugged and is
-    /// looked for says [`Error::Reconnecting`], for a bounded time.
+    /// If the caller is too slow, the oldest images are dropped and counted in [`Image::n_skipped`].
     ///
-    /// A camera that is played from a file says [`Error::NotDue`] where its next image comes later, and [`Error::Ended`] at the end.
+    /// # Errors
+    /// [`Error::NoImage`] after `timeout`; [`Error::Reconnecting`], for a limited time, while the driver tries to
+    /// reconnect to the camera. Cameras played back from a file return [`Error::NotDue`] if the next image is due
+    /// later, and [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
-    /// Whether it waits for a slow caller instead of losing images, as a file can that is played as fast as it is taken.
+    /// Whether the source waits for a slow caller instead of dropping images, for example a file that is read as fast
+    /// as possible.
     fn waits_for_caller(&self) -> bool {
         false
     }
@@ -59,15 +62,15 @@ pub trait Camera: Send {
 
 /// An arm whose joints can be read.
 pub trait Arm: Send {
-    /// Names of the joints, in the order of the readings.
+    /// Names of the joints, in the order of the values of a joint state.
     fn joint_names(&self) -> &[String];
-    /// Waits for the next joint state this call has not returned yet.
+    /// Waits for the next joint state that was not returned yet.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error>;
 }
 
-/// Whatever tells where the robot's base is.
+/// A source of poses of the robot's base.
 pub trait Base: Send {
-    /// Waits for the next pose this call has not returned yet, in stamp order.
+    /// Waits for the next pose that was not returned yet, in stamp order.
     fn next_pose(&mut self, timeout: Duration) -> Result<BasePose, Error>;
 }
 
@@ -75,16 +78,17 @@ pub trait Base: Send {
 pub trait RangeScanner: Send {
     /// Name in the rig file; also the name of its frame.
     fn name(&self) -> &str;
-    /// Waits for the next scan this call has not returned yet, in stamp order; a slow caller loses the oldest.
+    /// Waits for the next scan that was not returned yet, in stamp order. If the caller is too slow, the oldest scans
+    /// are dropped.
     fn next_scan(&mut self, timeout: Duration) -> Result<RangeScan, Error>;
 }
 
-/// Anything that yields samples of a whole rig in one deterministic order: a recording, a lockstep simulation, live devices.
+/// A source of all samples of a rig in one deterministic order: a recording, a lockstep simulation or live devices.
 pub trait Source: Send {
-    /// The next sample, in stamp order as far as the devices allow; `None` at the end.
+    /// Returns the next sample, in stamp order as far as the devices allow, or `None` at the end.
     fn next_sample(&mut self) -> Result<Option<Sample>, Error>;
 
-    /// Joint states, base poses and range scans that came and gave way to newer ones, so far, because the caller was slow.
+    /// Number of joint states, base poses and range scans dropped so far because the caller was too slow.
     fn n_other_samples_dropped(&self) -> u64 {
         0
     }

@@ -1,4 +1,4 @@
-//! Live devices as one source of samples: a thread a device, a bounded queue between it and the caller.
+//! Combines live devices into one source of samples. Each device has a thread and a bounded queue to the caller.
 
 use crate::{Arm, Base, Camera, Error, Image, RangeScanner, Sample, Source};
 use std::collections::VecDeque;
@@ -6,15 +6,15 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Images of one camera that may wait for a slow caller; older ones go.
+/// Queue capacity of a camera, in images. If it is full, the oldest image is dropped.
 const MAX_IMAGES: usize = 8;
-/// Joint readings that may wait: one second at 1 kHz.
+/// Queue capacity for joint states and base poses: one second at 1 kHz.
 const MAX_JOINTS: usize = 1000;
-/// Range scans of one scanner that may wait.
+/// Queue capacity of a range scanner, in scans.
 const MAX_SCANS: usize = 20;
-/// A device that says nothing for this long is an error.
+/// A device without samples for this long is an error.
 const MAX_SILENCE: Duration = Duration::from_secs(5);
-/// How long one wait on a device lasts, and so how soon its thread notices that it is to stop.
+/// Duration of one wait on a device. It bounds the time until its thread notices that it has to stop.
 const POLL: Duration = Duration::from_millis(100);
 
 /// The devices of a rig.
@@ -22,20 +22,23 @@ const POLL: Duration = Duration::from_millis(100);
 pub struct Devices {
     /// Cameras.
     pub cameras: Vec<Box<dyn Camera>>,
-    /// The arm, where there is one.
+    /// The arm, if there is one.
     pub arm: Option<Box<dyn Arm>>,
-    /// What tells where the base is, where it moves.
+    /// Source of base poses, if the base moves.
     pub base: Option<Box<dyn Base>>,
     /// Range scanners.
     pub scanners: Vec<Box<dyn RangeScanner>>,
 }
 
-/// All devices of a rig, read by a thread each.
+/// All devices of a rig, each read by its own thread.
 ///
-/// A slow caller loses the oldest samples of a device: images are counted in [`Image::n_skipped`] of the next image of the
-/// same kind, everything else in [`Source::n_other_samples_dropped`]; a camera that waits for its caller is made to wait. The first error of
-/// a device is returned once by [`Source::next_sample`] and ends the source. So does the end of the last camera, where cameras are
-/// played from files: what was read until then still comes. Dropping it stops the threads.
+/// If the caller is too slow, the oldest samples of a device are dropped. Dropped images are counted in
+/// [`Image::n_skipped`] of the next image of the same kind, all other samples in [`Source::n_other_samples_dropped`].
+/// Cameras that wait for their caller are blocked instead.
+///
+/// The first error of a device ends the source; [`Source::next_sample`] returns it once. If cameras are played back
+/// from files, the end of the last camera also ends the source, after all samples read until then have been returned.
+/// Dropping it stops the threads.
 #[derive(Debug)]
 pub struct Live {
     shared: Arc<Shared>,
@@ -46,23 +49,23 @@ pub struct Live {
 struct Shared {
     state: Mutex<State>,
     arrived: Condvar,
-    /// A sample was taken, or all is to stop.
+    /// Signaled when a sample was taken or all threads have to stop.
     taken: Condvar,
 }
 
 #[derive(Debug, Default)]
 struct State {
-    /// One queue a device.
+    /// One queue per device.
     queues: Vec<VecDeque<Sample>>,
-    /// Images dropped and not yet told, by device: colour and depth.
+    /// Dropped images that are not reported yet, by device: color and depth.
     dropped: Vec<[u64; 2]>,
     n_other_samples_dropped: u64,
     error: Option<Error>,
     failed: bool,
     n_running: usize,
-    /// Cameras whose images have not come to an end.
+    /// Number of cameras whose images have not ended.
     n_cameras: usize,
-    /// No device is read any more; what waits may still be taken.
+    /// Devices are no longer read. Queued samples may still be taken.
     stop: bool,
 }
 
@@ -151,11 +154,11 @@ impl Live {
     }
 }
 
-/// What lies between a device and a slow caller.
+/// Queue between a device and the caller.
 #[derive(Clone, Copy)]
 struct QueuePolicy {
     capacity: usize,
-    /// The device waits where there is none; else its oldest sample goes.
+    /// If the queue is full: whether the device waits. Otherwise, its oldest sample is dropped.
     blocks_device: bool,
 }
 
@@ -165,18 +168,18 @@ impl QueuePolicy {
     }
 }
 
-/// What one wait on a device led to.
+/// Result of one wait on a device.
 enum ReadOutcome {
     Sample(Sample),
-    /// It is there and said nothing.
+    /// The device is connected but sent nothing.
     NoSample,
-    /// It is lost, and its driver looks for it: how long, the driver bounds. Or it is a file, and its next image is not due.
+    /// The driver is trying to reconnect, for a time that it limits itself, or the next image of a file is not due yet.
     Pending,
-    /// It is a file, and that is at its end.
+    /// The file has ended.
     End,
 }
 
-/// The loop of one device's thread: `read` waits [`POLL`].
+/// Thread function of a device. `read` waits for [`POLL`].
 fn read_until_stopped(
     shared: &Shared,
     device_ix: usize,
@@ -226,14 +229,14 @@ fn read_until_stopped(
 }
 
 impl Shared {
-    /// The state, also after a thread panicked while it held it: queues are never left half changed.
+    /// Locks the state. A poisoned lock is accepted because queues are never left half changed.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl State {
-    /// Queues a sample; where there is no room the oldest of this device goes and is counted.
+    /// Queues a sample. If the queue is full, the oldest sample of this device is dropped and counted.
     fn put(&mut self, device_ix: usize, capacity: usize, mut sample: Sample) {
         if self.queues[device_ix].len() >= capacity {
             match self.queues[device_ix].pop_front() {
@@ -245,7 +248,7 @@ impl State {
         self.queues[device_ix].push_back(sample);
     }
 
-    /// Adds a lost image and what was lost before it to the next image of its kind.
+    /// Adds a dropped image, and those dropped before it, to the count of the next image of its kind.
     fn report_dropped(&mut self, device_ix: usize, dropped_image: &Image, newest: &mut Sample) {
         let same_kind = |sample: &&mut Sample| matches!(sample, Sample::Image(image) if image.is_depth() == dropped_image.is_depth());
         let pending = &mut self.dropped[device_ix][usize::from(dropped_image.is_depth())];
@@ -257,7 +260,7 @@ impl State {
         }
     }
 
-    /// The oldest waiting sample of all devices.
+    /// Removes the oldest queued sample of all devices.
     fn take(&mut self) -> Option<Sample> {
         let heads = self.queues.iter().enumerate().filter_map(|(ix, queue)| Some((queue.front()?.stamp(), ix)));
         let (_, device_ix) = heads.min()?;
@@ -293,7 +296,7 @@ impl Drop for Live {
         self.shared.lock().stop = true;
         self.shared.taken.notify_all();
         for thread in self.threads.drain(..) {
-            // A thread that panicked has printed why; there is nothing left to stop.
+            // A thread that panicked has already printed its message and has stopped.
             let _ = thread.join();
         }
     }
@@ -305,7 +308,7 @@ mod tests {
     use crate::PixelFormat;
     use kinematics::{Intrinsics, JointState, Lens, Stamp};
 
-    /// A camera that delivers numbered images as fast as it is asked, then fails.
+    /// A camera that delivers numbered images without delay, then fails.
     struct FastCamera {
         intrinsics: Intrinsics,
         n_images: i64,
@@ -378,19 +381,19 @@ mod tests {
         while live.shared.lock().n_running > 0 {
             std::thread::yield_now();
         }
-        // The error comes first: what a broken device said before it is no longer worth waiting for.
+        // Errors come first: samples that a broken device sent before are not worth waiting for.
         assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
         let mut stamps = Vec::new();
         let mut n_skipped = [0; 2];
-        while let Some(Sample::Image(image)) = live.next_sample().expect("told once") {
+        while let Some(Sample::Image(image)) = live.next_sample().expect("the error is returned only once") {
             stamps.push(image.stamp.0);
             n_skipped[usize::from(image.is_depth())] += image.n_skipped;
         }
         assert_eq!(stamps, (94..=101).collect::<Vec<_>>());
-        assert_eq!(n_skipped, [47, 46], "51 colour images with 4 delivered, 50 depth images with 4 delivered");
+        assert_eq!(n_skipped, [47, 46], "51 color images with 4 delivered, 50 depth images with 4 delivered");
     }
 
-    /// A camera whose cable is out for longer than a silent one is waited for; it waits for nothing itself.
+    /// A camera that reports reconnecting for longer than the silence limit. It returns without waiting.
     struct ReconnectingCamera {
         camera: FastCamera,
         n_tries: u32,
@@ -420,12 +423,12 @@ mod tests {
         while live.shared.lock().n_running > 0 {
             std::thread::yield_now();
         }
-        // The image came after ten seconds of looking, and the error is the one after it.
+        // The image comes after ten seconds of reconnecting. The error is the one after it.
         assert!(live.next_sample().expect_err("the cable").to_string().contains("cable pulled"));
-        assert_eq!(live.next_sample().expect("told once").expect("an image").stamp(), Stamp(1));
+        assert_eq!(live.next_sample().expect("the error is returned only once").expect("an image").stamp(), Stamp(1));
     }
 
-    /// A camera that is played from a file as fast as it is taken.
+    /// A camera that is played back from a file as fast as possible.
     struct FileCamera(FastCamera);
 
     impl Camera for FileCamera {
@@ -450,12 +453,12 @@ mod tests {
     fn file_camera_blocks_for_slow_caller_and_ends_source() {
         let n_images = 5 * i64::try_from(MAX_IMAGES).expect("a small number");
         let camera = FileCamera(FastCamera { intrinsics: LENS, n_images, next: 0 });
-        // The arm would go on for ever.
+        // The arm never ends.
         let arm: Box<dyn Arm> = Box::new(SlowArm { next: 0 });
         let devices = Devices { cameras: vec![Box::new(camera)], arm: Some(arm), ..Devices::default() };
         let mut live = Live::new(devices).expect("threads start");
         let mut stamps = Vec::new();
-        while let Some(sample) = live.next_sample().expect("an end is no error") {
+        while let Some(sample) = live.next_sample().expect("the end is not an error") {
             if let Sample::Image(image) = sample {
                 assert_eq!(image.n_skipped, 0);
                 stamps.push(image.stamp.0);
@@ -469,7 +472,7 @@ mod tests {
         let mut live = Live::new(Devices { arm: Some(Box::new(SlowArm { next: 0 })), ..Devices::default() })
             .expect("threads start");
         let stamps: Vec<_> =
-            (0..3).map(|_| live.next_sample().expect("alive").expect("three readings").stamp()).collect();
+            (0..3).map(|_| live.next_sample().expect("alive").expect("three joint states").stamp()).collect();
         assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);
         let shared = Arc::clone(&live.shared);
         drop(live);

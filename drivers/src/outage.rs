@@ -1,10 +1,11 @@
-//! A camera that was lost: since when, how often it was looked for, when the next try is due. The same for all drivers of cameras.
+//! Outage of a camera: its start, the number of reconnection attempts, and the time of the next one. Shared by all
+//! camera drivers.
 
 #[cfg(any(target_os = "linux", feature = "realsense"))]
 use kinematics::Stamp;
 use std::time::{Duration, Instant};
 
-/// A time without images.
+/// A period without images because a camera is disconnected.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Outage {
     pub(crate) since: Instant,
@@ -13,7 +14,7 @@ pub(crate) struct Outage {
 }
 
 impl Outage {
-    /// The outage of a camera that is lost now: the one that goes on, or a new one.
+    /// Returns the current outage of a camera, or starts a new one.
     pub(crate) fn of(outage: &mut Option<Self>) -> Self {
         let now = Instant::now();
         let outage = outage.get_or_insert(Self { since: now, n_tries: 0, last_try: now });
@@ -21,8 +22,8 @@ impl Outage {
         *outage
     }
 
-    /// Waits for the next try, which is due a pause after the last one, and counts it. False where it is not due before the deadline,
-    /// which is waited for.
+    /// Waits until the next attempt is due, one pause after the last attempt, and counts it. If it is due after the
+    /// deadline, waits until the deadline and returns false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));
@@ -35,11 +36,11 @@ impl Outage {
     }
 }
 
-/// Images that a rate puts between two stamps.
+/// Number of images between two stamps at the given rate.
 #[cfg(any(target_os = "linux", feature = "realsense"))]
 pub(crate) fn n_between(last: Stamp, next: Stamp, rate_hz: f64) -> u64 {
     let periods = next.0.saturating_sub(last.0) as f64 * 1e-9 * rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates, which is meant")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the cast saturates as intended")]
     let n_images = (periods.round() - 1.0).max(0.0) as u64;
     n_images
 }
@@ -62,13 +63,13 @@ mod tests {
     fn retry_waits_for_pause_but_not_past_deadline() {
         let mut lost = None;
         let mut outage = Outage::of(&mut lost);
-        assert!(outage.wait_for_retry(Duration::ZERO, Instant::now()), "the first may be due at once");
+        assert!(outage.wait_for_retry(Duration::ZERO, Instant::now()), "the first attempt may be due immediately");
         let began = Instant::now();
         assert!(!outage.wait_for_retry(Duration::from_secs(60), began + Duration::from_millis(10)));
         assert!(began.elapsed() >= Duration::from_millis(10) && began.elapsed() < Duration::from_secs(30));
         assert!(outage.wait_for_retry(Duration::from_millis(20), began + Duration::from_secs(60)));
         assert!(began.elapsed() >= Duration::from_millis(15));
         assert_eq!(outage.n_tries, 2);
-        assert_eq!(Outage::of(&mut lost).since, outage.since, "it goes on");
+        assert_eq!(Outage::of(&mut lost).since, outage.since, "the same outage continues");
     }
 }

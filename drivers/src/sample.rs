@@ -1,118 +1,120 @@
-//! What devices deliver.
+//! Samples delivered by devices.
 
 use crate::{YuvColors, YuvLayout};
 use kinematics::{JointState, Stamp, Transform};
 use std::sync::Arc;
 
-/// How the bytes of an [`Image`] are to be read.
+/// Format of the bytes of an [`Image`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PixelFormat {
-    /// Three bytes a pixel, red first.
+    /// Three bytes per pixel, red first.
     Rgb8,
-    /// Three bytes a pixel, blue first.
+    /// Three bytes per pixel, blue first.
     Bgr8,
-    /// One byte a pixel.
+    /// One byte per pixel.
     Gray8,
-    /// Luma and colour differences.
+    /// Luma and chroma.
     Yuv {
-        /// How they lie in the bytes.
+        /// Memory layout.
         layout: YuvLayout,
-        /// What they mean.
+        /// Matrix and range.
         colors: YuvColors,
     },
-    /// A JPEG file as the device sent it.
+    /// A JPEG file as sent by the device.
     Jpeg,
     /// A PNG file.
     Png,
-    /// Depth along the camera's z axis as little-endian 16-bit counts; 0 where the sensor saw nothing.
+    /// Depth along the camera's z axis as little-endian 16-bit counts; 0 if unknown.
     DepthU16 {
-        /// Metres per count; of a RealSense D4xx 0.001 unless set otherwise, of a D405 0.0001, of an L515 0.00025.
+        /// Meters per count. By default 0.001 for a RealSense D4xx, 0.0001 for a D405 and 0.00025 for an L515.
         meters_per_count: f64,
     },
 }
 
-/// One image of one camera, colour or depth.
+/// One color or depth image of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
     /// Name of the camera in the rig file.
     pub camera: Arc<str>,
-    /// Mid-exposure, when the device says so.
+    /// Mid-exposure, if the device reports it.
     pub stamp: Stamp,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// How `data` is to be read.
+    /// Format of `data`.
     pub format: PixelFormat,
-    /// The bytes, row major from the top left, no padding between rows (see [`Image::pack_rows`]).
+    /// Pixels in row-major order from the top left, without padding between rows (see [`Image::pack_rows`]).
     pub data: Arc<[u8]>,
-    /// Exposure time where the device tells it, seconds.
+    /// Exposure time in seconds, if the device reports it.
     pub exposure_secs: Option<f64>,
-    /// Images of this camera and kind lost just before this one.
+    /// Number of images of this camera and kind that were dropped just before this one.
     pub n_skipped: u64,
 }
 
-/// Pose of the robot's base at one instant.
+/// Pose of the robot's base at one time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BasePose {
-    /// When the base was there.
+    /// Time of the pose.
     pub stamp: Stamp,
     /// Pose of the base.
     pub world_from_base: Transform,
 }
 
-/// What a simulated camera would have seen without noise, blur or shear, and from where.
+/// Ground truth of a simulated image: the image without noise, blur and shear, and the camera pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TruthImage {
-    /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, same camera and stamp as the noisy one.
+    /// The noise-free image, [`PixelFormat::Rgb8`] or `Png`, with the camera and stamp of the noisy one.
     pub image: Image,
-    /// Noise-free depth along z, metres, `[height, width]`; 0 where nothing is. Empty when not asked for.
+    /// Noise-free depth along z, meters, `[height, width]`; 0 where there is no surface. Empty if not requested.
     pub depth_m: Arc<[f32]>,
     /// True pose of the camera at mid-exposure of the middle row.
     pub world_from_camera: Transform,
-    /// PSNR, dB, of the delivered image against the same image, shear and blur kept, before its noise; `None` without noise.
+    /// PSNR in dB of the delivered image relative to the same image, with shear and blur, before noise was added;
+    /// `None` without noise.
     pub psnr_ceiling: Option<f64>,
 }
 
-/// One echo of a range scanner.
+/// One return of a range scanner.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RangePoint {
-    /// Where the surface was in the sensor's frame (x ahead, z up) at the instant of this point, metres.
+    /// Position of the surface in the sensor frame (x forward, z up) at the time of this point, meters.
     pub position_m: [f32; 3],
-    /// Which of the scanner's rings measured it, from the lowest.
+    /// Ring of the scanner that measured the point, counted from the lowest.
     pub ring: u16,
-    /// From the stamp of the scan to this point, microseconds.
+    /// Time from the stamp of the scan to this point, microseconds.
     pub offset_micros: u32,
 }
 
-/// One turn of a range scanner; directions without an echo have no point.
+/// One revolution of a range scanner. Directions without a return have no point.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RangeScan {
     /// Name of the scanner in the rig file; also the name of its frame.
     pub scanner: Arc<str>,
-    /// When the turn began.
+    /// Start of the revolution.
     pub stamp: Stamp,
-    /// In the order in which they were measured. The scanner may move in between: each is told where the sensor was then.
+    /// Points in the order of measurement. Each is in the sensor frame at its own time, since the scanner may move
+    /// during a scan.
     pub points: Arc<[RangePoint]>,
 }
 
-/// One delivery of one device.
+/// One sample of one device.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Sample {
-    /// Colour or depth.
+    /// Color or depth image.
     Image(Image),
-    /// Joint readings.
+    /// Joint state.
     Joints(JointState),
     /// Base pose.
     Base(BasePose),
-    /// One turn of a range scanner.
+    /// One revolution of a range scanner.
     Range(RangeScan),
-    /// Where a simulated base truly was when it told a pose.
+    /// True pose of a simulated base at the stamp of a reported pose.
     BaseTruth(BasePose),
     /// Ground truth of a simulated image.
     Truth(TruthImage),
 }
 
 impl Sample {
-    /// When it was so.
+    /// Time of the sample.
     pub fn stamp(&self) -> Stamp {
         match self {
             Self::Image(image) => image.stamp,

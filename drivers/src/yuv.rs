@@ -1,22 +1,23 @@
-//! Luma and colour differences, as cameras send them, to red, green and blue.
+//! Converts YUV images (luma and chroma) from cameras to red, green and blue.
 //!
-//! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults, layouts). Transfer functions
-//! are taken to be sRGB's: cameras rarely mean what they announce, and the difference is that of a tone curve.
+//! Source: ITU-R BT.601-7 and BT.709-6 (matrices, limited range), Linux `videodev2.h` (defaults, layouts). The transfer
+//! function is assumed to be that of sRGB: the one that cameras announce is rarely correct, and the difference is only
+//! a tone curve.
 
 use crate::Error;
 
-/// How luma (Y) and colour differences (U is blue, V is red) lie in the bytes; 8 bits each.
+/// Memory layout of luma (Y) and chroma (U is blue, V is red); 8 bits each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum YuvLayout {
-    /// `Y0 U Y1 V` for each two pixels of a row.
+    /// `Y0 U Y1 V` for every two pixels of a row.
     Yuyv,
-    /// `U Y0 V Y1` for each two pixels of a row.
+    /// `U Y0 V Y1` for every two pixels of a row.
     Uyvy,
-    /// All Y, a row as long as an even width; then for each two rows one row of `U V` for each two pixels.
+    /// All Y, in rows padded to an even width; then, for every two rows, one row with `U V` for every two pixels.
     Nv12,
 }
 
-/// Share of red and blue in the luma.
+/// Weights of red and blue in the luma.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum YuvMatrix {
     /// Standard definition and webcams.
@@ -25,25 +26,26 @@ pub enum YuvMatrix {
     Bt709,
 }
 
-/// Which counts black and white have.
+/// Range of the counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum YuvRange {
-    /// Luma 16 to 235, differences 16 to 240.
+    /// Luma 16 to 235, chroma 16 to 240.
     Limited,
     /// 0 to 255.
     Full,
 }
 
-/// What the counts of a YUV image mean.
+/// Color encoding of a YUV image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct YuvColors {
-    /// Matrix between luma with differences and red, green, blue.
+    /// Matrix between YUV and RGB.
     pub matrix: YuvMatrix,
     /// Range of the counts.
     pub range: YuvRange,
 }
 
-/// What a V4L2 device says of its colours (`struct v4l2_pix_format`), numbers of `videodev2.h`; 0 stands for a default.
+/// Color encoding reported by a V4L2 device (`struct v4l2_pix_format`), with the constants of `videodev2.h`; 0 means
+/// default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct V4l2Colors {
     /// `enum v4l2_colorspace`.
@@ -52,13 +54,17 @@ pub struct V4l2Colors {
     pub ycbcr_enc: u32,
     /// `enum v4l2_quantization`.
     pub quantization: u32,
-    /// The device receives a high-definition television signal (it has DV timings), as HDMI grabbers do; cameras do not.
+    /// Whether the device receives a high-definition television signal (it has DV timings), as HDMI grabbers do and
+    /// cameras do not.
     pub is_hdtv: bool,
 }
 
 impl YuvColors {
-    /// Settles what a V4L2 device leaves open as `V4L2_MAP_COLORSPACE_DEFAULT`, `V4L2_MAP_YCBCR_ENC_DEFAULT` and
-    /// `V4L2_MAP_QUANTIZATION_DEFAULT` do; fails for BT.2020 and SMPTE 240M.
+    /// Resolves defaults like `V4L2_MAP_COLORSPACE_DEFAULT`, `V4L2_MAP_YCBCR_ENC_DEFAULT` and
+    /// `V4L2_MAP_QUANTIZATION_DEFAULT`.
+    ///
+    /// # Errors
+    /// For BT.2020 and SMPTE 240M.
     pub fn from_v4l2(reported: V4l2Colors) -> Result<Self, Error> {
         const REC709: u32 = 3;
         const JPEG: u32 = 7;
@@ -66,7 +72,7 @@ impl YuvColors {
         const DCI_P3: u32 = 12;
         let colorspace = match (reported.colorspace, reported.is_hdtv) {
             (0, true) => REC709,
-            (0, false) => SRGB, // Standard definition (SMPTE 170M) has the same matrix and range.
+            (0, false) => SRGB, // Same matrix and range as standard definition (SMPTE 170M).
             (colorspace, _) => colorspace,
         };
         let matrix = match (reported.ycbcr_enc, colorspace) {
@@ -91,7 +97,7 @@ impl YuvColors {
         }
     }
 
-    /// Luma of black, and counts of red, green, blue per count: `[y, v in red, u in green, v in green, u in blue]`.
+    /// Luma count of black, and coefficients of the counts: `[y, v in red, u in green, v in green, u in blue]`.
     fn coefficients(self) -> (f64, [f64; 5]) {
         let [red, blue] = self.luma_weights();
         let green = 1.0 - red - blue;
@@ -106,7 +112,7 @@ impl YuvColors {
 }
 
 impl YuvLayout {
-    /// Bytes of a row without padding; the last pixel of an odd width has a pair of its own.
+    /// Bytes per row without padding. For an odd width, the last pixel has its own pair.
     pub(crate) fn row_bytes(self, width: usize) -> usize {
         match self {
             Self::Yuyv | Self::Uyvy => width.div_ceil(2).saturating_mul(4),
@@ -114,7 +120,7 @@ impl YuvLayout {
         }
     }
 
-    /// Rows of that length.
+    /// Number of rows of that length.
     pub(crate) fn n_rows(self, height: usize) -> usize {
         match self {
             Self::Yuyv | Self::Uyvy => height,
@@ -123,7 +129,8 @@ impl YuvLayout {
     }
 }
 
-/// Red, green and blue, `[height, width, 3]`, of an image without padding; `data` is as long as its layout says.
+/// Converts an image without padding to red, green and blue, `[height, width, 3]`. The length of `data` must match the
+/// layout.
 pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data: &[u8]) -> Vec<u8> {
     let [width, height] = size_px.map(|side| side as usize);
     let mut rgb = vec![0; width * height * 3];
@@ -147,7 +154,7 @@ pub(crate) fn rgb(layout: YuvLayout, colors: YuvColors, size_px: [u32; 2], data:
     rgb
 }
 
-/// The coefficients of [`YuvColors`] times `1 << SHIFT`: products and sums fit 32 bits, and are off by less than 0.04 of a count.
+/// Coefficients of [`YuvColors`] times `1 << SHIFT`. Products and sums fit in 32 bits, with errors below 0.04 counts.
 #[derive(Clone, Copy)]
 struct Fixed {
     black: i32,
@@ -170,11 +177,12 @@ impl Fixed {
         Self { black: to_integer(black), luma, v_in_red, u_in_green, v_in_green, u_in_blue }
     }
 
-    /// One row from its pairs `[y0, y1, u, v]`; of the last pair an odd width takes the first pixel.
+    /// Converts one row from its pairs `[y0, y1, u, v]`. For an odd width, only the first pixel of the last pair is
+    /// used.
     #[inline(always)]
     fn row(self, out: &mut [u8], mut pairs: impl Iterator<Item = [u8; 4]>) {
-        let (to_integer, rest) = out.as_chunks_mut::<6>();
-        for (out, pair) in to_integer.iter_mut().zip(&mut pairs) {
+        let (complete, rest) = out.as_chunks_mut::<6>();
+        for (out, pair) in complete.iter_mut().zip(&mut pairs) {
             *out = self.pair(pair);
         }
         if let (false, Some(pair)) = (rest.is_empty(), pairs.next()) {
@@ -211,7 +219,7 @@ mod tests {
         })
     }
 
-    /// The twin in f64, written from the standards' own direction: differences are scaled `blue - luma` and `red - luma`.
+    /// CPU twin in f64, following the definition in the standards: chroma is `blue - luma` and `red - luma`, scaled.
     fn twin(colors: YuvColors, y: u8, u: u8, v: u8) -> [f64; 3] {
         let [red_weight, blue_weight] = colors.luma_weights();
         let [y, u, v] = [y, u, v].map(f64::from);
@@ -227,7 +235,7 @@ mod tests {
 
     #[test]
     fn every_value_is_within_one_count_of_twin() {
-        const MAX_ERROR: f64 = 0.54; // Half a count of rounding and what `Fixed` says.
+        const MAX_ERROR: f64 = 0.54; // Half a count of rounding plus the error of `Fixed`.
         for colors in all_colors() {
             let fixed = Fixed::new(colors);
             for y in 0..=255 {
@@ -239,7 +247,7 @@ mod tests {
                         {
                             assert!(
                                 (f64::from(*got) - expected).abs() <= MAX_ERROR,
-                                "{colors:?} {y} {u} {v}: {got}, wanted {expected}"
+                                "{colors:?} {y} {u} {v}: {got}, expected {expected}"
                             );
                         }
                     }
@@ -254,7 +262,7 @@ mod tests {
         let of = |colors: YuvColors, y, u, v| rgb(YuvLayout::Yuyv, colors, [1, 1], &[y, u, 0, v]);
         assert_eq!(of(limited, 16, 128, 128), [0, 0, 0]);
         assert_eq!(of(limited, 235, 128, 128), [255, 255, 255]);
-        assert_eq!(of(limited, 81, 90, 240), [254, 0, 0]); // Bars of BT.601: red; the counts are rounded, so red is not full.
+        assert_eq!(of(limited, 81, 90, 240), [254, 0, 0]); // Red bar of BT.601. Counts are rounded, so red is not 255.
         assert_eq!(of(limited, 41, 240, 110), [0, 0, 255]);
         let high = YuvColors { matrix: YuvMatrix::Bt709, range: YuvRange::Limited };
         assert_eq!(of(high, 63, 102, 240), [255, 1, 0]); // Bars of BT.709.
@@ -305,12 +313,12 @@ mod tests {
         };
         use YuvMatrix::{Bt601, Bt709};
         use YuvRange::{Full, Limited};
-        assert_eq!(resolved(0, 0, 0, false), Some((Bt601, Limited))); // Nothing told: sRGB.
+        assert_eq!(resolved(0, 0, 0, false), Some((Bt601, Limited))); // No information: sRGB.
         assert_eq!(resolved(0, 0, 0, true), Some((Bt709, Limited))); // An HDMI grabber.
         assert_eq!(resolved(1, 0, 0, true), Some((Bt601, Limited))); // SMPTE 170M
         assert_eq!(resolved(3, 0, 0, false), Some((Bt709, Limited))); // Rec. 709
         assert_eq!(resolved(7, 0, 0, false), Some((Bt601, Full))); // JPEG
-        assert_eq!(resolved(8, 0, 1, false), Some((Bt601, Full))); // sRGB, told to be full.
+        assert_eq!(resolved(8, 0, 1, false), Some((Bt601, Full))); // sRGB, reported as full range.
         assert_eq!(resolved(8, 2, 0, false), Some((Bt709, Limited)));
         assert_eq!(resolved(7, 0, 2, false), Some((Bt601, Limited)));
         assert_eq!(resolved(12, 0, 0, false), Some((Bt709, Limited))); // DCI-P3
@@ -321,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "a measurement: prints milliseconds"]
+    #[ignore = "benchmark: prints milliseconds"]
     fn speed_at_1080p() {
         let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
         for layout in LAYOUTS {
@@ -332,7 +340,7 @@ mod tests {
                 std::hint::black_box(rgb(layout, colors, [1920, 1080], std::hint::black_box(&data)));
                 began.elapsed()
             });
-            eprintln!("{layout:?} 1920x1080: {:.2?} at best", best.min().expect("20 runs"));
+            eprintln!("{layout:?} 1920x1080: minimum {:.2?}", best.min().expect("20 runs"));
         }
     }
 }

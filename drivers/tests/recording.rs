@@ -1,4 +1,5 @@
-//! Samples to a file and back: nothing changes, nothing is reordered, and a damaged file gives what is left of it.
+//! Tests of writing and reading recordings: samples and their order are preserved, and damaged files are read as far as
+//! possible.
 
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
 use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
@@ -8,7 +9,7 @@ use std::path::Path;
 
 const RIG: &str = "[arm]\ndriver = \"sim\"\n";
 
-/// Two seconds of a rig: joints at 100 Hz, colour and depth at 10 Hz with truth, some base poses.
+/// Two seconds of a rig: joints at 100 Hz, color and depth at 10 Hz with ground truth, some base poses.
 fn samples() -> Vec<Sample> {
     let mut samples = Vec::new();
     for tick in 0..200_i32 {
@@ -85,9 +86,9 @@ fn record(path: &Path, samples: &[Sample]) {
     };
     let mut recorder = Recorder::create(path, &recording_metadata).expect("a new file");
     for sample in samples {
-        recorder.write(sample).expect("room on the disk");
+        recorder.write(sample).expect("writing a sample");
     }
-    recorder.finish().expect("room on the disk");
+    recorder.finish().expect("finishing the recording");
 }
 
 fn replay(path: &Path) -> (Vec<Sample>, Recording) {
@@ -134,12 +135,12 @@ fn truncated_recording_yields_samples_before_the_cut() {
         std::fs::write(&cut_path, &whole[..whole.len() * eighths / 8]).expect("a shorter file");
         let (read, recording) = replay(&cut_path);
         assert!(read.len() >= n_before && read.len() < sent.len(), "{} of {} samples", read.len(), sent.len());
-        assert!(read[..] == sent[..read.len()], "what is left is unchanged");
-        let damage = recording.damage().expect("the cut is told");
-        assert!(damage.contains("cut off") && damage.contains(&read.len().to_string()), "{damage}");
+        assert!(read[..] == sent[..read.len()], "the remaining samples are unchanged");
+        let damage = recording.damage().expect("the truncation is reported");
+        assert!(damage.contains("truncated") && damage.contains(&read.len().to_string()), "{damage}");
         n_before = read.len();
     }
-    assert!(n_before > sent.len() / 2, "a cut near the end loses little: {n_before} of {}", sent.len());
+    assert!(n_before > sent.len() / 2, "a cut near the end loses few samples: {n_before} of {}", sent.len());
 }
 
 #[test]
@@ -151,7 +152,7 @@ fn flipped_bit_is_detected() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 4;
     std::fs::write(&path, bytes).expect("the file");
-    let mut recording = Recording::open(&path).expect("the start is fine");
+    let mut recording = Recording::open(&path).expect("the start is intact");
     let mut n_samples = 0;
     let damage_or_error = loop {
         match recording.next_sample() {
@@ -170,9 +171,9 @@ fn an_unfinished_recording_is_readable() {
     let sent = samples();
     let mut recorder = Recorder::create(&path, &RecordingMetadata::default()).expect("a new file");
     for sample in &sent {
-        recorder.write(sample).expect("room on the disk");
+        recorder.write(sample).expect("writing a sample");
     }
-    std::mem::forget(recorder); // As when the program is killed.
+    std::mem::forget(recorder); // As if the program were killed.
     let (read, recording) = replay(&path);
     assert!(read[..] == sent[..read.len()]);
     let last = read.last().expect("some").stamp();
@@ -183,12 +184,12 @@ fn an_unfinished_recording_is_readable() {
 #[test]
 fn non_recordings_are_rejected() {
     let folder = tempfile::tempdir().expect("a folder");
-    let missing = Recording::open(&folder.path().join("missing.mcap")).expect_err("there is none");
+    let missing = Recording::open(&folder.path().join("missing.mcap")).expect_err("the file does not exist");
     assert!(matches!(missing, Error::Open { .. }) && missing.to_string().contains("missing.mcap"));
-    for content in [&b""[..], b"short", b"a longer text that is no recording at all"] {
+    for content in [&b""[..], b"short", b"a longer text that is not a recording"] {
         let path = folder.path().join("text.mcap");
         std::fs::write(&path, content).expect("a file");
-        let error = Recording::open(&path).expect_err("no recording");
+        let error = Recording::open(&path).expect_err("not a recording");
         assert!(matches!(error, Error::NotARecording { .. }), "{error}");
     }
     let empty = folder.path().join("empty.mcap");
@@ -204,7 +205,7 @@ fn existing_file_is_rejected_and_unchanged() {
     let path = folder.path().join("run.mcap");
     record(&path, &samples());
     let before = std::fs::read(&path).expect("the file");
-    let error = Recorder::create(&path, &RecordingMetadata::default()).expect_err("the file is there");
+    let error = Recorder::create(&path, &RecordingMetadata::default()).expect_err("the file exists");
     assert!(matches!(error, Error::Exists { .. }) && error.to_string().contains("run.mcap"), "{error}");
     assert!(std::fs::read(&path).expect("the file") == before);
 }

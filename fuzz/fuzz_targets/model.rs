@@ -1,9 +1,13 @@
-//! Files of models: splats in `.ply` and `.spz`, checkpoints of training. The crate `trainer` is not linked, for the time it takes.
+//! Fuzz target for model files: splats in `.ply` and `.spz`, and training checkpoints. The crate `trainer` is not
+//! linked, to keep the build fast.
 //!
-//! A byte that says what, then a whole `.ply`, what a `.spz` packs, a `.spz` as it is, or a checkpoint without its checksum.
+//! The first byte selects the kind of the rest: a complete `.ply`, the uncompressed contents of a `.spz`, a complete
+//! `.spz`, or a checkpoint without its checksum.
 #![no_main]
-#![allow(dead_code, reason = "only reading is looked at here")]
+#![allow(dead_code, reason = "only reading is tested here")]
 
+#[path = "../../trainer/src/atomic_file.rs"]
+mod atomic_file;
 #[path = "../../trainer/src/checkpoint.rs"]
 mod checkpoint;
 #[path = "../../trainer/src/ply/mod.rs"]
@@ -20,7 +24,7 @@ use sha2::Digest;
 use std::io::Write;
 use std::path::PathBuf;
 
-/// The errors of these files; the trainer's own has the GPU's among them.
+/// The errors used by these files. Those of the trainer also include GPU errors.
 #[derive(Debug)]
 pub enum Error {
     Read { path: PathBuf, source: std::io::Error },
@@ -31,10 +35,10 @@ pub enum Error {
     SplatArrays(String),
 }
 
-/// A file in memory, written anew each time.
+/// Writes a file in memory, which is overwritten for each input.
 fn file(bytes: &[u8]) -> PathBuf {
     let path = PathBuf::from(format!("/dev/shm/fieldrig-model-{}", std::process::id()));
-    std::fs::write(&path, bytes).expect("room for small files");
+    std::fs::write(&path, bytes).expect("writing a small file");
     path
 }
 
@@ -58,7 +62,7 @@ libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     };
     let Ok(splats) = splats else { return };
     let path = file(&[]);
-    // What lies too far out for one format is refused, all else comes back.
+    // A format may reject positions outside of its range. Everything else must be read back.
     for (write, read) in [(ply::write as fn(_, _) -> _, ply::read as fn(_) -> _), (spz::write, spz::read)] {
         if write(&path, &splats).is_ok() {
             let reread = read(&path).unwrap_or_else(|error: Error| panic!("{error:?}"));

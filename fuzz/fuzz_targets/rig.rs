@@ -1,13 +1,14 @@
-//! A whole rig file, with the description of a robot beside it. What is accepted is accepted again once it is settled.
+//! Fuzz target for rig files, with a fixed robot description. The complete form of an accepted rig file must be
+//! accepted, too.
 #![no_main]
-#![allow(dead_code, unused_imports, reason = "only reading is looked at here")]
+#![allow(dead_code, unused_imports, reason = "only reading is tested here")]
 
 #[path = "../../src/config/mod.rs"]
 mod config;
 #[path = "../../src/method/kind.rs"]
 mod kind;
 mod method {
-    pub(crate) use crate::kind::Kind;
+    pub(crate) use crate::kind::ModelKind;
 }
 
 const URDF: &str = include_str!("../../kinematics/tests/data/panda.urdf");

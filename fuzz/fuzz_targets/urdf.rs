@@ -1,4 +1,4 @@
-//! A whole robot's description: every chain in it moves as numbers do.
+//! Fuzz target for robot descriptions: computes the kinematics of every chain.
 #![no_main]
 use kinematics::Chain;
 use kinematics::urdf::Robot;

@@ -234,10 +234,7 @@ mod tests {
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
         let on_base = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
         let message = error_of(&on_base);
-        assert!(
-            message.contains("no V4L2 camera goes by \"no such serial\"") && message.contains("--sim"),
-            "{message}"
-        );
+        assert!(message.contains("no V4L2 camera named \"no such serial\"") && message.contains("--sim"), "{message}");
         let without_scale = [&on_base[..3], &on_base[5..]].concat();
         let message = error_of(&without_scale);
         assert!(message.contains("camera.wrist.depth.device"), "{message}");

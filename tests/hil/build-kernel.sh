@@ -1,12 +1,12 @@
 #!/bin/sh
-# Builds a kernel of the tests, once. Prints its path as the only line on stdout.
-#   um    User-Mode Linux, an ordinary program, with cameras and virtual CAN buses: about 4 minutes on two cores
-#   x86   what QEMU boots, with the driver of real CAN cards: about 3 minutes
+# Builds a kernel for the tests, once. Prints its path as the only line on stdout.
+#   um    User-Mode Linux, which runs as an ordinary process, with cameras and virtual CAN buses: about 4 minutes on two cores
+#   x86   kernel for QEMU, with the driver of real CAN cards: about 3 minutes
 #
-# usage: build-kernel.sh um|x86 FOLDER      the folder keeps the kernel, a cache: remove it to build anew
+# usage: build-kernel.sh um|x86 FOLDER      FOLDER caches the kernel; remove it to rebuild
 #
-# The source is Debian's package linux-source-6.1, which apt checks; sources.sha256 says which version was tried. Another
-# version is told and used, other bytes of the same version are refused.
+# The source is Debian's package linux-source-6.1, verified by apt. sources.sha256 contains the tested version. Other versions are
+# used with a warning; different bytes of the tested version are rejected.
 set -eu
 
 here=$(cd "$(dirname "$0")" && pwd)
@@ -15,7 +15,7 @@ case "$1" in
 um) arch=um base=defconfig config=$here/kernel.config target=linux image=linux ;;
 x86) arch=x86_64 base=tinyconfig config=$here/kernel-x86.config target=bzImage image=arch/x86/boot/bzImage ;;
 *)
-    echo "build-kernel: um or x86, not $1" >&2
+    echo "build-kernel: invalid kernel $1, expected um or x86" >&2
     exit 2
     ;;
 esac
@@ -24,20 +24,20 @@ $(grep linux-source "$here/sources.sha256" | grep -v '^#')
 LINE
 
 if [ ! -r "$archive" ]; then
-    echo "build-kernel: $archive is missing: scripts/install-packages.sh hil" >&2
+    echo "build-kernel: $archive is missing; run scripts/install-packages.sh hil" >&2
     exit 1
 fi
 found=$(sha256sum "$archive" | cut -d' ' -f1)
 if [ "$found" != "$sha256" ]; then
     version=$(dpkg-query -W -f '${Package}=${Version}' linux-source-6.1 2>/dev/null || true)
     if [ "$version" = "$package" ]; then
-        echo "build-kernel: $archive is not that of $package: sha256 $found, expected $sha256" >&2
+        echo "build-kernel: $archive differs from $package: sha256 $found, expected $sha256" >&2
         exit 1
     fi
-    echo "build-kernel: tried with $package, here is ${version:-a source of unknown version}; going on" >&2
+    echo "build-kernel: tested with $package, found ${version:-an unknown version}; continuing" >&2
 fi
 
-# What the kernel is made of names it.
+# The name of the kernel contains a hash of its inputs.
 key=$(cat "$config" "$here/build-kernel.sh" | { cat; echo "$found"; } | sha256sum | cut -c1-16)
 kernel=$folder/linux-$1-$key
 if [ -s "$kernel" ]; then
@@ -48,14 +48,14 @@ fi
 mkdir -p "$folder"
 tree=$folder/source-$key
 log=$folder/build-$key.log
-echo "building the kernel of the tests ($1), once; its log: $log" >&2
+echo "building the kernel for the tests ($1), once; log: $log" >&2
 rm -rf "$tree"
 mkdir "$tree"
 tar --extract --file "$archive" --directory "$tree" --strip-components=1
 (
     cd "$tree"
-    # User-Mode Linux keeps the floating-point state of a process in 2696 bytes. Processors with AMX have 11 KB of it, and their kernels
-    # refuse to set less than all (EFAULT: "ptrace set fp regs failed"); what is more than all is no error.
+    # User-Mode Linux saves the floating-point state of a process in 2696 bytes. Processors with AMX have 11 KB of it, and their kernels
+    # reject a smaller buffer (EFAULT: "ptrace set fp regs failed"). A larger buffer is accepted.
     if [ "$arch" = um ]; then
         sed -i 's/DEFINE_LONGS(HOST_FP_SIZE, 2696)/DEFINE_LONGS(HOST_FP_SIZE, 12288)/' arch/x86/um/user-offsets.c
         grep -q 'HOST_FP_SIZE, 12288' arch/x86/um/user-offsets.c || exit 1
@@ -69,10 +69,10 @@ tar --extract --file "$archive" --directory "$tree" --strip-components=1
         esac
     done
     make ARCH=$arch olddefconfig
-    # An option that its conditions took away again would show as a missing device much later.
+    # An option that was disabled again by its dependencies would only show up much later, as a missing device.
     grep -v '^#' "$config" | while IFS== read -r option value; do
         if [ "$value" != n ] && ! grep -q "^CONFIG_$option=$value" .config; then
-            echo "the kernel does not take CONFIG_$option=$value"
+            echo "the kernel configuration rejects CONFIG_$option=$value"
             exit 1
         fi
     done || exit 1

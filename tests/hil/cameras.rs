@@ -1,6 +1,7 @@
-//! Inside the virtual kernel: the V4L2 driver against vivid. Two devices: `vivid-000` is a webcam, `vivid-001` a grabber of television.
+//! Tests of the V4L2 driver against vivid, inside the virtual kernel. There are two devices: `vivid-000` is a webcam,
+//! `vivid-001` a television grabber.
 //!
-//! vivid has no exposure control and no MJPEG: those are tested with tables and files beside their code.
+//! vivid has no exposure control and no MJPEG. Unit tests cover those.
 
 use drivers::v4l2::{self, Config, Counts, Delivery, Settings, V4l2Camera, V4l2Format};
 use drivers::{Camera, Error, Image};
@@ -13,17 +14,18 @@ use std::time::{Duration, Instant};
 
 pub(crate) const WEBCAM: &str = "platform:vivid-000";
 const GRABBER: &str = "platform:vivid-001";
-/// Controls by which vivid injects faults (`vivid-ctrls.c`): percent of the images that it drops; a pulled cable.
+/// Controls of vivid that inject faults (`vivid-ctrls.c`): percentage of images to drop; disconnection.
 pub(crate) const DROP_PERCENT: u32 = 0x00f0_f040;
 const DISCONNECT: u32 = 0x00f0_f041;
-/// The next image is damaged; the next stream does not begin; the stream that runs breaks down.
+/// The next image is damaged; the next stream does not start; the running stream fails.
 const DAMAGE: u32 = 0x00f0_f042;
 const REFUSE_STREAM: u32 = 0x00f0_f045;
 const BREAK_STREAM: u32 = 0x00f0_f046;
-/// Drift of stamps against numbers, periods, that no miscount explains: one moves it by a whole period. Vivid stamps when it gets to
-/// it: 0 to 0.25 periods late on an idle machine, up to 0.75 with twice as many busy programs as cores.
+/// Drift of stamps relative to sequence numbers, in periods, that is possible without a miscount, which would change it
+/// by a whole period. vivid stamps images with a delay: 0 to 0.25 periods on an idle machine, up to 0.75 with twice as
+/// many busy processes as cores.
 const DRIFT_RANGE: std::ops::Range<f64> = -0.7..0.95;
-/// Gain and brightness by the kernel's numbers, and values that are not the defaults.
+/// Kernel ids of gain and brightness, and values that are not the defaults.
 const GAIN: u32 = 0x0098_0913;
 const BRIGHTNESS: u32 = 0x0098_0900;
 const SETTINGS: Settings =
@@ -49,19 +51,19 @@ pub(crate) fn config(device: &str, size_px: [u32; 2], rate_hz: f64) -> Config {
     }
 }
 
-/// The node of a device now; it may have another number after a replug.
+/// Current node of a device. Its number may change after reconnecting.
 pub(crate) fn node(bus: &str) -> PathBuf {
-    v4l2::cameras().into_iter().flatten().find(|found| found.bus == bus).expect("vivid is there").node
+    v4l2::cameras().into_iter().flatten().find(|found| found.bus == bus).expect("vivid is loaded").node
 }
 
-/// What came in a stretch of time.
+/// Images captured in a period of time.
 struct CapturedImages {
     images: Vec<Image>,
     elapsed: Duration,
 }
 
 impl CapturedImages {
-    /// All images of `seconds`; only the first keeps its pixels.
+    /// Captures images for `seconds`. Only the first keeps its pixels.
     fn capture(camera: &mut V4l2Camera, seconds: f64) -> Self {
         let start_time = Instant::now();
         let mut images = Vec::new();
@@ -75,11 +77,13 @@ impl CapturedImages {
         Self { images, elapsed: start_time.elapsed() }
     }
 
-    /// Delivered and lost after the first image, once the stamps say the same: two counts that share nothing.
+    /// Returns the number of delivered and of lost images after the first one, and checks them against the stamps,
+    /// which are independent of the sequence numbers.
     fn report(&self, what: &str, rate_hz: f64) -> (u64, u64) {
         let first = self.images[0].stamp;
         let mut number = 0;
-        // How late each image is for its number, periods. A miscount moves all that follow by one; a busy machine only adds.
+        // Delay of each image relative to its sequence number, in periods. A miscount shifts all later images by one; a
+        // busy machine only delays images.
         let delays: Vec<f64> = (self.images.iter().enumerate())
             .map(|(ix, image)| {
                 number += if ix == 0 { 0 } else { 1 + image.n_skipped };
@@ -92,12 +96,12 @@ impl CapturedImages {
         let delivered = self.images.len() as u64 - 1;
         let n_lost = number - delivered;
         println!(
-            "{what}: {delivered} images and {n_lost} lost ones in {:.2?}; by their stamps {drift:+.2} more",
+            "{what}: {delivered} images and {n_lost} lost ones in {:.2?}; drift of the stamps {drift:+.2} periods",
             self.elapsed
         );
-        assert!(DRIFT_RANGE.contains(&drift), "{what}: a lost image was not counted, or one too many was");
+        assert!(DRIFT_RANGE.contains(&drift), "{what}: the number of lost images does not match the stamps");
         let in_order = self.images.windows(2).all(|pair| pair[0].stamp < pair[1].stamp);
-        assert!(in_order, "{what}: stamps go back");
+        assert!(in_order, "{what}: stamps decrease");
         (delivered, n_lost)
     }
 }
@@ -105,7 +109,7 @@ impl CapturedImages {
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn every_lost_image_is_counted() {
-    // As a webcam vivid is slow at 1080p, as a grabber it is not.
+    // vivid is slow at 1080p as a webcam, but not as a grabber.
     for (device, size_px) in [(WEBCAM, [640, 360]), (GRABBER, [1920, 1080])] {
         let rate_hz = 25.0;
         let mut camera = V4l2Camera::open(config(device, size_px, rate_hz)).expect("vivid opens");
@@ -132,11 +136,11 @@ fn injected_drops_are_counted_exactly() {
     let (delivered, n_lost) = CapturedImages::capture(&mut camera, 12.0).report("30 % dropped", rate_hz);
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 0).expect("vivid injects faults");
     let share = n_lost as f64 / (delivered + n_lost) as f64;
-    // 300 throws of a coin of 30 %: four standard deviations.
-    assert!((0.19..0.41).contains(&share), "a share of {share:.2} was lost");
+    // 300 Bernoulli trials at 30 %: four standard deviations.
+    assert!((0.19..0.41).contains(&share), "lost a fraction of {share:.2}");
 }
 
-/// Waits for an image after a fault; how long it took.
+/// Waits for an image after a fault and returns it with the elapsed time.
 fn time_to_recover(camera: &mut V4l2Camera, start_time: Instant) -> (Image, Duration) {
     loop {
         match camera.next_image(Duration::from_millis(100)) {
@@ -164,7 +168,7 @@ fn unplugging_is_survived_with_all_settings() {
         assert_eq!(
             (read_back_values["v4l2.gain"], read_back_values["v4l2.brightness"]),
             (77, 99),
-            "read back by the driver"
+            "values read back by the driver"
         );
         let node = node(WEBCAM);
         assert_eq!(v4l2::control(&node, GAIN).expect("vivid has gain"), 77);
@@ -175,12 +179,12 @@ fn unplugging_is_survived_with_all_settings() {
 
     for n_before in 0..3 {
         v4l2::set_control(&node(WEBCAM), DISCONNECT, 1).expect("vivid injects faults");
-        // Pictures that were taken before may still come.
+        // Images captured before may still arrive.
         let start_time = Instant::now();
         let image = loop {
             let (image, elapsed) = time_to_recover(&mut camera, start_time);
             if camera.counts().n_reconnections > n_before {
-                println!("disconnected: images again after {elapsed:.0?}, {} counted as lost", image.n_skipped);
+                println!("disconnected: recovered after {elapsed:.0?}, {} images counted as lost", image.n_skipped);
                 assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
                 break image;
             }
@@ -197,12 +201,12 @@ fn unplugging_is_survived_with_all_settings() {
     std::thread::sleep(Duration::from_secs(1).saturating_sub(unplugged_at.elapsed()));
     write_driver_action("bind");
     let (image, elapsed) = time_to_recover(&mut camera, Instant::now());
-    println!("plugged in again: images after {elapsed:.0?}, {} counted as lost", image.n_skipped);
+    println!("reconnected: recovered after {elapsed:.0?}, {} images counted as lost", image.n_skipped);
     assert!(elapsed < Duration::from_secs(1), "{elapsed:?}");
-    // A second without a camera, and what binding took.
+    // One second without a camera, plus the time to bind it.
     assert!((20..=60).contains(&image.n_skipped), "{} images counted for the outage", image.n_skipped);
     assert_settings(&camera);
-    CapturedImages::capture(&mut camera, 2.0).report("after the replug", rate_hz);
+    CapturedImages::capture(&mut camera, 2.0).report("after reconnecting", rate_hz);
 }
 
 #[test]
@@ -216,13 +220,15 @@ fn camera_that_stays_away_is_an_error_after_timeout() {
     let start_time = Instant::now();
     let error = loop {
         match camera.next_image(Duration::from_millis(100)) {
-            Ok(_) | Err(Error::Reconnecting { .. }) => assert!(start_time.elapsed() < 5 * wait, "no end to it"),
+            Ok(_) | Err(Error::Reconnecting { .. }) => {
+                assert!(start_time.elapsed() < 5 * wait, "the camera is not given up")
+            }
             Err(error) => break error.to_string(),
         }
     };
     write_driver_action("bind");
-    println!("stays away: {error}");
-    assert!(error.contains("\"front\"") && error.contains("not there again after"), "{error}");
+    println!("not reconnected: {error}");
+    assert!(error.contains("\"front\"") && error.contains("did not reconnect within"), "{error}");
     assert!(start_time.elapsed() >= wait && start_time.elapsed() < 2 * wait, "{:?}", start_time.elapsed());
 }
 
@@ -235,7 +241,7 @@ fn silent_camera_is_restarted_and_then_given_up() {
     CapturedImages::capture(&mut camera, 0.2);
     let set_drop_percent =
         |percent| v4l2::set_control(&node(WEBCAM), DROP_PERCENT, percent).expect("vivid injects faults");
-    // Silent for three seconds: begun anew after two, and there again.
+    // Silent for three seconds: restarted after two, then it recovers.
     set_drop_percent(100);
     let start_time = Instant::now();
     while start_time.elapsed() < Duration::from_secs(3) {
@@ -244,10 +250,10 @@ fn silent_camera_is_restarted_and_then_given_up() {
     }
     set_drop_percent(0);
     let (image, _) = time_to_recover(&mut camera, Instant::now());
-    println!("silent for 3 s: begun anew {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
+    println!("silent for 3 s: restarted {} times, {} images lost", camera.counts().n_reconnections, image.n_skipped);
     assert_eq!(camera.counts().n_reconnections, 1);
     assert!((70..=100).contains(&image.n_skipped), "{} images lost in 3 s at 25 Hz", image.n_skipped);
-    // Silent for good: opened again and again, and given up all the same.
+    // Silent forever: reopened repeatedly, then given up.
     set_drop_percent(100);
     let start_time = Instant::now();
     let error = loop {
@@ -257,8 +263,8 @@ fn silent_camera_is_restarted_and_then_given_up() {
         }
     };
     set_drop_percent(0);
-    println!("silent for good: {error}");
-    assert!(error.contains("not there again after") && error.contains("it sent no whole image for"), "{error}");
+    println!("silent forever: {error}");
+    assert!(error.contains("did not reconnect within") && error.contains("it sent no complete image for"), "{error}");
 }
 
 #[test]
@@ -274,25 +280,26 @@ fn damaged_images_and_broken_streams_are_counted_and_recovered() {
     let (_, n_lost) = captured.report("three damaged images", rate_hz);
     assert_eq!(camera.counts().n_damaged, 3);
     assert!(n_lost >= 3, "{n_lost}: a busy machine may lose more");
-    assert_eq!(camera.counts().n_reconnections, 0, "a damaged image is no reason to begin anew");
+    assert_eq!(camera.counts().n_reconnections, 0, "a damaged image does not restart the stream");
 
     v4l2::set_control(&node(WEBCAM), BREAK_STREAM, 1).expect("vivid injects faults");
     let (_, elapsed) = time_to_recover(&mut camera, Instant::now());
-    println!("a stream that broke down: images again after {elapsed:.0?}");
+    println!("failed stream: recovered after {elapsed:.0?}");
     assert!(elapsed < Duration::from_secs(1) && camera.counts().n_reconnections == 1);
     drop(camera);
 
     v4l2::set_control(&node(WEBCAM), REFUSE_STREAM, 1).expect("vivid injects faults");
-    let open_error = V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect_err("vivid refuses").to_string();
+    let open_error =
+        V4l2Camera::open(config(WEBCAM, [640, 360], rate_hz)).expect_err("vivid rejects the stream").to_string();
     println!("{open_error}");
-    assert!(open_error.contains("\"front\": it refuses to begin its stream"), "{open_error}");
+    assert!(open_error.contains("\"front\": it rejected the start of its stream"), "{open_error}");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn all_formats_show_the_same_picture() {
     use V4l2Format::{Bgr, Grey, Nv12, Rgb, Uyvy, Yuyv};
-    // Vivid works brightness into its pictures in another way for each format: the value that changes nothing.
+    // vivid applies brightness differently in each format; this value has no effect.
     const PLAIN: Settings = Settings { brightness: Some(128), ..SETTINGS };
     let size_px = [640, 360];
     let picture = |format| {
@@ -301,7 +308,7 @@ fn all_formats_show_the_same_picture() {
         camera.next_image(Duration::from_secs(2)).expect("vivid streams").decode_rgb().expect("raw pixels")
     };
     let rgb = picture(Rgb);
-    // Eight bars with text above: one pixel from the middle of each bar, low in the picture.
+    // The image has eight bars with text above: sample one pixel from the center of each bar, low in the image.
     let bars = |rgb: &[u8]| -> Vec<u8> {
         (0..8).flat_map(|bar| rgb[(330 * 640 + bar * 80 + 40) * 3..][..3].to_vec()).collect()
     };
@@ -310,15 +317,15 @@ fn all_formats_show_the_same_picture() {
     for format in [Bgr, Yuyv, Uyvy, Nv12] {
         let got = bars(&picture(format));
         let max_difference = expected.iter().zip(&got).map(|(a, b)| a.abs_diff(*b)).max();
-        println!("{}: off by {max_difference:?} of 255 at most", format.name());
-        // Rounding to counts of a limited range, there and back.
+        println!("{}: maximum difference {max_difference:?} of 255", format.name());
+        // Rounding errors of the conversion to a limited range and back.
         assert!(max_difference <= Some(3), "{}: {expected:?}, got {got:?}", format.name());
     }
     let gray = bars(&picture(Grey));
     let is_gray = gray.chunks_exact(3).all(|pixel| pixel[0] == pixel[1] && pixel[1] == pixel[2]);
     let falls = gray.chunks_exact(3).collect::<Vec<_>>().windows(2).all(|pair| pair[0][0] > pair[1][0]);
-    println!("grey: {:?}", gray.chunks_exact(3).map(|pixel| pixel[0]).collect::<Vec<_>>());
-    assert!(is_gray && falls, "the bars go from bright to dark: {gray:?}");
+    println!("gray: {:?}", gray.chunks_exact(3).map(|pixel| pixel[0]).collect::<Vec<_>>());
+    assert!(is_gray && falls, "the bars are not ordered from bright to dark: {gray:?}");
 }
 
 #[test]
@@ -341,28 +348,29 @@ fn newest_image_is_delivered_if_configured() {
         )
     };
     let ((_, n_lost), age_secs_of) = deliver(Delivery::Newest);
-    assert!(n_lost >= 20, "{n_lost} lost of five images each 200 ms");
+    assert!(n_lost >= 20, "{n_lost} images lost at five images per 200 ms");
     assert!(age_secs_of < 0.15, "the newest image is {age_secs_of} s old");
     let (_, age_secs_of) = deliver(Delivery::Every);
-    assert!(age_secs_of > 0.2, "the oldest waiting image is only {age_secs_of} s old");
+    assert!(age_secs_of > 0.2, "the oldest queued image is only {age_secs_of} s old");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn images_before_first_read_are_not_counted_as_lost() {
     let mut camera = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
-    // Other devices of a rig take their time to open; the eight images that fit wait meanwhile, the others go.
+    // Simulates other devices that take time to open. Meanwhile, the eight buffers fill up and later images are
+    // dropped.
     std::thread::sleep(Duration::from_secs(1));
     let asked_at = drivers::clock::now();
     let captured = CapturedImages::capture(&mut camera, 0.5);
     assert_eq!(captured.images[0].n_skipped, 0);
-    assert!(captured.images[0].stamp > asked_at, "an image from before");
+    assert!(captured.images[0].stamp > asked_at, "the image was captured before the first read");
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn unsupported_modes_report_supported_ones() {
-    let open_error = |config| V4l2Camera::open(config).expect_err("vivid cannot do that").to_string();
+    let open_error = |config| V4l2Camera::open(config).expect_err("vivid does not support this").to_string();
     let size = open_error(config(WEBCAM, [800, 600], 25.0));
     println!("{size}");
     assert!(size.contains("color 800x600 at 25 Hz") && size.contains("640x360 up to 40 Hz"), "{size}");
@@ -375,7 +383,7 @@ fn unsupported_modes_report_supported_ones() {
     assert!(balance.contains("no control for v4l2.white_balance_kelvin"), "{balance}");
     let gain =
         open_error(Config { settings: Settings { gain: Some(300), ..SETTINGS }, ..config(WEBCAM, [640, 360], 25.0) });
-    assert!(gain.contains("v4l2.gain is 300, it takes 0 to 255"), "{gain}");
+    assert!(gain.contains("v4l2.gain is 300, allowed: 0 to 255"), "{gain}");
     let _streams = V4l2Camera::open(config(WEBCAM, [640, 360], 25.0)).expect("vivid opens");
     let busy = open_error(config(WEBCAM, [640, 360], 25.0));
     println!("{busy}");
@@ -386,25 +394,25 @@ fn unsupported_modes_report_supported_ones() {
 #[ignore = "runs in the virtual kernel"]
 fn program_lists_and_records_camera() {
     let fieldrig = |args: &[&str]| {
-        let output = Command::new("/bin/fieldrig").args(args).current_dir("/tmp").output().expect("it starts");
+        let output = Command::new("/bin/fieldrig").args(args).current_dir("/tmp").output().expect("fieldrig starts");
         let text = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
         println!("fieldrig {}:\n{text}", args.join(" "));
         (output.status.code(), text)
     };
     let (code, text) = fieldrig(&["devices"]);
     assert_eq!(code, Some(0));
-    assert!(text.contains(WEBCAM) && text.contains(GRABBER), "both cameras by a name that stays");
-    assert!(text.contains("vcan0"), "the CAN bus that the start script made");
+    assert!(text.contains(WEBCAM) && text.contains(GRABBER), "both cameras are listed with a stable name");
+    assert!(text.contains("vcan0"), "the CAN bus created by the start script is listed");
     let (_, text) = fieldrig(&["doctor"]);
     assert!(text.contains("cameras"), "{text}");
     let (code, text) =
         fieldrig(&["record", "/rigs/vivid.toml", "--out", "/tmp/vivid.mcap", "--seconds", "4", "--json"]);
-    assert!(code == Some(0) || code == Some(3), "recorded, with loss at most: {code:?}");
+    assert!(code == Some(0) || code == Some(3), "recorded, possibly with losses: {code:?}");
     let summary = text.lines().find(|line| line.contains("\"done\"")).expect("a summary");
     let summary: serde_json::Value = serde_json::from_str(summary).expect("JSON");
     let number = |key: &str| summary[key].as_u64().expect("a number");
     let (images, n_lost) = (number("images"), number("images_dropped_by_devices"));
-    assert!((98..=103).contains(&(images + n_lost)), "{images} and {n_lost} lost in 4 s at 25 Hz");
+    assert!((98..=103).contains(&(images + n_lost)), "{images} images and {n_lost} lost in 4 s at 25 Hz");
     let node = node(WEBCAM);
     assert_eq!((v4l2::control(&node, GAIN).ok(), v4l2::control(&node, BRIGHTNESS).ok()), (Some(77), Some(99)));
     let mut recording = drivers::recording::Recording::open(Path::new("/tmp/vivid.mcap")).expect("a recording");
@@ -412,7 +420,11 @@ fn program_lists_and_records_camera() {
     while let Some(sample) = drivers::Source::next_sample(&mut recording).expect("readable") {
         if let drivers::Sample::Image(image) = sample {
             n_read += 1;
-            assert_eq!(image.exposure_secs, Some(0.004), "vivid has no exposure control: the rig file knows it");
+            assert_eq!(
+                image.exposure_secs,
+                Some(0.004),
+                "vivid has no exposure control, so the value of the rig file is used"
+            );
             assert_eq!(image.decode_rgb().expect("uyvy").len(), 640 * 360 * 3);
         }
     }

@@ -1,5 +1,6 @@
-//! Inside the virtual kernel: CAN buses and arms on them. The motors are played on the same virtual bus (`drivers::can::emulated`);
-//! a virtual bus has no bits, so rates, error states and loss of the bus are not seen here.
+//! Tests of CAN buses and arms inside the virtual kernel. The motors are emulated on the same virtual bus
+//! (`drivers::can::emulated`). A virtual bus has no bit timing, so bit rates, error states and bus-off are not tested
+//! here.
 
 use drivers::can::emulated::EmulatedMotor;
 use drivers::can::{ArmConfig, Bus, BusConfig, BusEvent, CanArm, Family, MotorConfig};
@@ -16,7 +17,7 @@ use std::time::Duration;
 
 pub(crate) const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
-/// The joints swing so far, rad, and so fast, rad/s.
+/// Amplitude (rad) and angular frequency (rad/s) of the joint motion.
 const SWING_RAD: f64 = 0.5;
 const SWING_RAD_S: f64 = 2.0;
 
@@ -25,7 +26,7 @@ pub(crate) fn ip(arguments: &str) {
     assert!(output.status.success(), "ip {arguments}: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// A virtual bus that is up; removed again when dropped.
+/// A virtual bus that is up. It is removed on drop.
 pub(crate) struct Wire(&'static str);
 
 impl Wire {
@@ -54,18 +55,18 @@ impl Drop for Wire {
     }
 }
 
-/// Where a joint is at a time, and how fast.
+/// Position and velocity of a joint at a time.
 fn swing(joint_ix: usize, at: Stamp) -> (f64, f64) {
     let phase = SWING_RAD_S * at.secs_since(Stamp(0)) + joint_ix as f64;
     (SWING_RAD * phase.sin(), SWING_RAD * SWING_RAD_S * phase.cos())
 }
 
-/// Where a joint rests.
+/// Rest position of a joint.
 pub(crate) fn rest_rad(joint_ix: usize) -> f64 {
     0.1234 * (joint_ix as f64 - 2.0)
 }
 
-/// Motors on a thread of their own, at rest until they swing.
+/// Motors on a separate thread, at rest until `is_swinging` is set.
 pub(crate) struct Bench {
     stop: Arc<AtomicBool>,
     is_swinging: Arc<AtomicBool>,
@@ -73,16 +74,16 @@ pub(crate) struct Bench {
 }
 
 impl Bench {
-    /// `commanded`: numbers of AK motors that another master commands.
+    /// `commanded`: ids of AK motors that another master commands.
     pub(crate) fn new(bus: BusConfig, motors: Vec<MotorConfig>, commanded: Vec<u8>) -> Self {
         let [stop, is_swinging] = [false; 2].map(|now| Arc::new(AtomicBool::new(now)));
-        let bus = Bus::open(&bus).expect("it is up");
+        let bus = Bus::open(&bus).expect("the bus is up");
         let (stop_flag, swing_flag) = (Arc::clone(&stop), Arc::clone(&is_swinging));
         let thread = std::thread::spawn(move || {
             let mut emulated: Vec<EmulatedMotor> =
                 motors.iter().map(|motor| EmulatedMotor::new(motor.family, DAMIAO_LIMITS)).collect();
             while !stop_flag.load(Ordering::Relaxed) {
-                // A bus that is taken down ends this.
+                // Ends when the bus is taken down.
                 let Ok(arrived) = bus.receive(Duration::from_millis(2)) else { return };
                 let now = clock::now();
                 let mut sent = Vec::new();
@@ -96,14 +97,14 @@ impl Bench {
                         torque_nm: 0.0,
                     });
                     if let Some((_, BusEvent::Frame(frame))) = &arrived {
-                        sent.extend(motor.take(frame).expect("the swing fits"));
+                        sent.extend(motor.take(frame).expect("the motion is within range"));
                     }
-                    sent.extend(motor.report(now).expect("the swing fits"));
+                    sent.extend(motor.report(now).expect("the motion is within range"));
                     if let Family::TMotor { motor: number, model } = config.family
                         && commanded.contains(&number)
                     {
                         let command = tmotor::encode_command(number, &MitCommand::default(), &model.limits());
-                        sent.extend(motor.take(&command.expect("zeros")).expect("the swing fits"));
+                        sent.extend(motor.take(&command.expect("zeros")).expect("the motion is within range"));
                     }
                 }
                 for frame in sent {
@@ -142,7 +143,7 @@ pub(crate) fn damiao(ix: u16) -> MotorConfig {
     motor(&format!("damiao{ix}"), Family::Damiao { motor: ix, feedback: 0x10 + ix })
 }
 
-/// One motor of each family, two of them behind gears or reversed.
+/// One motor of each family, two of them with gears or reversed.
 pub(crate) fn all_families() -> Vec<MotorConfig> {
     let node = |number| canopen::Node::new(number).expect("a node");
     vec![
@@ -180,12 +181,12 @@ fn ten_thousand_frames_at_1_khz_all_arrive() {
                 } else {
                     Frame::classic(id, &[a, b, c, d])
                 };
-                assert!(sender.send(&frame.expect("a length of its format")).expect("it is up"));
+                assert!(sender.send(&frame.expect("a length of its format")).expect("the bus is up"));
             }
         });
         let mut ages = Vec::new();
         for expected in 0..N_FRAMES {
-            let arrived = receiver.receive(Duration::from_secs(2)).expect("it is up");
+            let arrived = receiver.receive(Duration::from_secs(2)).expect("the bus is up");
             let Some((stamp, BusEvent::Frame(frame))) = arrived else {
                 panic!("frame {expected} is lost: {arrived:?}")
             };
@@ -196,12 +197,12 @@ fn ten_thousand_frames_at_1_khz_all_arrive() {
                 ages.push(stamp.nanos_since(sent));
             }
         }
-        sending.join().expect("all are sent");
+        sending.join().expect("all frames are sent");
         ages.sort_unstable();
         match ages.as_slice() {
             [] => println!("can: {N_FRAMES} classic frames at 1 kHz, none lost"),
             ages => println!(
-                "can: {N_FRAMES} FD frames at 1 kHz, none lost; from sending to stamp {:.3} ms in the median, {:.3} ms at 99 %",
+                "can: {N_FRAMES} FD frames at 1 kHz, none lost; latency from sending to stamp: median {:.3} ms, 99th percentile {:.3} ms",
                 ages[ages.len() / 2] as f64 / 1e6,
                 ages[ages.len() * 99 / 100] as f64 / 1e6
             ),
@@ -216,38 +217,34 @@ fn joints_are_read_from_motors_of_all_families() {
     let motors = all_families();
     let bench = Bench::new(wire.config(false), motors.clone(), vec![6]);
     let config = ArmConfig { buses: vec![wire.config(false)], motors: motors.clone(), rate_hz: 200.0 };
-    let mut arm = CanArm::open(&config).expect("all answer");
+    let mut arm = CanArm::open(&config).expect("all motors answer");
     assert_eq!(arm.joint_names(), motors.iter().map(|motor| motor.joint.clone()).collect::<Vec<_>>());
-    // Half a count of each; and half a count of velocity, by which readings are carried on for some milliseconds.
+    // Half a count of position, plus half a count of velocity times a few milliseconds of extrapolation.
     const EXTRAPOLATED_RAD: f64 = 1e-4;
     let half_counts = [12.5 / 65_535.0, 12.5 / 65_535.0, 12.57 / 65_535.0, 1e-6, 4.8e-5, 12.5 / 65_535.0];
-    // On a busy machine single readings are carried on for longer.
+    // On a busy machine, individual states are extrapolated over a longer time.
     const MAX_EXTRAPOLATED_RAD: f64 = 2e-3;
     let mut min_error = [f64::INFINITY; 6];
     for _ in 0..100 {
-        let state = arm.read(Duration::from_secs(1)).expect("they report");
+        let state = arm.read(Duration::from_secs(1)).expect("the motors report");
         for (ix, half_count) in half_counts.iter().enumerate() {
             let error_rad = (state.position[ix] - rest_rad(ix)).abs();
             min_error[ix] = min_error[ix].min(error_rad);
-            assert!(error_rad < half_count + MAX_EXTRAPOLATED_RAD, "{}: off by {error_rad} rad", motors[ix].joint);
+            assert!(error_rad < half_count + MAX_EXTRAPOLATED_RAD, "{}: error {error_rad} rad", motors[ix].joint);
         }
     }
     for (ix, error_rad) in min_error.iter().enumerate() {
-        assert!(
-            *error_rad < half_counts[ix] + EXTRAPOLATED_RAD,
-            "{}: off by {error_rad} rad at least",
-            motors[ix].joint
-        );
+        assert!(*error_rad < half_counts[ix] + EXTRAPOLATED_RAD, "{}: minimum error {error_rad} rad", motors[ix].joint);
     }
     bench.is_swinging.store(true, Ordering::Relaxed);
     let mut max_error = vec![0.0_f64; motors.len()];
     let mut read_delays = Vec::new();
     let start_time = clock::now();
     while clock::now().duration_since(start_time) < Duration::from_secs(3) {
-        let state = arm.read(Duration::from_secs(1)).expect("they report");
+        let state = arm.read(Duration::from_secs(1)).expect("the motors report");
         read_delays.push(clock::now().nanos_since(state.stamp));
         if state.stamp.duration_since(start_time) < Duration::from_millis(200) {
-            continue; // Some of them may not have begun to swing.
+            continue; // Some motors may not have started to move.
         }
         for (ix, max_error) in max_error.iter_mut().enumerate() {
             *max_error = max_error.max((state.position[ix] - swing(ix, state.stamp).0).abs());
@@ -255,12 +252,12 @@ fn joints_are_read_from_motors_of_all_families() {
     }
     read_delays.sort_unstable();
     println!(
-        "can: {} states in 3 s, off by {max_error:.5?} rad at most while swinging at 1 rad/s; read {:.2} ms after their stamp in the median",
+        "can: {} states in 3 s, maximum error {max_error:.5?} rad while moving at up to 1 rad/s; median latency from stamp to read {:.2} ms",
         read_delays.len(),
         read_delays[read_delays.len() / 2] as f64 / 1e6
     );
-    assert!(read_delays.len() > 100, "ODrive and Robstride report 100 times a second");
-    // A kernel without real time on a busy machine stands still for tens of milliseconds at a time.
+    assert!(read_delays.len() > 100, "ODrive and Robstride report 100 times per second");
+    // On a busy machine without a real-time kernel, processes may be delayed by tens of milliseconds.
     assert!(max_error.iter().all(|max_error| *max_error < 0.1 * SWING_RAD * SWING_RAD_S), "{max_error:?}");
 }
 
@@ -269,7 +266,7 @@ fn joints_are_read_from_motors_of_all_families() {
 fn missing_interfaces_and_motors_are_errors() {
     let open = |bus: BusConfig, motors: Vec<MotorConfig>| {
         let config = ArmConfig { buses: vec![bus], motors, rate_hz: 200.0 };
-        CanArm::open(&config).map(drop).expect_err("it cannot be opened").to_string()
+        CanArm::open(&config).map(drop).expect_err("the arm cannot be opened").to_string()
     };
     let missing = BusConfig {
         interface: "can7".to_owned(),
@@ -307,8 +304,8 @@ fn silent_motor_and_bus_down_are_errors() {
     let wire = Wire::new("vcan4", false);
     let config = ArmConfig { buses: vec![wire.config(false)], motors: vec![damiao(1), damiao(2)], rate_hz: 500.0 };
     let both_motors = Bench::new(wire.config(false), config.motors.clone(), vec![]);
-    let mut arm = CanArm::open(&config).expect("both answer");
-    arm.read(Duration::from_secs(1)).expect("both report");
+    let mut arm = CanArm::open(&config).expect("both motors answer");
+    arm.read(Duration::from_secs(1)).expect("both motors report");
     drop(both_motors);
     let _first = Bench::new(wire.config(false), vec![damiao(1)], vec![]);
     let start_time = clock::now();
@@ -321,8 +318,8 @@ fn silent_motor_and_bus_down_are_errors() {
     };
     assert!(error.to_string().contains("\"damiao2\" on \"vcan4\": no frame from the motor for 1s"), "{error}");
 
-    let mut arm = CanArm::open(&ArmConfig { motors: vec![damiao(1)], ..config }).expect("the first answers");
-    arm.read(Duration::from_secs(1)).expect("it reports");
+    let mut arm = CanArm::open(&ArmConfig { motors: vec![damiao(1)], ..config }).expect("the first motor answers");
+    arm.read(Duration::from_secs(1)).expect("the motor reports");
     ip("link set vcan4 down");
     let start_time = clock::now();
     let error = loop {
@@ -332,15 +329,15 @@ fn silent_motor_and_bus_down_are_errors() {
             other => break other.expect_err("the bus is down"),
         }
     };
-    println!("can: a bus that goes down: {error}");
+    println!("can: bus down: {error}");
     assert!(matches!(error, Error::CanBus { .. }), "{error}");
 }
 
-/// The production binary, with a rig file whose arm is two motors on a bus: whether it did its work, and what it told.
+/// Runs the production binary. Returns whether it succeeded, and its output.
 fn fieldrig(arguments: &[&str]) -> (bool, String) {
-    let output = Command::new("/bin/fieldrig").args(arguments).output().expect("it is laid out");
+    let output = Command::new("/bin/fieldrig").args(arguments).output().expect("fieldrig is installed");
     let printed = [output.stdout, output.stderr].concat();
-    // 3 is done with loss: a busy machine loses images, which are counted.
+    // Exit code 3 means success with losses: a busy machine drops images, which are counted.
     let is_done = matches!(output.status.code(), Some(0 | 3));
     (is_done, String::from_utf8_lossy(&printed).into_owned())
 }
@@ -362,12 +359,12 @@ fn binary_records_camera_and_can_arm() {
     let (is_done, printed) = fieldrig(&arguments);
     println!("fieldrig {}:\n{printed}", arguments.join(" "));
     assert!(is_done, "{printed}");
-    let summary = printed.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it says what it recorded");
+    let summary = printed.lines().find(|line| line.contains("\"event\":\"done\"")).expect("a summary is printed");
     let n = |key: &str| -> f64 {
         let (_, rest) = summary.split_once(&format!("\"{key}\":")).expect(key);
         rest.split([',', '}']).next().and_then(|number| number.parse().ok()).expect("a number")
     };
     assert!(n("images") + n("images_dropped_by_devices") > 65.0 && n("images") > 15.0, "{summary}");
-    // Two motors at 200 Hz, less what a kernel without real time on a busy machine misses.
+    // Two motors at 200 Hz, minus losses on a busy machine without a real-time kernel.
     assert!(n("joint_states") > 200.0, "{summary}");
 }

@@ -1,5 +1,6 @@
-//! Inside the virtual kernel: arms on CAN buses are moved, lost and found again. The motors are played, with shafts and watchdogs of
-//! their own; what is lost is real: a process that is killed or stopped, a link that is down, and a cable that carries nothing.
+//! Tests that move arms on CAN buses, interrupt the connection, and recover, inside the virtual kernel. The motors are
+//! emulated, including their shafts and watchdogs. The faults are real: a process is killed or stopped, a link is down,
+//! a cable is disconnected.
 
 use crate::can::{DAMIAO_LIMITS, Wire, all_families, damiao, ip, motor};
 use drivers::can::emulated::{self, EmulatedMotor, State};
@@ -17,36 +18,36 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Set to the name of a bus, this program is the one that moves the arm there and is killed.
+/// Environment variable with a bus name. If it is set, this program moves the arm on that bus until it is killed.
 const CHILD: &str = "FIELDRIG_HIL_CHILD";
 const RATE_HZ: f64 = 200.0;
-/// A kernel without real time on a busy machine stands still for tens of milliseconds at a time.
+/// Longer than the delays of a busy machine without a real-time kernel, which may be tens of milliseconds.
 const TIMEOUT: Duration = Duration::from_millis(250);
-/// How much later than its timeout a played motor may be seen to have stopped, besides what its own thread waited for.
+/// Tolerance of the stop time of an emulated motor, in addition to stalls of its thread.
 const STOP_TOLERANCE: Duration = Duration::from_millis(30);
-/// How much later the arm may tell it on a busy machine.
+/// Tolerance of the time at which the arm reports a stop on a busy machine.
 const REPORT_TOLERANCE: Duration = Duration::from_millis(300);
 const LIMITS: MotionLimits = MotionLimits { position: [-2.0, 2.0], velocity: 1.0, acceleration: 2.0, jerk: 20.0 };
 const GAINS: Gains = Gains { stiffness_nm_rad: 30.0, damping_nm_s_rad: 1.5 };
 const UNITS: Units = Units { counts_per_turn: 65_536.0, rated_torque_nm: 10.0 };
 
-/// What was seen of a motor, in angles of its joint.
+/// Observed state of a motor, in joint angles.
 #[derive(Clone, Debug)]
 pub(crate) struct MotorObservation {
     pub(crate) state: State,
     position_rad: f64,
     velocity_rad_s: f64,
     timed_out_at: Option<Stamp>,
-    /// Where it was commanded to be, command after command.
+    /// Commanded positions, in order.
     commanded_rad: Vec<f64>,
 }
 
-/// Motors on a thread of their own, on a cable that can be cut.
+/// Motors on a separate thread, on a cable that can be disconnected.
 pub(crate) struct Motors {
     observed: Arc<Mutex<Vec<MotorObservation>>>,
     is_disconnected: Arc<AtomicBool>,
     fails_next: Arc<AtomicBool>,
-    /// The longest that this thread itself stood still since it was asked for last, nanoseconds.
+    /// Longest stall of this thread since the last query, nanoseconds.
     max_stall: Arc<AtomicU64>,
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -60,7 +61,7 @@ impl Motors {
         let (disconnected, fail_flag, stop_flag, observed_by_thread) =
             (Arc::clone(&is_disconnected), Arc::clone(&fails_next), Arc::clone(&stop), Arc::clone(&observed));
         let stall_nanos = Arc::clone(&max_stall);
-        let bus = Bus::open(&bus).expect("it is up");
+        let bus = Bus::open(&bus).expect("the bus is up");
         let thread = std::thread::spawn(move || {
             let mut emulated: Vec<_> =
                 configs.iter().map(|config| EmulatedMotor::new(config.family, DAMIAO_LIMITS)).collect();
@@ -70,7 +71,7 @@ impl Motors {
             }
             let mut before = clock::now();
             while !stop_flag.load(Ordering::Relaxed) {
-                // A link that is down says so once.
+                // A link that goes down reports an error once.
                 let arrived = bus.receive(Duration::from_millis(1)).unwrap_or(None);
                 let now = clock::now();
                 let gap = u64::try_from(now.nanos_since(before)).expect("the clock is monotonic");
@@ -81,13 +82,13 @@ impl Motors {
                     emulated[0].fail();
                 }
                 for ((motor, config), commanded_rad) in emulated.iter_mut().zip(&configs).zip(&mut commanded_rad) {
-                    sent.extend(motor.report(now).expect("it fits"));
+                    sent.extend(motor.report(now).expect("the motion is within range"));
                     if let Some((_, BusEvent::Frame(frame))) = &arrived
                         && !disconnected.load(Ordering::Relaxed)
                     {
                         let before = motor.target();
-                        sent.extend(motor.take(frame).expect("it fits"));
-                        // Other frames quiet the watchdogs of axes and drives, too.
+                        sent.extend(motor.take(frame).expect("the motion is within range"));
+                        // For axes and drives, other frames also reset the watchdog.
                         let has_own_loop = matches!(config.family, Family::Odrive { .. } | Family::Cia402 { .. });
                         let is_watchdog_reset = motor.watchdog_reset_at() == Some(now) && !has_own_loop;
                         let is_new = motor.target() != before || is_watchdog_reset;
@@ -97,7 +98,7 @@ impl Motors {
                     }
                 }
                 for frame in sent.iter().filter(|_| !disconnected.load(Ordering::Relaxed)) {
-                    let _ = bus.send(frame); // As above.
+                    let _ = bus.send(frame); // Errors of a link that is down are ignored, as above.
                 }
                 let state = emulated.iter().zip(&configs).zip(&commanded_rad);
                 *observed_by_thread.lock().unwrap_or_else(PoisonError::into_inner) = state
@@ -112,7 +113,7 @@ impl Motors {
             }
         });
         let motors = Self { observed, is_disconnected, fails_next, max_stall, stop, thread: Some(thread) };
-        motors.wait_until("they are there", |observed| !observed.is_empty());
+        motors.wait_until("the motors run", |observed| !observed.is_empty());
         motors
     }
 
@@ -124,7 +125,7 @@ impl Motors {
         let start_time = clock::now();
         while !condition(&self.observed()) {
             let waited = clock::now().duration_since(start_time);
-            assert!(waited < Duration::from_secs(10), "not within 10 s: {what}; {:?}", self.states());
+            assert!(waited < Duration::from_secs(10), "timed out after 10 s: {what}; {:?}", self.states());
             std::thread::sleep(Duration::from_millis(2));
         }
     }
@@ -137,14 +138,16 @@ impl Motors {
         self.observed().iter().map(|observed| observed.position_rad).collect()
     }
 
-    /// Waits until all have stopped by themselves, each within its timeout, and says after how long.
+    /// Waits until the watchdogs have stopped all motors, checks that each did so within its timeout, and returns the
+    /// times in milliseconds.
     fn wait_until_timed_out(&self, since: Stamp, state: State) -> Vec<f64> {
-        self.wait_until("all have stopped by themselves", |observed| {
+        self.wait_until("the watchdogs have stopped all motors", |observed| {
             observed
                 .iter()
                 .all(|observed| observed.state == state && observed.timed_out_at.is_some_and(|lost| lost >= since))
         });
-        let after = |observed: &MotorObservation| observed.timed_out_at.expect("as waited for").duration_since(since);
+        let after =
+            |observed: &MotorObservation| observed.timed_out_at.expect("the wait has succeeded").duration_since(since);
         let after: Vec<Duration> = self.observed().iter().map(after).collect();
         let max_stall = Duration::from_nanos(self.max_stall.swap(0, Ordering::Relaxed));
         assert!(after.iter().all(|after| *after < TIMEOUT + STOP_TOLERANCE + max_stall), "{after:?} {max_stall:?}");
@@ -203,26 +206,26 @@ fn motors_with_watchdog() -> Vec<MotorConfig> {
     ]
 }
 
-/// Waits until the arm is held, and a moment more until its shafts rest.
+/// Waits until the arm holds, and then until its shafts are at rest.
 fn wait_until_holding(arm: &mut MovableCanArm) {
     let start_time = clock::now();
     while arm.motion() != Motion::Holding {
         assert!(!matches!(arm.motion(), Motion::Stopped { .. }), "{:?}", arm.motion());
-        assert!(clock::now().duration_since(start_time) < Duration::from_secs(20), "it never arrives");
+        assert!(clock::now().duration_since(start_time) < Duration::from_secs(20), "the arm does not arrive");
         std::thread::sleep(Duration::from_millis(5));
     }
     std::thread::sleep(Duration::from_millis(1500));
     while arm.read(Duration::ZERO).is_ok() {}
 }
 
-/// Why it stopped, once it has.
+/// Waits until the arm has stopped and returns the reason.
 pub(crate) fn wait_until_stopped(arm: &MovableCanArm) -> String {
     let start_time = clock::now();
     loop {
         if let Motion::Stopped { reason } = arm.motion() {
             return reason;
         }
-        assert!(clock::now().duration_since(start_time) < Duration::from_secs(5), "it goes on");
+        assert!(clock::now().duration_since(start_time) < Duration::from_secs(5), "the arm does not stop");
         std::thread::sleep(Duration::from_millis(1));
     }
 }
@@ -234,13 +237,13 @@ fn motors_of_all_families_reach_targets() {
     let configs = all_families();
     let motors = Motors::new(wire.config(false), configs.clone(), false);
     let config = movable(wire.config(false), &configs, OnLoss::Release);
-    let mut arm = MovableCanArm::open(&config).expect("all are switched on");
+    let mut arm = MovableCanArm::open(&config).expect("all motors are enabled");
     assert_eq!(motors.states(), [State::Enabled; 6]);
     assert_eq!(arm.motion(), Motion::Holding);
-    // The motors were found at 0, and those joints are elsewhere: nothing has moved by being switched on.
+    // The motors start at 0, which is another joint position for some. Enabling them must not cause motion.
     let initial: Vec<f64> = configs.iter().map(|config| config.offset_rad).collect();
-    // Half a count in the command and half in the answer; drives and ODrives resolve finer. In MIT mode no count of velocity is 0: half
-    // a one pushes a motor as far aside as damping is to stiffness.
+    // Resolution: half a count in the command and half in the feedback; drives and ODrives are more precise. In MIT
+    // mode, no count represents zero velocity: half a count displaces a motor by the ratio of damping to stiffness.
     let push_offset =
         |limit_rad_s: f64, counts: f64| limit_rad_s / counts * GAINS.damping_nm_s_rad / GAINS.stiffness_nm_rad;
     let counts = [
@@ -261,7 +264,7 @@ fn motors_of_all_families_reach_targets() {
         let target = JointTarget { position: target };
         assert_eq!(arm.command(&target).expect("within the limits"), target);
         wait_until_holding(&mut arm);
-        // Half a count of velocity carries a reading on for as long as the others' take.
+        // Extrapolation by half a count of velocity until the other motors have reported.
         const EXTRAPOLATED_RAD: f64 = 1e-4;
         let mut reported = [f64::INFINITY; 6];
         for _ in 0..50 {
@@ -271,19 +274,21 @@ fn motors_of_all_families_reach_targets() {
             }
         }
         let true_errors = errors(&motors.positions(), &target.position);
-        println!("can: sent to {:?}, off by {true_errors:.6?} rad", target.position);
+        println!("can: moved to {:?}, errors {true_errors:.6?} rad", target.position);
         assert!(is_within_resolution(&reported) && is_within_resolution(&true_errors), "{reported:?} {true_errors:?}");
     }
-    // Targets outside the range are brought into it; others change nothing.
+    // Targets outside the range are clamped. Targets with a wrong length are rejected.
     let clamped = arm.command(&JointTarget { position: vec![9.0; 6] }).expect("six numbers");
     assert!(clamped.position.iter().all(|position| *position <= 2.0), "{clamped:?}");
     assert!(arm.command(&JointTarget { position: vec![0.0; 5] }).is_err());
-    arm.stop().expect("it moves");
+    arm.stop().expect("the arm is moving");
     wait_until_holding(&mut arm);
     let rest = motors.positions();
-    assert!(rest.iter().all(|position| position.abs() < 1.0), "it stopped on its way: {rest:?}");
+    assert!(rest.iter().all(|position| position.abs() < 1.0), "expected a stop before the target: {rest:?}");
     drop(arm);
-    motors.wait_until("they are released", |observed| observed.iter().all(|observed| observed.state == State::Free));
+    motors.wait_until("the motors are released", |observed| {
+        observed.iter().all(|observed| observed.state == State::Free)
+    });
 }
 
 #[test]
@@ -292,10 +297,12 @@ fn motors_without_watchdog_get_fail_safe_resent() {
     let wire = Wire::new("vcan13", false);
     let configs: Vec<_> =
         all_families().into_iter().filter(|config| matches!(config.family, Family::TMotor { .. })).collect();
-    // The program ends in order, and while the arm looks on the cable fails: nothing of what is said then arrives.
+    // The cable is disconnected while the program shuts down, or while the arm is open. No frames arrive until it is
+    // reconnected.
     for is_dropped in [true, false] {
         let motors = Motors::new(wire.config(false), configs.clone(), false);
-        let arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("it is there");
+        let arm =
+            MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("the motor answers");
         assert_eq!(motors.states(), [State::Enabled]);
         motors.is_disconnected.store(true, Ordering::Relaxed);
         std::thread::scope(|threads| {
@@ -307,9 +314,13 @@ fn motors_without_watchdog_get_fail_safe_resent() {
                 Some(arm)
             };
             std::thread::sleep(TIMEOUT / 2);
-            assert_eq!(motors.states(), [State::Enabled], "it obeys its last command as long as it hears nothing else");
+            assert_eq!(
+                motors.states(),
+                [State::Enabled],
+                "the motor executes its last command until it receives another"
+            );
             motors.is_disconnected.store(false, Ordering::Relaxed);
-            motors.wait_until("they are released", |observed| {
+            motors.wait_until("the motors are released", |observed| {
                 observed.iter().all(|observed| observed.state == State::Free)
             });
             drop(held_arm);
@@ -327,17 +338,17 @@ fn commands_respect_limits_and_joints_arrive_together() {
     let two = Motors::new(second.config(false), vec![on_second.clone()], false);
     let mut config = movable(wire.config(false), &[damiao(1), on_second], OnLoss::Release);
     config.arm.buses.push(second.config(false));
-    let mut arm = MovableCanArm::open(&config).expect("both are switched on");
+    let mut arm = MovableCanArm::open(&config).expect("both motors are enabled");
     arm.command(&JointTarget { position: vec![1.5, 0.2] }).expect("within the limits");
     std::thread::sleep(Duration::from_millis(700));
-    arm.command(&JointTarget { position: vec![-0.5, 0.4] }).expect("another on the way");
+    arm.command(&JointTarget { position: vec![-0.5, 0.4] }).expect("another target during the motion");
     wait_until_holding(&mut arm);
     let commanded = [&one, &two].map(|motors| motors.observed()[0].commanded_rad.clone());
     let last_change = commanded.each_ref().map(|path| {
-        let last = *path.last().expect("it moved");
-        path.iter().rposition(|rad| (rad - last).abs() > 2e-3).expect("it moved")
+        let last = *path.last().expect("the joint moved");
+        path.iter().rposition(|rad| (rad - last).abs() > 2e-3).expect("the joint moved")
     });
-    // Alone the second joint would be there hundreds of cycles earlier; the last counts of a short way are long ones.
+    // The second joint alone would arrive hundreds of cycles earlier. The last counts of a short path take many cycles.
     assert!(last_change[0].abs_diff(last_change[1]) < 40, "{last_change:?}");
     const WINDOW: usize = 40;
     const COUNT_RAD: f64 = 25.0 / 65_535.0;
@@ -352,10 +363,10 @@ fn commands_respect_limits_and_joints_arrive_together() {
             }
         }
     }
-    println!("can: commands on two buses: at most {:.3} rad/s of 1 and {:.3} rad/s2 of 2", max[0], max[1]);
+    println!("can: commands on two buses: maximum {:.3} rad/s (limit 1) and {:.3} rad/s2 (limit 2)", max[0], max[1]);
     assert!(max[0] <= LIMITS.velocity + COUNT_RAD / secs, "{max:?}");
     assert!(max[1] <= LIMITS.acceleration + 2.0 * COUNT_RAD / secs.powi(2), "{max:?}");
-    assert!(max[0] > 0.9, "it was fast: {max:?}");
+    assert!(max[0] > 0.9, "expected a fast motion: {max:?}");
 }
 
 #[test]
@@ -365,8 +376,8 @@ fn unsafe_configurations_are_not_enabled() {
     let configs = all_families();
     let motors = Motors::new(wire.config(false), configs.clone(), false);
     let assert_rejected = |config: &MovableArmConfig, expected: &str| {
-        let reported = MovableCanArm::open(config).map(drop).expect_err("it cannot be moved so").to_string();
-        println!("can: refused: {reported}");
+        let reported = MovableCanArm::open(config).map(drop).expect_err("the configuration is unsafe").to_string();
+        println!("can: rejected: {reported}");
         assert!(reported.contains(expected), "{reported}");
     };
     let good = movable(wire.config(false), &configs, OnLoss::Release);
@@ -415,37 +426,38 @@ fn faults_stop_the_arm_until_recovery() {
         let n = configs.len();
         let motors = Motors::new(wire.config(false), configs.clone(), false);
         let mut arm =
-            MovableCanArm::open(&movable(wire.config(false), &configs, on_loss)).expect("they are switched on");
-        for fault in ["the cable is cut", "the link is down", "the bus is lost", "a motor fails"] {
+            MovableCanArm::open(&movable(wire.config(false), &configs, on_loss)).expect("the motors are enabled");
+        for fault in ["the cable is disconnected", "the link is down", "the bus is off", "a motor fails"] {
             let direction = if motors.positions()[0] > 0.0 { -1.0 } else { 1.0 };
-            arm.command(&JointTarget { position: vec![direction; n] }).expect("it is switched on");
+            arm.command(&JointTarget { position: vec![direction; n] }).expect("the arm is enabled");
             std::thread::sleep(Duration::from_millis(600));
             motors.max_stall.store(0, Ordering::Relaxed);
             let start_time = clock::now();
             match fault {
-                "the cable is cut" => motors.is_disconnected.store(true, Ordering::Relaxed),
+                "the cable is disconnected" => motors.is_disconnected.store(true, Ordering::Relaxed),
                 "the link is down" => ip("link set vcan10 down"),
-                "the bus is lost" => inject_bus_off("vcan10"),
+                "the bus is off" => inject_bus_off("vcan10"),
                 _ => motors.fails_next.store(true, Ordering::Relaxed),
             }
-            // The program that takes a link down takes its time: now it is down.
+            // The command that takes the link down takes some time; the link is down now.
             let faulted_at = clock::now();
             let reason = wait_until_stopped(&arm);
             let reported_after = clock::now().duration_since(start_time);
             assert!(reported_after < TIMEOUT + REPORT_TOLERANCE, "{fault}: {reported_after:?}");
-            // Where nothing of us reaches them they stop by themselves; else they were told to.
-            let is_isolated = ["the cable is cut", "the link is down"].contains(&fault);
+            // Without a connection, the watchdogs stop the motors. Otherwise, they received a command to stop.
+            let is_isolated = ["the cable is disconnected", "the link is down"].contains(&fault);
             let after_millis = if is_isolated { motors.wait_until_timed_out(faulted_at, state) } else { Vec::new() };
-            motors
-                .wait_until("none obeys", |observed| observed.iter().all(|observed| observed.state != State::Enabled));
+            motors.wait_until("no motor is enabled", |observed| {
+                observed.iter().all(|observed| observed.state != State::Enabled)
+            });
             println!(
-                "can: {fault}, on_loss = {:?}: told after {:.0} ms ({reason}); motors stopped by themselves after {after_millis:.0?} ms",
+                "can: {fault}, on_loss = {:?}: reported after {:.0} ms ({reason}); watchdogs stopped the motors after {after_millis:.0?} ms",
                 on_loss.name(),
                 1e3 * reported_after.as_secs_f64()
             );
             motors.is_disconnected.store(false, Ordering::Relaxed);
             ip("link set vcan10 up");
-            // Whatever comes back, nobody is switched on, and what is held does not move.
+            // After reconnection, no motor is enabled, and a held motor does not move.
             std::thread::sleep(Duration::from_millis(600));
             let before = motors.observed().clone();
             assert!(before.iter().all(|observed| observed.state != State::Enabled), "{fault}: {:?}", motors.states());
@@ -455,22 +467,21 @@ fn faults_stop_the_arm_until_recovery() {
                     "{fault}"
                 );
             }
-            let assert_rejected =
-                arm.command(&JointTarget { position: vec![0.0; n] }).expect_err("it was not recovered");
-            assert!(assert_rejected.to_string().contains("not been recovered"), "{assert_rejected}");
+            let rejection = arm.command(&JointTarget { position: vec![0.0; n] }).expect_err("the arm is not recovered");
+            assert!(rejection.to_string().contains("not been recovered"), "{rejection}");
             let n_commands: usize = before.iter().map(|observed| observed.commanded_rad.len()).sum();
             assert_eq!(
                 motors.observed().iter().map(|observed| observed.commanded_rad.len()).sum::<usize>(),
                 n_commands
             );
-            // The free ones have coasted on: within the joints' range, or it says so.
+            // Released motors coast. They must stay within the range of the joints, or recovery reports an error.
             let coasted: Vec<f64> = motors.positions();
             match arm.recover() {
                 Ok(()) => {
                     assert!(motors.states().iter().all(|state| *state == State::Enabled), "{fault}");
                     let moved: Vec<f64> =
                         motors.positions().iter().zip(&coasted).map(|(now, coasted)| (now - coasted).abs()).collect();
-                    assert!(moved.iter().all(|moved| *moved < 0.1), "{fault}: switched on where it is: {moved:?}");
+                    assert!(moved.iter().all(|moved| *moved < 0.1), "{fault}: enabling moved the motors: {moved:?}");
                 }
                 Err(error) => panic!("{fault}: {error}; the motors are at {coasted:?}"),
             }
@@ -484,10 +495,11 @@ fn malformed_frames_at_worst_stop_the_arm() {
     let wire = Wire::new("vcan12", false);
     let configs = motors_with_watchdog();
     let motors = Motors::new(wire.config(false), configs.clone(), false);
-    let mut arm = MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("they are on");
+    let mut arm =
+        MovableCanArm::open(&movable(wire.config(false), &configs, OnLoss::Release)).expect("the motors are enabled");
     arm.command(&JointTarget { position: vec![1.0; configs.len()] }).expect("within the limits");
-    let noise = Bus::open(&wire.config(false)).expect("it is up");
-    // Answers of each of them, and what else comes from motors: feedback, PDOs, SDO answers, heartbeats.
+    let noise = Bus::open(&wire.config(false)).expect("the bus is up");
+    // Ids of the answers of each motor and of its other frames: feedback, PDOs, SDO answers, heartbeats.
     let ids = [Id::standard(0x11), Id::extended(0x0280_03FD), Id::extended(0x1100_03FD), Id::standard(0x081)]
         .into_iter()
         .chain([0x089, 0x085, 0x185, 0x285, 0x585, 0x705].map(Id::standard))
@@ -501,12 +513,13 @@ fn malformed_frames_at_worst_stop_the_arm() {
     for _ in 0..3000 {
         let bytes: Vec<u8> = (0..next() % 9).map(|_| next().to_le_bytes()[0]).collect();
         let frame = Frame::classic(ids[next() % ids.len()], &bytes).expect("at most eight bytes");
-        noise.send(&frame).expect("it is up");
+        noise.send(&frame).expect("the bus is up");
         std::thread::sleep(Duration::from_micros(300));
     }
     let reason = wait_until_stopped(&arm);
-    println!("can: 3000 frames of nonsense: {reason}");
-    motors.wait_until("none obeys", |observed| observed.iter().all(|observed| observed.state != State::Enabled));
+    println!("can: 3000 random frames: {reason}");
+    motors
+        .wait_until("no motor is enabled", |observed| observed.iter().all(|observed| observed.state != State::Enabled));
     for observed in motors.observed().iter() {
         let steps = observed.commanded_rad.windows(2).map(|path| (path[1] - path[0]).abs());
         let max = steps.fold(0.0, f64::max);
@@ -517,14 +530,17 @@ fn malformed_frames_at_worst_stop_the_arm() {
     assert!(motors.states().iter().all(|state| *state == State::Enabled));
 }
 
-/// What a controller tells that goes off the bus.
+/// Sends the error frame of a controller that goes bus-off.
 fn inject_bus_off(interface: &str) {
     const CAN_ERR_BUSOFF: u32 = 0x40;
-    let socket = CanSocket::open(interface).expect("it is up");
-    socket.write_frame(&CanErrorFrame::new_error(CAN_ERR_BUSOFF, &[0; 8]).expect("eight bytes")).expect("it is up");
+    let socket = CanSocket::open(interface).expect("the bus is up");
+    socket
+        .write_frame(&CanErrorFrame::new_error(CAN_ERR_BUSOFF, &[0; 8]).expect("eight bytes"))
+        .expect("the bus is up");
 }
 
-/// The program that moves an arm until it is killed: this one, with a bus to do so on. It is told to recover by a line.
+/// Program that moves an arm until it is killed: this program, with the environment variable for a bus. It recovers
+/// after reading a line from stdin.
 #[test]
 #[ignore = "started by another test"]
 fn child_program_moves_arm() {
@@ -534,14 +550,14 @@ fn child_program_moves_arm() {
         if is_hold { (vec![drive(5), drive(6)], OnLoss::Hold) } else { (motors_with_watchdog(), OnLoss::Release) };
     let bus = arguments.split(' ').next().expect("a name").to_owned();
     let wire = BusConfig { interface: bus, bitrate_hz: 1_000_000, data_bitrate_hz: None, accept_no_restart: false };
-    let mut arm = MovableCanArm::open(&movable(wire, &configs, on_loss)).expect("they are switched on");
+    let mut arm = MovableCanArm::open(&movable(wire, &configs, on_loss)).expect("the motors are enabled");
     let mut lines = std::io::stdin().lines();
     let mut direction = 1.0;
     loop {
         match arm.motion() {
             Motion::Holding => {
                 let target = JointTarget { position: vec![direction; configs.len()] };
-                // It may have stopped since.
+                // The arm may have stopped in the meantime.
                 if arm.command(&target).is_ok() {
                     direction = -direction;
                 }
@@ -566,7 +582,7 @@ fn start_child(arguments: &str) -> Child {
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()
-        .expect("it is laid out")
+        .expect("the test program is installed")
 }
 
 fn signal(child: &Child, signal: &str) {
@@ -592,13 +608,13 @@ fn killed_or_suspended_program_triggers_watchdogs() {
         signal(&child, "-STOP");
         let start_time = clock::now();
         let after = motors.wait_until_timed_out(start_time, state);
-        println!("can: SIGSTOP, on_loss = {name:?}: motors stopped by themselves after {after:.0?} ms");
+        println!("can: SIGSTOP, on_loss = {name:?}: watchdogs stopped the motors after {after:.0?} ms");
         std::thread::sleep(Duration::from_millis(500));
         let before = motors.observed().clone();
         signal(&child, "-CONT");
         let mut reported = BufReader::new(child.stdout.take().expect("piped")).lines();
         let mut next = |expected: &str| loop {
-            let line = reported.next().expect("it lives").expect("text");
+            let line = reported.next().expect("the child runs").expect("text");
             if line.contains(expected) {
                 return line;
             }
@@ -609,11 +625,11 @@ fn killed_or_suspended_program_triggers_watchdogs() {
         std::thread::sleep(Duration::from_millis(500));
         for (before, after) in before.iter().zip(motors.observed().iter()) {
             assert_eq!(after.state, if name == "hold" { State::Holding } else { State::Free }, "{after:?}");
-            assert_eq!(after.commanded_rad.len(), before.commanded_rad.len(), "an old setpoint was obeyed");
-            assert!(name == "release" || after.position_rad == before.position_rad, "it was held and moved");
+            assert_eq!(after.commanded_rad.len(), before.commanded_rad.len(), "an old setpoint was executed");
+            assert!(name == "release" || after.position_rad == before.position_rad, "the held motor moved");
         }
-        // Only on request, and from where they are.
-        child.stdin.as_mut().expect("piped").write_all(b"recover\n").expect("it reads");
+        // Recovery happens only on request, and starts from the current positions.
+        child.stdin.as_mut().expect("piped").write_all(b"recover\n").expect("the child reads its stdin");
         next("child: recovered");
         motors.wait_until("the child moves the arm again", is_moving);
 
@@ -621,7 +637,7 @@ fn killed_or_suspended_program_triggers_watchdogs() {
         signal(&child, "-KILL");
         let start_time = clock::now();
         let after = motors.wait_until_timed_out(start_time, state);
-        println!("can: kill -9, on_loss = {name:?}: motors stopped by themselves after {after:.0?} ms");
+        println!("can: kill -9, on_loss = {name:?}: watchdogs stopped the motors after {after:.0?} ms");
         child.wait().expect("our own child");
     }
 }

@@ -1,5 +1,6 @@
-//! The Franka driver and the controller that we play against what others made of the same protocol: libfranka itself as a client
-//! (`pylibfranka`), and `franka-sim` as a controller. Both come from the Python Package Index into a virtual environment that is made once.
+//! Tests of the Franka driver and of the emulated controller against independent implementations of the protocol:
+//! libfranka as a client (`pylibfranka`) and `franka-sim` as a controller. Both are installed once from the Python
+//! Package Index into a virtual environment.
 
 #![cfg(target_os = "linux")]
 
@@ -16,13 +17,13 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// Set to `demand`, a machine that cannot run these tests fails them; `.ci/run` does.
+/// If set to `demand`, the tests fail instead of being skipped on a machine that cannot run them. `.ci/run` sets it.
 const REQUIRE_HIL_VARIABLE: &str = "FIELDRIG_HIL";
-/// For whatever is slow on a busy machine.
+/// Timeout for steps that are slow on a busy machine.
 const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 const URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 const PINS: &str = include_str!("sources.sha256");
-/// These tests want the machine for themselves.
+/// These tests must not run in parallel.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 #[test]
@@ -30,7 +31,7 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     const REST_RAD: [f64; N_JOINTS] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
     let _alone = ONE_AT_A_TIME.lock();
     let Some(python) = environment() else { return };
-    // libfranka always connects to port 1337: an address of the loopback network that nobody else has.
+    // libfranka always connects to port 1337, so use a loopback address that no other process uses.
     let [_, _, high, low] = std::process::id().to_be_bytes();
     let ip = Ipv4Addr::new(127, 37, high, low.clamp(1, 254));
     let config = RobotConfig {
@@ -45,10 +46,10 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
     let output = Command::new(python).arg(script).arg(ip.to_string()).output().unwrap();
     let [reported, errors] = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
     assert!(output.status.success(), "{reported}{errors}");
-    report(&format!("libfranka against the played robot: {reported}"));
+    report(&format!("libfranka against the emulated robot: {reported}"));
     let reported: serde_json::Value = serde_json::from_str(&reported).unwrap();
     let number = |key: &str| reported[key].as_f64().unwrap();
-    // States that came together are one cycle of the client.
+    // The client counts states that arrive together as one cycle.
     assert!(number("cycles") > 0.9 * 2000.0 && number("answered") > 0.99, "{reported}");
     for (ix, by) in reported["moved_rad"].as_array().unwrap().iter().enumerate() {
         let expected = if ix == 3 { 0.2 } else { 0.0 };
@@ -79,7 +80,7 @@ fn ten_thousand_states_are_received_from_franka_sim() {
     let statistics = arm.statistics();
     report(&format!("our driver against franka-sim: {statistics}\n"));
     assert!(statistics.success_frac() > 0.99, "{statistics}");
-    // While it is ours nobody else gets in; and the true flange is 107 mm further.
+    // FCI accepts one client at a time.
     let second_client_error = FrankaArm::open(&server.config()).unwrap_err().to_string();
     assert!(second_client_error.contains("one client") && second_client_error.contains("udp"), "{second_client_error}");
 }
@@ -104,12 +105,12 @@ fn ten_thousand_motion_cycles_with_both_controllers() {
     let chain = chain("panda_link8");
     let config =
         ArmConfig { address: emulated.address().to_string(), joint_names: chain.joint_names().to_vec(), chain };
-    follow_for_ten_thousand_cycles("the played robot", || {
+    follow_for_ten_thousand_cycles("the emulated robot", || {
         MovableFrankaArm::open(&config, &motion(), &ContactConfig::default()).unwrap()
     });
 }
 
-/// How an arm is moved in these tests.
+/// Motion configuration of these tests.
 fn motion() -> MotionConfig {
     MotionConfig {
         limits: chain("panda_link8").limits().iter().map(|joint| MotionLimits::new(joint, 0.5, 0.5, 0.1)).collect(),
@@ -119,42 +120,42 @@ fn motion() -> MotionConfig {
     }
 }
 
-/// Moves there and back until 10 000 states were answered, and looks at what came of that on both sides.
+/// Moves back and forth until 10 000 states were answered, and checks the statistics on both sides.
 ///
-/// A machine that is busy with other things gets a second chance, and a third; a reflex for limits that were not kept gets none.
+/// On a busy machine, up to three attempts are made. A reflex caused by a violated limit fails immediately.
 fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaArm) {
     const MAX_ATTEMPTS: usize = 3;
     const BY_RAD: f64 = 0.3;
-    const NEAR_RAD: f64 = 5e-3; // franka-sim's joints have mass.
+    const NEAR_RAD: f64 = 5e-3; // The joints of franka-sim have inertia.
     for attempt in 1..=MAX_ATTEMPTS {
         let mut arm = open();
-        let rest = arm.read(TEST_TIMEOUT).expect("it tells its joints").position;
+        let rest = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
         let mut directions = [-1.0, 0.0, 1.0, 0.0].into_iter().cycle();
         while arm.motion_statistics().n_answered < 10_000 {
-            let by_rad = BY_RAD * directions.next().expect("there is always another");
+            let by_rad = BY_RAD * directions.next().expect("the iterator is infinite");
             let target = JointTarget { position: rest.iter().map(|rest| rest + by_rad).collect() };
-            assert_eq!(arm.command(&target).expect("a target in its range"), target);
+            assert_eq!(arm.command(&target).expect("a target within range"), target);
             let until = Instant::now() + TEST_TIMEOUT;
             while arm.motion() == Motion::Moving {
-                assert!(Instant::now() < until, "it never comes to rest: {}", arm.motion_statistics());
+                assert!(Instant::now() < until, "the arm does not come to rest: {}", arm.motion_statistics());
                 std::thread::sleep(Duration::from_millis(5));
             }
             if let Motion::Stopped { reason } = arm.motion() {
                 assert!(reason.contains("communication_constraints_violation"), "{name}: {reason}");
-                arm.recover().expect("it recovers");
+                arm.recover().expect("the arm recovers");
                 continue;
             }
             let position = settled_position(&mut arm);
             let off = position
                 .iter()
                 .zip(&target.position)
-                .map(|(is, requirements)| (is - requirements).abs())
+                .map(|(actual, expected)| (actual - expected).abs())
                 .fold(0.0, f64::max);
             assert!(off < NEAR_RAD, "{name}: {off} rad from its target");
         }
         let statistics = arm.motion_statistics();
         report(&format!("our driver moves {name}: {statistics}\n"));
-        let [reported, _] = statistics.robot_success_frac().expect("it has moved");
+        let [reported, _] = statistics.robot_success_frac().expect("the arm has moved");
         if statistics.success_frac() > 0.99 && reported > 0.99 && statistics.n_motions > 0 {
             return;
         }
@@ -162,17 +163,17 @@ fn follow_for_ten_thousand_cycles(name: &str, open: impl Fn() -> MovableFrankaAr
     }
 }
 
-/// Where the joints are after they came to rest: states from before may wait.
+/// Joint positions after the arm has come to rest, skipping queued older states.
 fn settled_position(arm: &mut MovableFrankaArm) -> Vec<f64> {
     std::thread::sleep(Duration::from_millis(100));
-    let mut position = arm.read(TEST_TIMEOUT).expect("it tells its joints").position;
+    let mut position = arm.read(TEST_TIMEOUT).expect("the arm reports its joints").position;
     while let Ok(state) = arm.read(Duration::ZERO) {
         position = state.position;
     }
     position
 }
 
-/// `franka-sim`, which enforces what a robot does.
+/// A running `franka-sim`, which enforces the limits of a real robot.
 struct FrankaSim {
     address: String,
     _process: KillOnDrop,
@@ -182,8 +183,8 @@ impl FrankaSim {
     fn start(python: &Path) -> Self {
         let port =
             TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port").local_addr().expect("a free port").port();
-        let log = fs::File::create(folder().join("franka-sim.log")).expect("room on the disk");
-        // Its own model has to be fetched; ours is of primitives.
+        let log = fs::File::create(folder().join("franka-sim.log")).expect("creating the log file");
+        // The model of franka-sim is a separate download; ours uses primitive shapes.
         let (root, model) = (Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), folder().join("panda.xml"));
         let model_output = Command::new(python)
             .arg(root.join("tests/hil/franka_sim_model.py"))
@@ -203,13 +204,14 @@ impl FrankaSim {
         Self { address: SocketAddr::from((Ipv4Addr::LOCALHOST, port)).to_string(), _process: KillOnDrop(child) }
     }
 
-    /// It tells the pose of its seventh link as that of the flange.
+    /// Configuration for franka-sim, which reports the pose of its seventh link as flange
+    /// pose. The real flange is 107 mm further.
     fn config(&self) -> ArmConfig {
         let chain = chain("panda_link7");
         ArmConfig { address: self.address.clone(), joint_names: chain.joint_names().to_vec(), chain }
     }
 
-    /// Once it is there.
+    /// Opens the arm once the server is ready.
     fn open<T>(&self, open: impl Fn(&ArmConfig) -> Result<T, drivers::Error>) -> T {
         let until = Instant::now() + TEST_TIMEOUT;
         loop {
@@ -222,36 +224,36 @@ impl FrankaSim {
     }
 }
 
-/// Joints that rest there, and then are where they are wanted.
+/// Joints that start at a rest position and then follow the commands without delay.
 fn ideal_joints(rest_rad: [f64; N_JOINTS]) -> JointSimulator {
     let mut is_first = true;
-    Box::new(move |_, requirements| {
-        let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { requirements.position_rad };
-        Joints { position_rad, velocity_rad_s: requirements.velocity_rad_s, ..Joints::default() }
+    Box::new(move |_, command| {
+        let position_rad = if std::mem::take(&mut is_first) { rest_rad } else { command.position_rad };
+        Joints { position_rad, velocity_rad_s: command.velocity_rad_s, ..Joints::default() }
     })
 }
 
 fn chain(tip: &str) -> Chain {
-    Chain::from_urdf(URDF, "panda_link0", tip).expect("the description comes along")
+    Chain::from_urdf(URDF, "panda_link0", tip).expect("the URDF is valid")
 }
 
-/// A child that does not outlive the test.
+/// A child process that is killed on drop.
 struct KillOnDrop(Child);
 
 impl Drop for KillOnDrop {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // It may already have ended.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// Past what the test harness holds back: figures are to be seen when all is well, too.
+/// Writes to stderr directly, because the test harness hides the output of passing tests.
 fn report(text: &str) {
     std::io::stderr().write_all(text.as_bytes()).expect("stderr is open");
 }
 
-/// The Python of the virtual environment; `None`, told in a line, where it cannot be made.
+/// Python of the virtual environment. Returns `None` and prints the reason if it cannot be created.
 fn environment() -> Option<PathBuf> {
     if let Err(reason) = make_environment() {
         assert!(
@@ -264,29 +266,30 @@ fn environment() -> Option<PathBuf> {
     Some(folder().join("bin/python"))
 }
 
-/// Makes the virtual environment where it is not complete.
+/// Creates the virtual environment if it is not complete.
 fn make_environment() -> Result<(), String> {
     let (folder, complete_marker) = (folder(), folder().join("complete"));
     if complete_marker.exists() {
         return Ok(());
     }
     if !cfg!(target_arch = "x86_64") {
-        return Err("the peers of Franka arms are wheels for x86-64".to_owned());
+        return Err("the Python packages of the Franka tests require x86-64".to_owned());
     }
     let run = |program: &Path, arguments: &[&str]| {
         let output = Command::new(program).args(arguments).output();
-        let output = output.map_err(|error| format!("{} does not start: {error}", program.display()))?;
+        let output = output.map_err(|error| format!("cannot start {}: {error}", program.display()))?;
         let errors = String::from_utf8_lossy(&output.stderr).into_owned();
         let last = errors.lines().last().unwrap_or_default().to_owned();
         if output.status.success() { Ok(()) } else { Err(last) }
     };
     let is_python_3_11 = "import sys; sys.exit(sys.version_info[:2] != (3, 11))";
     run(Path::new("python3"), &["-c", is_python_3_11])
-        .map_err(|_| "the peers of Franka arms are wheels for Python 3.11 (Debian 12)".to_owned())?;
-    // What an interrupted run left.
+        .map_err(|_| "the Python packages of the Franka tests require Python 3.11 (Debian 12)".to_owned())?;
+    // Leftovers of an interrupted run.
     let _ = fs::remove_dir_all(&folder);
-    let [at, requirements] = [&folder, &folder.join("wanted.txt")].map(|path| path.display().to_string());
-    run(Path::new("python3"), &["-m", "venv", &at]).map_err(|error| format!("no virtual environment: {error}"))?;
+    let [at, requirements] = [&folder, &folder.join("requirements.txt")].map(|path| path.display().to_string());
+    run(Path::new("python3"), &["-m", "venv", &at])
+        .map_err(|error| format!("cannot create a virtual environment: {error}"))?;
     let requirements_text: String =
         pins().map(|[sha256, _, wheel]| format!("{wheel} --hash=sha256:{sha256}\n")).collect();
     fs::write(&requirements, requirements_text).map_err(|error| error.to_string())?;
@@ -301,17 +304,19 @@ fn make_environment() -> Result<(), String> {
         "-r",
         &requirements,
     ];
-    run(&folder.join("bin/python"), &pip).map_err(|error| format!("PyPI gives no peers of Franka arms: {error}"))?;
+    run(&folder.join("bin/python"), &pip)
+        .map_err(|error| format!("cannot install the Python packages of the Franka tests: {error}"))?;
     fs::write(complete_marker, "").map_err(|error| error.to_string())
 }
 
-/// Named by what is in it, beside the other virtual hardware in the target folder.
+/// Folder of the virtual environment, named after its contents, next to the other virtual hardware in the target
+/// folder.
 fn folder() -> PathBuf {
     let shas: String = pins().map(|[sha256, ..]| &sha256[..4]).collect();
     Path::new(env!("CARGO_TARGET_TMPDIR")).join("../hil").join(format!("franka-{shas}"))
 }
 
-/// The wheels: sha256, file, requirement.
+/// The pinned wheels: sha256, file, requirement.
 fn pins() -> impl Iterator<Item = [&'static str; 3]> {
     let columns = |line: &'static str| {
         let columns: Vec<&str> = line.split_whitespace().collect();

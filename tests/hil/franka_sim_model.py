@@ -1,13 +1,13 @@
-"""A model that franka-sim can move stiffly: a robot's description, with what rotors behind gears add to the joints' inertia.
+"""Writes a model for franka-sim that is stable under stiff control: a URDF plus the inertia of rotors behind gears.
 
-usage: franka_sim_model.py URDF MJCF      reads the first, writes the second
+usage: franka_sim_model.py URDF MJCF      reads URDF, writes MJCF
 """
 
 import sys
 
 import mujoco
 
-ROTORS_KG_M2 = 0.6  # Without, its damping of 450 Nm s/rad makes steps of a millisecond unstable.
+ROTORS_KG_M2 = 0.6  # Without it, the damping of 450 Nm s/rad makes steps of one millisecond unstable.
 
 
 def main():

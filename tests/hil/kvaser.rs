@@ -1,5 +1,6 @@
-//! Inside the machine that QEMU plays: two CAN cards on one bus, with the kernel's driver of real ones, so bit rates, the states of
-//! controllers and the loss of the bus are those of real interfaces. What QEMU's chips lack is bent from outside (`qemu.rs`).
+//! Tests of CAN on real drivers, inside a machine emulated by QEMU with two CAN cards on one bus. Bit rates, controller
+//! states and bus-off behave like those of real interfaces. Errors that QEMU's chips cannot produce are injected from
+//! outside (`qemu.rs`).
 
 use super::can::{Bench, damiao};
 use super::can_motion::{Motors, movable, wait_until_stopped};
@@ -15,57 +16,58 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
 
-// Of the chip's registers (SJA1000, data sheet of 2000, section 6.4): status and interrupts for errors.
+// Bits of status and interrupt registers of the chip for errors (SJA1000 data sheet of 2000, section 6.4).
 const HAS_ERRORS: u8 = 0x40;
 const IS_BUS_OFF: u8 = 0x80;
 const STATUS_CHANGED: u8 = 0x04;
 const PASSIVE_CHANGED: u8 = 0x20;
 
-/// What mends a card in all these tests.
+/// Command that fixes the configuration of a card in all these tests.
 fn fix_command(interface: &str) -> String {
     format!(
         "sudo ip link set {interface} down; sudo ip link set {interface} up type can bitrate 1000000 restart-ms 100"
     )
 }
 
-/// Types a line; what it told.
+/// Runs a shell command and returns its output.
 fn sh(line: &str) -> String {
-    let output = Command::new("/bin/sh").args(["-c", line]).output().expect("there is a shell");
+    let output = Command::new("/bin/sh").args(["-c", line]).output().expect("the shell starts");
     let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
     assert!(output.status.success(), "{line}: {printed}");
     printed
 }
 
-/// A card that its driver has found a moment ago.
+/// A card that was just bound to its driver.
 struct Card {
     interface: &'static str,
     device: PathBuf,
 }
 
 impl Card {
-    /// As the driver leaves it: down, without a bit rate.
+    /// A card in its initial state: down, without a bit rate.
     fn new(interface: &'static str) -> Self {
-        let device = fs::canonicalize(format!("/sys/class/net/{interface}/device")).expect("two cards are plugged in");
+        let device = fs::canonicalize(format!("/sys/class/net/{interface}/device")).expect("the machine has two cards");
         let slot = device.file_name().expect("a folder of the bus").as_encoded_bytes();
         for order in ["unbind", "bind"] {
-            fs::write(format!("/sys/bus/pci/drivers/kvaser_pci/{order}"), slot).expect("the driver takes orders");
+            fs::write(format!("/sys/bus/pci/drivers/kvaser_pci/{order}"), slot).expect("the driver can be (un)bound");
         }
         let card = Self { interface, device };
-        // Its name, for who bends it; while it is down the acceptance registers can be written, and all frames are accepted anyway.
+        // Write the interface name, which identifies the chip for fault injection. The acceptance registers are only
+        // writable while it is down; all frames are accepted anyway.
         for (value, register) in [interface.as_bytes(), &qemu::ACCEPT_ALL].concat().iter().zip(16..) {
             card.write(register, *value);
         }
         card
     }
 
-    /// Set up as the rig file has it.
+    /// A card configured as in the rig file.
     fn up(interface: &'static str) -> Self {
         let card = Self::new(interface);
         sh(&fix_command(interface));
         card
     }
 
-    /// Up, but coming back later, or never with 0, once it is off the bus.
+    /// A card that is up, but restarts later after bus-off, or never if `restart_millis` is 0.
     fn up_with_restart(interface: &'static str, restart_millis: u32) -> Self {
         let card = Self::new(interface);
         sh(&format!("sudo ip link set {interface} up type can bitrate 1000000 restart-ms {restart_millis}"));
@@ -82,28 +84,30 @@ impl Card {
     }
 
     fn bus(&self) -> Bus {
-        Bus::open(&self.config()).expect("it is set up")
+        Bus::open(&self.config()).expect("the card is configured")
     }
 
     fn link(&self) -> Link {
-        Link::read(self.interface).expect("it exists")
+        Link::read(self.interface).expect("the interface exists")
     }
 
-    /// Writes a register of its chip past the driver.
+    /// Writes a register of the chip directly, bypassing the driver.
     fn write(&self, register: u64, value: u8) {
-        let ports = fs::OpenOptions::new().write(true).open(self.device.join("resource1")).expect("we are root");
-        ports.write_all_at(&[value], register).expect("a register");
+        let ports =
+            fs::OpenOptions::new().write(true).open(self.device.join("resource1")).expect("the test runs as root");
+        ports.write_all_at(&[value], register).expect("the register is writable");
     }
 
-    /// Whether interrupts of its chip reach the computer.
+    /// Enables or disables interrupts of the chip.
     fn set_interrupts_enabled(&self, enabled: bool) {
         const CONTROL: u64 = 0x38;
-        let ports = fs::OpenOptions::new().write(true).open(self.device.join("resource0")).expect("we are root");
+        let ports =
+            fs::OpenOptions::new().write(true).open(self.device.join("resource0")).expect("the test runs as root");
         let control: u32 = if enabled { 0x2000 } else { 0 };
-        ports.write_all_at(&control.to_le_bytes(), CONTROL).expect("a register");
+        ports.write_all_at(&control.to_le_bytes(), CONTROL).expect("the register is writable");
     }
 
-    /// Has its chip bent; the driver is told with the chip's next interrupt.
+    /// Injects status and interrupt bits into the chip. The driver notices them at the next interrupt of the chip.
     fn inject(&self, status: u8, interrupts: u8) {
         println!("\n{}{} {status:02x} {interrupts:02x}", qemu::INJECT, self.interface);
         let mut answer = String::new();
@@ -111,10 +115,10 @@ impl Card {
         assert_eq!(answer.trim(), qemu::INJECTED);
     }
 
-    /// Has its chip bent, and interrupts.
+    /// Injects status and interrupt bits and triggers an interrupt.
     fn raise_error(&self, status: u8, interrupts: u8) {
         self.inject(status, interrupts);
-        // The order to clear an overrun, of which there is none; with it the chip looks at its interrupts anew.
+        // Send the command that clears an overrun, although there is none: it makes the chip reevaluate its interrupts.
         self.write(1, 0x08);
     }
 
@@ -131,19 +135,21 @@ impl Card {
     }
 }
 
-/// The production binary's view of the rig.
+/// Output of `fieldrig doctor` for the rig.
 fn doctor() -> String {
-    let output = Command::new("/bin/fieldrig").args(["doctor", "/rigs/kvaser.toml"]).output().expect("it is laid out");
+    let output =
+        Command::new("/bin/fieldrig").args(["doctor", "/rigs/kvaser.toml"]).output().expect("fieldrig is installed");
     String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
 }
 
-/// What error frames tell until they tell enough.
+/// Accumulates error frames until the condition holds.
 fn errors_until(bus: &Bus, condition: impl Fn(&WireErrors) -> bool) -> WireErrors {
     let mut errors = WireErrors::default();
     let until = clock::now() + Duration::from_secs(10);
     while !condition(&errors) {
         assert!(clock::now() < until, "{errors:?}");
-        if let Some((_, BusEvent::Errors(new_errors))) = bus.receive(Duration::from_millis(100)).expect("it is up") {
+        if let Some((_, BusEvent::Errors(new_errors))) = bus.receive(Duration::from_millis(100)).expect("the bus is up")
+        {
             errors.add(&new_errors);
         }
     }
@@ -176,7 +182,7 @@ fn misconfigured_card_reports_fix_command() {
             problem_found.is_some_and(|complaint| complaint.command == fix_command("can0")),
             "{set_up}: {problems:?}"
         );
-        let open_error = Bus::open(&card.config()).expect_err("it is not set up").to_string();
+        let open_error = Bus::open(&card.config()).expect_err("the card is not configured").to_string();
         assert!(open_error.contains(&fix_command("can0")), "{open_error}");
         let printed = doctor();
         assert!(
@@ -191,7 +197,7 @@ fn misconfigured_card_reports_fix_command() {
             printed.contains("can0: up, 1000000 bit/s, state active") && !printed.contains("sudo ip link set can0"),
             "{printed}"
         );
-        println!("kvaser: {what}: mended by {}", problems[0].command);
+        println!("kvaser: {what}: fixed by {}", problems[0].command);
     }
 }
 
@@ -205,9 +211,12 @@ fn frames_pass_between_cards_both_ways() {
             let id = if ix % 2 == 0 { Id::standard(ix) } else { Id::extended(0x0AB0_0000 + ix) };
             let bytes = ix.to_le_bytes().repeat(2);
             let sent = Frame::classic(id.expect("in range"), &bytes[..ix as usize % 9]).expect("up to eight bytes");
-            assert!(sender.send(&sent).expect("it is up"));
-            let arrived = receiver.receive(Duration::from_secs(5)).expect("it is up");
-            assert!(matches!(arrived, Some((_, BusEvent::Frame(frame))) if frame == sent), "{arrived:?}, not {sent:?}");
+            assert!(sender.send(&sent).expect("the bus is up"));
+            let arrived = receiver.receive(Duration::from_secs(5)).expect("the bus is up");
+            assert!(
+                matches!(arrived, Some((_, BusEvent::Frame(frame))) if frame == sent),
+                "{arrived:?}, expected {sent:?}"
+            );
         }
     }
 }
@@ -219,12 +228,12 @@ fn arm_reading_survives_bus_off() {
     let motors = vec![damiao(1), damiao(2)];
     let _bench = Bench::new(cards[1].config(), motors.clone(), vec![]);
     let config = ArmConfig { buses: vec![cards[0].config()], motors, rate_hz: 100.0 };
-    let mut arm = CanArm::open(&config).expect("both answer");
+    let mut arm = CanArm::open(&config).expect("both motors answer");
     for _ in 0..50 {
-        let state = arm.read(Duration::from_secs(5)).expect("they report");
+        let state = arm.read(Duration::from_secs(5)).expect("the motors report");
         for (ix, position) in state.position.iter().enumerate() {
             let off = (position - super::can::rest_rad(ix)).abs();
-            assert!(off < 1e-3, "joint {ix}: off by {off} rad");
+            assert!(off < 1e-3, "joint {ix}: error {off} rad");
         }
     }
     let monitor = cards[0].bus();
@@ -234,13 +243,13 @@ fn arm_reading_survives_bus_off() {
         assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
         let recovered_at = clock::now();
         let state = loop {
-            let state = arm.read(Duration::from_secs(1)).expect("it goes on");
+            let state = arm.read(Duration::from_secs(1)).expect("reading continues");
             if state.stamp > recovered_at {
                 break state;
             }
         };
         println!(
-            "kvaser: joints are read {:.0} ms after the bus is back",
+            "kvaser: joints are read {:.0} ms after the bus restarted",
             state.stamp.nanos_since(recovered_at) as f64 / 1e6
         );
     }
@@ -252,14 +261,14 @@ fn persistent_bus_off_is_reported_as_cause() {
     let cards = [Card::up_with_restart("can0", 60_000), Card::up("can1")];
     let _bench = Bench::new(cards[1].config(), vec![damiao(1)], vec![]);
     let config = ArmConfig { buses: vec![cards[0].config()], motors: vec![damiao(1)], rate_hz: 100.0 };
-    let mut arm = CanArm::open(&config).expect("it answers");
-    arm.read(Duration::from_secs(5)).expect("it reports");
+    let mut arm = CanArm::open(&config).expect("the motor answers");
+    arm.read(Duration::from_secs(5)).expect("the motor reports");
     cards[0].enter_bus_off();
     let until = clock::now() + Duration::from_secs(10);
     let error = loop {
         match arm.read(Duration::from_millis(100)) {
             Ok(_) | Err(Error::NoJoints { .. }) if clock::now() < until => {}
-            other => break other.expect_err("the bus is lost").to_string(),
+            other => break other.expect_err("the bus is off").to_string(),
         }
     };
     println!("kvaser: {error}");
@@ -273,30 +282,30 @@ fn bus_off_stops_moving_arm_until_recovery() {
     let configs = [damiao(1), damiao(2)];
     let motors = Motors::new(cards[1].config(), configs.to_vec(), false);
     let mut config = movable(cards[0].config(), &configs, OnLoss::Release);
-    // Longer than this machine stands still where the one that plays it is busy.
+    // Longer than the stalls of this machine on a busy host.
     config.motion.timeout = Duration::from_secs(2);
-    let mut arm = MovableCanArm::open(&config).expect("they are switched on");
+    let mut arm = MovableCanArm::open(&config).expect("the motors are enabled");
     let monitor = cards[0].bus();
     for direction_of_motion in [1.0, -1.0] {
-        arm.command(&JointTarget { position: vec![direction_of_motion; 2] }).expect("it is switched on");
+        arm.command(&JointTarget { position: vec![direction_of_motion; 2] }).expect("the arm is enabled");
         cards[0].enter_bus_off();
         let reason = wait_until_stopped(&arm);
         assert!(reason.contains("can0 went off the bus"), "{reason}");
         let errors = errors_until(&monitor, |errors| errors.n_restarts > 0);
         assert_eq!((errors.n_bus_off, errors.n_restarts), (1, 1), "{errors:?}");
-        motors.wait_until("none obeys", |observed| {
+        motors.wait_until("no motor is enabled", |observed| {
             observed.iter().all(|observed| observed.state == emulated::State::Free)
         });
         std::thread::sleep(Duration::from_millis(500));
-        assert_eq!(motors.states(), [emulated::State::Free; 2], "the bus is back");
-        let open_error = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("it was not recovered");
+        assert_eq!(motors.states(), [emulated::State::Free; 2], "the bus has restarted");
+        let open_error = arm.command(&JointTarget { position: vec![0.0; 2] }).expect_err("the arm is not recovered");
         assert!(open_error.to_string().contains("not been recovered"), "{open_error}");
         arm.recover().expect("the motors answer again");
         assert!(!matches!(arm.motion(), Motion::Stopped { .. }), "{:?}", arm.motion());
-        motors.wait_until("all obey", |observed| {
+        motors.wait_until("all motors are enabled", |observed| {
             observed.iter().all(|observed| observed.state == emulated::State::Enabled)
         });
-        println!("kvaser: {reason}; back, motors free; switched on again on request");
+        println!("kvaser: {reason}; restarted with motors released; enabled again on request");
     }
 }
 
@@ -315,7 +324,7 @@ fn controller_state_changes_are_reported() {
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_passive: 1, ..WireErrors::default() });
     assert_eq!(card.link().state, Some(State::Passive));
-    assert_eq!(card.link().problems(&card.config()), [], "it still takes part");
+    assert_eq!(card.link().problems(&card.config()), [], "the controller still communicates");
     card.enter_bus_off();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_bus_off: 1, ..WireErrors::default() });
@@ -323,16 +332,17 @@ fn controller_state_changes_are_reported() {
     assert_eq!(link.state, Some(State::BusOff), "{link}");
     let problems = link.problems(&card.config());
     assert!(problems.iter().any(|complaint| complaint.problem.starts_with("it is off the bus")), "{problems:?}");
-    // Once the kernel has noticed that nothing goes out, which may take it a second, it takes frames and drops them.
+    // After the kernel has noticed that nothing is transmitted, which may take a second, it accepts frames and drops
+    // them.
     let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[]).expect("no bytes");
     std::thread::sleep(Duration::from_millis(1200));
-    let n_accepted = (0..50).filter(|_| bus.send(&frame).expect("it is up")).count();
+    let n_accepted = (0..50).filter(|_| bus.send(&frame).expect("the interface is up")).count();
     assert_eq!(n_accepted, 50);
     let start_time = clock::now();
     let errors = errors_until(&bus, |errors| errors.n_frames > 0);
     assert_eq!(errors, WireErrors { n_frames: 1, n_restarts: 1, ..WireErrors::default() });
     assert_eq!(card.link().state, Some(State::Active));
-    println!("kvaser: warning, passive, off the bus, back after {:?}", clock::now().duration_since(start_time));
+    println!("kvaser: warning, passive, bus-off, restarted after {:?}", clock::now().duration_since(start_time));
 }
 
 #[test]
@@ -346,7 +356,7 @@ fn doctor_reports_bus_off_with_working_fix() {
     }
     let printed = doctor();
     assert!(printed.contains("can0: it is off the bus") && printed.contains(&fix_command("can0")), "{printed}");
-    // What takes the chip's place on the bus again takes back what was bent.
+    // Clear the injected bits, as a chip does that returns to the bus.
     card.inject(0, 0);
     sh(&fix_command("can0"));
     assert_eq!(card.link().problems(&card.config()), []);
@@ -358,11 +368,11 @@ fn doctor_reports_bus_off_with_working_fix() {
 fn unacknowledged_frames_are_distinguished_from_silence() {
     let card = Card::up("can0");
     let config = ArmConfig { buses: vec![card.config()], motors: vec![damiao(1)], rate_hz: 100.0 };
-    let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
+    let printed = CanArm::open(&config).expect_err("no motor is connected").to_string();
     assert!(printed.contains("no answer to 4 requests"), "{printed}");
-    // The chip tells it with the first question; that driver has no word for frames that nobody acknowledges.
+    // The chip reports it with the first query. Its driver cannot report frames without acknowledgment.
     card.inject(HAS_ERRORS, PASSIVE_CHANGED);
-    let printed = CanArm::open(&config).expect_err("nobody is there").to_string();
+    let printed = CanArm::open(&config).expect_err("no motor is connected").to_string();
     assert!(printed.contains("no node acknowledges frames"), "{printed}");
 }
 
@@ -374,22 +384,22 @@ fn receive_overflows_are_counted() {
     cards[0].set_interrupts_enabled(false);
     for ix in 0..10_u8 {
         let frame = Frame::classic(Id::standard(0x100).expect("11 bits"), &[ix; 8]).expect("eight bytes");
-        assert!(sender.send(&frame).expect("it is up"));
+        assert!(sender.send(&frame).expect("the bus is up"));
     }
     let stamp = clock::now();
     cards[0].set_interrupts_enabled(true);
     let (mut n_frames, mut errors) = (0, WireErrors::default());
-    while let Some((_, arrived)) = receiver.receive(Duration::from_millis(300)).expect("it is up") {
+    while let Some((_, arrived)) = receiver.receive(Duration::from_millis(300)).expect("the bus is up") {
         match arrived {
             BusEvent::Frame(_) => n_frames += 1,
             BusEvent::Errors(new_errors) => errors.add(&new_errors),
         }
     }
     println!(
-        "kvaser: {n_frames} of 10 frames found room, told after {:?}: {errors}",
+        "kvaser: {n_frames} of 10 frames fit into the chip, reported after {:?}: {errors}",
         clock::now().duration_since(stamp)
     );
-    // 64 bytes, and eleven a frame.
+    // The chip stores 64 bytes, and each frame takes eleven.
     assert_eq!(n_frames, 5);
     assert_eq!(errors, WireErrors { n_frames: 1, n_overflows: 1, ..WireErrors::default() });
 }
@@ -404,9 +414,9 @@ fn bus_load_matches_frames_sent() {
     let receiving = std::thread::spawn(move || {
         let mut n = 0;
         while n < N_FRAMES {
-            match receiver.receive(Duration::from_secs(5)).expect("it is up") {
+            match receiver.receive(Duration::from_secs(5)).expect("the bus is up") {
                 Some((_, BusEvent::Frame(_))) => n += 1,
-                other => panic!("{n} frames came, then {other:?}"),
+                other => panic!("{n} frames arrived, then {other:?}"),
             }
         }
         receiver.busy()
@@ -423,20 +433,20 @@ fn bus_load_matches_frames_sent() {
         };
         n_bits += n_other_bits + 8 * n_bytes;
         let frame = Frame::classic(id.expect("in range"), &[0x55; 8][..n_bytes as usize]).expect("up to eight bytes");
-        assert!(sender.send(&frame).expect("it is up"));
+        assert!(sender.send(&frame).expect("the bus is up"));
     }
     let elapsed_secs = clock::now().secs_since(start_time);
-    let busy = [sender.busy(), receiving.join().expect("all frames come")];
+    let busy = [sender.busy(), receiving.join().expect("all frames arrive")];
     let expected_secs = f64::from(n_bits) / 1e6;
     let load = |busy_secs: f64| 100.0 * busy_secs / elapsed_secs;
     println!(
-        "kvaser: {N_FRAMES} frames in {elapsed_secs:.1} s: {:.3} % and {:.3} % of the bus as the driver counts, {:.3} % by their bits",
+        "kvaser: {N_FRAMES} frames in {elapsed_secs:.1} s: bus load {:.3} % and {:.3} % as counted by the driver, {:.3} % computed from the bits",
         load(busy[0].as_secs_f64()),
         load(busy[1].as_secs_f64()),
         load(expected_secs)
     );
     for busy in busy {
-        // Each frame is counted in whole nanoseconds.
+        // Each frame is rounded to whole nanoseconds.
         assert!((busy.as_secs_f64() - expected_secs).abs() < 1e-9 * f64::from(N_FRAMES), "{busy:?}");
     }
     for (card, direction) in cards.iter().zip(["tx", "rx"]) {

@@ -1,6 +1,6 @@
-"""A client by libfranka itself: 2000 cycles of a motion, a step that no robot may make, the recovery; one JSON object out.
+"""Client based on libfranka: moves for 2000 cycles, commands a step that triggers a reflex, recovers; prints one JSON object.
 
-usage: libfranka_client.py ADDRESS      libfranka adds port 1337
+usage: libfranka_client.py ADDRESS      libfranka always uses port 1337
 """
 
 import json
@@ -14,7 +14,7 @@ JUMP_RAD = 0.001
 
 
 def move(robot, position_at):
-    """Commands one position a cycle until `position_at` gives none; cycles and least share of them that was answered."""
+    """Commands one position per cycle until `position_at` reports the end. Returns the number of cycles and the mean success rate."""
     control = robot.start_joint_position_control(ControllerMode.JointImpedance)
     cycles, seconds, shares, start = 0, 0.0, [], None
     while True:
@@ -22,7 +22,7 @@ def move(robot, position_at):
         start = start or list(state.q_d)
         seconds += period.to_sec()
         cycles += 1
-        if cycles > 100:  # The share is that of the last 100 cycles.
+        if cycles > 100:  # The rate covers the last 100 cycles.
             shares.append(state.control_command_success_rate)
         position, finished = position_at(start, seconds)
         command = JointPositions(position)
@@ -32,7 +32,7 @@ def move(robot, position_at):
             return cycles, sum(shares) / max(len(shares), 1)
 
 
-def way(start, seconds):
+def trajectory(start, seconds):
     share = min(seconds / (CYCLES * 1e-3), 1.0)
     by = BY_RAD * share**3 * (10 - 15 * share + 6 * share * share)
     return start[:3] + [start[3] + by] + start[4:], share >= 1.0
@@ -46,7 +46,7 @@ def jump(start, seconds):
 def main():
     robot = Robot(sys.argv[1], RealtimeConfig.kIgnore)
     before = list(robot.read_once().q)
-    cycles, share = move(robot, way)
+    cycles, share = move(robot, trajectory)
     after = list(robot.read_once().q)
     stopped = ""
     try:
@@ -56,11 +56,11 @@ def main():
     reflex = robot.read_once().robot_mode == RobotMode.Reflex
     robot.automatic_error_recovery()
     mode = RobotMode.Reflex
-    for _ in range(1000):  # States from before the recovery may still be on their way.
+    for _ in range(1000):  # States sent before the recovery may still arrive.
         mode = robot.read_once().robot_mode
         if mode == RobotMode.Idle:
             break
-    again, _ = move(robot, way)
+    again, _ = move(robot, trajectory)
     moved = [b - a for a, b in zip(before, after)]
     print(
         json.dumps(

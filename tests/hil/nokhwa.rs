@@ -1,4 +1,4 @@
-//! Inside the virtual kernel: cameras by way of nokhwa, against vivid.
+//! Tests of nokhwa cameras against vivid, inside the virtual kernel.
 
 use crate::cameras::{self, DROP_PERCENT, WEBCAM, node, write_driver_action};
 use drivers::nokhwa::{Config, NokhwaCamera};
@@ -28,28 +28,29 @@ fn config() -> Config {
     }
 }
 
-/// Leaves the camera in a format that nokhwa knows: it opens none whose present one it does not, as after the tests of V4L2.
+/// Opens a camera after setting a format that nokhwa supports. nokhwa cannot open a camera whose current format it does
+/// not support, which may be set by the V4L2 tests.
 fn open(config: Config) -> NokhwaCamera {
     let known_format = v4l2::Config { format: Some(V4l2Format::Yuyv), ..cameras::config(WEBCAM, [640, 360], RATE_HZ) };
     drop(V4l2Camera::open(known_format).expect("vivid opens"));
     NokhwaCamera::open(config).expect("vivid opens")
 }
 
-/// The next image after a fault, and how long it took.
+/// Waits for an image after a fault and returns it with the elapsed time.
 fn time_to_recover(camera: &mut NokhwaCamera) -> (Image, Duration) {
     let start_time = Instant::now();
     loop {
         match camera.next_image(Duration::from_millis(100)) {
             Ok(image) => return (image, start_time.elapsed()),
             Err(Error::NoImage { .. } | Error::Reconnecting { .. }) => {
-                assert!(start_time.elapsed() < Duration::from_secs(10), "no image any more")
+                assert!(start_time.elapsed() < Duration::from_secs(10), "no more images")
             }
             Err(other) => panic!("{other}"),
         }
     }
 }
 
-/// Until the camera says that it is looked for.
+/// Waits until the camera reports that it is reconnecting.
 fn time_to_disconnect(camera: &mut NokhwaCamera) -> Duration {
     let start_time = Instant::now();
     while !matches!(camera.next_image(Duration::from_millis(50)), Err(Error::Reconnecting { .. })) {
@@ -70,7 +71,7 @@ fn nokhwa_streams_ten_seconds() {
         let mut last = first.stamp;
         while start_time.elapsed() < Duration::from_secs(if format.is_none() { 10 } else { 2 }) {
             let image = camera.next_image(Duration::from_secs(2)).expect("vivid streams");
-            assert!(image.stamp > last, "stamps go back");
+            assert!(image.stamp > last, "stamps decrease");
             last = image.stamp;
         }
         let by_time = last.secs_since(first.stamp) * RATE_HZ;
@@ -78,7 +79,10 @@ fn nokhwa_streams_ten_seconds() {
         println!("nokhwa, {:?}: {counts:?} in {:.2?}, {by_time:.1} by time", first.format, start_time.elapsed());
         assert_eq!((counts.n_reconnections, counts.n_abandoned), (0, 0));
         let n_counted = (counts.n_images - 1 + counts.n_skipped) as f64;
-        assert!((n_counted - by_time).abs() < 3.0, "{n_counted} images and gaps, {by_time} by time");
+        assert!(
+            (n_counted - by_time).abs() < 3.0,
+            "{n_counted} images including gaps, expected {by_time} from the stamps"
+        );
     }
 }
 
@@ -87,10 +91,10 @@ fn nokhwa_streams_ten_seconds() {
 fn hanging_nokhwa_call_is_abandoned() {
     let mut camera = open(config());
     camera.next_image(Duration::from_secs(2)).expect("vivid streams");
-    // Vivid sends nothing any more: nokhwa waits for ever.
+    // vivid stops sending images, and the call of nokhwa never returns.
     v4l2::set_control(&node(WEBCAM), DROP_PERCENT, 100).expect("vivid injects faults");
     let detected_after = time_to_disconnect(&mut camera);
-    println!("nokhwa: a call that hangs was left behind after {detected_after:.2?}");
+    println!("nokhwa: a hanging call was abandoned after {detected_after:.2?}");
     assert!(detected_after < Duration::from_secs(2), "{detected_after:?}");
     assert_eq!(camera.counts().n_abandoned, 1);
     write_driver_action("unbind");
@@ -101,14 +105,14 @@ fn hanging_nokhwa_call_is_abandoned() {
     write_driver_action("bind");
     let (image, elapsed) = time_to_recover(&mut camera);
     println!(
-        "nokhwa: plugged in again, images after {elapsed:.2?}; about {} were lost; {:?}",
+        "nokhwa: reconnected, recovered after {elapsed:.2?}; about {} images were lost; {:?}",
         image.n_skipped,
         camera.counts()
     );
     assert!(elapsed < Duration::from_secs(2), "{elapsed:?}");
     assert_eq!(camera.counts().n_reconnections, 1);
     for _ in 0..25 {
-        camera.next_image(Duration::from_secs(2)).expect("it streams on");
+        camera.next_image(Duration::from_secs(2)).expect("streaming continues");
     }
 }
 
@@ -123,20 +127,20 @@ fn nokhwa_camera_survives_unplugging() {
     write_driver_action("bind");
     let (image, elapsed) = time_to_recover(&mut camera);
     println!(
-        "nokhwa: pulled, noticed after {detected_after:.2?}, images again after {elapsed:.2?}, about {} lost",
+        "nokhwa: disconnected, detected after {detected_after:.2?}, recovered after {elapsed:.2?}, about {} images lost",
         image.n_skipped
     );
     assert!(
         detected_after < Duration::from_secs(2) && elapsed < Duration::from_secs(2),
         "{detected_after:?}, {elapsed:?}"
     );
-    assert!((20..=60).contains(&image.n_skipped), "{} images for a second without a camera", image.n_skipped);
+    assert!((20..=60).contains(&image.n_skipped), "{} images counted for one second without a camera", image.n_skipped);
 }
 
 #[test]
 #[ignore = "runs in the virtual kernel"]
 fn unsupported_nokhwa_settings_are_errors() {
-    let open_error = |config| NokhwaCamera::open(config).expect_err("not to be had").to_string();
+    let open_error = |config| NokhwaCamera::open(config).expect_err("the settings are unsupported").to_string();
     let absent = open_error(Config { device: "no such camera".into(), ..config() });
     println!("{absent}");
     assert!(absent.contains("\"no such camera\"") && absent.contains("vivid-000"), "{absent}");
@@ -144,7 +148,7 @@ fn unsupported_nokhwa_settings_are_errors() {
     large.intrinsics.size_px = [800, 600];
     let large = open_error(large);
     println!("{large}");
-    assert!(large.contains("800x600 at 25 Hz cannot be had"), "{large}");
-    assert!(open_error(Config { rate_hz: 29.97, ..config() }).contains("whole numbers"));
+    assert!(large.contains("cannot start 800x600 at 25 Hz"), "{large}");
+    assert!(open_error(Config { rate_hz: 29.97, ..config() }).contains("expected an integer"));
     assert!(open_error(Config { format: Some(V4l2Format::Grey), ..config() }).contains("grey"));
 }

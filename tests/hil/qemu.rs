@@ -1,8 +1,10 @@
-//! On the host: a machine that QEMU plays, with two Kvaser PCI cards on one CAN bus, and faults of their chips.
+//! Runs on the host: a machine emulated by QEMU with two Kvaser PCI cards on one CAN bus, and fault injection into
+//! their chips.
 //!
-//! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) makes no errors: no line of it sets the bits of its status for errors and the
-//! bus being lost, nor their interrupts, and its error counters always read 0. So these bits are bent from outside, in QEMU's memory,
-//! as a debugger would; all that follows is done by the kernel's driver of real chips and what lies above it.
+//! QEMU's chip (SJA1000, `hw/net/can/can_sja1000.c`) produces no errors: it never sets the status bits for errors and
+//! bus-off or their interrupts, and its error counters always read 0. Therefore, these bits are set from outside in the
+//! memory of QEMU, as with a debugger. Everything else is done by the kernel's driver for real chips and the layers
+//! above it.
 
 use super::{run, write_script};
 use std::fs;
@@ -12,10 +14,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 pub(crate) const PROGRAM: &str = "/usr/bin/qemu-system-x86_64";
-/// That of busybox does not know bit rates.
+/// The `ip` of busybox does not support bit rates.
 pub(crate) const IP: &str = "/usr/sbin/ip";
 
-/// What the kernel runs first.
+/// First process of the kernel.
 const INIT: &str = r#"#!/bin/busybox sh
 bb=/bin/busybox
 $bb mount -t proc proc /proc
@@ -29,16 +31,18 @@ echo "hil: exit $?"
 $bb poweroff -f
 "#;
 
-/// Here everybody is root; what a person is told to type begins with `sudo`. With its path no command is taken for one of busybox.
+/// Emulates `sudo`, which the printed commands use; all processes here run as root. The explicit path prevents the use
+/// of busybox commands.
 const SUDO: &str = "#!/bin/busybox sh\nexec /bin/\"$@\"\n";
 
-/// How a test inside asks for a chip to be bent: interface, bits of its status and its interrupts, both hexadecimal.
-pub(crate) const INJECT: &str = "hil: bend ";
-/// What it is answered, a line.
-pub(crate) const INJECTED: &str = "bent";
-/// A chip takes all frames while these are the last half of its acceptance registers; the first half is then free to name it.
+/// Request for fault injection from a test inside: interface, status bits and interrupt bits, both hexadecimal.
+pub(crate) const INJECT: &str = "hil: inject ";
+/// Answer to a successful request.
+pub(crate) const INJECTED: &str = "injected";
+/// With these values in the last half of its acceptance registers, a chip accepts all frames. The first half is then
+/// available for the interface name.
 pub(crate) const ACCEPT_ALL: [u8; 4] = [0xFF; 4];
-/// Bits of the chip's status that say that it has errors and that it is off the bus.
+/// Bits of the status register for errors and bus-off.
 const STATUS_ERRORS: u8 = 0xC0;
 
 pub(crate) fn install_root(root: &Path) {
@@ -46,7 +50,7 @@ pub(crate) fn install_root(root: &Path) {
     write_script(&root.join("bin/sudo"), SUDO);
 }
 
-/// Boots and waits for the end; returns what came on the console.
+/// Boots the machine, waits until it ends, and returns the console output.
 pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
     let mut command = Command::new(PROGRAM);
     command
@@ -68,31 +72,32 @@ pub(crate) fn boot(kernel: &Path, root: &Path) -> String {
         if let Some((_, request)) = line.split_once(INJECT) {
             let answer = match inject_fault(machine.id(), request.trim()) {
                 Ok(()) => INJECTED.to_owned(),
-                Err(error) => format!("not bent: {error}"),
+                Err(error) => format!("not injected: {error}"),
             };
-            // Where the machine has ended by now, its console tells.
+            // If writing fails, the machine has ended, which its console shows.
             let _ = writeln!(machine.stdin.as_mut().expect("piped"), "{answer}");
         }
     })
 }
 
-/// Sets the bits for errors in a chip's status, and adds interrupts to those that it has yet to tell.
+/// Sets the error bits in the status of a chip and adds pending interrupts.
 ///
-/// The chip is found by its acceptance registers: the test inside has written the interface's name there. In QEMU these follow on
-/// mode, status, interrupts, enabled interrupts, messages waiting, their place, and clock divider, a byte each.
+/// The chip is located by its acceptance registers, where the test inside has written the interface name. In QEMU they
+/// follow mode, status, interrupts, enabled interrupts, number of waiting messages, their position, and clock divider,
+/// one byte each.
 fn inject_fault(machine: u32, request: &str) -> std::io::Result<()> {
     let words: Vec<&str> = request.split(' ').collect();
-    let &[interface, status, interrupts] = words.as_slice() else { panic!("three words, not {request}") };
+    let &[interface, status, interrupts] = words.as_slice() else { panic!("expected three words, got {request}") };
     let [status, interrupts] = [status, interrupts].map(|hex| u8::from_str_radix(hex, 16).expect("hexadecimal"));
     let maps = fs::read_to_string(format!("/proc/{machine}/maps"))?;
-    let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has one");
+    let heap = maps.lines().find(|line| line.ends_with("[heap]")).expect("QEMU has a heap");
     let (from, to) = heap.split_once(' ').and_then(|(range, _)| range.split_once('-')).expect("FROM-TO");
     let [from, to] = [from, to].map(|hex| u64::from_str_radix(hex, 16).expect("hexadecimal"));
     let memory = fs::OpenOptions::new().read(true).write(true).open(format!("/proc/{machine}/mem"))?;
     let mut bytes = vec![0; usize::try_from(to - from).expect("64 bits")];
     memory.read_exact_at(&mut bytes, from)?;
     let acceptance = [interface.as_bytes(), &ACCEPT_ALL].concat();
-    // The highest bit of the clock divider says that the chip speaks as the driver expects: a copy elsewhere has not that before it.
+    // The highest bit of the clock divider is set in the mode that the driver uses. Copies elsewhere in memory lack it.
     let is_chip = |at: &usize| bytes[*at..].starts_with(&acceptance) && bytes[*at - 1] & 0x80 != 0;
     let found: Vec<usize> = (7..bytes.len() - acceptance.len()).filter(is_chip).collect();
     let &[at] = found.as_slice() else {

@@ -1,5 +1,5 @@
-//! RealSense cameras without one: files that the real library records of a software device, played through the production driver;
-//! and our alignment of depth beside the library's.
+//! Tests of RealSense cameras without hardware: files that the library records from a software device are played back
+//! through the production driver, and our depth alignment is compared with that of the library.
 
 use drivers::align::DepthAlignment;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
@@ -16,17 +16,17 @@ use realsense_rust::processing_blocks::align::Align;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// For whatever is slow on a busy machine.
+/// Timeout for steps that are slow on a busy machine.
 const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 const RATE_HZ: u16 = 30;
-/// Whole microseconds, as the camera counts; some hours of them are more than 32 bits.
+/// Whole microseconds, like the camera clock. After a few hours, they exceed 32 bits.
 const BEGIN_NANOS: i64 = 11_000_000_123_000;
 const PERIOD_NANOS: i64 = 33_333_000;
-/// Colour and depth keep their own stamps.
+/// Color and depth have different stamps.
 const DEPTH_LATER_NANOS: i64 = 4_567_000;
 const N_IMAGES: i64 = 12;
 
-/// A D435i: depth from two infrared cameras, colour beside them.
+/// A D435i: depth from two infrared cameras, and a color camera next to them.
 fn d435i(color_px: [u32; 2], lens: Lens) -> EmulatedCamera {
     let focal_px = f64::from(color_px[1]) * 1.2625;
     EmulatedCamera {
@@ -59,10 +59,10 @@ fn d435i(color_px: [u32; 2], lens: Lens) -> EmulatedCamera {
 }
 
 fn depth_of(camera: &EmulatedCamera) -> &EmulatedDepth {
-    camera.depth.as_ref().expect("it has depth")
+    camera.depth.as_ref().expect("the camera has depth")
 }
 
-/// Depth along a ray of the plane `z` = 1, metres: a slanted wall, a floor, and a box with a slanted front before them.
+/// Depth in meters along a ray of the plane `z` = 1: a slanted wall, a floor, and a box with a slanted front.
 fn scene_m(ray: &Vector3<f64>) -> f64 {
     // normal * point = offset
     let planes = [(Vector3::new(0.25, 0.05, 1.0), 1.6), (Vector3::new(0.0, 1.0, 0.1), 0.7)];
@@ -76,7 +76,7 @@ fn scene_m(ray: &Vector3<f64>) -> f64 {
     if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 { front.min(background) } else { background }
 }
 
-/// What the camera counts of the scene, with some holes.
+/// Depth counts of the scene, with some holes.
 fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
     let [width, height] = depth.intrinsics.size_px;
     let pixels = (0..height).flat_map(|row| (0..width).map(move |column| [column, row]));
@@ -88,7 +88,7 @@ fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
-            reason = "a few metres are below 65535 counts"
+            reason = "a few meters are below 65535 counts"
         )]
         let count = (scene_m(&ray) / depth.meters_per_count).round() as u16;
         count
@@ -112,7 +112,7 @@ fn image(camera: &EmulatedCamera, number: i64) -> Image {
 
 fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
     let depth = depth_of(camera);
-    // Each image has its own reading in the corner.
+    // Each image has a different value near the corner.
     let mut counts = counts_of(depth);
     counts[1] = 1000 + u16::try_from(number).expect("few images");
     Image {
@@ -125,14 +125,14 @@ fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
     }
 }
 
-/// A file of so many images.
+/// Writes a file with this number of images.
 fn record(path: &Path, camera: &EmulatedCamera, n_images: i64) {
     let mut writer = BagWriter::create(path, camera).expect("a file to write");
     for number in 0..n_images {
-        writer.write(&image(camera, number)).expect("room on the disk");
-        writer.write(&depth_image(camera, number)).expect("room on the disk");
+        writer.write(&image(camera, number)).expect("writing an image");
+        writer.write(&depth_image(camera, number)).expect("writing an image");
     }
-    writer.finish().expect("room on the disk");
+    writer.finish().expect("completing the file");
 }
 
 fn config(path: PathBuf, camera: &EmulatedCamera, pace: Pace) -> Config {
@@ -152,7 +152,7 @@ fn config(path: PathBuf, camera: &EmulatedCamera, pace: Pace) -> Config {
     }
 }
 
-/// All images until the file's end.
+/// Reads all images until the end of the file.
 fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
     let mut camera = RealsenseCamera::open(config).unwrap_or_else(|error| panic!("{error}"));
     let mut images = Vec::new();
@@ -166,18 +166,21 @@ fn play(config: Config) -> (RealsenseCamera, Vec<Image>) {
     }
 }
 
-/// Single precision on the way.
+/// Compares lens parameters within single precision.
 fn assert_same_lens(got: &Intrinsics, expected: &Intrinsics) {
     const REL: f64 = 1e-7;
     let close = |got: f64, expected: f64| (got - expected).abs() <= REL * expected.abs().max(1.0);
     assert_eq!(got.size_px, expected.size_px);
     for axis in 0..2 {
-        assert!(close(got.focal_px[axis], expected.focal_px[axis]), "{got:?}, not {expected:?}");
-        assert!(close(got.principal_px[axis], expected.principal_px[axis]), "{got:?}, not {expected:?}");
+        assert!(close(got.focal_px[axis], expected.focal_px[axis]), "{got:?}, expected {expected:?}");
+        assert!(close(got.principal_px[axis], expected.principal_px[axis]), "{got:?}, expected {expected:?}");
     }
     match (got.lens, expected.lens) {
         (Lens::BrownConrady(got), Lens::BrownConrady(expected)) => {
-            assert!(got.iter().zip(expected).all(|(got, expected)| close(*got, expected)), "{got:?}, not {expected:?}");
+            assert!(
+                got.iter().zip(expected).all(|(got, expected)| close(*got, expected)),
+                "{got:?}, expected {expected:?}"
+            );
         }
         (got, expected) => assert_eq!(got, expected),
     }
@@ -199,7 +202,7 @@ fn emulated_camera_round_trips_through_driver() {
         let path = folder.path().join("camera.bag");
         record(&path, &camera, n_images);
         let (driver, images) = play(config(path, &camera, Pace::Fast));
-        // What the camera knows about itself.
+        // The calibration stored in the camera is preserved.
         let (calibration, depth) = (driver.calibration(), depth_of(&camera));
         let reported_depth = calibration.depth.as_ref().unwrap();
         assert_same_lens(&calibration.intrinsics, &camera.intrinsics);
@@ -207,25 +210,25 @@ fn emulated_camera_round_trips_through_driver() {
         let error = reported_depth.camera_from_depth.inverse() * depth.camera_from_depth;
         assert!(error.translation.vector.norm() < 1e-8 && error.rotation.angle() < 1e-6, "{error}");
         assert_eq!(reported_depth.meters_per_count, depth.meters_per_count);
-        // Every image once, in its own bytes, with its own stamp.
+        // Every image is delivered once, with unchanged bytes and stamp.
         let (depths, colors): (Vec<_>, Vec<_>) = images.into_iter().partition(Image::is_depth);
         for (got, expected) in [(&colors, image as fn(_, _) -> _), (&depths, depth_image)] {
             assert_eq!(
                 got.len(),
                 usize::try_from(n_images).unwrap(),
-                "images, first {:?}",
+                "number of images, first stamp {:?}",
                 got.first().map(|i| i.stamp)
             );
             for (got, number) in got.iter().zip(0..) {
                 let expected: Image = expected(&camera, number);
                 assert_eq!((got.stamp, got.size_px, got.format), (expected.stamp, expected.size_px, expected.format));
-                assert!(got.data == expected.data, "image {number} has other bytes");
-                let (got_secs, wanted_secs) = (got.exposure_secs.unwrap(), expected.exposure_secs.unwrap());
-                assert!((got_secs - wanted_secs).abs() < 1e-9, "{got_secs}, not {wanted_secs}");
+                assert!(got.data == expected.data, "the bytes of image {number} differ");
+                let (got_secs, expected_secs) = (got.exposure_secs.unwrap(), expected.exposure_secs.unwrap());
+                assert!((got_secs - expected_secs).abs() < 1e-9, "{got_secs}, expected {expected_secs}");
                 assert_eq!(got.n_skipped, 0);
             }
         }
-        // Metres: as exact as a count.
+        // Depth in meters is accurate to one count.
         let meters = depths[0].decode_depth_m().unwrap();
         for (ix, meters) in meters.iter().enumerate().filter(|(ix, meters)| *ix > 1 && **meters > 0.0) {
             let (column, row) = (ix % 640, ix / 640);
@@ -251,7 +254,7 @@ fn file_plays_in_real_time_and_fast_file_loses_nothing() {
     let first = images[0].stamp.0;
     let since: Vec<i64> = images.iter().filter(|image| !image.is_depth()).map(|image| image.stamp.0 - first).collect();
     assert_eq!(since, (0..N_IMAGES).map(|number| number * PERIOD_NANOS).collect::<Vec<_>>());
-    // The queue of a rig is shorter than this file.
+    // The file has more images than the queue of a live rig can hold.
     let open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).unwrap();
     let mut live = Live::new(Devices { cameras: vec![Box::new(open)], ..Devices::default() }).unwrap();
     let mut n_images = 0;
@@ -265,7 +268,7 @@ fn file_plays_in_real_time_and_fast_file_loses_nothing() {
 
 #[test]
 fn file_on_the_clock_starts_at_its_stamps() {
-    const LATER_SECS: f64 = 6.0; // Longer than a device may be silent.
+    const LATER_SECS: f64 = 6.0; // Longer than the silence limit of a device.
     let folder = tempfile::tempdir().unwrap();
     let camera = d435i([640, 480], Lens::Pinhole);
     let path = folder.path().join("camera.bag");
@@ -282,7 +285,7 @@ fn file_on_the_clock_starts_at_its_stamps() {
     for number in 0..3 {
         let sample = live.next_sample().unwrap().unwrap();
         assert_eq!(sample.stamp(), Stamp(starts_at.0 + number * PERIOD_NANOS));
-        assert!(drivers::clock::now() >= sample.stamp(), "it came before its time");
+        assert!(drivers::clock::now() >= sample.stamp(), "the image was delivered too early");
     }
     assert_eq!(live.next_sample().unwrap(), None);
 }
@@ -315,10 +318,10 @@ fn file_opened_late_starts_at_current_time_without_loss() {
 fn file_not_read_to_its_end_is_closed() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, camera) = (folder.path().join("long.bag"), d435i([640, 480], Lens::Pinhole));
-    // More than all queues together hold.
+    // More images than all queues together can hold.
     record(&path, &camera, 10 * N_IMAGES);
-    let mut open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("a file");
-    open.next_image(TEST_TIMEOUT).expect("its first image");
+    let mut open = RealsenseCamera::open(config(path, &camera, Pace::Fast)).expect("opening the file");
+    open.next_image(TEST_TIMEOUT).expect("the first image");
     std::thread::sleep(Duration::from_millis(500));
     let start_time = Instant::now();
     drop(open);
@@ -357,29 +360,30 @@ fn missing_streams_are_errors_and_filters_fill_holes() {
     assert_eq!(stamps(&filtered), stamps(&images));
 }
 
-/// The library's alignment of a file's depth to its colour: which image, the counts, and how long it took.
+/// Aligns the depth of a file to color with the library. Returns the index of each image, the counts, and the time it
+/// took.
 fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<u16>, Duration)> {
     let mut config = PipelineConfig::new();
-    config.enable_device_from_file(path, true).expect("our file");
+    config.enable_device_from_file(path, true).expect("the file is valid");
     let mut pipeline = InactivePipeline::try_from(&Context::new().expect("the library starts"))
         .expect("a pipeline")
         .start(Some(config))
-        .expect("our file");
+        .expect("the file is valid");
     let mut align = Align::new(Rs2StreamKind::Color, 1).expect("a block");
     let mut aligned = Vec::new();
     while aligned.len() < n_images {
-        let frames = pipeline.wait(Some(TEST_TIMEOUT)).expect("images come");
+        let frames = pipeline.wait(Some(TEST_TIMEOUT)).expect("images arrive");
         if frames.count() < 2 {
             continue;
         }
         let start_time = Instant::now();
         align.queue(frames).expect("depth and color");
-        let frames = align.wait(TEST_TIMEOUT).expect("it aligns");
+        let frames = align.wait(TEST_TIMEOUT).expect("the library aligns the images");
         let elapsed = start_time.elapsed();
         for depth in frames.frames_of_type::<DepthFrame>() {
             let count = |pixel: PixelKind<'_>| match pixel {
                 PixelKind::Z16 { depth } => *depth,
-                other => panic!("{other:?} is no depth"),
+                other => panic!("{other:?} is not depth"),
             };
             aligned.push((
                 i64::try_from(depth.frame_number()).expect("few images") - 1,
@@ -400,16 +404,17 @@ fn equal_frac(a: &[u16], b: &[u16]) -> f64 {
     a.iter().zip(b).filter(|(a, b)| a == b).count() as f64 / a.len() as f64
 }
 
-/// The library's fast path rounds the corners of a depth pixel after it has added half a pixel, as if to cut: everything lies half a
-/// pixel too far right and down (`src/proc/sse/sse-align.cpp`; its plain path does not). A colour camera whose centre lies half a
-/// pixel further sees the same from us.
+/// The fast path of the library rounds the corners of a depth pixel to the nearest integer after adding half a pixel,
+/// where it should truncate. This shifts the result by half a pixel to the right and down
+/// (`src/proc/sse/sse-align.cpp`; the scalar path is correct). With a principal point shifted by half a pixel, our
+/// result is the same.
 fn with_library_rounding(color: &Intrinsics) -> Intrinsics {
     Intrinsics { principal_px: color.principal_px.map(|center| center + 0.5), ..color.clone() }
 }
 
 #[test]
 fn alignment_matches_library_except_half_pixel() {
-    // Both work in single precision, which puts a corner on the other side of a pixel's edge now and then.
+    // Both use single precision, so a corner occasionally falls on the other side of a pixel edge.
     const EQUAL_FRAC: f64 = 0.999;
     let folder = tempfile::tempdir().unwrap();
     for color_px in [[640, 480], [1280, 720]] {
@@ -425,19 +430,19 @@ fn alignment_matches_library_except_half_pixel() {
             let equal_with_rounding = equal_frac(&align(&with_library_rounding(&camera.intrinsics), &image), &library);
             let equal_without_rounding = equal_frac(&align(&camera.intrinsics, &image), &library);
             eprintln!(
-                "{color_px:?}: equal {equal_with_rounding:.5}; without their half pixel {equal_without_rounding:.5}"
+                "{color_px:?}: equal {equal_with_rounding:.5}; without the half-pixel shift {equal_without_rounding:.5}"
             );
             assert!(
                 equal_with_rounding >= EQUAL_FRAC && equal_without_rounding < equal_with_rounding,
                 "{color_px:?}: {equal_with_rounding}, {equal_without_rounding}"
             );
-            assert!(library.iter().filter(|count| **count > 0).count() > library.len() / 2, "the scene is not seen");
+            assert!(library.iter().filter(|count| **count > 0).count() > library.len() / 2, "the scene is not visible");
         }
     }
 }
 
 #[test]
-#[ignore = "a measurement: prints milliseconds; run it in release on one core (taskset -c 0)"]
+#[ignore = "benchmark: prints milliseconds; run it in release mode on one core (taskset -c 0)"]
 fn alignment_is_faster_than_library() {
     let folder = tempfile::tempdir().unwrap();
     for color_px in [[640, 480], [1280, 720]] {
@@ -462,7 +467,7 @@ fn alignment_is_faster_than_library() {
         own.sort();
         let ratio = |at: usize| library[at].as_secs_f64() / own[at].as_secs_f64();
         eprintln!(
-            "depth 640x480 to {color_px:?}: ours {:.2?} at best, {:.2?} in the median; the library {:.2?}, {:.2?}; {:.1} and {:.1} times",
+            "depth 640x480 to {color_px:?}: ours: minimum {:.2?}, median {:.2?}; library: {:.2?}, {:.2?}; ratio {:.1} and {:.1}",
             own[0],
             own[30],
             library[0],

@@ -1,5 +1,5 @@
-//! Inside the virtual kernel: the simulated mobile arm on the wire, motors of four families on one bus, its base by datagrams, its
-//! camera as a file; read, and then moved, by the production binary.
+//! Tests of an emulated mobile arm inside the virtual kernel: motors of four families on one CAN bus, a base that sends
+//! datagrams, and a camera as a file. The production binary reads the arm and then moves it.
 
 #[path = "../wire/compare.rs"]
 mod compare;
@@ -8,16 +8,16 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// What was simulated on the host.
+/// Recording that was simulated on the host.
 pub(crate) const SCRIPT: &str = "rigs/mobile-arm.mcap";
 pub(crate) const SECONDS: &str = "6";
 
-/// Simulates the rig of the scene into a root folder.
+/// Simulates the rig and records it into a root folder.
 pub(crate) fn install_root(root: &Path) {
     let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/wire/mobile-arm.toml");
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
     command.arg("record").arg(rig).args(["--sim", "--lockstep", "--seconds", SECONDS, "--out"]).arg(root.join(SCRIPT));
-    let output = command.output().expect("it is built");
+    let output = command.output().expect("fieldrig starts");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
@@ -31,25 +31,25 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
         .args(["--seconds", SECONDS, "--start-in", "10", "--out", "/tmp/mobile", "--json"])
         .stdout(Stdio::piped())
         .spawn()
-        .expect("it is laid out");
+        .expect("fieldrig is installed");
     let mut line = String::new();
-    // It ends where nobody reads what it prints.
+    // The program ends if its output is not read, so keep the pipe open.
     let mut stdout = BufReader::new(playing.stdout.take().expect("piped"));
-    stdout.read_line(&mut line).expect("it prints a line");
+    stdout.read_line(&mut line).expect("fieldrig prints a line");
     assert!(line.contains("\"event\":\"ready\"") && line.contains("7 motors on vcan0"), "{line}");
     let fieldrig = |arguments: &[&str]| {
-        let output = Command::new("/bin/fieldrig").args(arguments).output().expect("it is laid out");
+        let output = Command::new("/bin/fieldrig").args(arguments).output().expect("fieldrig is installed");
         let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
         println!("fieldrig {}: {printed}", arguments.join(" "));
         (output.status.code(), printed)
     };
     let (code, printed) = fieldrig(&["record", "/tmp/mobile/rig.toml", "--out", "/tmp/mobile.mcap", "--json"]);
-    // A busy machine loses images, which are counted.
+    // A busy machine drops images, which are counted.
     assert!(matches!(code, Some(0 | 3)), "{printed}");
     let difference = compare::difference(&script, Path::new("/tmp/mobile.mcap"));
     println!("wire: {difference:?}");
     assert!(difference.n_images >= 20, "{difference:?}");
-    // Motors that report by themselves do so every 10 ms, and a joint turns by less than half a radian in a second.
+    // Motors that report automatically do so every 10 ms, and joints rotate by less than half a radian per second.
     assert!(difference.joints_rad[0] < 2e-3, "{difference:?}");
     assert!(difference.base_m < 1e-6, "{difference:?}");
 
@@ -58,6 +58,6 @@ fn mobile_arm_is_read_and_moved_through_drivers() {
     let (code, printed) = fieldrig(&arguments);
     assert_eq!(code, Some(0), "{printed}");
     assert!(compare::error_of_move(&printed) < 0.01, "{printed}");
-    let _ = playing.kill(); // It plays until it is stopped.
+    let _ = playing.kill(); // It runs until it is stopped.
     let _ = playing.wait();
 }

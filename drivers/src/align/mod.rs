@@ -1,10 +1,10 @@
-//! Depth images in the pixels of the colour camera beside the depth camera.
+//! Aligns depth images to the pixels of a color camera next to the depth camera.
 //!
-//! Source: the processing block `align` of librealsense (`src/proc/align.cpp`), by idea: a depth pixel is a square whose two
-//! opposite corners go to the colour image at the pixel's depth, and the nearest of all that cover a colour pixel stays. We keep
-//! the part inside the image of a square that reaches over the edge, where librealsense drops the square. Its SSE path
-//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and takes the upper left corner alone
-//! where colour has fewer pixels per angle than depth; we follow the plain path.
+//! Source: the processing block `align` of librealsense (`src/proc/align.cpp`). A depth pixel is a square. Two opposite
+//! corners are projected to the color image at the depth of the pixel, and each color pixel keeps the nearest square
+//! that covers it. We clip squares at the edge of the image, whereas librealsense drops them. Its SSE path
+//! (`src/proc/sse/sse-align.cpp`) rounds half a pixel further to the right and down, and uses only the upper left
+//! corner if color has fewer pixels per angle than depth; we follow the scalar path.
 
 mod cover;
 
@@ -13,14 +13,16 @@ use cover::{MAX_COLUMNS, NearestDepth, PixelBounds};
 use kinematics::{Intrinsics, Lens, Transform};
 use std::sync::Arc;
 
-/// Moves depth images of one camera into the pixels of another; what does not change between images is worked out once.
+/// Aligns depth images of one camera to the pixels of another. Precomputes everything that does not depend on the
+/// image.
 #[derive(Clone, Debug)]
 pub struct DepthAlignment {
     depth_px: [u32; 2],
     color: ColorCamera,
-    /// Rays of the pixels' corners, `z` = 1 in the depth camera, in the axes of the colour camera: `[height + 1, width + 1]`.
+    /// Rays of the pixel corners, `z` = 1 in the depth camera, rotated to the axes of the color camera: `[height + 1,
+    /// width + 1]`.
     corners: [Vec<f32>; 3],
-    /// The depth camera in the frame of the colour camera, metres.
+    /// Position of the depth camera in the frame of the color camera, meters.
     depth_in_color: [f64; 3],
 }
 
@@ -31,7 +33,7 @@ struct ColorCamera {
     focal_px: [f32; 2],
     principal_px: [f32; 2],
     lens: ColorLens,
-    /// Square of the radius on the plane `z` = 1 up to which the lens is in use; beyond it distortion polynomials may turn back.
+    /// Square of the largest valid radius on the plane `z` = 1. Beyond it, distortion polynomials may not be monotonic.
     max_radius_squared: f32,
 }
 
@@ -42,40 +44,40 @@ enum ColorLens {
     KannalaBrandt([f32; 4]),
 }
 
-/// Which corner of each pixel of one row of depth.
+/// A corner of the pixels of one row of depth.
 #[derive(Clone, Copy)]
 enum Corner {
-    /// Left and upper: what is not seen lies behind the image.
+    /// Upper left. Hidden corners are set to a position after the image.
     First,
-    /// Right and lower: what is not seen lies before the image.
+    /// Lower right. Hidden corners are set to a position before the image.
     Last,
 }
 
-/// From a ray to a position in the colour image.
+/// Maps a ray to a position in the color image.
 struct View {
-    /// The depth camera in the frame of the colour camera, in units of one count.
+    /// Position of the depth camera in the frame of the color camera, in units of one count.
     depth_in_color: [f32; 3],
     focal_px: [f32; 2],
     principal_px: [f32; 2],
-    /// Position that stands for what the colour camera does not see.
+    /// Position used for points that the color camera cannot see.
     hidden_px: f32,
 }
 
-/// Room for the work on one row of depth.
+/// Buffers for one row of depth.
 struct Row {
     /// Depth along z.
     counts: Vec<u16>,
-    /// The same.
+    /// The same as floats.
     numbers: Vec<f32>,
-    /// Columns and rows in the colour image, pixels.
+    /// Columns and rows in the color image, pixels.
     positions_px: [Vec<f32>; 2],
     bounds: PixelBounds,
 }
 
-/// What is done with vector instructions.
+/// Work that runs with vector instructions.
 struct Task<'a> {
     alignment: &'a DepthAlignment,
-    /// Two bytes each, the lower one first.
+    /// Two bytes each, little endian.
     counts: &'a [u8],
     meters_per_count: f64,
 }
@@ -87,10 +89,10 @@ impl pulp::NullaryFnOnce for Task<'_> {
     fn call(self) -> Arc<[u8]> {
         let aligned = self.alignment.align_counts(self.counts.as_chunks().0, self.meters_per_count);
         let mut data: Arc<[u8]> = std::iter::repeat_n(0, 2 * aligned.len()).collect();
-        let bytes = Arc::get_mut(&mut data).expect("nobody else has it yet");
+        let bytes = Arc::get_mut(&mut data).expect("the buffer was just created and is not shared");
         for (bytes, count_minus_one) in bytes.as_chunks_mut::<2>().0.iter_mut().zip(aligned) {
             let count = count_minus_one.wrapping_add(1);
-            // The largest count says nothing either.
+            // The largest count is invalid, too.
             *bytes = if count == u16::MAX { [0; 2] } else { count.to_le_bytes() };
         }
         data
@@ -98,7 +100,7 @@ impl pulp::NullaryFnOnce for Task<'_> {
 }
 
 impl DepthAlignment {
-    /// For the images of a depth camera seen beside a colour camera; both lenses may be distorted.
+    /// Prepares the alignment of a depth camera to a color camera. Both lenses may be distorted.
     pub fn new(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform) -> Self {
         let [width, height] = depth.size_px;
         let rays = (0..=height).flat_map(|row| (0..=width).map(move |column| [f64::from(column), f64::from(row)]));
@@ -116,10 +118,11 @@ impl DepthAlignment {
         }
     }
 
-    /// The depth image in the pixels of the colour image: the same counts, along the z axis of the depth camera; 0 where no
-    /// depth pixel is seen. Readings of 0 and of the largest count say nothing and go nowhere.
+    /// Returns the depth image in the pixels of the color image. Counts keep their unit and are along the z axis of the
+    /// depth camera; 0 means no depth. Readings of 0 and of the largest count are invalid and are skipped.
     ///
-    /// Fails for images that hold no depth or have another size than the depth camera.
+    /// # Errors
+    /// If the image holds no depth or its size is not that of the depth camera.
     pub fn align(&self, depth: &Image) -> Result<Image, Error> {
         let PixelFormat::DepthU16 { meters_per_count } = depth.format else {
             return Err(depth.wrong_kind("depth"));
@@ -132,13 +135,13 @@ impl DepthAlignment {
                 expected_px: self.depth_px,
             });
         }
-        // The same code for every set of vector instructions; the widest that this computer has runs.
+        // Runs with the widest vector instructions of this CPU.
         let task = Task { alignment: self, counts: depth.raw_bytes()?, meters_per_count };
         let data = pulp::Arch::new().dispatch(task);
         Ok(Image { size_px: self.color.size_px, data, ..depth.clone() })
     }
 
-    /// The nearest count less one of each colour pixel: so 0, which says nothing, is the largest number and never stays.
+    /// Nearest count minus one of each color pixel. The invalid count 0 wraps to the largest number and never wins.
     #[inline(always)]
     fn align_counts(&self, counts: &[[u8; 2]], meters_per_count: f64) -> Vec<u16> {
         let depth_width = self.depth_px[0] as usize;
@@ -150,21 +153,21 @@ impl DepthAlignment {
             positions_px: [vec![0.0; depth_width], vec![0.0; depth_width]],
             bounds: PixelBounds { first: pixel_bounds(), last: pixel_bounds() },
         };
-        // In units of one count, so that counts need no factor.
+        // In units of one count, so that counts need no scaling.
         let depth_in_color = self.depth_in_color.map(|meters| narrow(meters / meters_per_count));
         for (row_ix, row) in counts.chunks_exact(depth_width.max(1)).enumerate() {
             work.counts.iter_mut().zip(row).for_each(|(count, bytes)| *count = u16::from_le_bytes(*bytes));
             work.numbers.iter_mut().zip(&work.counts).for_each(|(number, count)| *number = f32::from(*count));
             let first_corner = row_ix * (depth_width + 1);
             self.project(&mut work, depth_in_color, first_corner, Corner::First);
-            // The opposite corners lie one row and one column on.
+            // The opposite corners are one row and one column further.
             self.project(&mut work, depth_in_color, first_corner + depth_width + 2, Corner::Last);
             nearest_depth.put(&work.counts, &work.bounds);
         }
         nearest_depth.into_nearest()
     }
 
-    /// Colour pixels, column and row, where the corners of a row are seen; `start` is the place of the first among all.
+    /// Projects the corners of a row to columns and rows of the color image. `start` is the index of the first corner.
     #[inline(always)]
     fn project(&self, work: &mut Row, depth_in_color: [f32; 3], start: usize, corner: Corner) {
         let view = View {
@@ -203,8 +206,9 @@ impl DepthAlignment {
     }
 }
 
-/// Positions in the colour image, columns and rows, by a lens that says where a point of the plane `z` = 1 lies and whether it is
-/// in use there; free of branches, and each list an argument of its own, so that the compiler makes vector code of it.
+/// Projects rays to columns and rows of the color image. `distort` maps a point of the plane `z` = 1 to its distorted
+/// position and returns whether the lens model is valid there. Branch-free, with each slice as its own argument, so
+/// that the compiler vectorizes it.
 #[inline(always)]
 fn project_by(
     columns: &mut [f32],
@@ -222,28 +226,29 @@ fn project_by(
         let inverse = 1.0 / z;
         let (x, y) = ((counts[ix] * xs[ix] + tx) * inverse, (counts[ix] * ys[ix] + ty) * inverse);
         let ([distorted_x, distorted_y], is_valid) = distort(x, y);
-        // The column alone keeps a pixel away.
+        // Moving the column out of the image is sufficient to hide a pixel.
         columns[ix] = if (z > 0.0) & is_valid { distorted_x * fx + cx } else { hidden_px };
         rows[ix] = distorted_y * fy + cy;
     }
 }
 
-/// Numbers of the pixels at some positions, from 1 on, cut to the image and one number behind it ([`Corner::First`]) or before it.
-#[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the number")]
+/// Converts positions to pixel indices that start at 1, clipped to the image and one index after it ([`Corner::First`])
+/// or before it ([`Corner::Last`]).
+#[expect(clippy::cast_possible_truncation, reason = "the low 16 bits are the index")]
 #[inline(always)]
 fn number(numbers: &mut [u16], positions_px: &[f32], side: u32, corner: Corner) {
-    // Larger images get no depth beyond.
+    // Columns and rows beyond this limit get no depth.
     let side = (side as usize).min(MAX_COLUMNS) as f32;
     let (min, max) = match corner {
         Corner::First => (1.0, side + 1.0),
         Corner::Last => (0.0, side),
     };
-    // From here on floats have no fractions, and their low bits count.
+    // Above 2^23, floats have no fraction and their low bits are the integer.
     const INTEGER_FLOAT: f32 = 8_388_608.0;
     let n = positions_px.len();
     let (numbers, positions_px) = (&mut numbers[..n], &positions_px[..n]);
     for ix in 0..n {
-        // Comparisons as vector instructions make them, which `max` and `min` are not for what is no number.
+        // These comparisons compile to vector instructions; `max` and `min` do not because of their NaN handling.
         let one_based = positions_px[ix] + 1.0;
         let one_based = if one_based > min { one_based } else { min };
         let one_based = if one_based < max { one_based } else { max };
@@ -272,7 +277,7 @@ impl ColorCamera {
     }
 }
 
-/// The largest radius on the plane `z` = 1 that the edge of an image shows, and a little more for corners just outside.
+/// Largest radius on the plane `z` = 1 at the edge of the image, plus a margin for corners just outside.
 fn max_radius(camera: &Intrinsics) -> f64 {
     const MARGIN: f64 = 1.02;
     let [width, height] = camera.size_px;
@@ -283,7 +288,7 @@ fn max_radius(camera: &Intrinsics) -> f64 {
     largest * MARGIN
 }
 
-/// As in [`kinematics::Lens`].
+/// Distortion as defined in [`kinematics::Lens`].
 #[inline(always)]
 fn brown_conrady([k1, k2, p1, p2, k3]: [f32; 5], x: f32, y: f32, r2: f32) -> [f32; 2] {
     let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
@@ -291,7 +296,7 @@ fn brown_conrady([k1, k2, p1, p2, k3]: [f32; 5], x: f32, y: f32, r2: f32) -> [f3
     [x * radial + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * radial + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
 }
 
-/// As in [`kinematics::Lens`].
+/// Distortion as defined in [`kinematics::Lens`].
 #[inline(always)]
 fn kannala_brandt([k1, k2, k3, k4]: [f32; 4], x: f32, y: f32, r2: f32) -> [f32; 2] {
     let radius = r2.sqrt();
@@ -302,7 +307,7 @@ fn kannala_brandt([k1, k2, k3, k4]: [f32; 4], x: f32, y: f32, r2: f32) -> [f32; 
     [x * scale, y * scale]
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "f32 places a point to 1e-4 pixels")]
+#[expect(clippy::cast_possible_truncation, reason = "f32 is accurate to 1e-4 pixels")]
 fn narrow(number: f64) -> f32 {
     number as f32
 }
@@ -341,7 +346,7 @@ mod tests {
         image.data.as_chunks::<2>().0.iter().map(|&bytes| u16::from_le_bytes(bytes)).collect()
     }
 
-    /// A slanted wall with a box before it, and holes.
+    /// A slanted wall with a box in front of it, and holes.
     fn scene([width, height]: [u32; 2]) -> Vec<u16> {
         let count = |column: u32, row: u32| match (column * 7 + row * 13) % 41 {
             0 => 0,
@@ -349,10 +354,10 @@ mod tests {
             _ => 900 + 400 * column / width + 300 * row / height,
         };
         let pixels = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
-        pixels.map(|(column, row)| u16::try_from(count(column, row)).expect("below two metres")).collect()
+        pixels.map(|(column, row)| u16::try_from(count(column, row)).expect("below two meters")).collect()
     }
 
-    /// The twin: the same squares in f64 with the lenses of `kinematics`.
+    /// CPU twin: the same squares in f64 with the lenses of `kinematics`.
     fn twin(depth: &Intrinsics, color: &Intrinsics, color_from_depth: &Transform, counts: &[u16]) -> Vec<u16> {
         let [width, height] = color.size_px.map(i64::from);
         let mut aligned = vec![0; color.size_px.map(|side| side as usize).iter().product()];
@@ -363,7 +368,7 @@ mod tests {
                 let point = depth.unproject(corner)? * (f64::from(count) * METERS_PER_COUNT);
                 let pixel =
                     color.project(&(color_from_depth.rotation * point + color_from_depth.translation.vector))?;
-                #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+                #[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
                 let cell = |position: f64| position.floor() as i64;
                 Some(pixel.map(cell))
             };
@@ -382,7 +387,7 @@ mod tests {
         aligned
     }
 
-    /// As on a D435: the colour camera 15 mm beside the depth camera, and turned a little.
+    /// As on a D435: the color camera is 15 mm to the side of the depth camera and slightly rotated.
     fn color_from_depth_like_d435() -> Transform {
         Transform::from_parts(
             Translation3::new(0.0148, 0.0002, 0.0003),
@@ -397,14 +402,14 @@ mod tests {
 
     #[test]
     fn aligned_depth_matches_twin() {
-        // f32 puts a corner on the other side of a pixel's edge once in some ten thousand.
+        // With f32, about one corner in ten thousand falls on the other side of a pixel edge.
         const EQUAL_FRAC: f64 = 0.999;
         let size_px = [320, 240];
         let scene = scene(size_px);
         let fisheye = Lens::KannalaBrandt([-0.01, 0.02, -0.015, 0.003]);
         let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
         for (depth_lens, color_lens) in [(Lens::Pinhole, Lens::Pinhole), (Lens::Pinhole, d455), (d455, fisheye)] {
-            // As large as a square is wide at most: 2, 4, 7 and 2 columns, the last with several squares to a column.
+            // Squares are at most 2, 4, 7 and 2 columns wide. In the last case, several squares share a column.
             let cameras = [([320, 240], 300.0), ([640, 360], 455.0), ([1280, 720], 1000.0), ([160, 120], 140.0)];
             for (color_px, focal_px) in cameras {
                 let (depth, color) = (camera(size_px, 190.0, depth_lens), camera(color_px, focal_px, color_lens));
@@ -415,9 +420,9 @@ mod tests {
                 assert!(equal >= EQUAL_FRAC, "{color_lens:?} {color_px:?}: {equal}");
                 assert!(
                     expected.iter().filter(|count| **count > 0).count() > expected.len() / 2,
-                    "the scene is not seen"
+                    "the scene is not visible"
                 );
-                // The comparison sees a camera one centimetre elsewhere.
+                // The comparison detects an offset of the camera by one centimeter.
                 let shifted =
                     Transform::from_parts(Translation3::new(0.025, 0.0, 0.0), color_from_depth_like_d435().rotation);
                 assert!(equal_frac(&got, &twin(&depth, &color, &shifted, &scene)) < EQUAL_FRAC);
@@ -435,16 +440,19 @@ mod tests {
             let alignment = DepthAlignment::new(&depth, &color, &shifted);
             let got = counts(&alignment.align(&image(depth.size_px, &scene)).expect("depth"));
             let expected = twin(&depth, &color, &shifted, &scene);
-            // So far from the middle f32 knows a corner to some thousandths of a pixel.
+            // So far from the center, f32 is accurate to a few thousandths of a pixel.
             let equal = equal_frac(&got, &expected);
             assert!(equal >= 0.99, "{width}: {equal}");
-            assert!(expected.iter().filter(|count| **count > 0).count() > expected.len() / 2, "the scene is not seen");
+            assert!(
+                expected.iter().filter(|count| **count > 0).count() > expected.len() / 2,
+                "the scene is not visible"
+            );
         }
     }
 
     #[test]
     fn disparity_is_baseline_over_depth_with_occlusion() {
-        // 400 px * 51.25 mm / 1 m is 20.5 px to the right; no corner lies on an edge of a pixel's column.
+        // 400 px * 51.25 mm / 1 m is 20.5 px to the right. No corner lies on the edge of a pixel column.
         let camera =
             Intrinsics { focal_px: [400.0; 2], principal_px: [32.0, 16.25], ..camera([64, 32], 1.0, Lens::Pinhole) };
         let color = Intrinsics { principal_px: [32.0, 16.75], ..camera.clone() };
@@ -454,7 +462,7 @@ mod tests {
         for (ix, count) in counts(&wall).into_iter().enumerate() {
             assert_eq!(count, if ix % 64 < 20 { 0 } else { 1000 }, "column {} row {}", ix % 64, ix / 64);
         }
-        // At 0.5 m it moves by 41 px: columns 10 to 13 go to 51 to 54, and touch 55 at most.
+        // At 0.5 m the disparity is 41 px: columns 10 to 13 map to 51 to 54 and touch at most 55.
         let mut with_box = [1000; 64 * 32];
         (0..64 * 32).filter(|ix| (10..14).contains(&(ix % 64))).for_each(|ix| with_box[ix] = 500);
         let aligned = counts(&alignment.align(&image([64, 32], &with_box)).expect("depth"));
@@ -467,7 +475,7 @@ mod tests {
     #[test]
     fn invalid_and_behind_camera_depth_is_dropped() {
         let camera = camera([64, 48], 60.0, Lens::BrownConrady([0.1, 0.0, 0.0, 0.0, 0.0]));
-        // The colour camera stands 1 mm before the depth camera: a count of 1 lies in its centre.
+        // The color camera is 1 mm in front of the depth camera, so a count of 1 lies in its center.
         for z in [-0.001, -0.000_999_99, -1.0, f64::NAN] {
             let alignment = DepthAlignment::new(&camera, &camera, &Transform::translation(0.0, 0.0, z));
             for count in [0, 1, 2, u16::MAX] {
@@ -485,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "a measurement: prints milliseconds"]
+    #[ignore = "benchmark: prints milliseconds"]
     fn speed_at_640x480() {
         let size_px = [640, 480];
         let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
@@ -500,7 +508,7 @@ mod tests {
                 std::hint::black_box(alignment.align(std::hint::black_box(&depth)).expect("depth"));
                 began.elapsed()
             });
-            eprintln!("640x480 to {color_px:?}, {lens:?}: {:.2?} at best", best.min().expect("50 runs"));
+            eprintln!("640x480 to {color_px:?}, {lens:?}: minimum {:.2?}", best.min().expect("50 runs"));
         }
     }
 }

@@ -9,19 +9,19 @@ use std::path::{Path, PathBuf};
 /// One posed photo on disk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DatasetFrame {
-    /// Name in the dataset, mostly the path of the image inside the folder.
+    /// Name in the dataset, usually the path of the image inside the folder.
     pub name: String,
-    /// Lens parameters of the colour image at its own size.
+    /// Lens parameters of the color image at its original size.
     pub intrinsics: Intrinsics,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// When the photo was taken; where the folder does not say, frames are a millisecond apart in the order of their names.
+    /// When the photo was taken. If the dataset has no times, frames are 1 ms apart in the order of their names.
     pub stamp: Stamp,
-    /// The colour image.
+    /// The color image.
     pub image_path: PathBuf,
-    /// Its depth, where there is any.
+    /// Its depth image, if any.
     pub depth: Option<DepthFile>,
-    /// An image that is 0 where the photo must not be used.
+    /// Image that is 0 at pixels that must not be used.
     pub mask_path: Option<PathBuf>,
 }
 
@@ -30,7 +30,7 @@ pub struct DatasetFrame {
 pub struct DepthFile {
     /// The file.
     pub path: PathBuf,
-    /// Metres per count; a count of 0 is unknown.
+    /// Meters per count; a count of 0 is unknown.
     pub meters_per_count: f64,
     /// Pose of the depth camera when the depth image was taken.
     pub world_from_camera: Transform,
@@ -39,25 +39,26 @@ pub struct DepthFile {
 /// The decoded files of one frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameImages {
-    /// `[height, width, 4]`, sRGB, still distorted; alpha is 0 where the mask or the photo's own alpha leaves a pixel out, else 255.
+    /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha of the photo
+    /// excludes, else 255.
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
-    /// Why there is no depth though the frame has a file for it.
+    /// Why depth is missing although the frame has a depth file.
     pub depth_error: Option<String>,
 }
 
-/// Decoded depth with its own size.
+/// Decoded depth at its own size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthImage {
-    /// Lens parameters of the depth image: those of the photo at the size of the depth image.
+    /// Lens parameters of the photo, scaled to the size of the depth image.
     pub intrinsics: Intrinsics,
-    /// `[height, width]`, metres along the camera's z axis; 0 where unknown.
+    /// `[height, width]`, meters along the camera's z axis; 0 if unknown.
     pub depth_m: Vec<f32>,
 }
 
 impl DatasetFrame {
-    /// Decodes the files of this frame; depth that does not decode costs the depth, not the photo.
+    /// Decodes the files of this frame. If only the depth image fails to decode, the photo is still returned.
     pub fn load(&self) -> Result<FrameImages, Error> {
         let mut rgba = decode_file(&self.image_path)?.into_rgba8();
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
@@ -83,7 +84,7 @@ impl DatasetFrame {
         let DynamicImage::ImageLuma16(counts) = decode_file(&file.path)? else {
             return Err(Error::NotDepth { path: file.path.clone() });
         };
-        #[expect(clippy::cast_possible_truncation, reason = "16-bit counts keep more digits in f32 than sensors have")]
+        #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
         let meters_from_count = |count: &u16| (f64::from(*count) * file.meters_per_count) as f32;
         Ok(DepthImage {
             intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),
@@ -100,7 +101,7 @@ impl DatasetFrame {
     }
 }
 
-/// Width and height of an image, from its first bytes.
+/// Reads the width and height of an image from its header.
 pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
     let size = open_image(path)?.into_dimensions().map_err(|source| decode_error(path, source))?;
     Ok(size.into())

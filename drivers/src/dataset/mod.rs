@@ -14,20 +14,20 @@ use std::path::{Path, PathBuf};
 pub struct Dataset {
     /// The folder.
     pub path: PathBuf,
-    /// In file-name order (nerfstudio) or in time (TUM); never empty.
+    /// Sorted by file name (nerfstudio) or time (TUM); never empty.
     pub frames: Vec<DatasetFrame>,
-    /// Frames left out because their image is not there.
+    /// Number of frames skipped because their image file does not exist.
     pub n_missing: usize,
-    /// Frames left out because their image is not one, or has no pose or depth near it in time.
+    /// Number of frames skipped because their image is broken or has no pose or depth close enough in time.
     pub n_unusable: usize,
-    /// What a user should know: one sentence each, with the first names of what was left out.
+    /// Notes for the user: one sentence each, with the names of the first skipped frames.
     pub notes: Vec<String>,
-    /// What is there but broken, so that it is lost to the user: one sentence each.
+    /// Broken data that are missing from the result: one sentence each.
     pub data_losses: Vec<String>,
 }
 
 impl Dataset {
-    /// Whether the stamps of its frames are times; else they only count the frames.
+    /// Whether the stamps are real times. Otherwise, they only count the frames.
     pub fn has_times(&self) -> bool {
         !is_nerfstudio(&self.path) && self.path.join(tum::COLOR_LIST).is_file()
     }
@@ -53,23 +53,23 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     Err(Error::NotADataset { path: path.to_owned() })
 }
 
-/// Poses beyond this are slips of the pen, metres.
+/// Positions beyond this are assumed to be mistakes, meters.
 const MAX_POSITION_M: f64 = 1e4;
 
-/// What was left out while reading.
+/// Frames skipped while reading.
 #[derive(Debug, Default)]
 struct SkippedFrames {
     missing: Vec<String>,
-    /// With the reason, and so below.
+    /// Names with the reason; also in `broken`.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
 }
 
 impl SkippedFrames {
-    /// Names told in a note.
+    /// Maximum number of names in a note.
     const MAX_NAMED: usize = 5;
 
-    /// The dataset, once there is something in it.
+    /// Builds the dataset. Fails if it is empty.
     fn dataset(self, path: &Path, frames: Vec<DatasetFrame>, mut notes: Vec<String>) -> Result<Dataset, Error> {
         let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
         if frames.is_empty() {
@@ -79,7 +79,7 @@ impl SkippedFrames {
         }
         if n_missing > 0 {
             let (images, verb) = plural(n_missing, "image");
-            notes.push(format!("{images} {verb} not there: {}", first_names(&self.missing)));
+            notes.push(format!("{images} {verb} missing: {}", first_names(&self.missing)));
         }
         notes.extend(unusable_note(&self.unusable));
         let data_losses = unusable_note(&self.broken).into_iter().collect();
@@ -93,12 +93,12 @@ fn unusable_note(images: &[(String, String)]) -> Option<String> {
     (!named.is_empty()).then(|| format!("{n_images} cannot be used: {}", first_names(&named)))
 }
 
-/// `1 image` and `is`, `2 images` and `verb`.
+/// Noun with count, and verb: `1 image` and `is`, `2 images` and `are`.
 fn plural(n: usize, noun: &str) -> (String, &'static str) {
     if n == 1 { (format!("1 {noun}"), "is") } else { (format!("{n} {noun}s"), "are") }
 }
 
-/// The first names, and that there are more.
+/// Joins the first names, with an ellipsis if there are more.
 fn first_names(names: &[String]) -> String {
     let more = if names.len() > SkippedFrames::MAX_NAMED { ", ..." } else { "" };
     format!("{}{more}", names[..names.len().min(SkippedFrames::MAX_NAMED)].join(", "))

@@ -1,6 +1,6 @@
-//! Folders with a `transforms.json`, as nerfstudio and instant-ngp write them.
+//! Folders with a `transforms.json`, as written by nerfstudio and instant-ngp.
 //!
-//! Their cameras look along -z with y up (OpenGL); poses are turned to ours here and nowhere else.
+//! Their cameras look along -z with y up (OpenGL). Poses are converted to our convention only here.
 
 use super::frame::image_size_px;
 use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames, plural};
@@ -11,38 +11,41 @@ use serde::de::Error as _;
 use serde::{Deserialize, Deserializer};
 use std::path::{Path, PathBuf};
 
-/// Name of the file that makes a folder one of these.
+/// File that identifies such a folder.
 pub const FILE_NAME: &str = "transforms.json";
-/// Depth counts are millimetres unless the file says otherwise.
+/// Depth counts are millimeters unless the file specifies another unit.
 const DEFAULT_METERS_PER_COUNT: f64 = 0.001;
 /// Extensions tried when a path has none.
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Reads a folder, or the file itself.
 ///
-/// Frames come in file-name order. Images that are listed twice, are not there, are no images, or were taken further away than any robot
-/// goes, are left out and counted; and so are those whose
-/// pose is not finite or not rigid; a camera model we lack is an error that names the frame.
+/// Frames are sorted by file name. The following images are skipped and counted: duplicates, missing or broken files,
+/// poses that are not finite or not rigid, and poses that are implausibly far away.
+///
+/// # Errors
+/// If the file cannot be parsed, no image is usable, or a frame uses an unsupported camera model; the error names the
+/// frame.
 pub fn read(path: &Path) -> Result<Dataset, Error> {
     let file = if path.is_file() { path.to_owned() } else { path.join(FILE_NAME) };
     let folder = file.parent().unwrap_or(Path::new(".")).to_owned();
     let text = std::fs::read_to_string(&file).map_err(|source| Error::Open { path: file.clone(), source })?;
     let file_error = |reason: String| Error::DatasetFile { path: file.clone(), reason };
     if !text.trim_start().starts_with('{') {
-        return Err(file_error("neither a recording (.mcap) nor a dataset folder nor a transforms.json".to_owned()));
+        return Err(file_error("not a recording (.mcap), a dataset folder or a transforms.json".to_owned()));
     }
     let mut document: Document =
         serde_json::from_str(&nan_as_null(&text)).map_err(|error| file_error(error.to_string()))?;
     document.frames.sort_by(|a, b| a.file_path.cmp(&b.file_path));
     let meters_per_count = document.depth_unit_scale_factor.unwrap_or(DEFAULT_METERS_PER_COUNT);
     if !(meters_per_count.is_finite() && meters_per_count > 0.0) {
-        return Err(file_error(format!("depth_unit_scale_factor is {meters_per_count}, must be above 0")));
+        return Err(file_error(format!("depth_unit_scale_factor is {meters_per_count}, expected a number above 0")));
     }
 
     let (mut frames, mut skipped, mut notes) = (Vec::new(), SkippedFrames::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
         if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
-            skipped.unusable.push((entry.file_path.clone(), "listed twice, the first counts".to_owned()));
+            skipped.unusable.push((entry.file_path.clone(), "listed twice, only the first entry is used".to_owned()));
             continue;
         }
         let frame_error = |reason: String| file_error(format!("frame {:?}: {reason}", entry.file_path));
@@ -73,14 +76,17 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         {
             skipped.broken.push((
                 entry.file_path.clone(),
-                format!("a pose {excessive_distance_m:e} m away, at most {MAX_POSITION_M:e} m"),
+                format!("its pose is {excessive_distance_m:e} m away, the maximum is {MAX_POSITION_M:e} m"),
             ));
             continue;
         }
         let camera = entry.camera.or(&document.camera);
         let intrinsics = camera.intrinsics(size_px).map_err(frame_error)?;
         if notes.is_empty() && camera.size_px().is_some_and(|reported| reported != size_px) {
-            notes.push(format!("images are {}x{}, not as told; lens parameters follow", size_px[0], size_px[1]));
+            notes.push(format!(
+                "images are {}x{}, which differs from transforms.json; lens parameters are scaled",
+                size_px[0], size_px[1]
+            ));
         }
         let depth_path = entry.depth_file_path.as_ref().and_then(|name| find_image(&folder, name));
         frames.push(DatasetFrame {
@@ -100,12 +106,12 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
     let n_missing_depth = document.frames.iter().filter(|entry| entry.lacks_depth(&folder)).count();
     if n_missing_depth > 0 {
         let (images, verb) = plural(n_missing_depth, "depth image");
-        notes.push(format!("{images} {verb} not there"));
+        notes.push(format!("{images} {verb} missing"));
     }
     skipped.dataset(&folder, frames, notes)
 }
 
-/// The whole file; keys we do not know are left alone.
+/// The whole file. Unknown keys are ignored.
 #[derive(Deserialize)]
 struct Document {
     frames: Vec<FrameEntry>,
@@ -114,23 +120,23 @@ struct Document {
     camera: CameraEntry,
 }
 
-/// One frame; its own lens parameters go before the common ones.
+/// One frame. Its own lens parameters override the common ones.
 #[derive(Deserialize)]
 struct FrameEntry {
     file_path: String,
     depth_file_path: Option<String>,
     mask_path: Option<String>,
     transform_matrix: Matrix,
-    /// Our own key: where the depth camera was, when that is not where the photo was taken.
+    /// Our extension: pose of the depth camera if it differs from that of the photo.
     depth_transform_matrix: Option<Matrix>,
     #[serde(flatten)]
     camera: CameraEntry,
 }
 
-/// Rows of a pose; null where the file has no finite number.
+/// Rows of a pose; `None` where the number is not finite.
 type Matrix = Vec<Vec<Option<f64>>>;
 
-/// Lens parameters as the file names them.
+/// Lens parameters under the names used in the file.
 #[derive(Clone, Default, Deserialize)]
 struct CameraEntry {
     camera_model: Option<String>,
@@ -163,10 +169,10 @@ struct CameraEntry {
     is_fisheye: Option<bool>,
 }
 
-/// A number that is there and finite; what is not there is no error.
+/// Deserializes a number and rejects null, which stands for NaN. Missing keys are allowed.
 fn deserialize_finite<'de, D: Deserializer<'de>>(from: D) -> Result<Option<f64>, D::Error> {
     let number = Option::<f64>::deserialize(from)?;
-    number.map(Some).ok_or_else(|| D::Error::custom("a parameter of the lens is not a finite number"))
+    number.map(Some).ok_or_else(|| D::Error::custom("a lens parameter is not a finite number"))
 }
 
 impl FrameEntry {
@@ -182,29 +188,29 @@ fn rows_of(matrix: &Matrix) -> Result<[f64; 16], String> {
         rows.extend([0.0, 0.0, 0.0, 1.0]);
     }
     rows.try_into()
-        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, must be 4 rows of 4", rows.len()))
+        .map_err(|rows: Vec<f64>| format!("transform_matrix has {} numbers, expected 4 rows of 4", rows.len()))
 }
 
-/// A pose of theirs as one of ours.
+/// Converts an OpenGL camera pose to our convention.
 fn world_from_camera(rows: &[f64; 16]) -> Result<Transform, String> {
     let world_from_opengl = transform::from_rows(rows).map_err(|error| error.to_string())?;
     Ok(world_from_opengl * opengl_from_camera())
 }
 
-/// How far away along an axis a pose lies that is too far.
+/// Largest absolute coordinate of a pose if it exceeds the maximum.
 fn excessive_distance_m(pose: Transform) -> Option<f64> {
     let excessive_distance_m = pose.translation.vector.amax();
     (excessive_distance_m > MAX_POSITION_M).then_some(excessive_distance_m)
 }
 
-/// Half a turn about x: theirs looks along -z with y up, ours along z with y down.
+/// Rotation by 180 degrees about x: OpenGL cameras look along -z with y up, ours along z with y down.
 pub fn opengl_from_camera() -> Transform {
     let half_turn = UnitQuaternion::new_unchecked(nalgebra::Quaternion::new(0.0, 1.0, 0.0, 0.0));
     Transform::from_parts(Vector3::zeros().into(), half_turn)
 }
 
 impl CameraEntry {
-    /// These parameters where given, else the common ones.
+    /// These parameters if set, else the common ones.
     fn or(&self, common: &Self) -> Self {
         let model = || self.camera_model.clone().or_else(|| common.camera_model.clone());
         Self {
@@ -226,13 +232,13 @@ impl CameraEntry {
         }
     }
 
-    /// The size the parameters are for, where the file tells it.
+    /// Image size that the parameters refer to, if the file contains it.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "sizes are small; the cast saturates")]
     fn size_px(&self) -> Option<[u32; 2]> {
         Some([self.w? as u32, self.h? as u32])
     }
 
-    /// Lens parameters for images of this size.
+    /// Lens parameters for images of the given size.
     fn intrinsics(&self, image_px: [u32; 2]) -> Result<Intrinsics, String> {
         let size_px = self.size_px().unwrap_or(image_px);
         let [width, height] = size_px.map(f64::from);
@@ -259,17 +265,19 @@ impl CameraEntry {
             None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL") => {
                 let coefficients = [k1, k2, p1, p2, k3];
                 match (k4 == 0.0, coefficients == [0.0; 5]) {
-                    (false, _) => Err(format!("k4 is {k4}: only fisheye lenses have a fourth radial coefficient here")),
+                    (false, _) => {
+                        Err(format!("k4 is {k4}, but a fourth radial coefficient is only supported for OPENCV_FISHEYE"))
+                    }
                     (true, true) => Ok(Lens::Pinhole),
                     (true, false) => Ok(Lens::BrownConrady(coefficients)),
                 }
             }
-            Some(other) => Err(format!("camera_model {other:?}, must be OPENCV, OPENCV_FISHEYE or PINHOLE")),
+            Some(other) => Err(format!("camera_model is {other:?}, expected OPENCV, OPENCV_FISHEYE or PINHOLE")),
         }
     }
 }
 
-/// The file of this name, or with an extension added where it has none.
+/// The file of this name, or of this name plus one of the known extensions.
 fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
     let as_named = folder.join(name);
     if as_named.is_file() {
@@ -279,19 +287,21 @@ fn find_image(folder: &Path, name: &str) -> Option<PathBuf> {
     candidates.into_iter().find(|path| path.is_file())
 }
 
-/// The text of an error with what lies under it.
+/// Text of the source of an error, or of the error if it has no source.
 fn reason_of(error: &Error) -> String {
     std::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
 }
 
-/// Python writes numbers JSON has not: `NaN` and `Infinity` outside of strings become null, so that the frame can be named.
+/// Replaces `NaN` and `Infinity` outside of strings with null. Python writes them although JSON does not have them;
+/// with null, the error can name the frame.
 fn nan_as_null(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for (ix, part) in text.split('"').enumerate() {
         if ix > 0 {
             out.push('"');
         }
-        // Names with an escaped quote shift what counts as a string; they hold no such number, so nothing changes for them.
+        // An escaped quote in a name shifts which parts count as strings. Names do not contain these words, so nothing
+        // changes for them.
         if ix % 2 == 0 && (part.contains("NaN") || part.contains("Infinity")) {
             out.push_str(&part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null"));
         } else {

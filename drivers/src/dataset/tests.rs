@@ -1,4 +1,4 @@
-//! Reading of dataset folders: real ones, and small ones written here.
+//! Tests with real dataset folders and with small folders created here.
 
 use super::*;
 use crate::test_data;
@@ -7,14 +7,14 @@ use kinematics::{Lens, Stamp};
 use nalgebra::{Point3, Vector3};
 use serde_json::{Value, json};
 
-/// Positions written with a dozen digits.
+/// Tolerance for positions written with a dozen digits.
 const EXACT_M: f64 = 1e-9;
 
 fn identity_rows() -> Value {
     json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 }
 
-/// A folder with two photos of 8 x 6 pixels, and its `transforms.json` to be changed.
+/// A folder with two photos of 8 x 6 pixels, and its `transforms.json` for the test to modify.
 fn small_folder() -> (tempfile::TempDir, Value) {
     let folder = tempfile::tempdir().unwrap();
     for name in ["a.png", "b.png"] {
@@ -48,7 +48,7 @@ fn fox_is_read_without_missing_photos() {
     let Some(folder) = test_data::folder("fox") else { return };
     let dataset = read(&folder).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
-    assert!(dataset.notes[0].starts_with("17 images are not there: "), "{:?}", dataset.notes);
+    assert!(dataset.notes[0].starts_with("17 images are missing: "), "{:?}", dataset.notes);
     let first = &dataset.frames[0];
     assert_eq!(first.name, "images/0001.jpg");
     assert_eq!(
@@ -56,7 +56,7 @@ fn fox_is_read_without_missing_photos() {
         Lens::BrownConrady([0.057_842_1, -0.080_509_9, -0.000_980_296, 0.000_155_75, 0.0])
     );
     assert_eq!((first.intrinsics.size_px, first.intrinsics.principal_px), ([540, 960], [277.279, 482.634]));
-    // The file's camera looks along the third column turned round, with its second column up.
+    // The camera in the file looks along its negative third column, with the second column up.
     let forward = first.world_from_camera * Vector3::z();
     assert!((forward - Vector3::new(-0.442_090_026, 0.894_068_914, 0.072_091_785)).norm() < 1e-6, "{forward}");
     let down = first.world_from_camera * Vector3::y();
@@ -113,7 +113,7 @@ fn lens_parameters_follow_the_size_of_the_images() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!(dataset.frames[0].intrinsics.focal_px, [2.5, 3.0]);
-    assert_eq!(dataset.notes, ["images are 8x6, not as told; lens parameters follow"]);
+    assert_eq!(dataset.notes, ["images are 8x6, which differs from transforms.json; lens parameters are scaled"]);
     dataset.frames[0].load().unwrap();
 }
 
@@ -128,7 +128,7 @@ fn masks_and_resized_depth_are_decoded() {
     document["depth_unit_scale_factor"] = json!(0.0002);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!(dataset.notes, ["1 depth image is not there"]);
+    assert_eq!(dataset.notes, ["1 depth image is missing"]);
     let images = dataset.frames[0].load().unwrap();
     let alphas: Vec<u8> = images.rgba_srgb.chunks_exact(4).take(8).map(|pixel| pixel[3]).collect();
     assert_eq!(alphas, [0, 0, 255, 255, 255, 255, 255, 255]);
@@ -149,13 +149,13 @@ fn missing_and_garbage_images_are_skipped_and_counted() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (2, 1, 1));
-    assert_eq!(dataset.notes, ["1 image is not there: none.png"]);
+    assert_eq!(dataset.notes, ["1 image is missing: none.png"]);
     assert!(dataset.data_losses[0].starts_with("1 image cannot be used: garbage.jpg ("), "{:?}", dataset.data_losses);
     for name in ["a.png", "b.png"] {
         std::fs::remove_file(folder.path().join(name)).unwrap();
     }
     let text = read_error(&folder);
-    assert!(text.contains("no usable image: 3 are not there, 1 cannot be used (garbage.jpg: "), "{text}");
+    assert!(text.contains("no usable image: 3 are missing, 1 cannot be used (garbage.jpg: "), "{text}");
 }
 
 #[test]
@@ -188,14 +188,14 @@ fn implausibly_far_pose_skips_frame() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
-    assert_eq!(dataset.data_losses, ["1 image cannot be used: a.png (a pose 1e30 m away, at most 1e4 m)"]);
+    assert_eq!(dataset.data_losses, ["1 image cannot be used: a.png (its pose is 1e30 m away, the maximum is 1e4 m)"]);
 }
 
 #[test]
 fn undecodable_depth_keeps_photo() {
     let (folder, mut document) = small_folder();
     document["frames"][1]["depth_file_path"] = json!("depth.png");
-    std::fs::write(folder.path().join("depth.png"), b"no picture").unwrap();
+    std::fs::write(folder.path().join("depth.png"), b"not an image").unwrap();
     write_transforms(&folder, &document);
     let images = read(folder.path()).unwrap().frames[0].load().unwrap();
     assert_eq!((images.rgba_srgb.len(), images.depth), (8 * 6 * 4, None));
@@ -219,12 +219,12 @@ fn invalid_camera_error_names_frame() {
     assert!(error_after_replacing("\"aabb_scale\":16", "\"k4\":0.1").contains("k4 is 0.1"));
     assert!(error_after_replacing("\"fl_x\":5.0", "\"fl_x\":-5.0").contains("focal length x is -5"));
     assert!(error_after_replacing("\"fl_x\":5.0,", "").contains("no focal length"));
-    assert!(error_after_replacing("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0").contains("must be above 0"));
-    assert!(error_after_replacing("\"frames\"", "\"frame\"").contains("missing field `frames`"));
     assert!(
-        error_after_replacing("{", "")
-            .contains("neither a recording (.mcap) nor a dataset folder nor a transforms.json")
+        error_after_replacing("\"aabb_scale\":16", "\"depth_unit_scale_factor\":0")
+            .contains("expected a number above 0")
     );
+    assert!(error_after_replacing("\"frames\"", "\"frame\"").contains("missing field `frames`"));
+    assert!(error_after_replacing("{", "").contains("not a recording (.mcap), a dataset folder or a transforms.json"));
     assert!(error_after_replacing("}", "").contains("transforms.json"));
 }
 
@@ -240,7 +240,7 @@ fn nan_lens_parameter_is_an_error() {
 #[test]
 fn invalid_pose_skips_image_with_note() {
     let (folder, document) = small_folder();
-    // As Python writes it, which is no JSON.
+    // Python writes these values, but they are not valid JSON.
     for (row, reason) in [
         ("[1.0,0.0,0.0,NaN]", "not a finite number"),
         ("[1.0,-Infinity,0.0,0.0]", "not a finite number"),
@@ -260,10 +260,10 @@ fn invalid_pose_skips_image_with_note() {
 fn unknown_folder_is_rejected() {
     let folder = tempfile::tempdir().unwrap();
     let text = read_error(&folder);
-    assert!(text.ends_with("it holds neither transforms.json (nerfstudio) nor rgb.txt (TUM RGB-D)"), "{text}");
+    assert!(text.ends_with("expected transforms.json (nerfstudio) or rgb.txt (TUM RGB-D) in it"), "{text}");
 }
 
-/// A TUM folder: four photos, three with poses near them, depth for two of them.
+/// A TUM folder: four photos, three of them with poses close in time, two with depth.
 fn tum_folder() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let path_of = |name: &str| folder.path().join(name);
@@ -282,7 +282,7 @@ fn tum_folder() -> tempfile::TempDir {
     let photos = ["1.000000", "1.100000", "1.200000", "1.300000", "9.000000"];
     std::fs::write(path_of("rgb.txt"), list(&photos, "rgb")).unwrap();
     std::fs::write(path_of("depth.txt"), list(&["1.015000", "1.110000"], "depth")).unwrap();
-    // Along x at 1 m/s, every 10 ms from just before to just after the photos.
+    // Along x at 1 m/s, every 10 ms from just before the first photo until just after the third.
     let poses =
         (0..=25).map(|ix| format!("{:.4} {} 2 3 0 0 0 1\n", 0.995 + 0.01 * f64::from(ix), 0.01 * f64::from(ix)));
     std::fs::write(path_of("groundtruth.txt"), poses.collect::<String>()).unwrap();
@@ -299,7 +299,7 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     assert!(dataset.notes.contains(&"1 photo has no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
     let second = &dataset.frames[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
-    // Halfway between two readings; the depth image was taken 10 ms later and 1 cm on.
+    // Halfway between two poses. The depth image was taken 10 ms later and 1 cm further.
     assert!((second.world_from_camera.translation.vector - Vector3::new(0.105, 2.0, 3.0)).norm() < EXACT_M);
     let depth = second.depth.as_ref().unwrap();
     assert!((depth.world_from_camera.translation.x - 0.115).abs() < EXACT_M);
@@ -329,12 +329,12 @@ fn tum_intrinsics_come_from_file_or_folder_name() {
 fn broken_tum_list_error_names_line() {
     let folder = tum_folder();
     std::fs::write(folder.path().join("rgb.txt"), "# list\nnoon rgb/1.png\n").unwrap();
-    assert!(read_error(&folder).contains("line 2: \"noon\" is no time in seconds"));
+    assert!(read_error(&folder).contains("line 2: \"noon\" is not a time in seconds"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0\n").unwrap();
-    assert!(read_error(&folder).contains("nothing follows the time"));
+    assert!(read_error(&folder).contains("the time is not followed by a file name"));
     std::fs::write(folder.path().join("rgb.txt"), "1.0 rgb/1.000000.png\n").unwrap();
     std::fs::write(folder.path().join("groundtruth.txt"), "1.0 nan 0 0 0 0 0 1\n").unwrap();
-    assert!(read_error(&folder).contains("no pose within 20 ms"), "a pose that is none does not count");
+    assert!(read_error(&folder).contains("no pose within 20 ms"), "an invalid pose is skipped");
     std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
     assert_eq!(read(folder.path()).unwrap().frames.len(), 1);
 }

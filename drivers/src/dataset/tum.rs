@@ -1,6 +1,7 @@
 //! TUM RGB-D folders: `rgb.txt`, `depth.txt`, `groundtruth.txt`.
 //!
-//! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats on the benchmark's pages.
+//! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats documented on the web pages of the
+//! benchmark.
 
 use super::frame::image_size_px;
 use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames};
@@ -9,17 +10,17 @@ use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::path::Path;
 
-/// Name of the file that makes a folder one of these.
+/// File that identifies such a folder.
 pub const COLOR_LIST: &str = "rgb.txt";
 const DEPTH_LIST: &str = "depth.txt";
 const POSE_LIST: &str = "groundtruth.txt";
-/// Optional: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, pixel centres at whole numbers as in OpenCV.
+/// Optional: `fx fy cx cy`, then optionally `k1 k2 p1 p2 k3`, with pixel centers at integers as in OpenCV.
 const CAMERA_FILE: &str = "calibration.txt";
-/// Readings further apart in time than this do not belong together.
+/// Maximum time between samples that are matched to each other.
 const MAX_GAP_NANOS: i64 = 20_000_000;
 const METERS_PER_COUNT: f64 = 1.0 / 5000.0;
 
-/// The benchmark's cameras by a part of the folder's name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
+/// Cameras of the benchmark by a part of the folder name: `fx fy cx cy`, then `k1 k2 p1 p2 k3`.
 const CAMERAS: [(&str, [f64; 9]); 3] = [
     ("freiburg1", [517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314]),
     (
@@ -31,8 +32,8 @@ const CAMERAS: [(&str, [f64; 9]); 3] = [
 
 /// Reads a folder.
 ///
-/// A photo takes the pose interpolated at its stamp and the depth image nearest in time, each within 20 ms; photos
-/// without a pose are left out and counted. Lens parameters come from `calibration.txt`, else from the folder's name.
+/// Each photo gets the pose interpolated at its stamp and the depth image closest in time, both within 20 ms. Photos
+/// without a pose are skipped and counted. Lens parameters come from `calibration.txt`, else from the folder name.
 pub fn read(folder: &Path) -> Result<Dataset, Error> {
     let camera = camera_of(folder)?;
     let colors = stamped_names(folder, COLOR_LIST)?;
@@ -73,7 +74,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
     skipped.dataset(folder, frames, notes)
 }
 
-/// Lens parameters; the size is filled in from each photo.
+/// Lens parameters. The caller sets the size to that of each photo.
 fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
     let path = folder.join(CAMERA_FILE);
     let numbers = match std::fs::read_to_string(&path) {
@@ -82,7 +83,7 @@ fn camera_of(folder: &Path) -> Result<Intrinsics, Error> {
     };
     let [fx, fy, cx, cy, k1, k2, p1, p2, k3] = numbers;
     let lens = if numbers[4..] == [0.0; 5] { Lens::Pinhole } else { Lens::BrownConrady([k1, k2, p1, p2, k3]) };
-    // Their pixel centres are whole numbers, ours lie half a pixel in.
+    // Pixel centers are at integers in these files and at half-integers in ours.
     let (focal_px, principal_px) = ([fx, fy], [cx + 0.5, cy + 0.5]);
     let intrinsics = Intrinsics { size_px: [640, 480], focal_px, principal_px, lens, rectified: false };
     intrinsics
@@ -102,12 +103,12 @@ fn camera_numbers(text: &str) -> Result<[f64; 9], String> {
 }
 
 fn camera_by_name(folder: &Path) -> Option<[f64; 9]> {
-    let integer = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
-    let name = integer.file_name()?.to_string_lossy().to_lowercase();
+    let absolute = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned());
+    let name = absolute.file_name()?.to_string_lossy().to_lowercase();
     CAMERAS.iter().find(|(part, _)| name.contains(part)).map(|(_, numbers)| *numbers)
 }
 
-/// The lines of a list, each a stamp and the words after it, in time.
+/// Lines of a list, each split into its stamp and the words after it, sorted by time.
 fn stamped_lines(folder: &Path, list: &str) -> Result<Vec<(Stamp, Vec<String>)>, Error> {
     let path = folder.join(list);
     let text = std::fs::read_to_string(&path).map_err(|source| Error::Open { path: path.clone(), source })?;
@@ -117,10 +118,10 @@ fn stamped_lines(folder: &Path, list: &str) -> Result<Vec<(Stamp, Vec<String>)>,
         let Some(first) = words.next().filter(|word| !word.starts_with('#')) else { continue };
         let line_error =
             |what: &str| Error::DatasetFile { path: path.clone(), reason: format!("line {}: {what}", line_ix + 1) };
-        let stamp = stamp_of(&first).ok_or_else(|| line_error(&format!("{first:?} is no time in seconds")))?;
+        let stamp = stamp_of(&first).ok_or_else(|| line_error(&format!("{first:?} is not a time in seconds")))?;
         let rest: Vec<String> = words.collect();
         if rest.is_empty() {
-            return Err(line_error("nothing follows the time"));
+            return Err(line_error("the time is not followed by a file name"));
         }
         lines.push((stamp, rest));
     }
@@ -133,7 +134,7 @@ fn stamped_names(folder: &Path, list: &str) -> Result<Vec<(Stamp, String)>, Erro
     Ok(lines.into_iter().map(|(stamp, words)| (stamp, words.join(" "))).collect())
 }
 
-/// Seconds since 1970 with decimals; read as two whole numbers, since f64 would round to a quarter of a microsecond.
+/// Parses seconds since 1970 with decimals. Uses two integers because f64 would round to a quarter of a microsecond.
 fn stamp_of(word: &str) -> Option<Stamp> {
     let (integer, decimals) = word.split_once('.').unwrap_or((word, ""));
     let secs: i64 = integer.parse().ok()?;
@@ -142,7 +143,7 @@ fn stamp_of(word: &str) -> Option<Stamp> {
     Some(Stamp(secs.checked_mul(1_000_000_000)?.checked_add(nanos)?))
 }
 
-/// The entry nearest in time, within the allowed gap.
+/// Entry closest in time, within the maximum gap.
 fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
     let gap = |entry: &(Stamp, T)| entry.0.nanos_since(stamp).saturating_abs();
     let after = entries.partition_point(|entry| entry.0 < stamp);
@@ -150,7 +151,7 @@ fn nearest<T>(entries: &[(Stamp, T)], stamp: Stamp) -> Option<&(Stamp, T)> {
     candidates.iter().min_by_key(|entry| gap(entry)).filter(|entry| gap(entry) <= MAX_GAP_NANOS)
 }
 
-/// The trajectory of the colour camera.
+/// Trajectory of the color camera.
 struct Poses(Vec<(Stamp, Transform)>);
 
 impl Poses {
@@ -166,10 +167,10 @@ impl Poses {
                 return Some(Err(line_error("expected tx ty tz qx qy qz qw")));
             };
             let rotation = Quaternion::new(qw, qx, qy, qz);
-            // Written so that no number is no pose.
+            // The comparisons are written so that NaN fails them.
             let is_near = [x, y, z].iter().all(|along| along.abs() <= MAX_POSITION_M);
             if !(is_near && (rotation.norm() - 1.0).abs() <= 0.01) {
-                log::warn!("{}", line_error("left out: not finite, too far, or its quaternion is not of length 1"));
+                log::warn!("{}", line_error("skipped: not finite, too far away, or the quaternion is not of length 1"));
                 return None;
             }
             let rotation = UnitQuaternion::new_normalize(rotation);
@@ -178,7 +179,7 @@ impl Poses {
         Ok(Self(poses.collect::<Result<_, _>>()?))
     }
 
-    /// The pose at a stamp, between two that lie no further than the allowed gap from it.
+    /// Pose at a stamp, interpolated between two poses that are both within the maximum gap.
     fn at(&self, stamp: Stamp) -> Option<Transform> {
         let after_ix = self.0.partition_point(|(other, _)| *other < stamp);
         let after = self.0.get(after_ix).filter(|(other, _)| other.nanos_since(stamp) <= MAX_GAP_NANOS)?;

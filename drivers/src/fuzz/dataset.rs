@@ -1,16 +1,16 @@
-//! Lists of images and poses from anyone; the images themselves are there.
+//! Fuzz targets for dataset lists. The images they refer to are valid.
 
 use super::Scratch;
 use crate::dataset;
 use kinematics::transform;
 
 thread_local! {
-    /// Folders with a photo and a depth image, whose lists are written anew each time.
+    /// Folders with a photo and a depth image. Their lists are rewritten for each input.
     static NERFSTUDIO: Scratch = folder("nerfstudio");
     static TUM: Scratch = folder("tum");
 }
 
-/// A whole `transforms.json`.
+/// Reads a complete `transforms.json`.
 pub fn nerfstudio(bytes: &[u8]) {
     NERFSTUDIO.with(|folder| {
         folder.write("transforms.json", bytes);
@@ -18,7 +18,7 @@ pub fn nerfstudio(bytes: &[u8]) {
     });
 }
 
-/// The lists of a TUM folder, with a line of three equals signs between them: photos, depth images, poses, lens.
+/// Reads the lists of a TUM folder, separated by lines of three equals signs: photos, depth images, poses, lens.
 pub fn tum(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     let mut lists = text.splitn(4, "===\n");
@@ -42,8 +42,8 @@ fn read(folder: &Scratch) {
 fn folder(name: &str) -> Scratch {
     let folder = Scratch::new(name);
     let photo = image::RgbImage::from_pixel(4, 3, image::Rgb([40, 60, 7]));
-    photo.save(folder.0.join("photo.png")).expect("a small picture");
+    photo.save(folder.0.join("photo.png")).expect("a small image");
     let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(4, 3, image::Luma([1000]));
-    depth.save(folder.0.join("depth.png")).expect("a small picture");
+    depth.save(folder.0.join("depth.png")).expect("a small image");
     folder
 }

@@ -1,9 +1,10 @@
-//! Messages of recordings from anyone.
+//! Fuzz target for messages of recordings.
 
 use super::take;
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 
-/// A byte that says what, then one message. What can be read is the same once it was written and read again.
+/// Reads one byte for the kind of message, then one message. Checks that readable messages survive encoding and
+/// decoding.
 pub fn messages(mut bytes: &[u8]) {
     let [kind] = take(&mut bytes);
     let assert_round_trip = |encoded: Vec<u8>, reencoded: Option<Vec<u8>>| assert_eq!(Some(encoded), reencoded);

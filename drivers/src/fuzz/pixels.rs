@@ -1,4 +1,4 @@
-//! Images from anyone, in every format that cameras and recordings have.
+//! Fuzz target for images in every format of cameras and recordings.
 
 use super::take;
 use crate::{Image, PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange, jpeg};
@@ -17,9 +17,10 @@ const FORMATS: [PixelFormat; 9] = [
     PixelFormat::DepthU16 { meters_per_count: 0.001 },
 ];
 
-/// A byte of format, width, height and bytes from row to row in two bytes each, little-endian, then the image's own bytes.
+/// Reads the format in one byte, then width, height and bytes per line in two bytes each, little endian, then the image
+/// data.
 ///
-/// An image that can be read has as many pixels as it says.
+/// Checks that readable images have as many pixels as declared.
 pub fn pixels(mut bytes: &[u8]) {
     let [format] = take(&mut bytes);
     let format = FORMATS[usize::from(format) % FORMATS.len()];
@@ -27,7 +28,7 @@ pub fn pixels(mut bytes: &[u8]) {
     let size_px = [width, height].map(u32::from);
     let n_pixels = usize::from(width) * usize::from(height);
     let image = Image {
-        camera: "it".into(),
+        camera: "camera".into(),
         stamp: Stamp(0),
         size_px,
         format,

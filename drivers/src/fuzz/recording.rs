@@ -1,19 +1,19 @@
-//! Recordings from anyone.
+//! Fuzz target for recordings.
 
 use super::Scratch;
 use crate::Source;
 use crate::recording::Recording;
 
 thread_local! {
-    /// With one file, written anew each time.
+    /// Contains one file, which is rewritten for each input.
     static FOLDER: Scratch = Scratch::new("recording");
 }
 
-/// A whole file. Reading it ends.
+/// Reads a complete file. Checks that reading terminates.
 pub fn recording(bytes: &[u8]) {
     FOLDER.with(|folder| {
         let Ok(mut recording) = Recording::open(&folder.write("it.mcap", bytes)) else { return };
-        // A message that cannot be read is told, and the next one may be asked for.
+        // After a message that cannot be read, the next one may be requested.
         for _ in 0..bytes.len() {
             if let Ok(None) = recording.next_sample() {
                 return;

@@ -1,4 +1,4 @@
-//! The seeds of the folder `fuzz`, as they are and spoilt, through every reader.
+//! Feeds the seeds of the folder `fuzz`, unchanged and corrupted, to every reader.
 
 use super::*;
 use crate::recording::{Recorder, RecordingMetadata};
@@ -9,7 +9,7 @@ use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 
 type Reader = fn(&[u8]);
 
-/// What reads the seeds of a folder.
+/// Reader for each seed folder.
 const READERS: [(&str, Reader); 9] = [
     ("can", frames),
     ("udp", datagrams),
@@ -34,7 +34,7 @@ fn load_seeds(name: &str) -> Vec<Vec<u8>> {
     paths.iter().map(|path| std::fs::read(path).unwrap()).collect()
 }
 
-/// The bytes spoilt once more: a cut, a piece twice, two pieces swapped, bytes and bits at random.
+/// Corrupts the bytes: truncates, deletes or repeats a section, swaps two sections, or changes bytes or bits at random.
 fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
     if bytes.is_empty() {
         return bytes.push(7);
@@ -54,7 +54,7 @@ fn corrupt(bytes: &mut Vec<u8>, random: &mut Random) {
 
 #[test]
 fn corrupted_seeds_never_panic() {
-    /// Each a few of [`corrupt`]; a reader of files takes 50 us for one.
+    /// Each is corrupted a few times. File readers take 50 us per input.
     const N_CORRUPTED: usize = 400;
     for (name, read) in READERS {
         let mut random = Random(5);
@@ -73,9 +73,9 @@ fn corrupted_seeds_never_panic() {
     }
 }
 
-/// Run by hand where a format has changed; what fuzzing found keeps its own name and stays.
+/// Run this manually after a format change. Seeds found by fuzzing have other names and are kept.
 #[test]
-#[ignore = "writes the seeds that are made here anew"]
+#[ignore = "rewrites the generated seeds"]
 fn write_seeds() {
     let write = |name: &str, seed: &str, bytes: &[u8]| {
         std::fs::create_dir_all(seed_folder(name)).unwrap();
@@ -97,7 +97,7 @@ fn write_seeds() {
     write("recording", "rig.mcap", &small_recording());
 }
 
-/// Small images with the head that [`pixels`] takes.
+/// Small images with the header that [`pixels`] expects.
 fn images() -> Vec<(&'static str, Vec<u8>)> {
     let rgb: Vec<u8> = (0..3 * 16 * 8).map(|ix: u32| (ix * ix % 251) as u8).collect();
     let file = |format| {
@@ -109,7 +109,7 @@ fn images() -> Vec<(&'static str, Vec<u8>)> {
         [&[format, 16, 0, 8, 0][..], &bytes_per_line.to_le_bytes(), data].concat()
     };
     let jpeg = file(image::ImageFormat::Jpeg);
-    // Motion JPEG leaves the tables of the Huffman codes out.
+    // Motion JPEG omits the Huffman tables.
     let mut without_tables = Vec::new();
     let mut rest = &jpeg[..];
     while let [0xff, 0xc4, high, low, ..] | [0xff, _, high, low, ..] = *rest {
@@ -150,7 +150,7 @@ fn scan() -> RangeScan {
     RangeScan { scanner: "lidar".into(), stamp: Stamp(9), points: [point; 2].into() }
 }
 
-/// One of each message, in the order of the kinds of [`messages`].
+/// One of each message, in the order of the kinds in [`messages`].
 fn one_of_each_message() -> Vec<(&'static str, Vec<u8>)> {
     let pose = Transform::new([0.1, 0.2, -0.3].into(), [0.3, 0.0, 1.0].into());
     let depth = PixelFormat::DepthU16 { meters_per_count: 0.001 };

@@ -1,4 +1,4 @@
-//! Such a camera as the rest of the program sees it: images while it is plugged in, waiting while it is not, and never for ever.
+//! A nokhwa camera that reconnects after an outage and never blocks forever.
 
 use super::gap_estimator::GapEstimator;
 use super::worker::{Frame, Worker, WorkerEvent};
@@ -10,23 +10,23 @@ use kinematics::Intrinsics;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-/// A call for an image that has not come back for so long, or for so many images, is left behind.
+/// If no image comes for this long, or for the time of this many images, the call is abandoned.
 const MAX_SILENCE: Duration = Duration::from_millis(1500);
 const MAX_SILENT_IMAGES: f64 = 5.0;
-/// Opening takes longer: cameras measure the light first.
+/// Opening takes longer: cameras adjust the exposure first.
 const MAX_OPENING: Duration = Duration::from_secs(8);
-/// Between two tries to find a lost camera again.
+/// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
-/// Threads that hang in a call and cannot be ended: past these no further one is begun.
+/// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is started.
 const MAX_ABANDONED: usize = 8;
-/// How long a thread that streams may take to notice that it is to end.
+/// How long to wait for a streaming thread to stop.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A camera that streams.
+/// A streaming camera.
 ///
-/// One that is unplugged, or whose call hangs, is opened again for at most [`Config::reconnect_for`]: until then
-/// [`Camera::next_image`] says [`Error::Reconnecting`], after that what it was. Images are stamped as they arrive, and how many
-/// were lost is estimated from that.
+/// If the camera is disconnected or a call hangs, it is reopened for at most [`Config::reconnect_for`]. During that
+/// time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Images are stamped on arrival.
+/// The number of dropped images is estimated from the stamps.
 #[derive(Debug)]
 pub struct NokhwaCamera {
     config: Config,
@@ -34,21 +34,21 @@ pub struct NokhwaCamera {
     connection: Connection,
     gap_estimator: GapEstimator,
     counts: Counts,
-    /// Threads that were left behind.
+    /// Threads that were abandoned.
     abandoned: Vec<Weak<()>>,
     outage: Option<Outage>,
 }
 
-/// What became of the camera since it was opened.
+/// Statistics of a camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Images delivered.
+    /// Number of delivered images.
     pub n_images: u64,
-    /// Images lost, estimated from stamps; all were told in [`Image::n_skipped`].
+    /// Number of dropped images, estimated from stamps. All were reported in [`Image::n_skipped`].
     pub n_skipped: u64,
-    /// Times that it was found again.
+    /// Number of reconnections.
     pub n_reconnections: u32,
-    /// Calls that hung and were left behind.
+    /// Number of calls that hung and were abandoned.
     pub n_abandoned: u32,
 }
 
@@ -57,7 +57,7 @@ enum Connection {
     Connected {
         worker: Worker,
         alive: Weak<()>,
-        /// Since when nothing came.
+        /// Time of the last image, or of the start.
         last_image_at: Instant,
         is_streaming: bool,
     },
@@ -85,18 +85,18 @@ impl NokhwaCamera {
             Some(WorkerEvent::Streaming(what)) => {
                 (*is_streaming, *last_image_at) = (true, Instant::now());
                 log::info!(
-                    "camera {:?}: {what}; stamped as images arrive, lost ones are estimated from that",
+                    "camera {:?}: {what}; images are stamped on arrival, and dropped images are estimated from the stamps",
                     camera.config.name
                 );
                 Ok(camera)
             }
             Some(WorkerEvent::Failed(problem)) => Err(camera.error(problem)),
-            Some(WorkerEvent::Frame(_)) => unreachable!("a thread says first that it streams"),
+            Some(WorkerEvent::Frame(_)) => unreachable!("the first event is Streaming or Failed"),
             None => Err(camera.error(Problem::Hung { what: "open it", waited: MAX_OPENING })),
         }
     }
 
-    /// What became of it so far.
+    /// Statistics since the camera was opened.
     pub fn counts(&self) -> Counts {
         self.counts
     }
@@ -118,7 +118,7 @@ impl NokhwaCamera {
         Ok(())
     }
 
-    /// One step of waiting for an image of a camera that is there or being opened.
+    /// Waits once for an image of a camera that is connected or being opened.
     fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
         let Connection::Connected { worker, last_image_at, is_streaming, .. } = &mut self.connection else {
             return Ok(None);
@@ -141,13 +141,13 @@ impl NokhwaCamera {
             Some(WorkerEvent::Streaming(what)) => {
                 (*is_streaming, *last_image_at) = (true, Instant::now());
                 let waited = self.outage.map_or(Duration::ZERO, |outage| outage.since.elapsed());
-                log::info!("camera {:?}: there again after {waited:.1?}: {what}", self.config.name);
+                log::info!("camera {:?}: reconnected after {waited:.1?}: {what}", self.config.name);
                 self.counts.n_reconnections += 1;
                 Ok(None)
             }
             Some(WorkerEvent::Failed(problem)) => self.handle_disconnect(problem).map(|()| None),
             None if Instant::now() >= gives_up_at => {
-                let what = if *is_streaming { "have its next image" } else { "open it" };
+                let what = if *is_streaming { "get its next image" } else { "open it" };
                 self.handle_disconnect(Problem::Hung { what, waited: timeout }).map(|()| None)
             }
             None => Ok(None),
@@ -171,7 +171,7 @@ impl NokhwaCamera {
         }
     }
 
-    /// Leaves the thread to itself; whether that is for good it does not tell. Fails when the camera has been lost for too long.
+    /// Abandons the thread, which may still be running. Fails if the camera has been disconnected for too long.
     fn handle_disconnect(&mut self, problem: Problem) -> Result<(), Error> {
         if let Connection::Connected { alive, .. } = std::mem::replace(&mut self.connection, Connection::Disconnected)
             && matches!(problem, Problem::Hung { .. })
@@ -182,7 +182,11 @@ impl NokhwaCamera {
         let is_new = self.outage.is_none();
         let Outage { since, n_tries, .. } = Outage::of(&mut self.outage);
         if is_new {
-            log::warn!("camera {:?}: {problem}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+            log::warn!(
+                "camera {:?}: {problem}; trying to reconnect for {:?}",
+                self.config.name,
+                self.config.reconnect_for
+            );
             return Ok(());
         }
         let waited = since.elapsed();
@@ -193,7 +197,7 @@ impl NokhwaCamera {
         Err(self.error(Problem::Lost { waited, n_tries, last: Box::new(problem) }))
     }
 
-    /// One try to open a lost camera again, not before the pause since the last one is over.
+    /// Tries once to reopen a disconnected camera, after the pause since the last attempt.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
         let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
         let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
@@ -243,7 +247,7 @@ impl Drop for NokhwaCamera {
             return;
         };
         drop(worker);
-        // Until it has, nobody else can open the camera; a thread that hangs is left behind.
+        // The camera can only be reopened after the thread has ended. A thread that hangs is abandoned.
         let until = Instant::now() + SHUTDOWN_TIMEOUT;
         while alive.strong_count() > 0 && Instant::now() < until {
             std::thread::sleep(Duration::from_millis(5));

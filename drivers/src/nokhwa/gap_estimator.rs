@@ -1,13 +1,14 @@
-//! How many images were lost, estimated from when the others came.
+//! Estimates the number of dropped images from the arrival times of the others.
 
 use kinematics::Stamp;
 
-/// Images this many periods later than they should be follow a loss; what comes less late was held up.
+/// An image that is later than this many periods follows dropped images; a smaller lateness is jitter.
 const LATE_PERIODS: f64 = 0.75;
-/// Share of its lateness that an image moves what is expected of the next ones: cameras are not exactly as fast as they say.
+/// Fraction of the lateness that corrects the next due time, because the actual frame rate differs from the nominal
+/// one.
 const DRIFT_GAIN: f64 = 0.05;
 
-/// When the images of one camera are due: they may come late, never early.
+/// Estimates when the images of a camera are due. Images may be late, but never early.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct GapEstimator {
     period_secs: f64,
@@ -19,7 +20,7 @@ impl GapEstimator {
         Self { period_secs: 1.0 / rate_hz, due: None }
     }
 
-    /// Images that were lost before one that came then, as near as that can be told.
+    /// Estimated number of images that were dropped before an image with this stamp.
     pub(super) fn n_lost_before(&mut self, stamp: Stamp) -> u64 {
         let Some(due) = self.due else {
             self.due = Some(stamp.plus_secs(self.period_secs));
@@ -28,7 +29,7 @@ impl GapEstimator {
         let late_periods = stamp.secs_since(due) / self.period_secs;
         let lost_periods = (late_periods - LATE_PERIODS).ceil().max(0.0);
         let delayed_secs = (late_periods - lost_periods) * self.period_secs;
-        // One that came before it was due tells that the ones before were held up.
+        // An image before its due time means that earlier images were delayed.
         let correction_secs = if delayed_secs < 0.0 { delayed_secs } else { DRIFT_GAIN * delayed_secs };
         self.due = Some(due.plus_secs((1.0 + lost_periods) * self.period_secs + correction_secs));
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "not negative; the cast saturates")]
@@ -41,7 +42,7 @@ impl GapEstimator {
 mod tests {
     use super::*;
 
-    /// Images lost by the estimate, of those whose stamps are told in milliseconds.
+    /// Estimated number of dropped images for the given stamps in milliseconds.
     fn n_lost(rate_hz: f64, millis: impl IntoIterator<Item = f64>) -> u64 {
         let mut gap_estimator = GapEstimator::new(rate_hz);
         millis.into_iter().map(|millis| gap_estimator.n_lost_before(Stamp::from_secs(millis * 1e-3))).sum()
@@ -51,7 +52,7 @@ mod tests {
     fn gaps_are_counted_but_jitter_is_not() {
         assert_eq!(n_lost(25.0, [0.0, 40.0, 80.0, 160.0, 200.0]), 1);
         assert_eq!(n_lost(25.0, [0.0, 40.0, 1080.0, 1120.0]), 25);
-        // Held up, one after the other, and then on time again.
+        // Images delayed one after another, then on time again.
         assert_eq!(n_lost(25.0, [0.0, 65.0, 105.0, 122.0, 160.0]), 0);
         let jitter = |ix: u32| f64::from(ix) * 40.0 + f64::from(ix * ix % 27);
         assert_eq!(n_lost(25.0, (0..1000).map(jitter)), 0);

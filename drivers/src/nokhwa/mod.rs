@@ -1,8 +1,9 @@
-//! Webcams by way of `nokhwa`: macOS's `AVFoundation`, Windows's Media Foundation, V4L2 where that is wanted.
+//! Webcams through `nokhwa`: `AVFoundation` on macOS, Media Foundation on Windows, and optionally V4L2.
 //!
-//! A call for an image may never return, and cannot be broken off: `worker.rs` makes it on a thread of its own, `camera.rs` watches
-//! over it, leaves a thread that hangs behind and begins anew. Images are the device's own bytes. Their numbers are not told:
-//! `gap_estimator.rs` estimates from stamps how many were lost.
+//! A call for an image may never return and cannot be canceled. `worker.rs` therefore calls nokhwa on a separate
+//! thread. `camera.rs` monitors the thread, abandons it if it hangs, and starts a new one. Images are the unmodified
+//! bytes of the device. They have no sequence numbers, so `gap_estimator.rs` estimates the number of dropped images
+//! from stamps.
 
 mod camera;
 mod gap_estimator;
@@ -14,87 +15,87 @@ use crate::v4l2::{Delivery, V4l2Format};
 use kinematics::Intrinsics;
 use std::time::Duration;
 
-/// What a rig file says of such a camera.
+/// Configuration of a nokhwa camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// The camera's own name or a part of it, its number, or on Linux the path of its node or of a link to it.
+    /// Name of the device or a part of it, its number, or on Linux the path of its node or of a link to it.
     pub device: String,
-    /// Pixel format; `None` takes the first that is offered at this size and rate.
+    /// Pixel format; `None` selects the first one available at this size and rate.
     pub format: Option<V4l2Format>,
-    /// Lens and size of the images.
+    /// Lens parameters and size of the images.
     pub intrinsics: Intrinsics,
-    /// Images a second, a whole number.
+    /// Images per second, an integer.
     pub rate_hz: f64,
-    /// Exposure of each image, microseconds, where it is known; the camera is not told.
+    /// Exposure time of each image, microseconds, if known. The camera is not configured with it.
     pub exposure_micros: Option<f64>,
-    /// Which image a slow caller gets.
+    /// Which image the next call returns if the caller is slow.
     pub delivery: Delivery,
-    /// How long a camera that was lost is looked for.
+    /// How long to try to reconnect to a camera.
     pub reconnect_for: Duration,
 }
 
-/// What is wrong with such a camera.
+/// Problems with a nokhwa camera.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
-    /// Nothing that is plugged in goes by this name.
-    #[error("no camera goes by {device:?}; there are: {connected}")]
+    /// No connected camera has this name.
+    #[error("no camera named {device:?} found; connected cameras: {connected}")]
     NoDevice {
-        /// Name of the rig file.
+        /// Name in the rig file.
         device: String,
-        /// Names and numbers of those that are plugged in.
+        /// Names and numbers of the connected cameras.
         connected: String,
     },
-    /// Its format cannot be read here.
-    #[error("{format} cannot be had from nokhwa: mjpeg, yuyv, nv12, rgb and bgr can")]
+    /// The pixel format is not supported by this driver.
+    #[error("the format {format} is not supported by the nokhwa driver, expected mjpeg, yuyv, nv12, rgb or bgr")]
     Format {
         /// Name of the format.
         format: &'static str,
     },
-    /// The rate is no whole number.
-    #[error("rate_hz is {rate_hz}, nokhwa sets whole numbers only")]
+    /// The rate is not an integer.
+    #[error("rate_hz is {rate_hz}, expected an integer for the nokhwa driver")]
     Rate {
-        /// That of the rig file.
+        /// Rate in the rig file.
         rate_hz: f64,
     },
-    /// It does not stream as wanted.
-    #[error("{requested} cannot be had: {reason}")]
+    /// The camera cannot stream as requested.
+    #[error("cannot start {requested}: {reason}")]
     Refused {
-        /// Format, size and rate.
+        /// Requested format, size and rate.
         requested: String,
-        /// What nokhwa says.
+        /// Error of nokhwa.
         reason: String,
     },
-    /// An image could not be had from a camera that streamed.
-    #[error("it is unplugged, or as good as that: {reason}")]
+    /// Reading an image from a streaming camera failed.
+    #[error("it was disconnected or stopped delivering images: {reason}")]
     Unplugged {
-        /// What nokhwa says.
+        /// Error of nokhwa.
         reason: String,
     },
-    /// A call has not come back for too long, and was left alone.
-    #[error("a call to {what} has not come back for {waited:.1?} and was left behind")]
+    /// A call did not return in time and was abandoned.
+    #[error("a call to {what} did not return within {waited:.1?} and was abandoned")]
     Hung {
-        /// What was asked for.
+        /// Purpose of the call.
         what: &'static str,
-        /// For how long.
+        /// Time spent waiting.
         waited: Duration,
     },
-    /// So many calls hang that no further one is made.
-    #[error("{n_abandoned_threads} calls hang; plug the camera in anew, or end the program")]
+    /// Too many calls hang to start another one.
+    #[error("{n_abandoned_threads} calls hang: reconnect the camera, or restart the program")]
     TooManyAbandoned {
-        /// How many.
+        /// Number of calls that hang.
         n_abandoned_threads: usize,
     },
-    /// It did not come back in time.
-    #[error("not there again after {waited:.1?} and {n_tries} tries: {last}")]
+    /// The camera did not reconnect in time.
+    #[error("it disconnected and did not reconnect within {waited:.1?} ({n_tries} attempts): {last}")]
     Lost {
-        /// Since it was lost.
+        /// Time since the camera was disconnected.
         waited: Duration,
-        /// Tries to open it.
+        /// Number of attempts to reopen it.
         n_tries: u32,
-        /// What the last one said.
+        /// Problem at the last attempt.
         last: Box<Self>,
     },
 }

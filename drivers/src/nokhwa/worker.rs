@@ -1,4 +1,4 @@
-//! The thread that calls `nokhwa`, whose calls may not come back.
+//! Thread that calls `nokhwa`, whose calls may never return.
 
 use super::{Config, Problem};
 use crate::v4l2::V4l2Format;
@@ -12,11 +12,11 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-/// Images that may wait for the caller: a quarter of a second at 30 Hz.
+/// Capacity of the queue to the caller: a quarter of a second at 30 Hz.
 const MAX_WAITING: usize = 8;
-/// What cameras mean by YUV where they do not say.
+/// Color encoding assumed for YUV formats, since cameras do not report one.
 const DEFAULT_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
-/// What formats are called here and there, best first.
+/// Formats by their names here and in nokhwa, in order of preference.
 const FORMATS: [(V4l2Format, FrameFormat, PixelFormat); 5] = [
     (V4l2Format::Yuyv, FrameFormat::YUYV, PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: DEFAULT_COLORS }),
     (V4l2Format::Nv12, FrameFormat::NV12, PixelFormat::Yuv { layout: YuvLayout::Nv12, colors: DEFAULT_COLORS }),
@@ -25,29 +25,29 @@ const FORMATS: [(V4l2Format, FrameFormat, PixelFormat); 5] = [
     (V4l2Format::Bgr, FrameFormat::RAWBGR, PixelFormat::Bgr8),
 ];
 
-/// What the thread has to say.
+/// Event sent by the thread.
 pub(super) enum WorkerEvent {
-    /// It streams; what, for people.
+    /// The camera streams. Contains a description for the log.
     Streaming(String),
     Frame(Frame),
-    /// The last that comes.
+    /// The thread failed. This is its last event.
     Failed(Problem),
 }
 
-/// An image as it came.
+/// An image as received from nokhwa.
 pub(super) struct Frame {
     pub(super) arrival: Stamp,
     pub(super) format: PixelFormat,
     pub(super) bytes: Vec<u8>,
 }
 
-/// A thread that streams; once this is dropped it ends as soon as its call comes back.
+/// A streaming thread. After this is dropped, the thread ends as soon as its current call returns.
 #[derive(Debug)]
 pub(super) struct Worker {
     shared: Arc<Shared>,
 }
 
-/// What lies between the thread and the caller.
+/// State shared by the thread and the caller.
 #[derive(Debug, Default)]
 struct Shared {
     state: Mutex<State>,
@@ -57,7 +57,7 @@ struct Shared {
 #[derive(Default)]
 struct State {
     queue: VecDeque<WorkerEvent>,
-    /// The caller is gone.
+    /// The caller has dropped the worker.
     stop: bool,
 }
 
@@ -68,7 +68,7 @@ impl std::fmt::Debug for State {
 }
 
 impl Worker {
-    /// Begins to open the camera, and then to stream. `alive` is held for as long as the thread lives.
+    /// Starts a thread that opens the camera and streams. The thread holds `alive` until it ends.
     pub(super) fn start(config: &Config, alive: Arc<()>) -> Result<Self, Problem> {
         let shared = Arc::new(Shared::default());
         let (config, sender) = (config.clone(), Arc::clone(&shared));
@@ -80,11 +80,11 @@ impl Worker {
         });
         match thread {
             Ok(_) => Ok(Self { shared }),
-            Err(error) => Err(Problem::Refused { requested: "a thread".to_owned(), reason: error.to_string() }),
+            Err(error) => Err(Problem::Refused { requested: "its thread".to_owned(), reason: error.to_string() }),
         }
     }
 
-    /// The oldest that was told and not taken; `None` when there was nothing until then.
+    /// Returns the oldest queued event, or `None` if none came until `until`.
     pub(super) fn next(&self, until: Instant) -> Option<WorkerEvent> {
         let mut state = self.shared.lock();
         loop {
@@ -107,12 +107,13 @@ impl Drop for Worker {
 }
 
 impl Shared {
-    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    /// Locks the state. A poisoned lock is accepted because the queue is never left half changed.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The oldest image goes where there are too many: it is missed by its stamp. Whether the caller still listens.
+    /// Queues an event and returns whether the caller is still listening. If the queue is full, the oldest image is
+    /// dropped; the gap is detected from the stamps.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.lock();
         if state.queue.len() >= MAX_WAITING {
@@ -124,7 +125,7 @@ impl Shared {
     }
 }
 
-/// Streams until nobody listens; whatever goes wrong ends it.
+/// Streams until the caller stops listening. Any error ends it.
 fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     let index = find(&config.device)?;
     let (mut camera, format) = open(config, index)?;
@@ -141,13 +142,13 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     Ok(())
 }
 
-/// The camera of a name. Numbers change with every plug, so it is looked for each time.
+/// Finds the camera by name. Numbers change with every connection, so this is repeated each time.
 fn find(device: &str) -> Result<CameraIndex, Problem> {
     if let Some(index) = number(device) {
         return Ok(CameraIndex::Index(index));
     }
     let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
-    // Some have several nodes: the first is the one for images.
+    // Some cameras have several nodes: the first one is for images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
     let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
     let is_partial_match = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
@@ -164,17 +165,17 @@ fn find(device: &str) -> Result<CameraIndex, Problem> {
     }
 }
 
-/// A number, or that of a node or of what a link leads to.
+/// Parses a number, the path of a node, or a link to a node.
 fn number(device: &str) -> Option<u32> {
     let node = std::fs::canonicalize(device).ok();
     let node = node.as_ref().and_then(|node| node.to_str()).unwrap_or(device);
     node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
 }
 
-/// The camera in the wanted format, or in the first that it has.
+/// Opens the camera in the requested format, or in the first one it supports.
 fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
     let rate_hz = config.rate_hz;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with what it was")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with the original below")]
     let whole_hz = rate_hz.round() as u32;
     if f64::from(whole_hz) != rate_hz {
         return Err(Problem::Rate { rate_hz });
@@ -209,10 +210,10 @@ fn requested(config: &Config, format: V4l2Format) -> String {
 
 fn pixels(format: V4l2Format) -> PixelFormat {
     let of_name = FORMATS.iter().find(|(name, ..)| *name == format);
-    of_name.expect("opened with one of them").2
+    of_name.expect("the camera was opened with one of these formats").2
 }
 
-/// An image without what lies behind it: on Linux the whole buffer comes, however short the image in it.
+/// Removes the bytes after the image. On Linux, nokhwa returns the whole buffer even if the image in it is shorter.
 fn trim(buffer: &[u8], format: V4l2Format, size_px: [u32; 2]) -> Vec<u8> {
     let n_bytes = match pixels(format).raw_size(size_px) {
         Some([row_bytes, n_rows]) => row_bytes.saturating_mul(n_rows),

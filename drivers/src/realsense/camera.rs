@@ -1,4 +1,4 @@
-//! A RealSense camera as the rest of the program sees it: images while it is plugged in, waiting while it is not.
+//! A RealSense camera that reconnects after an outage.
 
 use super::find;
 use super::sdk::Context;
@@ -9,43 +9,43 @@ use crate::{Camera, Error, Image};
 use kinematics::{Intrinsics, Stamp};
 use std::time::{Duration, Instant};
 
-/// Between two tries to find a lost camera again; after a reset it is away for some seconds.
+/// Pause between two attempts to reconnect. After a reset, a camera is unavailable for a few seconds.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
-/// A stream that is silent for this long, or for so many images, is begun anew: cameras hang.
+/// A stream without images for this long, or for the time of this many images, is restarted, because cameras may hang.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 10.0;
-/// A camera that is there and does not stream after so many tries is reset, and once more after as many.
+/// After every so many failed attempts, a camera that is connected but does not stream is reset.
 const TRIES_BEFORE_RESET: u32 = 3;
 
-/// A RealSense camera that streams colour or infrared and, where that is asked for, depth; or a file that plays one.
+/// A RealSense camera that streams color or infrared and, if configured, depth; or a file that is played back.
 ///
-/// A camera that is unplugged, or hangs, is opened again with the same settings, for at most [`Config::reconnect_for`], and reset
-/// where that does not help: until then [`Camera::next_image`] says [`Error::Reconnecting`], after that what it was. Dropping it
-/// ends the streams.
+/// A camera that is disconnected or hangs is reopened with the same settings for at most [`Config::reconnect_for`], and
+/// reset if that does not help. During that time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards
+/// the cause. Dropping it stops the streams.
 #[derive(Debug)]
 pub struct RealsenseCamera {
     config: Config,
     connection: Connection,
     calibration: Calibration,
     counts: Counts,
-    /// Stamps of the last images, depth last, across reconnections.
+    /// Stamps of the last color or infrared image and of the last depth image, kept across reconnections.
     last: [Option<Stamp>; 2],
-    /// Set from a loss to the next image.
+    /// Set from the start of an outage until the next image.
     outage: Option<Outage>,
-    /// Resets since it was lost.
+    /// Number of resets in the current outage.
     n_resets: u32,
 }
 
-/// What became of the camera since it was opened.
+/// Statistics of a camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Images delivered, depth among them.
+    /// Number of delivered images, including depth.
     pub n_images: u64,
-    /// Images lost, all of which were told in [`Image::n_skipped`].
+    /// Number of dropped images, all of which were reported in [`Image::n_skipped`].
     pub n_skipped: u64,
-    /// Times that it was found again.
+    /// Number of reconnections.
     pub n_reconnections: u32,
-    /// Times that it was reset.
+    /// Number of resets.
     pub n_resets: u32,
 }
 
@@ -56,7 +56,7 @@ enum Connection {
 }
 
 impl RealsenseCamera {
-    /// Opens a camera or a file, sets it up as the rig file says, and starts its streams.
+    /// Opens a camera or a file, applies the settings of the rig file, and starts the streams.
     pub fn open(config: Config) -> Result<Self, Error> {
         let session = Session::start(&config)
             .map_err(|problem| Error::Realsense { camera: config.name.clone(), problem: Box::new(problem) })?;
@@ -72,17 +72,17 @@ impl RealsenseCamera {
         })
     }
 
-    /// What the camera knows about its lenses.
+    /// Calibration stored in the camera.
     pub fn calibration(&self) -> &Calibration {
         &self.calibration
     }
 
-    /// What became of it so far.
+    /// Statistics since the camera was opened.
     pub fn counts(&self) -> Counts {
         self.counts
     }
 
-    /// One step of waiting for an image of a camera that is there.
+    /// Waits once for an image of a connected camera.
     fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
         let Connection::Connected(session) = &mut self.connection else { return Ok(None) };
         match session.next(deadline) {
@@ -112,7 +112,7 @@ impl RealsenseCamera {
         image
     }
 
-    /// Lets go of the device before it is looked for. A file has no second try.
+    /// Closes the device before it is reopened. Files are not reopened.
     fn handle_disconnect(&mut self, cause: Problem) -> Result<(), Error> {
         if self.config.file.is_some() {
             return Err(Error::Realsense { camera: self.config.name.clone(), problem: Box::new(cause) });
@@ -122,11 +122,11 @@ impl RealsenseCamera {
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, cause);
         }
-        log::warn!("camera {:?}: {cause}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        log::warn!("camera {:?}: {cause}; trying to reconnect for {:?}", self.config.name, self.config.reconnect_for);
         Ok(())
     }
 
-    /// The error of a camera that was lost for longer than the rig file allows.
+    /// Fails if the camera has been disconnected for longer than the rig file allows.
     fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, cause: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
@@ -137,7 +137,7 @@ impl RealsenseCamera {
         Err(Error::Realsense { camera, problem: Box::new(problem) })
     }
 
-    /// One try to open a lost camera again, not before the pause since the last one is over.
+    /// Tries once to reopen a disconnected camera, after the pause since the last attempt.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
         let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
         if !outage.wait_for_retry(RETRY_PAUSE, deadline) {
@@ -152,7 +152,7 @@ impl RealsenseCamera {
         match Session::start(&self.config) {
             Ok(session) => {
                 let (camera, waited) = (&self.config.name, outage.since.elapsed());
-                log::info!("camera {camera:?}: there again after {waited:?}: {}", session.describe());
+                log::info!("camera {camera:?}: reconnected after {waited:?}: {}", session.describe());
                 self.counts.n_reconnections += 1;
                 self.connection = Connection::Connected(Box::new(session));
                 Ok(())
@@ -162,10 +162,10 @@ impl RealsenseCamera {
     }
 }
 
-/// Resets a camera as if it were unplugged and plugged in; false where it is not there.
+/// Resets a camera, which has the effect of reconnecting it. Returns false if it is not connected.
 fn reset(config: &Config) -> bool {
     let Ok(device) = Context::new().and_then(|context| find::camera(&context, &config.serial)) else { return false };
-    log::warn!("camera {:?}: it does not stream: resetting it", config.name);
+    log::warn!("camera {:?}: it is connected but does not stream; resetting it", config.name);
     device.reset();
     true
 }

@@ -1,84 +1,85 @@
-//! What a rig file says of a RealSense camera.
+//! Configuration of a RealSense camera.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// A RealSense camera as the rig file has it.
+/// A RealSense camera as configured in the rig file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// Serial number; empty takes the only one that is plugged in.
+    /// Serial number; if empty, the only connected camera is used.
     pub serial: String,
-    /// A recorded file that is played in the place of a camera.
+    /// Recorded file to play back in place of a camera.
     pub file: Option<PathBuf>,
-    /// When images of a file come.
+    /// Timing of images played back from a file.
     pub pace: Pace,
-    /// With [`Pace::Clock`]: what is added to the stamps of the file, nanoseconds.
+    /// With [`Pace::Clock`]: offset added to the stamps of the file, nanoseconds.
     pub clock_offset_nanos: i64,
-    /// Which stream gives the images that are not depth.
+    /// Stream of the images that are not depth.
     pub stream: Stream,
-    /// Their width and height, pixels.
+    /// Width and height of these images, pixels.
     pub size_px: [u32; 2],
-    /// Images a second.
+    /// Images per second.
     pub rate_hz: f64,
-    /// Width and height of depth, pixels; `None` takes no depth.
+    /// Width and height of depth images, pixels; `None` for no depth.
     pub depth_size_px: Option<[u32; 2]>,
-    /// How the camera is set up.
+    /// Settings of the camera.
     pub settings: Settings,
-    /// What the library does to depth, in this order.
+    /// Depth filters of the library, in order.
     pub filters: Vec<Filter>,
-    /// How long a camera that was lost is looked for.
+    /// How long to try to reconnect to a camera.
     pub reconnect_for: Duration,
 }
 
-/// When the images of a file come, and on which clock their stamps are.
+/// When images of a file are delivered, and the clock of their stamps.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pace {
-    /// As from a camera: the first at once, and that is its stamp; the others as long after it as they were recorded.
+    /// Like a live camera: the first image comes immediately and is stamped on arrival. Later images follow at the
+    /// recorded intervals.
     #[default]
     RealTime,
-    /// As fast as they are taken, with the stamps of the file.
+    /// As fast as the caller takes them, with the stamps of the file.
     Fast,
-    /// With the stamps of the file and [`Config::clock_offset_nanos`], which are of this computer's monotonic clock, and each when
-    /// that time has come: for simulations that play other devices beside the file.
+    /// Stamps are those of the file plus [`Config::clock_offset_nanos`], on the monotonic clock of this computer, and
+    /// each image is delivered at that time. For simulations that emulate other devices in parallel with the file.
     Clock,
 }
 
 /// A stream of images that are not depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Stream {
-    /// The colour camera.
+    /// The color camera.
     #[default]
     Color,
-    /// The left (D4xx) or only infrared camera, which depth is registered to.
+    /// The left infrared camera (D4xx) or the only one. Depth is in its frame.
     Infrared,
 }
 
-/// How a camera is set up; what is left open is automatic where the camera can do that, else left as it is.
+/// Camera settings. A missing setting is automatic if the camera supports that, else it is left unchanged.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Exposure time of [`Config::stream`], microseconds; `None` lets the camera choose at the rate it was asked for.
+    /// Exposure time of [`Config::stream`], microseconds; `None` for automatic exposure without lowering the rate.
     pub exposure_micros: Option<f64>,
-    /// Gain, counts of the camera.
+    /// Gain, in units of the camera.
     pub gain: Option<i32>,
     /// White balance, kelvin.
     pub white_balance_kelvin: Option<i32>,
-    /// Brightness, counts of the camera.
+    /// Brightness, in units of the camera.
     pub brightness: Option<i32>,
-    /// Preset of the depth camera, by the name that the camera gives it.
+    /// Preset of the depth camera, by the name that the camera uses.
     pub preset: Option<String>,
-    /// Power of the projector or laser, in the camera's units (D4xx: milliwatts); 0 switches it off.
+    /// Power of the projector or laser, in units of the camera (D4xx: milliwatts); 0 turns it off.
     pub laser_power: Option<f64>,
 }
 
-/// A filter of the library on depth images, as it is set up there.
+/// A depth filter of the library, with its default parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Filter {
-    /// Smooths over neighbouring pixels, edges kept.
+    /// Edge-preserving smoothing across neighboring pixels.
     Spatial,
-    /// Smooths over earlier images: what moves leaves traces.
+    /// Smoothing over time. Moving objects leave trails.
     Temporal,
-    /// Fills pixels without a reading from their left: invented depth.
+    /// Fills pixels without depth from their left neighbors. The result is not measured depth.
     HoleFilling,
 }

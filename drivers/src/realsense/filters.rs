@@ -1,4 +1,4 @@
-//! The library's filters on depth images, those that a rig file names, set up as the library sets them up.
+//! Depth filters of the library that the rig file enables, with their default parameters.
 
 use super::sdk::{Frame, as_depth};
 use super::{Filter, Problem};
@@ -9,10 +9,10 @@ use realsense_rust::processing_blocks::temporal_filter::TemporalFilter;
 use std::fmt::Display;
 use std::time::Duration;
 
-/// Filters work on the caller's thread, so what they made is there at once.
+/// Filters run on the calling thread, so their result is available immediately.
 const FILTER_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Filters in the order in which depth passes them.
+/// Filters in the order in which they are applied.
 #[derive(Debug, Default)]
 pub(super) struct Filters(Vec<Block>);
 
@@ -23,8 +23,9 @@ enum Block {
     HoleFilling(HoleFillingFilter),
 }
 
-// SAFETY: the library may be called from any thread, one after the other; blocks are never cloned, so we hold the only pointers.
-#[expect(unsafe_code, reason = "the wrapper forgot to say so")]
+// SAFETY: the library may be called from any thread, one at a time; blocks are never cloned, so these are the only
+// pointers.
+#[expect(unsafe_code, reason = "the wrapper lacks a Send implementation")]
 unsafe impl Send for Filters {}
 
 impl Filters {
@@ -41,7 +42,7 @@ impl Filters {
         self.0.is_empty()
     }
 
-    /// A depth image that has passed all of them.
+    /// Applies all filters to a depth image.
     pub(super) fn apply(&mut self, frame: Frame) -> Result<DepthFrame, Problem> {
         let mut frame = as_depth(frame)?;
         for block in &mut self.0 {

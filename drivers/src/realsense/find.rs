@@ -1,21 +1,21 @@
-//! RealSense cameras that are plugged in, and what is wrong with them.
+//! Lists connected RealSense cameras and their problems.
 
 use super::Problem;
 use super::sdk::{Context, Device};
 use realsense_rust::kind::Rs2CameraInfo;
 
-/// A camera that is plugged in.
+/// A connected camera.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FoundCamera {
-    /// What it calls itself.
+    /// Model name.
     pub name: String,
-    /// Its serial number, which a rig file names.
+    /// Serial number, which identifies the camera in a rig file.
     pub serial: String,
-    /// Version of its firmware.
+    /// Firmware version.
     pub firmware: String,
-    /// Version that the library wants, where it says so.
+    /// Firmware version that the library recommends, if it reports one.
     pub recommended_firmware: Option<String>,
-    /// Version of USB that it runs at, like `3.2`.
+    /// USB version of the connection, such as `3.2`.
     pub usb: Option<String>,
 }
 
@@ -36,24 +36,24 @@ impl FoundCamera {
         self.usb.as_deref().is_some_and(|usb| usb.starts_with('2') || usb.starts_with('1'))
     }
 
-    /// Whether its firmware is older than the library wants.
+    /// Whether its firmware is older than the library recommends.
     pub fn has_old_firmware(&self) -> bool {
         let numbers = |version: &str| version.split('.').map(|part| part.parse().unwrap_or(0)).collect::<Vec<u32>>();
         self.recommended_firmware.as_deref().is_some_and(|requested| numbers(&self.firmware) < numbers(requested))
     }
 
-    /// Name and serial number, for people.
+    /// Name and serial number for messages.
     pub(super) fn describe(&self) -> String {
         format!("{} {}", self.name, self.serial)
     }
 }
 
-/// All that are plugged in.
+/// All connected cameras.
 pub fn cameras() -> Result<Vec<FoundCamera>, Problem> {
     Ok(Context::new()?.devices()?.iter().map(FoundCamera::of).collect())
 }
 
-/// The camera with a serial number, or the only one that there is where that is empty.
+/// Finds the camera with a serial number, or the only connected camera if the number is empty.
 pub(super) fn camera(context: &Context, serial: &str) -> Result<Device, Problem> {
     let mut devices = context.devices()?;
     let found: Vec<FoundCamera> = devices.iter().map(FoundCamera::of).collect();
@@ -61,7 +61,7 @@ pub(super) fn camera(context: &Context, serial: &str) -> Result<Device, Problem>
     let connected = || found.iter().map(FoundCamera::describe).collect();
     match found.iter().filter(|found| is_match(found)).count() {
         0 => Err(Problem::NoDevice { serial: serial.to_owned(), connected: connected() }),
-        1 => Ok(devices.swap_remove(found.iter().position(is_match).expect("it was counted"))),
+        1 => Ok(devices.swap_remove(found.iter().position(is_match).expect("the filter found one match"))),
         _ => Err(Problem::Ambiguous { connected: connected() }),
     }
 }
@@ -90,7 +90,7 @@ mod tests {
     #[test]
     fn missing_camera_error_names_it() {
         let context = Context::new().expect("the library starts without a camera");
-        let message = camera(&context, "no such serial").expect_err("none is there").to_string();
+        let message = camera(&context, "no such serial").expect_err("no camera is connected").to_string();
         assert!(message.contains("no such serial"), "{message}");
     }
 }

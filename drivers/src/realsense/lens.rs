@@ -1,22 +1,24 @@
-//! Lenses as librealsense2 tells them.
+//! Converts lens parameters from and to those of librealsense2.
 //!
-//! Source: `include/librealsense2/rsutil.h` of 2.56, functions `rs2_project_point_to_pixel` and `rs2_deproject_pixel_to_point`.
-//! There the centre of the first pixel is (0, 0), here (0.5, 0.5).
+//! Source: `include/librealsense2/rsutil.h` of 2.56, functions `rs2_project_point_to_pixel` and
+//! `rs2_deproject_pixel_to_point`.
+//! In the library, the center of the first pixel is (0, 0); here it is (0.5, 0.5).
 
 use super::Problem;
 use kinematics::{Intrinsics, Lens, Transform};
 use nalgebra::{Matrix3, Matrix5, Rotation3, Translation3, UnitQuaternion, Vector5};
 use realsense_sys as sys;
 
-/// A model of ours that is fitted to one of the library's may be off by so much of a pixel; a D455's is by 0.04.
+/// Maximum error of a fit of our lens model to one of the library, in pixels. The error for a D455 is 0.04.
 const MAX_FIT_ERROR_PX: f64 = 0.5;
-/// Points along each side of the image that a fit goes through.
+/// Number of fit points along each side of the image.
 const N_FIT_POINTS: u32 = 24;
 
-/// The library's intrinsics as ours.
+/// Converts intrinsics of the library to ours.
 ///
-/// Brown-Conrady and Kannala-Brandt are the same models. The library's "modified" and "inverse" Brown-Conrady (all D4xx colour
-/// cameras say the latter, mostly with coefficients of zero) are other polynomials: they are fitted by ours.
+/// Brown-Conrady and Kannala-Brandt are the same models. "Modified" and "inverse" Brown-Conrady are different
+/// polynomials, and our model is fitted to them. All D4xx color cameras report the inverse model, usually with zero
+/// coefficients.
 pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Result<Intrinsics, Problem> {
     let lens_problem = |model: &str| Problem::Lens { stream, model: model.to_owned() };
     let size_px = [raw.width, raw.height].map(|side| u32::try_from(side).unwrap_or(0));
@@ -44,11 +46,11 @@ pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Res
         sys::rs2_distortion_RS2_DISTORTION_FTHETA => return Err(lens_problem("F-theta")),
         other => return Err(lens_problem(&format!("number {other}"))),
     };
-    intrinsics.validate().map_err(|error| Problem::Library { what: "tell intrinsics", reason: error.to_string() })?;
+    intrinsics.validate().map_err(|error| Problem::Library { what: "get intrinsics", reason: error.to_string() })?;
     Ok(intrinsics)
 }
 
-/// Ours as the library's, where it has the same model.
+/// Converts our intrinsics to those of the library, which has the same models.
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() { Lens::Pinhole } else { intrinsics.lens };
     let (model, k) = match lens {
@@ -64,16 +66,16 @@ pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     sys::rs2_intrinsics { width, height, ppx, ppy, fx, fy, model, coeffs: k.map(narrow) }
 }
 
-/// `to_from_from` of the library's extrinsics between two streams.
+/// Converts extrinsics of the library, which map coordinates from the first stream to the second.
 pub(super) fn transform(raw: &sys::rs2_extrinsics) -> Transform {
     let rotation = Matrix3::from_column_slice(&raw.rotation.map(f64::from));
-    // Single precision leaves it a little skewed.
+    // Single precision leaves the matrix slightly non-orthogonal.
     let rotation = Rotation3::from_matrix_eps(&rotation, 1e-12, 100, Rotation3::identity());
     let [x, y, z] = raw.translation.map(f64::from);
     Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
-/// The library's extrinsics of a transform.
+/// Converts a transform to extrinsics of the library.
 pub(super) fn extrinsics(transform: &Transform) -> sys::rs2_extrinsics {
     let rotation = transform.rotation.to_rotation_matrix();
     let mut columns = [0.0; 9];
@@ -82,7 +84,7 @@ pub(super) fn extrinsics(transform: &Transform) -> sys::rs2_extrinsics {
     sys::rs2_extrinsics { rotation: columns, translation: translation.map(narrow) }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the library has single precision")]
+#[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
 fn narrow(number: f64) -> f32 {
     number as f32
 }
@@ -96,7 +98,7 @@ fn polynomial(k: &[f64; 5], [x, y]: [f64; 2]) -> [f64; 2] {
     ]
 }
 
-/// The tangential part acts on what the radial one has moved already.
+/// The tangential part is applied to the result of the radial part.
 fn modified(k: &[f64; 5], [x, y]: [f64; 2]) -> [f64; 2] {
     let r2 = x * x + y * y;
     let radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]));
@@ -104,9 +106,11 @@ fn modified(k: &[f64; 5], [x, y]: [f64; 2]) -> [f64; 2] {
     [x + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x), y + 2.0 * k[3] * x * y + k[2] * (r2 + 2.0 * y * y)]
 }
 
-/// Our Brown-Conrady lens that does the same as another model, by least squares over the image; `None` where none does.
+/// Fits our Brown-Conrady model to another model by least squares over the image. Returns `None` if the fit is not
+/// accurate enough.
 ///
-/// `pair` gives, for a position on the plane `z` = 1 as a pinhole sees it, a ray and where that is seen.
+/// `pair` takes the position on the plane `z` = 1 that a pinhole camera observes at a pixel, and returns a ray and its
+/// distorted position.
 fn fit_brown_conrady(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2], [f64; 2])) -> Option<Lens> {
     let mut pairs = Vec::new();
     for row in 0..=N_FIT_POINTS {
@@ -116,7 +120,7 @@ fn fit_brown_conrady(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2],
             pairs.push(pair([ray_at.x, ray_at.y]));
         }
     }
-    // What the lens adds to a ray is linear in its coefficients.
+    // The displacement caused by the lens is linear in its coefficients.
     let (mut normal_matrix, mut rhs) = (Matrix5::zeros(), Vector5::zeros());
     for ([x, y], distorted_point) in &pairs {
         let r2 = x * x + y * y;
@@ -143,7 +147,7 @@ fn fit_brown_conrady(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2],
         (0..2).map(|axis| ((ours[axis] - distorted_point[axis]) * pinhole.focal_px[axis]).abs()).fold(0.0, f64::max)
     });
     let fit_error_px = fit_error_px.fold(0.0, f64::max);
-    log::debug!("a lens model of the library is met to {fit_error_px:.4} px");
+    log::debug!("fitted a lens model of the library with a maximum error of {fit_error_px:.4} px");
     (fit_error_px < MAX_FIT_ERROR_PX).then_some(Lens::BrownConrady(k))
 }
 
@@ -151,7 +155,7 @@ fn fit_brown_conrady(pinhole: &Intrinsics, pair: impl Fn([f64; 2]) -> ([f64; 2],
 mod tests {
     use super::*;
 
-    /// A D455's colour camera, as `rs-enumerate-devices -c` prints it.
+    /// Color camera of a D455, as printed by `rs-enumerate-devices -c`.
     const D455: sys::rs2_intrinsics = sys::rs2_intrinsics {
         width: 1280,
         height: 720,
@@ -163,7 +167,7 @@ mod tests {
         coeffs: [-0.0555, 0.0657, -0.0006, 0.0004, -0.0213],
     };
 
-    /// By how much the fit of this lens is off.
+    /// Maximum error of the fit of this lens.
     const FIT_TOLERANCE_PX: f64 = 0.05;
 
     #[test]
@@ -176,11 +180,11 @@ mod tests {
         ];
         for model in models {
             let raw = sys::rs2_intrinsics { model, ..D455 };
-            let ours = intrinsics(&raw, "color").expect("a lens like any");
+            let ours = intrinsics(&raw, "color").expect("a supported lens");
             let k = raw.coeffs.map(f64::from);
             for row in (0..=720).step_by(90) {
                 for column in (0..=1280).step_by(80) {
-                    // The library's own pixel, its centre whole.
+                    // Pixel in the convention of the library, with integer centers.
                     let pixel = [f64::from(column), f64::from(row)];
                     let plane = [
                         (pixel[0] - f64::from(raw.ppx)) / f64::from(raw.fx),
@@ -192,7 +196,8 @@ mod tests {
                         sys::rs2_distortion_RS2_DISTORTION_MODIFIED_BROWN_CONRADY => (plane, modified(&k, plane)),
                         _ => (polynomial(&k, plane), plane),
                     };
-                    let got = ours.project(&nalgebra::Vector3::new(ray[0], ray[1], 1.0)).expect("before the camera");
+                    let got =
+                        ours.project(&nalgebra::Vector3::new(ray[0], ray[1], 1.0)).expect("in front of the camera");
                     let expected = [
                         distorted_point[0] * f64::from(raw.fx) + f64::from(raw.ppx) + 0.5,
                         distorted_point[1] * f64::from(raw.fy) + f64::from(raw.ppy) + 0.5,
@@ -200,7 +205,7 @@ mod tests {
                     for axis in 0..2 {
                         assert!(
                             (got[axis] - expected[axis]).abs() < FIT_TOLERANCE_PX,
-                            "{model}: {got:?}, not {expected:?}"
+                            "{model}: {got:?}, expected {expected:?}"
                         );
                     }
                 }
@@ -222,10 +227,10 @@ mod tests {
                 lens,
                 rectified: false,
             };
-            assert_eq!(intrinsics(&raw(&ours), "color").expect("a lens of ours"), ours);
+            assert_eq!(intrinsics(&raw(&ours), "color").expect("a supported lens"), ours);
         }
         let fisheye = sys::rs2_intrinsics { model: sys::rs2_distortion_RS2_DISTORTION_FTHETA, ..D455 };
-        assert!(intrinsics(&fisheye, "color").expect_err("no such model").to_string().contains("F-theta"));
+        assert!(intrinsics(&fisheye, "color").expect_err("an unsupported model").to_string().contains("F-theta"));
         let pose = Transform::from_parts(
             Translation3::new(0.0148, 0.0002, -0.0003),
             UnitQuaternion::from_euler_angles(0.01, -0.02, 0.03),

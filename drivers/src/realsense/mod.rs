@@ -1,9 +1,10 @@
-//! RealSense cameras by their maker's library (librealsense2), and files that it recorded.
+//! RealSense cameras through librealsense2, and files recorded by it.
 //!
-//! What a rig file says of them (`config.rs`, `problem.rs`) is there always; the rest needs the cargo feature `realsense`.
-//! `sdk.rs` is the part of the library that `realsense-rust` leaves out, `lens.rs` and `stamps.rs` say what its numbers mean,
-//! `options.rs` sets a camera up; `session.rs` moves bytes, `camera.rs` survives an unplugged cable. `emulated/` writes files as a
-//! simulated camera.
+//! Configuration and problems (`config.rs`, `problem.rs`) are always compiled; the rest needs the cargo feature
+//! `realsense`. `sdk.rs` wraps the part of the library that `realsense-rust` lacks; `find.rs` lists cameras; `lens.rs`
+//! and `stamps.rs` convert lens parameters and time stamps; `options.rs` applies settings; `streams.rs` selects and
+//! opens streams; `filters.rs` filters depth; `session.rs` converts frames to images; `camera.rs` handles
+//! disconnections. `emulated/` writes the files of an emulated camera.
 
 mod config;
 mod problem;

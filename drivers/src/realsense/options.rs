@@ -1,31 +1,32 @@
-//! Exposure, gain, white balance, presets and laser of a RealSense camera: what is set for a rig file, and read back.
+//! Exposure, gain, white balance, presets and laser of a RealSense camera: set from the rig file and read back.
 
 use super::sdk::{Device, Sensor};
 use super::{Problem, Settings};
 use realsense_rust::kind::{Rs2CameraInfo, Rs2Option};
 use realsense_sys as sys;
 
-/// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
+/// Maximum relative difference of the exposure when read back: cameras round it to rows of their sensor.
 const EXPOSURE_TOLERANCE_FRAC: f32 = 0.1;
-/// Colour cameras beside a depth camera count their exposure like any webcam; depth cameras count microseconds.
+/// The RGB module of a depth camera counts exposure like a webcam; depth sensors count microseconds.
 const RGB_MODULE: &str = "RGB Camera";
 const RGB_MICROS_PER_COUNT: f64 = 100.0;
 
-/// Microseconds in a count of a sensor's exposure, set or told.
+/// Microseconds per count of the exposure of a sensor.
 pub(super) fn exposure_micros_per_count(sensor: &Sensor) -> f64 {
     let name = sensor.options.info(Rs2CameraInfo::Name).map(|name| name.to_string_lossy().into_owned());
     if name.as_deref() == Some(RGB_MODULE) { RGB_MICROS_PER_COUNT } else { 1.0 }
 }
 
-/// Sets a camera up and reads everything back; `image_sensor` is that of the images that are not depth.
+/// Applies the settings and reads them back. `image_sensor` is the sensor of the images that are not depth. Returns a
+/// description of each setting.
 pub(super) fn apply(settings: &Settings, device: &mut Device, image_sensor: usize) -> Result<Vec<String>, Problem> {
     let mut applied = Vec::new();
     for sensor in &mut device.sensors {
-        // The camera's clock is mapped here: the library's own mapping believes late arrivals.
+        // The camera clock is mapped in `stamps.rs`. The library's own mapping is biased by late arrivals.
         set_if_supported(sensor, Rs2Option::GlobalTimeEnabled, 0.0);
     }
     if let Some(sensor) = device.sensors.iter_mut().find(|sensor| is_supported(sensor, Rs2Option::DepthUnits)) {
-        // A preset changes what the others say, so it comes first.
+        // A preset changes other options, so it is set first.
         if let Some(name) = &settings.preset {
             let value = preset(sensor, name)?;
             set(sensor, "realsense.preset", Rs2Option::VisualPreset, value, 0.0)?;
@@ -36,16 +37,16 @@ pub(super) fn apply(settings: &Settings, device: &mut Device, image_sensor: usiz
             applied.push(format!("laser power {power}"));
         }
     } else if settings.preset.is_some() || settings.laser_power.is_some() {
-        return Err(Problem::NoSetting { setting: "realsense.preset or laser_power: it has no depth" });
+        return Err(Problem::NoSetting { setting: "realsense.preset or laser_power because it has no depth sensor" });
     }
     applied.extend(apply_image_settings(settings, &mut device.sensors[image_sensor])?);
     Ok(applied)
 }
 
-/// The picture of the images that are not depth.
+/// Settings of the images that are not depth.
 fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<String>, Problem> {
     let mut applied = Vec::new();
-    // Automatic exposure may not lower the rate.
+    // Automatic exposure must not lower the rate.
     set_if_supported(sensor, Rs2Option::AutoExposurePriority, 0.0);
     match (settings.exposure_micros, settings.gain) {
         (None, None) => set_if_supported(sensor, Rs2Option::EnableAutoExposure, 1.0),
@@ -53,7 +54,7 @@ fn apply_image_settings(settings: &Settings, sensor: &mut Sensor) -> Result<Vec<
             return Err(Problem::SettingRange {
                 setting: "realsense.gain",
                 requested: gain.to_string(),
-                allowed: "a gain only together with exposure_micros: automatic exposure sets both".into(),
+                allowed: "a gain only with exposure_micros, because automatic exposure sets both".into(),
             });
         }
         (Some(micros), gain) => {
@@ -92,7 +93,7 @@ fn laser(sensor: &mut Sensor, power: f64) -> Result<(), Problem> {
     set(sensor, KEY, Rs2Option::LaserPower, narrow(power), step)
 }
 
-/// The number of a preset that the camera has by this name; spaces, underscores and capitals do not matter.
+/// Value of the preset with this name. Case is ignored; underscores and hyphens match spaces.
 fn preset(sensor: &Sensor, name: &str) -> Result<f32, Problem> {
     const KEY: &str = "realsense.preset";
     let normalized = |name: &str| name.to_lowercase().replace(['_', '-'], " ");
@@ -115,7 +116,7 @@ fn is_supported(sensor: &Sensor, option: Rs2Option) -> bool {
     sensor.options.supports_option(option)
 }
 
-/// What the rig file does not ask for may be refused.
+/// Sets an option that the rig file does not require. Failures are only logged.
 fn set_if_supported(sensor: &mut Sensor, option: Rs2Option, value: f32) {
     if is_supported(sensor, option)
         && let Err(error) = sensor.options.set_option(option, value)
@@ -124,7 +125,7 @@ fn set_if_supported(sensor: &mut Sensor, option: Rs2Option, value: f32) {
     }
 }
 
-/// Sets what the rig file asks for, and reads it back; `tolerance` is how far off that may be.
+/// Sets an option that the rig file requires, and checks the value read back. `tolerance` is the maximum difference.
 fn set(
     sensor: &mut Sensor,
     setting: &'static str,
@@ -147,7 +148,7 @@ fn set(
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the library has single precision")]
+#[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
 fn narrow(number: f64) -> f32 {
     number as f32
 }

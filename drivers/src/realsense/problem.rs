@@ -1,105 +1,105 @@
-//! What can be wrong with a RealSense camera, and what to do about it.
+//! Problems with RealSense cameras and their remedies.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// What is wrong with a RealSense camera.
+/// Problem with a RealSense camera.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
-    /// The library does not work at all.
-    #[error("librealsense2 refuses to {what}: {reason}")]
+    /// A call to the library failed.
+    #[error("librealsense2 failed ({what}): {reason}")]
     Library {
-        /// What was asked of it.
+        /// Purpose of the call.
         what: &'static str,
-        /// What it says.
+        /// Error of the library.
         reason: String,
     },
-    /// None is plugged in, or not this one.
+    /// No camera is connected, or not the requested one.
     #[error(
-        "no RealSense camera {}is plugged in; there {}",
+        "no RealSense camera {}is plugged in; connected cameras: {}",
         if serial.is_empty() { String::new() } else { format!("with the serial number {serial:?} ") },
-        if connected.is_empty() { "is none at all (`lsusb -d 8086:` shows them; udev rules of the SDK let them be opened)".to_owned() }
-        else { format!("are {}", connected.join(", ")) }
+        if connected.is_empty() { "none (check with `lsusb -d 8086:` and install the udev rules of the SDK)".to_owned() }
+        else { connected.join(", ") }
     )]
     NoDevice {
-        /// Serial number of the rig file; empty where it names none.
+        /// Serial number in the rig file; may be empty.
         serial: String,
-        /// Names and serial numbers of those that are.
+        /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,
     },
-    /// Several are plugged in and the rig file does not say which.
-    #[error("several RealSense cameras are plugged in, write device = \"SERIAL\" with one of: {}", connected.join(", "))]
+    /// Several cameras are connected and the rig file does not select one.
+    #[error("several RealSense cameras are plugged in: set device = \"SERIAL\" in the rig file to one of {}", connected.join(", "))]
     Ambiguous {
-        /// Names and serial numbers.
+        /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,
     },
-    /// A recorded file cannot be played.
-    #[error("cannot play {path:?}: {reason}")]
+    /// A recorded file cannot be read or written.
+    #[error("cannot use {path:?}: {reason}")]
     File {
         /// The file.
         path: PathBuf,
-        /// What the library says.
+        /// Error of the library.
         reason: String,
     },
-    /// It does not offer what is asked for.
+    /// The camera does not support the requested mode.
     #[error("it does not offer {requested}; it offers {offered}")]
     NoMode {
-        /// Stream, size and rate of the rig file.
+        /// Requested stream, size and rate.
         requested: String,
-        /// All that it has of that stream.
+        /// All modes of that stream.
         offered: String,
     },
-    /// A setting is not there.
-    #[error("it has no {setting}: leave the key out")]
+    /// The camera does not support a setting.
+    #[error("it does not support {setting}: remove the key")]
     NoSetting {
         /// Name of the key.
         setting: &'static str,
     },
-    /// The rig file sets something to a value that the camera does not know.
-    #[error("{setting} is {requested}, it takes {allowed}")]
+    /// A setting is outside the range of the camera.
+    #[error("{setting} is {requested}, allowed: {allowed}")]
     SettingRange {
         /// Name of the key.
         setting: &'static str,
-        /// Asked for, in the units of the key.
+        /// Requested value, in the units of the key.
         requested: String,
-        /// What there is.
+        /// Allowed values.
         allowed: String,
     },
-    /// It took a setting and tells another one.
-    #[error("{setting} was set to {requested} and reads {got}")]
+    /// The camera reports a different value after a setting was written.
+    #[error("{setting} was set to {requested} and reads back as {got}")]
     ReadBack {
         /// Name of the key.
         setting: &'static str,
-        /// What was set, in the camera's units.
+        /// Value that was set, in units of the camera.
         requested: f32,
-        /// What it tells.
+        /// Value that was read back.
         got: f32,
     },
-    /// Its lens is not one of ours.
-    #[error("its {stream} has the lens model {model}, which is not read here")]
+    /// The lens model of a stream is not supported.
+    #[error("its {stream} stream has the lens model {model}, which is not supported")]
     Lens {
-        /// Which stream.
+        /// Name of the stream.
         stream: &'static str,
-        /// What the library calls the model.
+        /// Name of the model in the library.
         model: String,
     },
-    /// It sends nothing.
+    /// The camera delivers no images.
     #[error("it sent no image for {waited:?}")]
     Silent {
-        /// How long.
+        /// Time since the last image.
         waited: Duration,
     },
-    /// It went away, or hung, and did not come back in time.
-    #[error("it was lost, and not there again after {waited:?}, {n_tries} tries and {n_resets} resets: {last}")]
+    /// The camera disconnected or hung and did not reconnect in time.
+    #[error("it disconnected and did not reconnect within {waited:?} ({n_tries} attempts, {n_resets} resets): {last}")]
     Lost {
-        /// Since when.
+        /// Time since it disconnected.
         waited: Duration,
-        /// How often it was tried.
+        /// Number of attempts to reopen it.
         n_tries: u32,
-        /// How often it was reset.
+        /// Number of resets.
         n_resets: u32,
-        /// What came of the last try.
+        /// Problem at the last attempt.
         last: Box<Self>,
     },
 }

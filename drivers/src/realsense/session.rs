@@ -1,4 +1,4 @@
-//! A RealSense camera that streams, or a file that plays: from the library's frames to stamped images.
+//! Streams from a RealSense camera or a file and converts the frames of the library to stamped images.
 
 use super::filters::Filters;
 use super::find::{self, FoundCamera};
@@ -14,61 +14,61 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Images of all streams that may wait while we copy one: a quarter of a second of two streams at 30 Hz.
+/// Queue capacity for images of all streams: a quarter of a second of two streams at 30 Hz.
 const N_WAITING: u8 = 16;
-/// How soon the end of a file is noticed.
+/// Polling interval for the end of a file.
 const POLL: Duration = Duration::from_millis(100);
-/// How soon the end of a stop is noticed.
+/// Polling interval while the streams stop.
 const DRAIN_POLL: Duration = Duration::from_millis(10);
-/// A file that has given no image for this long is at its end, or holds none.
+/// A file without any image after this time is treated as empty.
 const MAX_STARTUP: Duration = Duration::from_secs(2);
-/// Exposures of depth are told in microseconds.
+/// Exposure times of depth are in microseconds.
 const DEPTH_SECS_PER_COUNT: f64 = 1e-6;
 
-/// A device that streams.
+/// A streaming device.
 #[derive(Debug)]
 pub(super) struct Session {
     camera: Arc<str>,
     stamps: Stamps,
     filters: Filters,
     counter: [FrameCounter; 2],
-    /// Of a file: taken and not due yet.
+    /// Files only: an image that was read but is not due yet.
     pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
     n_images: u64,
-    /// Of a file: due before it was opened.
+    /// Files only: number of images that were due before the file was opened.
     n_before_open: u64,
     description: String,
     started: ActiveStreams,
     device: Device,
-    /// After what runs into it.
+    /// Declared, and so dropped, after the device whose streams write to it.
     queue: Queue,
-    /// After what it listed.
+    /// Declared, and so dropped, after the devices that it listed.
     _context: Context,
 }
 
-/// What came of one kind of image: colour or infrared, and depth.
+/// State of one kind of image: color or infrared, or depth.
 #[derive(Clone, Copy, Debug, Default)]
 struct FrameCounter {
     last_number: Option<u64>,
     n_unreported: u64,
 }
 
-/// What one wait led to.
+/// Result of one wait.
 pub(super) enum Next {
     Image(Image),
     NoImage,
-    /// The next image of the file is due so much later.
+    /// The next image of the file is due after this time.
     NotDue(Duration),
-    /// The file is at its end.
+    /// The file has ended.
     End,
 }
 
 impl Session {
-    /// Finds the device of a config, sets it up and starts its streams.
+    /// Opens the device of a configuration, applies the settings and starts the streams.
     pub(super) fn start(config: &Config) -> Result<Self, Problem> {
         let context = Context::new()?;
         let mut device = match &config.file {
@@ -81,9 +81,9 @@ impl Session {
         let mut description = format!("{}, {}", found.describe(), started.description);
         if config.file.is_none() {
             warn_of_device(&config.name, &found);
-            let frame_time = options::apply(&config.settings, &mut device, started.image_sensor);
-            let frame_time = frame_time.inspect_err(|_| started.stop(&device))?;
-            description = format!("{description}; set and read back: {}", frame_time.join(", "));
+            let applied = options::apply(&config.settings, &mut device, started.image_sensor);
+            let applied = applied.inspect_err(|_| started.stop(&device))?;
+            description = format!("{description}; set and read back: {}", applied.join(", "));
         }
         let micros_per_count = options::exposure_micros_per_count(&device.sensors[started.image_sensor]);
         Ok(Self {
@@ -106,7 +106,7 @@ impl Session {
         })
     }
 
-    /// Device, modes and settings, for people.
+    /// Description of device, modes and settings for the log.
     pub(super) fn describe(&self) -> &str {
         &self.description
     }
@@ -115,17 +115,17 @@ impl Session {
         &self.started.calibration
     }
 
-    /// Images given out since the start.
+    /// Number of images returned since the start.
     pub(super) fn n_images(&self) -> u64 {
         self.n_images
     }
 
-    /// Since when no image came.
+    /// Time since the last image.
     pub(super) fn time_since_image(&self) -> Duration {
         self.last_image.elapsed()
     }
 
-    /// The next image of any stream; an error means that the device is lost.
+    /// Returns the next image of any stream. An error means that the device was disconnected.
     pub(super) fn next(&mut self, deadline: Instant) -> Result<Next, Problem> {
         loop {
             if let Some(image) = self.pending.take_if(|image| self.stamps.is_due(image.stamp)) {
@@ -140,7 +140,7 @@ impl Session {
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // Asked before: what came until then is in the queue.
+            // Checked before the queue, so that all images until then are in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
@@ -160,12 +160,12 @@ impl Session {
         }
     }
 
-    /// Says once how many images of a file came too early for us.
+    /// Logs once how many images of a file were due too early.
     fn warn_of_images_before_open(&mut self, which: &str) {
         let n_before_open = std::mem::take(&mut self.n_before_open);
         if n_before_open > 0 {
             log::warn!(
-                "camera {:?}: {which} images of its file, {n_before_open}, were due before it was opened: they are passed over",
+                "camera {:?}: {which} images of its file ({n_before_open}) were due before it was opened and are skipped",
                 self.camera
             );
         }
@@ -178,14 +178,14 @@ impl Session {
         image
     }
 
-    /// Copies a frame out of the library; one that came already is none.
+    /// Copies a frame to an image. Returns `None` for duplicates.
     fn image(&mut self, frame: Frame) -> Result<Option<Image>, Problem> {
         let arrival = clock::now();
         let is_depth = frame.stream_profile().kind() == Rs2StreamKind::Depth;
         let counter = &mut self.counter[usize::from(is_depth)];
         let number = frame.frame_number();
         match counter.last_number.replace(number) {
-            // The library gives the last image of a stream again in some cases.
+            // The library sometimes returns the last image of a stream again.
             Some(last) if last == number => return Ok(None),
             Some(last) if number > last => counter.n_unreported += number - last - 1,
             _ => {}
@@ -219,11 +219,13 @@ impl Session {
         } else {
             with_pixels(image, &frame)
         };
-        image.map(Some).map_err(|error| Problem::Library { what: "give a whole image", reason: error.to_string() })
+        image
+            .map(Some)
+            .map_err(|error| Problem::Library { what: "deliver a complete image", reason: error.to_string() })
     }
 }
 
-/// An image with the bytes of a frame.
+/// Copies the pixels of a frame into an image.
 fn with_pixels<Kind>(image: Image, frame: &ImageFrame<Kind>) -> Result<Image, Error> {
     let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
     let size_px = [side(frame.width()), side(frame.height())];
@@ -238,18 +240,22 @@ fn warn_of_device(camera: &str, found: &FoundCamera) {
     }
     if found.has_old_firmware() {
         let requested = found.recommended_firmware.as_deref().unwrap_or_default();
-        log::warn!("camera {camera:?}: its firmware {} is older than the library wants ({requested})", found.firmware);
+        log::warn!(
+            "camera {camera:?}: its firmware {} is older than the version that librealsense2 recommends ({requested})",
+            found.firmware
+        );
     }
 }
 
 impl Drop for Session {
-    /// The reader of a file waits for room in the queue, and the library's stop for that reader: so the queue is emptied meanwhile.
+    /// Stops the streams while draining the queue. Otherwise they would deadlock: stopping waits for the thread that
+    /// reads the file, and that thread waits for space in the queue.
     fn drop(&mut self) {
         let (queue, is_stopped) = (&self.queue, AtomicBool::new(false));
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 while !is_stopped.load(Ordering::Relaxed) {
-                    // What still comes is not wanted any more.
+                    // These images are no longer needed.
                     let _ = queue.wait(DRAIN_POLL);
                 }
             });

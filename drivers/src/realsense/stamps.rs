@@ -1,8 +1,8 @@
-//! When an image of a RealSense camera was taken, on our clock.
+//! Computes when an image of a RealSense camera was taken, on our clock.
 //!
-//! With its metadata (a patched kernel module, or the library's own USB backend) a camera tells the middle of the exposure on its
-//! own clock, a count of microseconds with 32 bits; the library's conversion to "global time" is switched off, for ours bears
-//! late arrivals. Without metadata there is only the arrival.
+//! With metadata (a patched kernel module, or the USB backend of the library), a camera reports mid-exposure on its own
+//! clock, a 32-bit count of microseconds. The library's conversion to "global time" is switched off because our mapping
+//! is robust to late arrivals. Without metadata, only the arrival time is known.
 
 use super::{Config, Pace};
 use crate::clock;
@@ -13,14 +13,14 @@ use realsense_rust::kind::{Rs2FrameMetadata, Rs2TimestampDomain};
 
 const NANOS_PER_MILLI: f64 = 1e6;
 
-/// What the library says of one frame's time.
+/// Time information of one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct FrameTime {
-    /// Mid-exposure by the camera's clock, microseconds.
+    /// Mid-exposure on the camera clock, microseconds.
     pub(super) mid_exposure_micros: Option<i64>,
-    /// The library's own stamp, milliseconds.
+    /// Stamp of the library, milliseconds.
     pub(super) millis: f64,
-    /// Whether that is of the camera's clock, too.
+    /// Whether that stamp is also of the camera clock.
     pub(super) is_device_clock: bool,
 }
 
@@ -34,7 +34,7 @@ impl FrameTime {
     }
 }
 
-/// Makes stamps of what the library tells, for all streams of one camera: they are on one clock.
+/// Computes stamps for all streams of one camera, which share one clock.
 #[derive(Debug)]
 pub(super) struct Stamps {
     camera: String,
@@ -44,7 +44,7 @@ pub(super) struct Stamps {
     opened: Stamp,
     micros: WrappingMicros,
     map: ClockMap,
-    /// First time of a file, nanoseconds of the file, and when it came.
+    /// First time in a file, nanoseconds, and when it arrived.
     first: Option<(i64, Stamp)>,
     has_warned: bool,
 }
@@ -63,13 +63,13 @@ impl Stamps {
         }
     }
 
-    /// The stamp of an image that came just now.
+    /// Stamp of an image that just arrived.
     pub(super) fn stamp(&mut self, frame_time: &FrameTime, arrival: Stamp) -> Stamp {
         let device_nanos = self.device_nanos(frame_time);
         let Some(pace) = self.pace else {
             return device_nanos.map_or(arrival, |nanos| self.map.stamp(nanos, arrival));
         };
-        // A file without a camera's clock has at least the library's stamps in order.
+        // A file without camera clock still has ordered stamps of the library.
         let nanos = device_nanos.unwrap_or_else(|| nanos_of(frame_time.millis));
         match pace {
             Pace::Fast => Stamp(nanos),
@@ -81,20 +81,20 @@ impl Stamps {
         }
     }
 
-    /// When an image is to be given out.
+    /// Whether an image is due.
     pub(super) fn is_due(&self, stamp: Stamp) -> bool {
         matches!(self.pace, None | Some(Pace::Fast)) || stamp <= clock::now()
     }
 
-    /// Whether an image was due before the file was opened: nobody waited for it, and it is none that is late.
+    /// Whether an image was due before the file was opened. Such images are skipped and do not count as late.
     pub(super) fn is_before_open(&self, stamp: Stamp) -> bool {
         self.pace == Some(Pace::Clock) && stamp < self.opened
     }
 
-    /// Time of the camera's clock, nanoseconds since it began; `None`, told once, where it does not tell.
+    /// Camera clock in nanoseconds, or `None` if the camera does not report it, which is logged once.
     fn device_nanos(&mut self, frame_time: &FrameTime) -> Option<i64> {
         if let Some(micros) = frame_time.mid_exposure_micros {
-            // A simulated camera has wider counts, which do not start again.
+            // Emulated cameras use 64-bit counts, which do not wrap.
             let is_64_bit = micros > i64::from(u32::MAX);
             return Some(if is_64_bit { micros.saturating_mul(1000) } else { self.micros.nanos(low_bits(micros)) });
         }
@@ -102,27 +102,27 @@ impl Stamps {
         let camera = &self.camera;
         if frame_time.is_device_clock {
             if !has_warned {
-                log::warn!("camera {camera:?}: it does not tell mid-exposure: stamps are those of the readout's begin");
+                log::warn!("camera {camera:?}: it does not report mid-exposure; stamps are the start of the readout");
             }
             return Some(nanos_of(frame_time.millis));
         }
         if !has_warned {
             log::warn!(
-                "camera {camera:?}: its images come without metadata (the kernel's uvcvideo is not patched; the SDK's scripts \
-                 do it, or its RSUSB backend): they are stamped as they arrive"
+                "camera {camera:?}: its images come without metadata because the kernel module uvcvideo is not patched; stamps are \
+                 arrival times. Patch it with the scripts of the SDK, or use the RSUSB backend"
             );
         }
         None
     }
 }
 
-/// Counts start again with each 2^32.
+/// Counts wrap at 2^32.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the low 32 bits are the count")]
 fn low_bits(micros: i64) -> u32 {
     micros as u32
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+#[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
 fn nanos_of(millis: f64) -> i64 {
     (millis * NANOS_PER_MILLI).round() as i64
 }
@@ -154,13 +154,13 @@ mod tests {
         let begin = i64::from(u32::MAX) - 500_000;
         for image in 0..100_i64 {
             let since_micros = image * 33_333;
-            // Negative where the middle of an exposure lies before the wrap and the readout behind it.
+            // Negative if the middle of an exposure lies before the wrap and the readout after it.
             let wrapped = (begin + since_micros) % (1 << 32);
             let micros = if wrapped < 20_000 { wrapped - (1 << 32) } else { wrapped };
             let late_nanos = 5_000_000 + (image % 7) * 3_000_000;
             let arrival = Stamp(since_micros * 1000 + late_nanos);
             let error_nanos = stamps.stamp(&frame_time(micros), arrival).0 - since_micros * 1000;
-            // The least latency cannot be seen; jitter must not be.
+            // The minimum latency is not observable, but jitter must be removed.
             assert!((error_nanos - 5_000_000).abs() < 200_000, "image {image}: {error_nanos}");
         }
     }
@@ -179,7 +179,7 @@ mod tests {
             assert_eq!(got, expected, "{pace:?}");
             assert_eq!(stamps.is_due(Stamp(i64::MAX)), pace == Pace::Fast);
         }
-        // Counts of a simulated camera go on.
+        // Counts of an emulated camera do not wrap.
         let mut emulated_clock = stamps(Some(Pace::Fast));
         let wrap = i64::from(u32::MAX);
         let got =

@@ -1,4 +1,4 @@
-//! Which streams of a camera are opened for a rig file, and what the camera knows about them.
+//! Selects and opens the streams requested by a rig file, and reads their calibration.
 
 use super::sdk::{Device, Mode, Modes, Queue};
 use super::{Config, Problem, Stream, lens};
@@ -8,61 +8,61 @@ use realsense_rust::kind::Rs2Option;
 use realsense_sys as sys;
 use std::collections::BTreeSet;
 
-/// Luma and colour differences as librealsense2 itself takes it (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
+/// YUV encoding as in librealsense2 (`src/proc/color-formats-converter.cpp`): BT.601, limited range.
 const YUV_COLORS: YuvColors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
-/// Formats of images, the best first: what the camera itself sends before what the library makes of it.
+/// Image formats in order of preference: native formats of the camera come before those converted by the library.
 const FORMATS: [(sys::rs2_format, &str, PixelFormat); 5] = [
     (sys::rs2_format_RS2_FORMAT_YUYV, "yuyv", PixelFormat::Yuv { layout: YuvLayout::Yuyv, colors: YUV_COLORS }),
     (sys::rs2_format_RS2_FORMAT_UYVY, "uyvy", PixelFormat::Yuv { layout: YuvLayout::Uyvy, colors: YUV_COLORS }),
     (sys::rs2_format_RS2_FORMAT_RGB8, "rgb", PixelFormat::Rgb8),
     (sys::rs2_format_RS2_FORMAT_BGR8, "bgr", PixelFormat::Bgr8),
-    (sys::rs2_format_RS2_FORMAT_Y8, "grey", PixelFormat::Gray8),
+    (sys::rs2_format_RS2_FORMAT_Y8, "gray", PixelFormat::Gray8),
 ];
-/// The left one of two.
+/// Index of the left one of two infrared cameras.
 const LEFT: i32 = 1;
 
-/// What a camera knows about itself.
+/// Calibration stored in a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
-    /// Lens of the images that are not depth.
+    /// Lens parameters of the images that are not depth.
     pub intrinsics: Intrinsics,
-    /// Of depth, where it is taken.
+    /// Calibration of depth, if it is enabled.
     pub depth: Option<DepthCalibration>,
 }
 
-/// What a camera knows about its depth images.
+/// Calibration of the depth images of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthCalibration {
-    /// Its lens.
+    /// Lens parameters.
     pub intrinsics: Intrinsics,
     /// Pose of the depth camera in the frame of the other images.
     pub camera_from_depth: Transform,
-    /// Metres per count.
+    /// Meters per count.
     pub meters_per_count: f64,
 }
 
-/// Streams that run; [`ActiveStreams::stop`] ends them.
+/// Running streams. [`ActiveStreams::stop`] stops them.
 #[derive(Debug)]
 pub(super) struct ActiveStreams {
     pub(super) calibration: Calibration,
-    /// How the bytes of images are to be read.
+    /// Pixel format of the images that are not depth.
     pub(super) format: PixelFormat,
     /// Sensor of the images that are not depth.
     pub(super) image_sensor: usize,
-    /// Sensors that run.
+    /// Sensors that are running.
     sensors: BTreeSet<usize>,
-    /// Modes, for people.
+    /// Description of the modes for the log.
     pub(super) description: String,
-    /// The modes that run point into these.
+    /// The running modes point into these.
     _modes: Vec<Modes>,
 }
 
-/// One stream wanted.
+/// A requested stream.
 struct StreamRequest {
     name: &'static str,
     stream: sys::rs2_stream,
     size_px: [u32; 2],
-    /// Formats by number, the best first.
+    /// Formats in order of preference.
     formats: Vec<sys::rs2_format>,
 }
 
@@ -74,15 +74,16 @@ impl StreamRequest {
             && self.is_of_stream(mode)
     }
 
-    /// Whether a mode is of this stream; of two infrared cameras the left one is meant, where depth is seen from.
+    /// Whether a mode belongs to this stream. Of two infrared cameras, only the left one matches, because depth is in
+    /// its frame.
     fn is_of_stream(&self, mode: &Mode) -> bool {
         let is_infrared = mode.stream == sys::rs2_stream_RS2_STREAM_INFRARED;
         mode.stream == self.stream && (!is_infrared || mode.index <= LEFT)
     }
 
-    /// The best mode among all sensors: which sensor, which of its modes.
+    /// Best mode among all sensors: index of the sensor and of its mode.
     fn choose(&self, config: &Config, modes: &[Modes]) -> Result<(usize, usize), Problem> {
-        // A file holds what was recorded; at which rate, its stamps tell.
+        // A file has only one rate, which follows from its stamps.
         let rate_hz = config.file.is_none().then_some(config.rate_hz);
         let all = || {
             let of_sensor = |(sensor, modes): (usize, &'_ Modes)| {
@@ -106,7 +107,7 @@ impl StreamRequest {
     }
 }
 
-/// Opens the streams of a rig file into a queue.
+/// Opens the requested streams and starts them into a queue.
 pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<ActiveStreams, Problem> {
     let modes: Vec<Modes> = device.sensors.iter().map(|sensor| sensor.modes()).collect::<Result<_, _>>()?;
     let (name, stream) = match config.stream {
@@ -132,7 +133,7 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<A
         format: FORMATS
             .iter()
             .find(|(format, ..)| *format == mode_at(image).format)
-            .expect("one of these was chosen")
+            .expect("the mode was chosen from these formats")
             .2,
         image_sensor: image.0,
         sensors: chosen.iter().map(|(sensor, _)| *sensor).collect(),
@@ -149,7 +150,8 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<A
 }
 
 impl ActiveStreams {
-    /// Lets all that is open run. A file gives what comes first to those that run first, so it is held until all do.
+    /// Starts all open sensors. A file sends its first images to the sensors that start first, so it is paused until
+    /// all are started.
     fn run(&self, device: &Device, queue: &Queue, is_file: bool) -> Result<(), Problem> {
         if is_file {
             device.set_paused(true)?;
@@ -161,7 +163,7 @@ impl ActiveStreams {
         Ok(())
     }
 
-    /// Ends the streams of the device that they were started on.
+    /// Stops the streams. `device` must be the device that they were started on.
     pub(super) fn stop(&self, device: &Device) {
         self.sensors.iter().for_each(|sensor| device.sensors[*sensor].stop());
     }
@@ -173,14 +175,14 @@ fn depth_calibration(
     depth: &Mode,
     image: &Mode,
 ) -> Result<DepthCalibration, Problem> {
-    let calibration_problem = |reason: String| Problem::Library { what: "tell how depth and images lie", reason };
+    let calibration_problem = |reason: String| Problem::Library { what: "get the calibration of depth", reason };
     let extrinsics =
         depth.profile()?.extrinsics(&image.profile()?).map_err(|error| calibration_problem(error.to_string()))?;
     let scale = device.sensors[sensor].options.get_option(Rs2Option::DepthUnits);
-    let scale = scale.ok_or_else(|| calibration_problem("it tells no depth units".into()))?;
-    // Single precision means the shortest decimal that it stands for: 0.001, not 0.001000000047.
+    let scale = scale.ok_or_else(|| calibration_problem("it does not report depth units".into()))?;
+    // Parse the shortest decimal of the single-precision value: 0.001, not 0.001000000047.
     let meters_per_count =
-        scale.to_string().parse().map_err(|_| calibration_problem("its depth units are no number".into()))?;
+        scale.to_string().parse().map_err(|_| calibration_problem("its depth units are not a number".into()))?;
     Ok(DepthCalibration {
         intrinsics: lens::intrinsics(&depth.intrinsics()?, "depth")?,
         camera_from_depth: lens::transform(&extrinsics.0),

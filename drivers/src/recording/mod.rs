@@ -1,4 +1,4 @@
-//! Recordings: samples to an MCAP file and back, bit for bit and in the same order.
+//! Recordings: write samples to an MCAP file and read them back bit for bit, in the same order.
 //!
 //! `docs/reference/recording.md` lists the topics and describes what a crash or a full disk leaves readable.
 
@@ -11,8 +11,8 @@ mod writer;
 pub use reader::Recording;
 pub use writer::{Recorder, RecordingMetadata};
 
-/// The rig file of a recording, an attachment.
+/// Name of the attachment with the rig file.
 pub const RIG_FILE: &str = "rig.toml";
 
-/// The robot's description, an attachment.
+/// Name of the attachment with the robot description (URDF).
 pub const URDF_FILE: &str = "robot.urdf";

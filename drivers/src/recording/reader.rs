@@ -1,7 +1,6 @@
-//! Reads samples back from an MCAP file, a chunk at a time.
+//! Reads samples from an MCAP file, one chunk at a time.
 //!
-//! The file is read from front to back without its index, so a recording that was cut off anywhere gives every sample
-//! before the cut.
+//! The file is read sequentially without its index, so a truncated recording yields every sample before the cut.
 
 use super::record::Record;
 use super::records::{RawRecord, ReadError, Records};
@@ -14,7 +13,7 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A recording being replayed: a [`Source`] with the samples in the order in which they were recorded.
+/// A recording that is being replayed: a [`Source`] of its samples in recorded order.
 #[derive(Debug)]
 pub struct Recording {
     path: PathBuf,
@@ -23,7 +22,7 @@ pub struct Recording {
     channels: BTreeMap<u16, Channel>,
     attachments: BTreeMap<String, Vec<u8>>,
     joint_names: Option<Vec<String>>,
-    /// Parts of the ground truth that is not complete yet.
+    /// Parts of a ground-truth sample that is not complete yet.
     true_color: Option<Image>,
     true_depth_m: Option<Arc<[f32]>>,
     first: Option<Sample>,
@@ -40,7 +39,10 @@ struct Channel {
 }
 
 impl Recording {
-    /// Opens a recording; fails when there is none, when it is no MCAP file, and when it holds no sample of ours.
+    /// Opens a recording.
+    ///
+    /// # Errors
+    /// If the file does not exist, is not an MCAP file, or contains no samples of ours.
     pub fn open(path: &Path) -> Result<Self, Error> {
         let open = |source| Error::Open { path: path.to_owned(), source };
         let mut file = File::open(path).map_err(open)?;
@@ -71,17 +73,18 @@ impl Recording {
         Ok(recording)
     }
 
-    /// A file kept in the recording, such as [`super::RIG_FILE`].
+    /// Returns an attached file, such as [`super::RIG_FILE`].
     pub fn attachment(&self, name: &str) -> Option<&[u8]> {
         self.attachments.get(name).map(Vec::as_slice)
     }
 
-    /// Names of the joints in the order of the readings, where the recording tells them; known from the first sample on.
+    /// Names of the joints in the order of the joint states, if the recording contains them. Available from the first
+    /// sample on.
     pub fn joint_names(&self) -> Option<&[String]> {
         self.joint_names.as_deref()
     }
 
-    /// Says how the file is damaged and how much of it could be read; known once the samples have ended.
+    /// Describes the damage of the file and how much of it could be read. Available after the last sample.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }
@@ -112,7 +115,7 @@ impl Recording {
             Some(format!("the recording {:?} {description} after {} readable samples", self.path, self.n_samples));
     }
 
-    /// Takes in one record; gives a sample when one is complete.
+    /// Processes one record and returns a sample if it completes one.
     fn take(&mut self, record: Record<'_>) -> Result<Option<Sample>, Error> {
         match record {
             Record::Schema { id, name } => {

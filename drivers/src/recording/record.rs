@@ -1,4 +1,4 @@
-//! What the records of an MCAP file say that recordings are made of; no length in them is believed before its bytes are there.
+//! Decodes the MCAP records that recordings consist of. Lengths are checked against the available bytes before use.
 //!
 //! Source: the MCAP format specification, <https://mcap.dev/spec>, "Records".
 
@@ -9,7 +9,7 @@ const CHANNEL: u8 = 0x04;
 const MESSAGE: u8 = 0x05;
 const ATTACHMENT: u8 = 0x09;
 
-/// A record that is read.
+/// A decoded record.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Record<'a> {
     Schema {
@@ -30,18 +30,18 @@ pub(super) enum Record<'a> {
         name: &'a str,
         data: &'a [u8],
     },
-    /// Indices, statistics and whatever newer writers know.
+    /// Indices, statistics and records of newer writers.
     Other,
 }
 
-/// What is wrong with a record.
+/// Why a record cannot be decoded.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RecordError {
     #[error("a record ends inside a field")]
     Truncated,
     #[error("a name is not UTF-8")]
     Text,
-    #[error("the checksum of attachment {name:?} is wrong")]
+    #[error("the checksum of attachment {name:?} does not match")]
     Checksum { name: String },
 }
 
@@ -84,7 +84,7 @@ impl<'a> Record<'a> {
     }
 }
 
-/// What is left of a record.
+/// Remaining bytes of a record.
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {
@@ -158,7 +158,7 @@ mod tests {
         assert_eq!(
             Record::decode(ATTACHMENT, &attachment(|_| 0)),
             Record::decode(ATTACHMENT, &complete),
-            "none is told"
+            "a checksum of 0 means none"
         );
         let damaged = attachment(|_| 1);
         let checksum_error = Record::decode(ATTACHMENT, &damaged);

@@ -1,41 +1,41 @@
-//! The records of an MCAP file from front to back, those in chunks among the others.
+//! Reads the records of an MCAP file sequentially, inside and outside of chunks.
 //!
-//! Source: the MCAP format specification, <https://mcap.dev/spec>. Memory is taken for bytes that came, never for a length that is
-//! only told; chunks are read without compression, as the recorder writes them.
+//! Source: the MCAP format specification, <https://mcap.dev/spec>. Memory is allocated for received bytes, not for
+//! declared lengths. Only uncompressed chunks are supported, as written by the recorder.
 
 use crc32fast::Hasher;
 use std::io::Read;
 
-/// Longer records than this are taken for damage; the largest real one is one image.
+/// Longer records are treated as damage. The largest valid record contains one image.
 const MAX_RECORD_BYTES: u64 = 512 << 20;
-/// What is set aside before any byte of a record came.
+/// Maximum allocation before any byte of a record was read.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
-/// Before a record: its opcode and its length.
+/// Header of a record: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
-/// Of a chunk before its compression's name: times, length, checksum, length of the name.
+/// Header of a chunk up to the name of its compression: times, length, checksum, length of the name.
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
 const FOOTER: u8 = 0x02;
 const CHUNK: u8 = 0x06;
 
-/// Why a file ends before its end.
+/// Why reading ends before the end of a file.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ReadError {
-    #[error("is cut off")]
+    #[error("is truncated")]
     Truncated,
     #[error("is damaged (a record of {n_bytes} bytes)")]
     TooLong { n_bytes: u64 },
-    #[error("is damaged (the parts of a chunk are longer than the chunk)")]
+    #[error("is damaged (the records of a chunk are longer than the chunk)")]
     ExceedsChunk,
-    #[error("is damaged (the checksum of a chunk is {reported:#010x}, its bytes give {computed:#010x})")]
+    #[error("is damaged (a chunk has the checksum {computed:#010x}, expected {reported:#010x})")]
     Checksum { reported: u32, computed: u32 },
-    #[error("cannot be read (its chunks are compressed by {compression:?})")]
+    #[error("cannot be read (its chunks are compressed with {compression:?})")]
     Compressed { compression: String },
     #[error("cannot be read")]
     Read(#[from] std::io::Error),
 }
 
-/// A file behind its first magic bytes.
+/// A file after its leading magic bytes.
 #[derive(Debug)]
 pub(super) struct Records<R> {
     input: R,
@@ -46,16 +46,16 @@ pub(super) struct Records<R> {
 /// A chunk that is being read.
 #[derive(Debug)]
 struct Chunk {
-    /// Bytes of its records that are left.
+    /// Remaining bytes of its records.
     n_remaining: u64,
-    /// Bytes behind them.
+    /// Number of bytes after the records.
     n_padding: u64,
-    /// Of all its records; 0 where the writer does not tell.
+    /// Checksum of all its records; 0 if the writer stored none.
     checksum: u32,
     hasher: Hasher,
 }
 
-/// One record's opcode and its bytes.
+/// Opcode and bytes of one record.
 pub(super) struct RawRecord {
     pub(super) opcode: u8,
     pub(super) bytes: Vec<u8>,
@@ -66,7 +66,7 @@ impl<R: Read> Records<R> {
         Self { input, chunk: None, ended: false }
     }
 
-    /// The next record; `None` behind the footer. After an error there is nothing more.
+    /// Returns the next record, or `None` at the footer and after an error.
     pub(super) fn next(&mut self) -> Result<Option<RawRecord>, ReadError> {
         let next = if self.ended { Ok(None) } else { self.read() };
         self.ended |= !matches!(next, Ok(Some(_)));
@@ -133,12 +133,12 @@ impl<R: Read> Records<R> {
     }
 }
 
-/// So many bytes; memory grows with those that come.
+/// Reads the given number of bytes. Memory grows with the bytes received.
 fn bytes_of(input: &mut impl Read, n_bytes: u64) -> Result<Vec<u8>, ReadError> {
     if n_bytes > MAX_RECORD_BYTES {
         return Err(ReadError::TooLong { n_bytes });
     }
-    let n_preallocated = usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("a megabyte");
+    let n_preallocated = usize::try_from(n_bytes.min(MAX_PREALLOCATED_BYTES)).expect("at most one megabyte");
     let mut bytes = Vec::with_capacity(n_preallocated);
     input.take(n_bytes).read_to_end(&mut bytes)?;
     if bytes.len() as u64 == n_bytes { Ok(bytes) } else { Err(ReadError::Truncated) }
@@ -152,7 +152,7 @@ mod tests {
         [&[opcode][..], &(bytes.len() as u64).to_le_bytes(), bytes].concat()
     }
 
-    /// A chunk of records that says so much about their length, with three bytes behind them.
+    /// A chunk with the given records, declared length and checksum, followed by three extra bytes.
     fn chunk(records: &[u8], reported_bytes: u64, checksum: u32, compression: &str) -> Vec<u8> {
         let n_name = u32::try_from(compression.len()).expect("short").to_le_bytes();
         let head =
@@ -189,7 +189,7 @@ mod tests {
             let (before, reported) = read(&file[..n_bytes]);
             assert_eq!(
                 (&before[..], reported.as_deref()),
-                (&expected[..before.len()], Some("is cut off")),
+                (&expected[..before.len()], Some("is truncated")),
                 "{n_bytes}"
             );
         }
@@ -204,12 +204,12 @@ mod tests {
             (chunk(&inner, n_inner + 4, 0, ""), "longer than the chunk"),
             (chunk(&inner, u64::MAX, 0, ""), "longer than the chunk"),
             (chunk(&inner, n_inner, 1, ""), "checksum"),
-            (chunk(&inner, n_inner, 0, "zstd"), "compressed by \"zstd\""),
+            (chunk(&inner, n_inner, 0, "zstd"), "compressed with \"zstd\""),
             ([&[3][..], &u64::MAX.to_le_bytes()].concat(), "a record of 18446744073709551615 bytes"),
-            ([&[3][..], &(400_u64 << 20).to_le_bytes()].concat(), "is cut off"),
+            ([&[3][..], &(400_u64 << 20).to_le_bytes()].concat(), "is truncated"),
         ] {
             let reported = read(&[bytes, record(1, b"one")].concat()).1.expect(reason);
-            assert!(reported.contains(reason), "{reported}, not {reason}");
+            assert!(reported.contains(reason), "{reported}, expected {reason}");
         }
     }
 }

@@ -1,37 +1,37 @@
-//! Topics of a recording and what each holds.
+//! Topics of a recording and their contents.
 
 use crate::wire::{descriptor, joint_state};
 
-/// Key of the joints' names, separated by commas, in the metadata of their channel.
+/// Metadata key of the joint names, separated by commas, in the channel of the joints.
 pub(super) const JOINT_NAMES: &str = "joint_names";
 
-/// What the messages of a topic are.
+/// Contents of a topic.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Topic {
-    /// Colour images of a camera.
+    /// Color images of a camera.
     Color(String),
     /// Depth images of a camera.
     Depth(String),
-    /// Lens parameters of a camera, for viewers; the rig file holds them too.
+    /// Lens parameters of a camera, for viewers. The rig file also contains them.
     Calibration(String),
-    /// Noise-free colour of a simulated camera; comes before the other two of the same image.
+    /// Noise-free color image of a simulated camera. It precedes depth and pose of the same image.
     TrueColor(String),
-    /// Noise-free depth of a simulated camera; absent when it was not asked for.
+    /// Noise-free depth image of a simulated camera, if requested.
     TrueDepth(String),
-    /// True pose of a simulated camera; completes one ground truth.
+    /// True pose of a simulated camera. It completes a ground-truth sample.
     TruePose(String),
-    /// Joint readings.
+    /// Joint states.
     Joints,
     /// Poses of the base.
     Base,
     /// True poses of a simulated base.
     TrueBase,
-    /// Turns of a range scanner.
+    /// Scans of a range scanner.
     Range(String),
 }
 
 impl Topic {
-    /// The topic's name in the file.
+    /// Name of the topic in the file.
     pub(super) fn name(&self) -> String {
         match self {
             Self::Color(camera) => format!("/camera/{camera}/color"),
@@ -47,7 +47,7 @@ impl Topic {
         }
     }
 
-    /// The topic of this name, if it is one of ours.
+    /// Parses a topic name. Returns `None` for topics of other programs.
     pub(super) fn from_name(name: &str) -> Option<Self> {
         match name {
             "/joints" => return Some(Self::Joints),
@@ -72,7 +72,7 @@ impl Topic {
     }
 }
 
-/// Name, encoding and bytes of the schema that a channel carries, and how its messages are encoded.
+/// Name, encoding and contents of the schema of a channel, and the encoding of its messages.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Encoding {
     pub(super) schema_name: &'static str,
@@ -82,7 +82,7 @@ pub(super) struct Encoding {
 }
 
 impl Encoding {
-    /// One of Foxglove's messages, in protobuf.
+    /// A Foxglove message in protobuf.
     pub(super) fn protobuf(schema: descriptor::Schema) -> Self {
         Self {
             schema_name: schema.name,
@@ -92,7 +92,7 @@ impl Encoding {
         }
     }
 
-    /// Our joint readings, in JSON.
+    /// Our joint states in JSON.
     pub(super) fn joint_state() -> Self {
         Self {
             schema_name: joint_state::SCHEMA_NAME,

@@ -1,6 +1,6 @@
-//! Writes samples to an MCAP file as they come.
+//! Writes samples to an MCAP file as they arrive.
 //!
-//! Chunks are closed at least once a second of sample time, so whatever stops the program costs at most that second.
+//! Chunks are closed at least once per second of sample time, so a crash loses at most one second.
 
 use super::reader::Recording;
 use super::topic::{Encoding, JOINT_NAMES, Topic};
@@ -17,21 +17,20 @@ use std::path::{Path, PathBuf};
 const CHUNK_BYTES: u64 = 4 << 20;
 const FLUSH_NANOS: i64 = 1_000_000_000;
 
-/// What a recording says about its rig before the first sample.
+/// Description of the rig, written before the first sample.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RecordingMetadata<'a> {
-    /// Files kept inside, by name: the settled rig file, the robot's description.
+    /// Files to attach, by name: the complete rig file and the robot description.
     pub files: &'a [(&'a str, &'a [u8])],
-    /// Cameras and their lenses.
+    /// Cameras and their lens parameters.
     pub cameras: &'a [(&'a str, &'a Intrinsics)],
-    /// Names of the joints, in the order of the readings.
+    /// Names of the joints, in the order of the joint states.
     pub joint_names: &'a [String],
 }
 
 /// A recording being written.
-///
-/// After an error nothing more can be written; what was written before stays readable. Dropping it finishes the file.
-/// A file in which no sample has arrived is removed when writing fails or ends.
+/// After an error, nothing more can be written, but earlier samples stay readable. Dropping it completes the file. If
+/// no sample was written, the file is removed when writing fails or ends.
 pub struct Recorder {
     path: PathBuf,
     /// `None` after a failure.
@@ -40,10 +39,10 @@ pub struct Recorder {
     cameras: Vec<(String, Intrinsics)>,
     joint_names: String,
     n_messages: u32,
-    /// Samples written, some of them only into the open chunk, and their stamps' range.
+    /// Number of samples written, including those in the open chunk, and the range of their stamps.
     n_samples: u64,
     stamps: Option<[Stamp; 2]>,
-    /// What the closed chunks hold.
+    /// Samples in closed chunks.
     recorded: RecordedSpan,
     open_bytes: u64,
     open_since: Option<Stamp>,
@@ -53,7 +52,10 @@ trait Sink: Write + Seek + Send {}
 impl<W: Write + Seek + Send> Sink for W {}
 
 impl Recorder {
-    /// Begins a recording in a new file; an existing one is refused, for it may be the very recording that is replayed.
+    /// Starts a recording in a new file.
+    ///
+    /// # Errors
+    /// If the file already exists, because it may be the recording that is being replayed, or cannot be created.
     pub fn create(path: &Path, recording_metadata: &RecordingMetadata<'_>) -> Result<Self, Error> {
         let file = File::create_new(path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => Error::Exists { path: path.to_owned() },
@@ -110,9 +112,10 @@ impl Recorder {
         self.try_write(sample).map_err(|error| self.fail(error))
     }
 
-    /// Writes the index that viewers seek by, and tells whether everything could be written.
+    /// Writes the index for viewers, completes the file, and returns the recorded span.
     ///
-    /// Gives what was kept: everything.
+    /// # Errors
+    /// If not everything could be written.
     pub fn finish(mut self) -> Result<RecordedSpan, Error> {
         let closed = self.close_chunk().and_then(|()| self.mcap()?.finish().map(drop));
         closed.map_err(|error| self.fail(error))?;
@@ -128,10 +131,11 @@ impl Recorder {
         self.mcap.as_mut().ok_or_else(|| McapError::Io(std::io::Error::other("an earlier write failed")))
     }
 
-    /// Closes the file after a failure; the error reports how much of it can be read. A file without samples is removed.
+    /// Closes the file after a failure. The error reports how much of it is readable. A file without samples is
+    /// removed.
     fn fail(&mut self, error: McapError) -> Error {
         if self.mcap.take().is_some() {
-            // The truncated chunk also holds some samples, so the readable samples are counted.
+            // The truncated chunk also contains some samples, so the readable samples are counted.
             self.recorded = readable(&self.path);
             if self.recorded.n_samples == 0 {
                 remove_stub(&self.path);
@@ -140,7 +144,7 @@ impl Recorder {
         Error::Record { path: self.path.clone(), recorded: self.recorded, source: io_error(error) }
     }
 
-    /// Brings everything written so far into the file.
+    /// Closes the open chunk, which writes all samples to the file.
     fn close_chunk(&mut self) -> mcap::McapResult<()> {
         self.mcap()?.flush()?;
         self.recorded = RecordedSpan { n_samples: self.n_samples, seconds: duration_secs(self.stamps) };
@@ -151,7 +155,7 @@ impl Recorder {
     fn try_write(&mut self, sample: &Sample) -> mcap::McapResult<()> {
         let stamp = sample.stamp();
         if self.n_messages == 0 && !self.joint_names.is_empty() {
-            // Before all samples, so that who opens the file knows the joints at once.
+            // Announced before all samples, so that readers know the joints immediately.
             self.joints_channel()?;
         }
         for (camera, intrinsics) in std::mem::take(&mut self.cameras) {
@@ -231,7 +235,8 @@ impl Recorder {
         self.channel(Topic::Joints, Encoding::joint_state(), JOINT_NAMES, &names)
     }
 
-    /// The channel of a topic, announced in the file when it is new; `key` and `value` go into its metadata.
+    /// Returns the channel of a topic and announces it in the file if it is new. `key` and `value` are added to its
+    /// metadata.
     fn channel(&mut self, topic: Topic, encoding: Encoding, key: &str, value: &str) -> mcap::McapResult<u16> {
         let known = (topic, encoding.schema_name);
         if let Some(channel) = self.channels.get(&known) {
@@ -246,7 +251,7 @@ impl Recorder {
     }
 
     fn append(&mut self, channel_id: u16, stamp: Stamp, message: &[u8]) -> mcap::McapResult<()> {
-        // Viewers sort by this time; the exact stamp, which may lie before zero, is in the message.
+        // Viewers sort by this time. The exact stamp, which may be negative, is in the message.
         let log_time = u64::try_from(stamp.0).unwrap_or(0);
         let header = MessageHeader { channel_id, sequence: self.n_messages, log_time, publish_time: log_time };
         self.n_messages = self.n_messages.wrapping_add(1);
@@ -264,7 +269,7 @@ impl std::fmt::Debug for Recorder {
     }
 }
 
-/// Counts what can be read of a truncated recording.
+/// Counts the readable samples of a truncated recording.
 fn readable(path: &Path) -> RecordedSpan {
     let (mut n_samples, mut stamps) = (0, None);
     if let Ok(mut recording) = Recording::open(path) {
@@ -276,7 +281,7 @@ fn readable(path: &Path) -> RecordedSpan {
     RecordedSpan { n_samples, seconds: duration_secs(stamps) }
 }
 
-/// The range of stamps extended by one stamp.
+/// Extends a range of stamps by one stamp.
 fn with_stamp(range: Option<[Stamp; 2]>, stamp: Stamp) -> [Stamp; 2] {
     let [first, last] = range.unwrap_or([stamp; 2]);
     [first.min(stamp), last.max(stamp)]
@@ -286,7 +291,7 @@ fn duration_secs(range: Option<[Stamp; 2]>) -> f64 {
     range.map_or(0.0, |[first, last]| (last.0 - first.0) as f64 * 1e-9)
 }
 
-/// The file's own error where there is one: the rest is the format's, and says less.
+/// Unwraps an I/O error, which is more informative than the error of the format.
 fn io_error(error: McapError) -> std::io::Error {
     match error {
         McapError::Io(io) => io,
@@ -294,12 +299,12 @@ fn io_error(error: McapError) -> std::io::Error {
     }
 }
 
-/// Removes a file that no sample has reached.
+/// Removes a file without samples.
 fn remove_stub(path: &Path) {
     if let Err(error) = std::fs::remove_file(path)
         && error.kind() != ErrorKind::NotFound
     {
-        log::warn!("the empty recording {path:?} stays: {error}");
+        log::warn!("cannot remove the empty recording {path:?}: {error}");
     }
 }
 
@@ -318,7 +323,7 @@ mod tests {
     use kinematics::JointState;
     use std::io::{Error as IoError, SeekFrom};
 
-    /// A file on a disk that is full after some bytes.
+    /// A file on a disk that is full after the given number of bytes.
     struct FullDisk {
         file: File,
         remaining: usize,
@@ -351,7 +356,8 @@ mod tests {
         let path = folder.path().join("run.mcap");
         let file = File::create(&path).expect("a new file");
         let sink = Box::new(BufWriter::new(FullDisk { file, remaining: 300_000 }));
-        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default()).expect("room for the header");
+        let mut recorder =
+            Recorder::to(sink, &path, &RecordingMetadata::default()).expect("the header fits on the disk");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
             Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
@@ -359,11 +365,11 @@ mod tests {
         let error = (0..20_000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
         let Error::Record { recorded, .. } = error else { panic!("{error}") };
         let expected_end =
-            format!("run.mcap\", which keeps the first {:.1} s ({} samples)", recorded.seconds, recorded.n_samples);
+            format!("run.mcap\": the first {:.1} s ({} samples) are saved", recorded.seconds, recorded.n_samples);
         assert!(error.to_string().ends_with(&expected_end), "{error}");
         let io_error = std::error::Error::source(&error).map(ToString::to_string);
         assert!(io_error.is_some_and(|io_error| io_error.contains("no storage space")), "{error:?}");
-        assert!(recorder.write(&reading(0)).is_err(), "it stays failed");
+        assert!(recorder.write(&reading(0)).is_err(), "writing after a failure fails");
         drop(recorder);
         let mut recording = Recording::open(&path).expect("a recording");
         let mut n_samples = 0_i64;
@@ -371,7 +377,7 @@ mod tests {
             assert_eq!(sample, reading(n_samples));
             n_samples += 1;
         }
-        // Samples of the truncated chunk count too: the error reports what can be read.
+        // Samples of the truncated chunk count, too: the error reports what can be read.
         assert!(
             recorded.n_samples > 1000 && n_samples.unsigned_abs() == recorded.n_samples,
             "{n_samples} of {recorded:?}"
@@ -385,15 +391,16 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
         let recorder = Recorder::create(&path, &RecordingMetadata::default()).expect("a new file");
-        assert_eq!(recorder.finish().expect("room on the disk"), RecordedSpan::default());
+        assert_eq!(recorder.finish().expect("finishing succeeds"), RecordedSpan::default());
         assert!(!path.exists());
         let sink = Box::new(FullDisk { file: File::create(&path).expect("a new file"), remaining: 1000 });
-        let mut recorder = Recorder::to(sink, &path, &RecordingMetadata::default()).expect("room for the header");
+        let mut recorder =
+            Recorder::to(sink, &path, &RecordingMetadata::default()).expect("the header fits on the disk");
         let reading = |ix: i64| {
             let position = vec![0.25; 7];
             Sample::Joints(JointState { stamp: Stamp(ix * 1_000_000), position, velocity: vec![], effort: vec![] })
         };
         let error = (0..2000).map(|ix| recorder.write(&reading(ix))).find_map(Result::err).expect("the disk is full");
-        assert!(error.to_string().ends_with("nothing of it is kept") && !path.exists(), "{error}");
+        assert!(error.to_string().ends_with("no samples were saved") && !path.exists(), "{error}");
     }
 }

@@ -1,4 +1,4 @@
-//! Tags in images, found in a thread of its own.
+//! Detects tags in images on a separate thread.
 
 use crate::{Error, Image};
 use apriltag::families::Family as ApriltagFamily;
@@ -7,25 +7,28 @@ use kinematics::Stamp;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
-/// Wrong cells that are mended. With two or more, noise is taken for a tag now and then (Olson 2011, section V.B).
+/// Maximum number of wrong cells that are corrected. With two or more, noise is occasionally detected as a tag (Olson
+/// 2011, section V.B).
 const CORRECTED_BITS: usize = 1;
-/// Mean difference in grey between the cells of a tag and the threshold of its code below which it is none. AprilTag's authors call
-/// less than 10 noise; a tag that is hardly seen is not worth its corners.
+/// Minimum mean difference in gray value between the cells of a tag and the decision threshold. The authors of AprilTag
+/// consider values below 10 noise; the corners of a barely visible tag are not accurate enough to use.
 const MIN_MARGIN: f32 = 20.0;
-/// From this many pixels on, squares are looked for at half the resolution; corners are refined at the whole.
+/// From this number of pixels on, quads are searched at half the resolution. Corners are always refined at full
+/// resolution.
 const DECIMATE_ABOVE_PX: usize = 1_000_000;
 
-/// The detector reads beyond images smaller than a few of its tiles of 4 pixels; none has room for a tag.
+/// Minimum width and height. The detector reads out of bounds for images smaller than a few of its 4-pixel tiles, and
+/// such images are too small for a tag anyway.
 const MIN_SIDE_PX: usize = 16;
 
-/// Which tags are looked for.
+/// Tag family to detect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Family {
-    /// `tag36h11`, the usual one.
+    /// `tag36h11`, the most common family.
     Tag36h11,
     /// `tag25h9`.
     Tag25h9,
-    /// `tag16h5`: noise is easily taken for it.
+    /// `tag16h5`, prone to false detections.
     Tag16h5,
     /// `tagStandard41h12`.
     Standard41h12,
@@ -34,7 +37,7 @@ pub enum Family {
 }
 
 impl Family {
-    /// How many tags it has; their numbers are below that.
+    /// Number of tags in the family. Valid ids are below this number.
     pub fn n_tags(self) -> u32 {
         match self {
             Self::Tag36h11 => 587,
@@ -46,27 +49,27 @@ impl Family {
     }
 }
 
-/// A tag in an image.
+/// A tag detected in an image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagDetection {
-    /// Its number in the family.
+    /// Id in the family.
     pub id: u32,
-    /// Where its corners are seen, pixels: lower left, lower right, upper right, upper left of the tag as it is printed.
+    /// Corners in the image, pixels: lower left, lower right, upper right, upper left of the printed tag.
     pub corners_px: [[f64; 2]; 4],
 }
 
-/// The tags of an image.
+/// Tags detected in one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagDetections {
-    /// The camera.
+    /// Name of the camera.
     pub camera: Arc<str>,
     /// The device's stamp of the image.
     pub stamp: Stamp,
-    /// What is in it, in no order; numbers may come twice where somebody printed a tag twice.
+    /// Detected tags in no particular order. An id may occur twice if a tag was printed twice.
     pub tags: Vec<TagDetection>,
 }
 
-/// Looks for tags, one image at a time.
+/// Detects tags in one image at a time.
 #[derive(Debug)]
 pub struct TagDetector {
     images: SyncSender<Image>,
@@ -75,16 +78,17 @@ pub struct TagDetector {
 }
 
 impl TagDetector {
-    /// Starts the thread, which ends with this.
+    /// Starts the thread, which ends when this is dropped.
     ///
-    /// Fails where the system gives no thread.
+    /// # Errors
+    /// If the thread cannot be started.
     pub fn start(family: Family) -> Result<Self, Error> {
-        // No image waits in the channel: a thread that is busy takes none.
+        // The channel holds no images: a busy thread accepts none.
         let (images, incoming) = sync_channel(0);
-        // The thread goes on looking while the last sighting waits to be taken.
+        // The thread can continue while the last result waits to be received.
         let (sender, detections) = sync_channel(1);
         let detect_all = move || {
-            // It cannot go from thread to thread.
+            // Created here because the detector cannot be sent between threads.
             let mut detector = detector(family);
             while let Ok(image) = incoming.recv() {
                 if sender.send(detect(&mut detector, &image)).is_err() {
@@ -97,29 +101,29 @@ impl TagDetector {
         Ok(Self { images, detections, n_pending: 0 })
     }
 
-    /// Has a colour image looked at; false where the thread is busy with another one.
+    /// Submits a color image. Returns false if the thread is busy.
     pub fn detect(&mut self, image: Image) -> bool {
         let is_accepted = self.images.try_send(image).is_ok();
         self.n_pending += usize::from(is_accepted);
         is_accepted
     }
 
-    /// Looks at a colour image, whatever time that takes, and at those before it.
+    /// Detects tags in a color image and waits for the result. Also returns the results of earlier images.
     pub fn detect_blocking(&mut self, image: Image) -> Vec<Result<TagDetections, Error>> {
-        // The thread ends after this only.
+        // Sending succeeds because the thread only ends after this is dropped.
         let is_accepted = self.images.send(image).is_ok();
         self.n_pending += usize::from(is_accepted);
         self.finish()
     }
 
-    /// What was found since the last call; an image that cannot be read is an error.
+    /// Results since the last call. An image that cannot be decoded yields an error.
     pub fn new_detections(&mut self) -> Vec<Result<TagDetections, Error>> {
         let new_detections: Vec<_> = self.detections.try_iter().collect();
         self.n_pending -= new_detections.len();
         new_detections
     }
 
-    /// The same, once everything was looked at.
+    /// Waits until all submitted images are processed and returns the results.
     pub fn finish(&mut self) -> Vec<Result<TagDetections, Error>> {
         let new_detections: Vec<_> = self.detections.iter().take(self.n_pending).collect();
         self.n_pending = 0;
@@ -128,20 +132,20 @@ impl TagDetector {
 }
 
 fn detector(family: Family) -> Detector {
-    let code = match family {
+    let tag_family = match family {
         Family::Tag36h11 => ApriltagFamily::tag_36h11(),
         Family::Tag25h9 => ApriltagFamily::tag_25h9(),
         Family::Tag16h5 => ApriltagFamily::tag_16h5(),
         Family::Standard41h12 => ApriltagFamily::tag_standard_41h12(),
         Family::Standard52h13 => ApriltagFamily::tag_standard_52h13(),
     };
-    let detector = Detector::builder().add_family_bits(code, CORRECTED_BITS).build();
-    let mut detector = detector.expect("it has a family");
+    let detector = Detector::builder().add_family_bits(tag_family, CORRECTED_BITS).build();
+    let mut detector = detector.expect("the detector has a family");
     detector.set_thread_number(1);
     detector
 }
 
-/// All tags in an image.
+/// Detects all tags in an image.
 fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error> {
     let rgb = image.decode_rgb()?;
     let [width, height] = image.size_px.map(|side| side as usize);
@@ -151,7 +155,7 @@ fn detect(detector: &mut Detector, image: &Image) -> Result<TagDetections, Error
     }
     let mut gray = Gray::zeros_with_alignment(width, height, 1).map_err(|_| image.wrong_kind("color"))?;
     for (gray, [red, green, blue]) in gray.as_slice_mut().iter_mut().zip(rgb.as_chunks().0) {
-        // Rec. 601 in 256 parts.
+        // Rec. 601 luma weights in units of 1/256.
         let parts = 77 * u32::from(*red) + 150 * u32::from(*green) + 29 * u32::from(*blue);
         *gray = parts.to_le_bytes()[1];
     }
@@ -175,7 +179,7 @@ mod tests {
         Image { camera, stamp, size_px, format, data: data.into(), exposure_secs: None, n_skipped: 0 }
     }
 
-    /// The corners of four numbers each in brackets, line by line.
+    /// Parses corners of two numbers in parentheses, four per line.
     fn parse_annotations(text: &str) -> Vec<[[f64; 2]; 4]> {
         let corner = |text: &str| {
             let (x, y) = text.split_once(')')?.0.split_once(' ')?;
@@ -187,7 +191,7 @@ mod tests {
 
     #[test]
     fn tags_in_photo_match_annotations() {
-        /// The marks are the detector's own of an earlier version, with other settings.
+        /// The annotations were made by an earlier version of the detector with other settings.
         const NEAR_PX: f64 = 1.5;
         let Some(folder) = test_data::folder("apriltag") else { return };
         let read = |name: &str| std::fs::read(folder.join(name)).unwrap();

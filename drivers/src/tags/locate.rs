@@ -1,78 +1,80 @@
-//! The pose of a camera that sees tags whose places are known.
+//! Estimates the pose of a camera from tags at known poses.
 //!
-//! Every corner of every tag is projected through the camera's own lens, and the pose with the least squares of what is off is found
-//! by Gauss and Newton's method with Levenberg's damping. It begins at the two poses that explain one tag almost equally well: the
-//! picture of a small square hardly tells to which side it is tilted (Schweighofer and Pinz 2006, "Robust Pose Estimation from a
-//! Planar Target"). Where the better one is not clearly better, no pose is told.
+//! All tag corners are projected with the lens model of the camera, and the reprojection error is minimized with the
+//! Levenberg-Marquardt method. The optimization starts from both poses that explain a single tag almost equally well,
+//! since the image of a small square hardly determines to which side it is tilted (Schweighofer and Pinz 2006, "Robust
+//! Pose Estimation from a Planar Target"). If the better pose is not clearly better, no pose is returned.
 
 use kinematics::{Intrinsics, Transform, Twist, transform};
 use nalgebra::{Matrix2x3, Matrix3, Matrix3x6, Matrix6, Rotation3, SMatrix, SVector, UnitQuaternion, Vector3, Vector6};
 
-/// Corners are found this well in a sharp image, pixels; nobody sees better.
+/// Standard deviation of detected corners in a sharp image, pixels. It is the lower limit of the assumed noise.
 const CORNER_SIGMA_PX: f64 = 0.2;
-/// What is off by more counts by its size, not by its square (Huber 1964): sides seen from far aside have corners that are anywhere.
+/// Residuals above this count linearly instead of quadratically (Huber 1964), because corners of tags viewed at a
+/// grazing angle are unreliable.
 const HUBER_PX: f64 = 3.0 * CORNER_SIGMA_PX;
-/// Corners further off than this, root mean square, are not those of the tags that the rig file tells of; in pixels.
+/// If the root mean square error is larger, the corners do not match the tags of the rig file; pixels.
 const MAX_RMS_ERROR_PX: f64 = 3.0;
-/// The second best pose explains a tag so much worse, by squares, or the best one is not trusted.
+/// The cost of the second-best pose must be larger than the best cost by this factor, else the pose is ambiguous.
 const MIN_AMBIGUITY_RATIO: f64 = 3.0;
 const MAX_ITERATIONS: usize = 50;
 
-/// A tag whose place is known.
+/// A tag with a known pose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TagPlacement {
-    /// Side of its border, where black meets white, metres.
+    /// Side length of its border, where black meets white, meters.
     pub size_m: f64,
-    /// Its centre; x to the right of the print, y down, z into it.
+    /// Pose of its center; x to the right of the print, y down, z into it.
     pub world_from_tag: Transform,
 }
 
-/// A camera that looks.
+/// A camera and its motion during the exposure.
 #[derive(Clone, Debug)]
 pub struct RollingShutterCamera<'a> {
-    /// Its lens.
+    /// Its lens parameters.
     pub intrinsics: &'a Intrinsics,
-    /// How it moves by what carries it, in its own axes. Rows are exposed one after the other: corners are seen from where it was then.
+    /// Its velocity in its own axes. Rows are exposed one after another, so each corner is observed from a different
+    /// pose.
     pub twist: Twist,
-    /// From the first row to the last, seconds; 0 where all are exposed at once.
+    /// Time from the first row to the last, seconds; 0 for a global shutter.
     pub readout_secs: f64,
 }
 
 impl RollingShutterCamera<'_> {
-    /// The camera at the middle of its exposure, seen by itself at the instant of a row.
+    /// Maps the camera frame at mid-exposure to the camera frame at the time of a row.
     fn row_from_mid_exposure(&self, row_px: f64) -> Transform {
         let since_mid_exposure_frac = row_px / f64::from(self.intrinsics.size_px[1].max(1)) - 0.5;
         transform::exp(&self.twist, since_mid_exposure_frac.clamp(-0.5, 0.5) * self.readout_secs).inverse()
     }
 }
 
-/// Where a camera is.
+/// Estimated pose of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraPoseEstimate {
-    /// Pose of the camera at the middle of its exposure.
+    /// Pose of the camera at mid-exposure.
     pub world_from_camera: Transform,
-    /// Covariance of the pose: of a small motion of the world seen by the camera, in its axes; metres first, then radians.
+    /// Covariance of a small motion of the world in the axes of the camera; meters first, then radians.
     pub covariance: Matrix6<f64>,
-    /// How far corners are off, root mean square, pixels.
+    /// Root mean square reprojection error of the corners, pixels.
     pub rms_error_px: f64,
 }
 
-/// Why it cannot be told where a camera is.
+/// Why the camera pose cannot be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum LocateError {
-    /// No tag with a known place is in the image.
-    #[error("no tag of the rig file is seen")]
+    /// The image contains no tag with a known pose.
+    #[error("no tag of the rig file is visible")]
     NoTag,
-    /// Corners are not where any pose puts them.
+    /// No pose explains the corners.
     #[error(
-        "the corners of the tags are {rms_error_px:.1} px off: sizes and places of the tags, and the lens, are to be looked at"
+        "the corners of the tags are {rms_error_px:.1} px off: check the sizes and poses of the tags, and the intrinsics of the camera"
     )]
     LargeReprojectionError {
-        /// Root mean square, pixels.
+        /// Root mean square error, pixels.
         rms_error_px: f64,
     },
-    /// Two poses are as good.
-    #[error("a tag alone, so small that it may be tilted to either side")]
+    /// Two poses explain the tags almost equally well.
+    #[error("a single tag in view is too small to determine to which side it is tilted")]
     Ambiguous,
 }
 
@@ -80,11 +82,14 @@ pub enum LocateError {
 struct Corner {
     point_in_world: Vector3<f64>,
     observed_px: [f64; 2],
-    /// From the camera in the middle of the exposure to that at the instant of the corner's row.
+    /// Maps the camera frame at mid-exposure to the one at the time of the corner's row.
     row_from_mid_exposure: Transform,
 }
 
-/// Where a camera is by the tags that it sees, each with its corners as [`super::TagDetection`] tells them.
+/// Estimates the pose of a camera from tags and their corners in the image, in the order of [`super::TagDetection`].
+///
+/// # Errors
+/// If no tag is given, no pose explains the corners, or two poses explain them almost equally well.
 pub fn locate(
     camera: &RollingShutterCamera<'_>,
     tags: &[(&TagPlacement, [[f64; 2]; 4])],
@@ -100,7 +105,7 @@ pub fn locate(
     if rms_error_px > MAX_RMS_ERROR_PX {
         return Err(LocateError::LargeReprojectionError { rms_error_px });
     }
-    // Noise alone puts this much between a pose and itself.
+    // Contribution of noise to the cost.
     let floor = corners.len() as f64 * CORNER_SIGMA_PX * CORNER_SIGMA_PX;
     let is_different_pose =
         |(_, pose): &&(f64, Transform)| (pose * camera_from_world.inverse()).rotation.angle() > 0.05;
@@ -117,7 +122,7 @@ pub fn locate(
     Ok(CameraPoseEstimate { world_from_camera: camera_from_world.inverse(), covariance, rms_error_px })
 }
 
-/// Corners on the tag, metres, in the order of the detector.
+/// Corners in the frame of the tag, meters, in the order of the detector.
 fn corners_in_tag(size_m: f64) -> [Vector3<f64>; 4] {
     [[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]].map(|[x, y]| Vector3::new(x, y, 0.0) * (0.5 * size_m))
 }
@@ -131,22 +136,23 @@ fn corners(camera: &RollingShutterCamera<'_>, tag: &TagPlacement, observed_px: &
     })
 }
 
-/// The poses of the world in the camera that one tag alone suggests; none where the lens has no ray to a corner.
+/// Both candidate poses of the world in the camera frame from a single tag. Empty if a corner cannot be unprojected.
 fn initial_poses(intrinsics: &Intrinsics, tag: &TagPlacement, observed_px: &[[f64; 2]; 4]) -> Vec<Transform> {
     let rays = observed_px.map(|pixel| intrinsics.unproject(pixel));
     let [Some(a), Some(b), Some(c), Some(d)] = rays else { return Vec::new() };
     let Some(first) = pose_from_homography(tag.size_m, [a, b, c, d]) else { return Vec::new() };
-    // The other one: the tag mirrored at the plane through it that faces the camera.
+    // The second candidate: the normal of the tag is mirrored about the viewing direction.
     let view_direction = first.translation.vector.normalize();
-    let normal_matrix = first.rotation * Vector3::z();
-    let mirrored = view_direction * (2.0 * view_direction.dot(&normal_matrix)) - normal_matrix;
-    let rotation = UnitQuaternion::rotation_between(&normal_matrix, &mirrored).unwrap_or_default();
+    let normal = first.rotation * Vector3::z();
+    let mirrored = view_direction * (2.0 * view_direction.dot(&normal)) - normal;
+    let rotation = UnitQuaternion::rotation_between(&normal, &mirrored).unwrap_or_default();
     let second = Transform::from_parts(first.translation, rotation * first.rotation);
     let tag_from_world = tag.world_from_tag.inverse();
     vec![first * tag_from_world, second * tag_from_world]
 }
 
-/// The pose of a tag in the camera by the homography from its plane to the plane `z` = 1 of the camera.
+/// Pose of a tag in the camera frame from the homography between the plane of the tag and the plane `z` = 1 of the
+/// camera.
 ///
 /// Source: Zhang 2000, "A flexible new technique for camera calibration", section 3.1.
 fn pose_from_homography(size_m: f64, rays: [Vector3<f64>; 4]) -> Option<Transform> {
@@ -165,11 +171,11 @@ fn pose_from_homography(size_m: f64, rays: [Vector3<f64>; 4]) -> Option<Transfor
     let (x, y) = (first * scale, second * scale);
     let approximate = Matrix3::from_columns(&[x, y, x.cross(&y)]);
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&approximate));
-    let solutions = Transform::from_parts((center * scale).into(), rotation);
-    transform::is_finite(&solutions).then_some(solutions)
+    let pose = Transform::from_parts((center * scale).into(), rotation);
+    transform::is_finite(&pose).then_some(pose)
 }
 
-/// The pose of the world in the camera with the least squares near one, and those squares.
+/// Refines a pose of the world in the camera frame by least squares. Returns the cost and the pose.
 fn refine(intrinsics: &Intrinsics, corners: &[Corner], mut pose: Transform) -> Option<(f64, Transform)> {
     let (mut cost, mut normal_matrix, mut rhs) = equations(intrinsics, corners, &pose)?;
     let mut damping = 1e-4;
@@ -194,8 +200,8 @@ fn refine(intrinsics: &Intrinsics, corners: &[Corner], mut pose: Transform) -> O
     Some((cost, pose))
 }
 
-/// Sum of the squares of what is off, px², large ones tempered, and the normal equations for a small motion of the world in the camera's axes; `None`
-/// where a corner is not before the camera.
+/// Sum of squared residuals in px² with the Huber loss, and the normal equations for a small motion of the world in the
+/// axes of the camera. `None` if a corner is not in front of the camera.
 fn equations(
     intrinsics: &Intrinsics,
     corners: &[Corner],
@@ -210,23 +216,23 @@ fn equations(
         let mut d_point_d_pose = Matrix3x6::identity();
         d_point_d_pose.fixed_view_mut::<3, 3>(0, 3).copy_from(&-point.cross_matrix());
         let jacobian = d_pixel_d_point * row_from_mid_exposure.rotation.to_rotation_matrix().matrix() * d_point_d_pose;
-        let rms_error_px = residual.norm();
-        let weight = HUBER_PX / rms_error_px.max(HUBER_PX);
-        cost += weight * (2.0 - weight) * rms_error_px * rms_error_px;
+        let residual_px = residual.norm();
+        let weight = HUBER_PX / residual_px.max(HUBER_PX);
+        cost += weight * (2.0 - weight) * residual_px * residual_px;
         normal_matrix += jacobian.transpose() * jacobian * weight;
         rhs += jacobian.transpose() * residual * weight;
     }
     Some((cost, normal_matrix, rhs))
 }
 
-/// How far corners are off, root mean square, pixels.
+/// Root mean square reprojection error of the corners, pixels.
 fn rms_error_px(intrinsics: &Intrinsics, corners: &[Corner], camera_from_world: &Transform) -> f64 {
-    let cost = corners.iter().map(|Corner { point_in_world, observed_px, row_from_mid_exposure }| {
+    let squares = corners.iter().map(|Corner { point_in_world, observed_px, row_from_mid_exposure }| {
         let point = row_from_mid_exposure * camera_from_world * nalgebra::Point3::from(*point_in_world);
         let [u, v] = intrinsics.project(&point.coords).unwrap_or([f64::INFINITY; 2]);
         (observed_px[0] - u).powi(2) + (observed_px[1] - v).powi(2)
     });
-    (cost.sum::<f64>() / corners.len() as f64).sqrt()
+    (squares.sum::<f64>() / corners.len() as f64).sqrt()
 }
 
 #[cfg(test)]
@@ -244,7 +250,7 @@ mod tests {
         }
     }
 
-    /// All rows are exposed at the same time.
+    /// A camera that exposes all rows at the same time.
     fn global_shutter(intrinsics: &Intrinsics) -> RollingShutterCamera<'_> {
         RollingShutterCamera { intrinsics, twist: Twist::zero(), readout_secs: 0.0 }
     }
@@ -255,7 +261,7 @@ mod tests {
             (camera(Lens::Pinhole), camera_in_front_of_tag(0.5), tag(0.0, [0.2, -0.6, 2.5]));
         let twist = Twist { linear_m_s: Vector3::new(0.2, -0.1, 0.1), angular_rad_s: Vector3::new(0.3, 0.5, -0.4) };
         let camera = RollingShutterCamera { intrinsics: &intrinsics, twist, readout_secs: 0.03 };
-        // Each corner from where the camera is at the instant of the row that it is seen in.
+        // Project each corner from the camera pose at the time of its row.
         let mut pixels = project_corners(&intrinsics, &mid_exposure, &tag, [[0.0; 2]; 4]);
         for _ in 0..20 {
             pixels = std::array::from_fn(|ix| {
@@ -268,29 +274,29 @@ mod tests {
         };
         let [m, rad] = residual(&camera);
         assert!(m < 1e-8 && rad < 1e-8, "{m} m, {rad} rad");
-        assert!(residual(&global_shutter(&intrinsics))[0] > 1e-3, "it does not matter here");
+        assert!(residual(&global_shutter(&intrinsics))[0] > 1e-3, "the rolling shutter has no effect in this test");
     }
 
     fn tag(x: f64, rotation: [f64; 3]) -> TagPlacement {
         TagPlacement { size_m: 0.1, world_from_tag: Transform::new(Vector3::new(x, 0.2, 0.4), Vector3::from(rotation)) }
     }
 
-    /// What a camera sees of a tag; `rms_error_px` from corner to corner.
+    /// Projects the corners of a tag and adds the given errors.
     fn project_corners(
         camera: &Intrinsics,
         world_from_camera: &Transform,
         tag: &TagPlacement,
-        rms_error_px: [[f64; 2]; 4],
+        errors_px: [[f64; 2]; 4],
     ) -> [[f64; 2]; 4] {
         let corners_in_tag = corners_in_tag(tag.size_m);
         std::array::from_fn(|ix| {
             let world = tag.world_from_tag * nalgebra::Point3::from(corners_in_tag[ix]);
-            let [u, v] = camera.project(&(world_from_camera.inverse() * world).coords).expect("before the camera");
-            [u + rms_error_px[ix][0], v + rms_error_px[ix][1]]
+            let [u, v] = camera.project(&(world_from_camera.inverse() * world).coords).expect("in front of the camera");
+            [u + errors_px[ix][0], v + errors_px[ix][1]]
         })
     }
 
-    /// A camera at so many metres before the tag at `x` = 0, turned a little.
+    /// A camera at the given distance in front of the tag at `x` = 0, slightly rotated.
     fn camera_in_front_of_tag(distance_m: f64) -> Transform {
         Transform::new(Vector3::new(0.05, 0.15, 0.4 - distance_m), Vector3::new(0.1, -0.15, 0.05))
     }
@@ -322,8 +328,8 @@ mod tests {
     fn errors_match_estimated_covariance() {
         let (camera, truth, tag) = (camera(Lens::Pinhole), camera_in_front_of_tag(0.5), tag(0.0, [0.4, 0.3, 0.1]));
         let mut random = 88_172_645_463_325_252_u64;
-        let mut normal_matrix = || {
-            // The sum of twelve even numbers, less six.
+        let mut standard_normal = || {
+            // Sum of twelve uniform numbers minus six: approximately normal.
             (0..12)
                 .map(|_| {
                     random ^= random << 13;
@@ -337,16 +343,16 @@ mod tests {
         let (mut chi2, n) = (0.0, 400);
         for _ in 0..n {
             let residual =
-                std::array::from_fn(|_| [CORNER_SIGMA_PX * normal_matrix(), CORNER_SIGMA_PX * normal_matrix()]);
+                std::array::from_fn(|_| [CORNER_SIGMA_PX * standard_normal(), CORNER_SIGMA_PX * standard_normal()]);
             let located = locate(&global_shutter(&camera), &[(&tag, project_corners(&camera, &truth, &tag, residual))])
                 .expect("a large tag");
             let residual = transform::log(&(located.world_from_camera.inverse() * truth), 1.0);
             let residual = Vector6::from_iterator(residual.linear_m_s.iter().chain(&residual.angular_rad_s).copied());
             let expected = located.covariance * (CORNER_SIGMA_PX / located.rms_error_px.max(CORNER_SIGMA_PX)).powi(2);
-            chi2 += (residual.transpose() * expected.try_inverse().expect("it is one") * residual).x;
+            chi2 += (residual.transpose() * expected.try_inverse().expect("a covariance is invertible") * residual).x;
         }
         let mean = chi2 / f64::from(n);
-        assert!((5.0..7.2).contains(&mean), "6 numbers are free: {mean}");
+        assert!((5.0..7.2).contains(&mean), "expected about 6 degrees of freedom: {mean}");
     }
 
     #[test]
@@ -359,7 +365,7 @@ mod tests {
         let located =
             locate(&global_shutter(&camera), &[(&one, observe(&one)), (&other, observe(&other))]).expect("two tags");
         let [m, rad] = error(&located, &truth);
-        // The other tilt is 0.28 rad away.
+        // The ambiguous tilt differs by 0.28 rad.
         assert!(m < 0.1 && rad < 0.05, "{m} m, {rad} rad");
     }
 

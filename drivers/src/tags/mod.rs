@@ -1,7 +1,8 @@
-//! Where a camera is, by AprilTags whose places are known.
+//! Camera poses from AprilTags at known poses.
 //!
-//! `detector` finds tags in images, in a thread of its own, with the reference implementation of AprilTag 3; `locate` makes the
-//! camera's pose of the corners of all tags in an image; `pose_filter` averages poses while nothing moves.
+//! `detector` finds tags in images on a separate thread, with the reference implementation of AprilTag 3. `locate`
+//! estimates the camera pose from the corners of all tags in an image. `pose_filter` averages poses while nothing
+//! moves.
 
 mod detector;
 mod locate;

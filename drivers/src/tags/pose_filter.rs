@@ -1,32 +1,32 @@
-//! Poses of what mostly stands still, averaged as long as it does.
+//! Averages poses of a mostly stationary object, and restarts when it moves.
 
 use kinematics::{Transform, Twist, transform};
 use nalgebra::{Matrix6, Vector6};
 
-/// A pose this far from the average, by the square of standard deviations, tells that it moved: once in 10 000 where it did not
-/// (chi-squared, 6 degrees of freedom).
+/// Squared Mahalanobis distance from the average above which the object is assumed to have moved. Without motion, this
+/// happens once in 10 000 poses (chi-squared, 6 degrees of freedom).
 const MAX_CHI_SQUARED: f64 = 27.86;
-/// What an average knows grows old at this rate a pose: errors of lenses and of what was measured by hand do not average out, so some
-/// 30 poses are enough.
+/// Information in the average decays by this factor per pose, which limits the average to about 30 poses. More are
+/// useless because errors of the lens parameters and of measured tag poses do not average out.
 const FORGETTING_FACTOR: f64 = 0.97;
 
-/// The average so far.
+/// Running average of a pose.
 #[derive(Clone, Debug, Default)]
 pub struct StationaryPoseFilter {
-    /// The pose, and its covariance in its own axes: metres first, then radians.
+    /// The pose and its covariance in its own axes: meters first, then radians.
     average: Option<(Transform, Matrix6<f64>)>,
 }
 
 impl StationaryPoseFilter {
-    /// Takes the next pose with its covariance, which is of a small motion in the axes of what is there (metres first, then radians);
-    /// comes back with the average since it last moved.
+    /// Adds a pose with its covariance in its own axes (meters first, then radians). Returns the average since the last
+    /// motion.
     pub fn push(&mut self, pose: &Transform, covariance: &Matrix6<f64>) -> Transform {
         let (average, covariance) = self.merged(pose, covariance).unwrap_or((*pose, *covariance));
         self.average = Some((average, covariance));
         average
     }
 
-    /// The average with another pose; `None` where that is of another place.
+    /// Average with another pose; `None` if that pose is too far away.
     fn merged(&self, pose: &Transform, covariance: &Matrix6<f64>) -> Option<(Transform, Matrix6<f64>)> {
         let (average, average_covariance) = self.average.as_ref()?;
         let average_covariance = average_covariance / FORGETTING_FACTOR;
@@ -53,7 +53,7 @@ mod tests {
         Matrix6::from_diagonal(&Vector6::from_fn(|ix, _| variance(ix)))
     }
 
-    /// There and back by a millimetre and a milliradian.
+    /// Alternates by one millimeter and one milliradian.
     fn with_noise(true_pose: &Transform, ix: usize) -> Transform {
         let by = if ix.is_multiple_of(2) { 1e-3 } else { -1e-3 };
         true_pose * Transform::new(Vector3::new(by, -by, by), Vector3::new(by, by, -by))
@@ -75,7 +75,7 @@ mod tests {
         for ix in 0..100 {
             let average = steady.push(&drifting(ix), &covariance);
             let lag_m = (average.inverse() * drifting(ix)).translation.vector.norm();
-            assert!(lag_m < 3.5e-3, "{lag_m} m behind what creeps");
+            assert!(lag_m < 3.5e-3, "lags behind a slow motion by {lag_m} m");
         }
     }
 

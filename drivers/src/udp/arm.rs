@@ -1,4 +1,4 @@
-//! An arm whose joint states come over UDP, for instance from the program that moves it.
+//! An arm whose joint states are received over UDP, for example from the program that moves it.
 
 use super::counts::DatagramCounts;
 use super::reader::DatagramReader;
@@ -8,7 +8,7 @@ use kinematics::JointState;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-/// An arm that is told about.
+/// An arm whose joint states are received over UDP.
 #[derive(Debug)]
 pub struct UdpArm {
     names: Vec<String>,
@@ -16,17 +16,17 @@ pub struct UdpArm {
 }
 
 impl UdpArm {
-    /// Listens for states of these joints; port 0 takes a free one.
+    /// Listens for states of these joints. With port 0, a free port is used.
     pub fn open(joint_names: &[String], address: SocketAddr) -> Result<Self, Error> {
         Ok(Self { names: joint_names.to_vec(), states: DatagramReader::open("arm", "joint states", address)? })
     }
 
-    /// Where it listens.
+    /// Address it listens on.
     pub fn address(&self) -> SocketAddr {
         self.states.address()
     }
 
-    /// What became of the datagrams so far.
+    /// Statistics of the datagrams so far.
     pub fn counts(&self) -> DatagramCounts {
         self.states.counts()
     }

@@ -1,4 +1,4 @@
-//! A base whose poses come over UDP, for instance from a localiser of its own.
+//! A base whose poses are received over UDP, for example from its own localization.
 
 use super::counts::{DatagramCounts, count_and_warn};
 use super::reader::DatagramReader;
@@ -7,7 +7,7 @@ use crate::{Base, BasePose, Error};
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-/// A base that is told where it is.
+/// A base whose poses are received over UDP.
 #[derive(Debug)]
 pub struct UdpBase {
     poses: DatagramReader,
@@ -15,18 +15,20 @@ pub struct UdpBase {
 }
 
 impl UdpBase {
-    /// Listens; port 0 takes a free one. Poses that their sender is less sure of than `max_sigma` are passed over: root mean squares of
-    /// the position's error and of the turn's, metres and radians. Those without a word on that are taken.
+    /// Listens for poses. With port 0, a free port is used.
+    ///
+    /// Poses with a standard deviation above `max_sigma` are skipped: root mean square errors of position and rotation,
+    /// meters and radians. Poses without covariance are accepted.
     pub fn open(address: SocketAddr, max_sigma: [f64; 2]) -> Result<Self, Error> {
         Ok(Self { poses: DatagramReader::open("base", "poses", address)?, max_sigma })
     }
 
-    /// Where it listens.
+    /// Address it listens on.
     pub fn address(&self) -> SocketAddr {
         self.poses.address()
     }
 
-    /// What became of the datagrams so far.
+    /// Statistics of the datagrams so far.
     pub fn counts(&self) -> DatagramCounts {
         self.poses.counts()
     }
@@ -41,7 +43,7 @@ impl Base for UdpBase {
             let (stamp, pose) = self.poses.next(remaining, decode)?.ok_or(Error::NoBasePose { waited: timeout })?;
             match pose.sigmas() {
                 Some([m, rad]) if m > self.max_sigma[0] || rad > self.max_sigma[1] => {
-                    let what = format_args!("a pose is known to {m:.3} m and {rad:.4} rad only, and passed over");
+                    let what = format_args!("skipped a pose with a standard deviation of {m:.3} m and {rad:.4} rad");
                     count_and_warn("base", &mut self.poses.counts.n_uncertain, 1, what);
                 }
                 _ => return Ok(BasePose { stamp, world_from_base: pose.world_from_base }),

@@ -1,4 +1,4 @@
-//! Datagrams from anyone, to an arm, a base and a range scanner.
+//! Fuzz target for datagrams to an arm, a base and a range scanner.
 
 use super::reader::DatagramReader;
 use super::receiver::ReceivedDatagram;
@@ -9,12 +9,12 @@ use kinematics::Stamp;
 use std::cell::RefCell;
 use std::time::Duration;
 
-/// When the first datagram arrives: seeds have stamps near it.
+/// Arrival time of the first datagram. Stamps in the seeds are close to it.
 pub(crate) const START_TIME: Stamp = Stamp(1_000_000_000_000);
-/// Nothing that is told lies further off, metres, radians or what a joint's unit is; of echoes each coordinate.
+/// Limit of received values: meters, radians or the unit of a joint; also of each point coordinate.
 const MAX_ABS_VALUE: f64 = 1e4;
 
-/// An arm of three joints, a base, and a scanner named `lidar`, without the threads' bytes.
+/// An arm of three joints, a base, and a scanner named `lidar`. Data from their sockets are not used.
 struct Readers {
     names: Vec<String>,
     arm: DatagramReader,
@@ -23,7 +23,7 @@ struct Readers {
 }
 
 thread_local! {
-    /// Ports are taken once: what is read is begun anew each time.
+    /// Sockets are opened once. Their state is reset for each input.
     static READERS: RefCell<Readers> = RefCell::new(Readers::new());
 }
 
@@ -40,14 +40,15 @@ impl Readers {
     }
 }
 
-/// Datagrams, one a line, a millisecond apart; a line that is a whole number lets so many milliseconds pass instead.
+/// Reads datagrams, one per line and one millisecond apart. A line with an integer lets that many milliseconds pass
+/// instead.
 ///
-/// Stamps of a device grow and are of now; numbers lie within what the format allows.
+/// Checks that stamps of each device increase and are recent, and that values are within the limits of the format.
 pub fn datagrams(bytes: &[u8]) {
     joint_states(bytes);
 }
 
-/// The positions of the arm's joints that the datagrams told, see [`datagrams`].
+/// Positions of the arm's joints received in the datagrams; see [`datagrams`].
 pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
     READERS.with_borrow_mut(|readers| {
         let Readers { names, arm, base, scanner } = readers;
@@ -90,7 +91,7 @@ pub(crate) fn joint_states(bytes: &[u8]) -> Vec<Vec<f64>> {
     })
 }
 
-/// A stamp comes after the one before, and not after its arrival, but for what rounding does.
+/// Checks that a stamp is after the previous one and not after its arrival, except for rounding.
 fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
     assert!(newest.is_none_or(|newest| stamp > newest), "{newest:?}, then {stamp:?}");
     assert!(stamp.secs_since(arrival) <= 1e-3, "{stamp:?} arrived at {arrival:?}");
@@ -107,7 +108,7 @@ pub(crate) mod tests {
     };
     use kinematics::Transform;
 
-    /// What an arm, a base and a scanner send in 30 ms, one datagram a line.
+    /// Datagrams that an arm, a base and a scanner send in 30 ms.
     pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
         let names = ["a", "b", "c"].map(str::to_owned);
         let mut lines = Vec::new();
@@ -141,7 +142,7 @@ pub(crate) mod tests {
             read.len()
         };
         let doubled: Vec<_> = lines.iter().flat_map(|line| [line.clone(), line.clone()]).collect();
-        assert_eq!(read(&doubled), 10, "the second is no news");
+        assert_eq!(read(&doubled), 10, "duplicates are ignored");
         let mut random = Random(2);
         for _ in 0..50 {
             let mut shuffled = lines.clone();
@@ -153,6 +154,6 @@ pub(crate) mod tests {
             assert_eq!(read(&cut), 0, "{n_bytes} bytes");
         }
         let doubled_payload: Vec<_> = lines.iter().map(|line| line.repeat(2)).collect();
-        assert_eq!(read(&doubled_payload), 0, "two in one datagram are none");
+        assert_eq!(read(&doubled_payload), 0, "two messages in one datagram are rejected");
     }
 }

@@ -1,4 +1,4 @@
-//! Readings of which each comes whole in one datagram.
+//! Reads values that each fit in one datagram.
 
 use super::counts::{CLOCK_RESTARTED, DatagramCounts, Senders, count_and_warn};
 use super::receiver::{ReceivedDatagram, Receiver};
@@ -10,10 +10,10 @@ use kinematics::Stamp;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-/// A sender of such readings; dropping it frees the port.
+/// Receives values from one sender. Dropping it frees the port.
 #[derive(Debug)]
 pub(super) struct DatagramReader {
-    /// What they are called in messages.
+    /// Name of the values in messages, in the plural.
     plural: &'static str,
     receiver: Receiver,
     pub(super) sequence: SequenceTracker,
@@ -22,24 +22,24 @@ pub(super) struct DatagramReader {
 }
 
 impl DatagramReader {
-    /// Listens; port 0 takes a free one.
+    /// Listens. With port 0, a free port is used.
     pub(super) fn open(device: &str, plural: &'static str, address: SocketAddr) -> Result<Self, Error> {
         let receiver = Receiver::open(device.to_owned(), address)?;
         let (sequence, counts, senders) = (SequenceTracker::default(), DatagramCounts::default(), Senders::default());
         Ok(Self { plural, receiver, sequence, counts, senders })
     }
 
-    /// Where it listens.
+    /// Address it listens on.
     pub(super) fn address(&self) -> SocketAddr {
         self.receiver.address()
     }
 
-    /// What became of the datagrams so far.
+    /// Statistics of the datagrams so far.
     pub(super) fn counts(&self) -> DatagramCounts {
         self.counts
     }
 
-    /// The next reading that `decode` understands, with our time of it; `None` when none came within a time.
+    /// Returns the next value that `decode` accepts with its stamp on our clock, or `None` if none came in time.
     pub(super) fn next<T>(
         &mut self,
         timeout: Duration,
@@ -51,7 +51,7 @@ impl DatagramReader {
                 return Ok(Some(reading));
             }
             if Instant::now() >= until {
-                break; // However many useless ones there are.
+                break; // Even if invalid datagrams keep arriving.
             }
         }
         Ok(None)
@@ -69,23 +69,25 @@ impl DatagramReader {
             device,
             &mut counts.n_dropped,
             datagram.n_dropped,
-            format_args!("{plural} gave way to newer ones"),
+            format_args!("{plural} were dropped because the program was too slow"),
         );
         let (header, reading) = match decode(&datagram.bytes) {
             Ok(decoded) => decoded,
             Err(error) => {
-                count_and_warn(device, &mut counts.n_rejected, 1, format_args!("a datagram is refused: {error}"));
+                count_and_warn(device, &mut counts.n_rejected, 1, format_args!("rejected a datagram: {error}"));
                 return None;
             }
         };
         senders.note(device, datagram.from);
         match sequence.position(header.seq, datagram.at) {
             SequencePosition::New { n_lost } => {
-                count_and_warn(device, &mut counts.n_lost, n_lost, format_args!("{plural} did not come"))
+                count_and_warn(device, &mut counts.n_lost, n_lost, format_args!("{plural} did not arrive"))
             }
-            SequencePosition::Restart => count_and_warn(device, &mut counts.n_restarts, 1, "the sender counts anew"),
+            SequencePosition::Restart => {
+                count_and_warn(device, &mut counts.n_restarts, 1, "the sender's sequence numbers restarted")
+            }
             SequencePosition::Current | SequencePosition::Late => {
-                count_and_warn(device, &mut counts.n_late, 1, format_args!("{plural} came late or twice"));
+                count_and_warn(device, &mut counts.n_late, 1, format_args!("{plural} were late or duplicate"));
                 return None;
             }
         }
@@ -95,7 +97,9 @@ impl DatagramReader {
         if stamp.is_none() {
             let stamp_nanos = header.stamp_nanos;
             let hint = sequence::hint(&header, datagram.at);
-            let what = format_args!("the stamp {stamp_nanos} is not after the last, or not of now{hint}");
+            let what = format_args!(
+                "rejected a datagram: the stamp {stamp_nanos} is not after the previous one, or not recent{hint}"
+            );
             count_and_warn(device, &mut counts.n_rejected, 1, what);
         }
         Some((stamp?, reading))

@@ -1,4 +1,4 @@
-//! A socket read by a thread of its own, which stamps datagrams as they arrive.
+//! A UDP socket read by a separate thread that stamps datagrams on arrival.
 
 use crate::{Error, clock};
 use kinematics::Stamp;
@@ -9,23 +9,23 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Bytes of datagrams that may wait; past them the oldest goes.
+/// Capacity of the queue in bytes. If it is exceeded, the oldest datagram is dropped.
 const MAX_WAITING_BYTES: usize = 16 << 20;
-/// What a datagram takes besides its bytes, about: none is free.
+/// Approximate memory use of a datagram in addition to its bytes, so that empty ones count, too.
 const OVERHEAD_BYTES: usize = 128;
-/// No datagram is longer.
+/// Maximum length of a datagram.
 const MAX_DATAGRAM_BYTES: usize = 65_536;
-/// What came so long before it is asked for the first time is not wanted: other devices were still being opened.
+/// At the first read, older datagrams are discarded: they arrived while other devices were still being opened.
 const MAX_BUFFERED_AGE: Duration = Duration::from_millis(200);
-/// How soon the thread notices that it is to stop.
+/// Interval at which the thread checks whether it has to stop.
 const POLL: Duration = Duration::from_millis(100);
 
-/// One datagram.
+/// A datagram with its arrival time and sender.
 pub(super) struct ReceivedDatagram {
     pub(super) at: Stamp,
     pub(super) from: SocketAddr,
     pub(super) bytes: Vec<u8>,
-    /// Those before it that gave way.
+    /// Number of datagrams dropped before this one.
     pub(super) n_dropped: u64,
 }
 
@@ -50,13 +50,13 @@ struct State {
     n_bytes: usize,
     n_dropped: u64,
     error: Option<std::io::Error>,
-    /// Somebody has asked for datagrams.
+    /// Whether a datagram was requested yet.
     has_reader: bool,
     stop: bool,
 }
 
 impl Receiver {
-    /// Listens; port 0 takes a free one. `device` names it in messages.
+    /// Listens. With port 0, a free port is used. `device` is its name in messages.
     pub(super) fn open(device: String, address: SocketAddr) -> Result<Self, Error> {
         let bound = UdpSocket::bind(address).and_then(|socket| {
             socket.set_read_timeout(Some(POLL))?;
@@ -67,7 +67,9 @@ impl Receiver {
             Err(source) => return Err(Error::Listen { device, address, source }),
         };
         if !address.ip().is_loopback() {
-            log::warn!("{device}: whoever reaches {address} can send to it: there is no password in this format");
+            log::warn!(
+                "{device}: any program that can reach {address} can send data to it, because datagrams are not authenticated"
+            );
         }
         let shared = Arc::new(Shared::default());
         let reading = Arc::clone(&shared);
@@ -78,17 +80,17 @@ impl Receiver {
         }
     }
 
-    /// Where it listens.
+    /// Address it listens on.
     pub(super) fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// What it is called in messages.
+    /// Name of the device in messages.
     pub(super) fn device(&self) -> &str {
         &self.device
     }
 
-    /// The oldest datagram that waits; `None` when none came until then.
+    /// Returns the oldest queued datagram, or `None` if none came until `until`.
     pub(super) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
         let mut state = self.shared.lock();
         if !std::mem::replace(&mut state.has_reader, true) {
@@ -112,7 +114,7 @@ impl Receiver {
 }
 
 impl Shared {
-    /// The state, also after a thread panicked while it held it: the queue is never left half changed.
+    /// Locks the state. A poisoned lock is accepted because the queue is never left half changed.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -170,7 +172,7 @@ impl Drop for Receiver {
     fn drop(&mut self) {
         self.shared.lock().stop = true;
         if let Some(thread) = self.thread.take() {
-            // A panic of the thread was reported by the panic hook.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
@@ -206,6 +208,9 @@ mod tests {
         for ix in 0..1_000_000 {
             state.put(Stamp(ix), SENDER, Vec::new());
         }
-        assert!(state.queue.len() <= MAX_WAITING_BYTES / OVERHEAD_BYTES, "empty datagrams are bounded too");
+        assert!(
+            state.queue.len() <= MAX_WAITING_BYTES / OVERHEAD_BYTES,
+            "the number of empty datagrams is limited, too"
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! A range scanner whose turns come over UDP, each in one datagram or cut into parts.
+//! A range scanner whose scans are received over UDP, each in one or more datagrams.
 
 use super::counts::{CLOCK_RESTARTED, DatagramCounts, Senders, count_and_warn};
 use super::receiver::{ReceivedDatagram, Receiver};
@@ -11,9 +11,9 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// A scanner that sends JSON.
+/// A range scanner whose scans are received over UDP.
 ///
-/// A turn is told once all its parts are there, or without those that are not once a later turn begins.
+/// A scan is returned when all its parts have arrived, or without the missing ones when the next scan begins.
 #[derive(Debug)]
 pub struct UdpScanner {
     name: Arc<str>,
@@ -21,7 +21,7 @@ pub struct UdpScanner {
     sequence: SequenceTracker,
     counts: DatagramCounts,
     senders: Senders,
-    /// The turn whose parts are coming.
+    /// The scan whose parts are arriving.
     partial_scan: Option<PartialScan>,
     pub(super) completed: VecDeque<RangeScan>,
 }
@@ -34,7 +34,7 @@ struct PartialScan {
 }
 
 impl UdpScanner {
-    /// Listens for the scanner of this name; port 0 takes a free one.
+    /// Listens for the scanner of this name. With port 0, a free port is used.
     pub fn open(name: &str, address: SocketAddr) -> Result<Self, Error> {
         let receiver = Receiver::open(format!("range scanner {name:?}"), address)?;
         Ok(Self {
@@ -48,17 +48,17 @@ impl UdpScanner {
         })
     }
 
-    /// Where it listens.
+    /// Address it listens on.
     pub fn address(&self) -> SocketAddr {
         self.receiver.address()
     }
 
-    /// What became of the datagrams so far.
+    /// Statistics of the datagrams so far.
     pub fn counts(&self) -> DatagramCounts {
         self.counts
     }
 
-    /// As if nothing had come yet.
+    /// Resets the state to before the first datagram.
     #[cfg(any(test, fuzzing))]
     pub(super) fn reset(&mut self) {
         (self.sequence, self.partial_scan) = (SequenceTracker::default(), None);
@@ -68,32 +68,42 @@ impl UdpScanner {
     pub(super) fn take(&mut self, datagram: &ReceivedDatagram) {
         self.counts.n_received += 1;
         let device = self.receiver.device();
-        count_and_warn(device, &mut self.counts.n_dropped, datagram.n_dropped, "datagrams gave way to newer ones");
+        count_and_warn(
+            device,
+            &mut self.counts.n_dropped,
+            datagram.n_dropped,
+            "datagrams were dropped because the program was too slow",
+        );
         let part = match decode_scan(&datagram.bytes) {
             Ok(part) => part,
             Err(error) => return self.reject(format_args!("{error}")),
         };
         if *part.frame != *self.name {
-            return self.reject(format_args!("it is of another frame"));
+            return self.reject(format_args!("it belongs to another frame"));
         }
         self.senders.note(device, datagram.from);
         match self.sequence.position(part.header.seq, datagram.at) {
             SequencePosition::New { n_lost } => {
-                count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not come");
+                count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_lost, "scans did not arrive");
                 self.begin(part, datagram.at);
             }
             SequencePosition::Restart => {
-                count_and_warn(self.receiver.device(), &mut self.counts.n_restarts, 1, "the sender counts anew");
+                count_and_warn(
+                    self.receiver.device(),
+                    &mut self.counts.n_restarts,
+                    1,
+                    "the sender's sequence numbers restarted",
+                );
                 self.begin(part, datagram.at);
             }
             SequencePosition::Current => self.add(part),
             SequencePosition::Late => {
-                count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came late")
+                count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part of a scan was late")
             }
         }
     }
 
-    /// A new turn; what has come of the one before is all there will be.
+    /// Starts a new scan. The previous one is returned without its missing parts.
     fn begin(&mut self, part: ScanPart, arrival: Stamp) {
         self.finish_scan();
         let n_before = self.sequence.n_clock_restarts();
@@ -102,7 +112,8 @@ impl UdpScanner {
         count_and_warn(self.receiver.device(), &mut self.counts.n_clock_restarts, n_new_restarts, CLOCK_RESTARTED);
         let Some(stamp) = stamp else {
             let (stamp_nanos, hint) = (part.header.stamp_nanos, sequence::hint(&part.header, arrival));
-            return self.reject(format_args!("the stamp {stamp_nanos} is not after the last, or not of now{hint}"));
+            return self
+                .reject(format_args!("the stamp {stamp_nanos} is not after the previous one, or not recent{hint}"));
         };
         let parts = vec![None; part.n_parts as usize];
         self.partial_scan = Some(PartialScan { header: part.header, stamp, parts });
@@ -111,15 +122,25 @@ impl UdpScanner {
 
     fn add(&mut self, part: ScanPart) {
         let Some(partial_scan) = &mut self.partial_scan else {
-            // Of a turn that is complete, or was refused.
-            return count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice or late");
+            // The scan is already complete, or was rejected.
+            return count_and_warn(
+                self.receiver.device(),
+                &mut self.counts.n_late,
+                1,
+                "a part of a scan was late or duplicate",
+            );
         };
         if partial_scan.header != part.header || partial_scan.parts.len() != part.n_parts as usize {
             return self.reject(format_args!("it contradicts another part of the same scan"));
         }
         let position = &mut partial_scan.parts[part.part as usize];
         if position.is_some() {
-            return count_and_warn(self.receiver.device(), &mut self.counts.n_late, 1, "a part came twice");
+            return count_and_warn(
+                self.receiver.device(),
+                &mut self.counts.n_late,
+                1,
+                "a part of a scan was duplicate",
+            );
         }
         *position = Some(part.points);
         if partial_scan.parts.iter().all(Option::is_some) {
@@ -130,7 +151,7 @@ impl UdpScanner {
     fn finish_scan(&mut self) {
         let Some(PartialScan { stamp, parts, .. }) = self.partial_scan.take() else { return };
         let n_missing = parts.iter().filter(|part| part.is_none()).count() as u64;
-        count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not come");
+        count_and_warn(self.receiver.device(), &mut self.counts.n_lost, n_missing, "parts of a scan did not arrive");
         let points: Arc<[RangePoint]> = parts.into_iter().flatten().flatten().collect();
         self.completed.push_back(RangeScan { scanner: Arc::clone(&self.name), stamp, points });
     }
@@ -140,7 +161,7 @@ impl UdpScanner {
             self.receiver.device(),
             &mut self.counts.n_rejected,
             1,
-            format_args!("a datagram is refused: {reason}"),
+            format_args!("rejected a datagram: {reason}"),
         );
     }
 }
@@ -159,7 +180,7 @@ impl RangeScanner for UdpScanner {
             let Some(datagram) = self.receiver.next(until)? else { break };
             self.take(&datagram);
             if self.completed.is_empty() && Instant::now() >= until {
-                break; // However many useless ones there are.
+                break; // Even if invalid datagrams keep arriving.
             }
         }
         Err(Error::NoScan { scanner: self.name.to_string(), waited: timeout })

@@ -1,32 +1,32 @@
-//! What follows what: numbers that grow, stamps that grow.
+//! Tracks sequence numbers and stamps of a sender, both of which must increase.
 
 use crate::wire::datagram::{Clock, DatagramHeader};
 use kinematics::{ClockMap, Stamp};
 use std::time::Duration;
 
-/// Numbers further apart than this are no gap: the sender counts anew.
+/// A larger difference of sequence numbers is not a gap but a restart of the sender.
 const MAX_SEQUENCE_GAP: u64 = 1000;
-/// When the newest number is this old, a lower one is no late one: the sender counts anew.
+/// If the newest sequence number is older than this, a lower one is not late but a restart of the sender.
 const MAX_REORDER_AGE: Duration = Duration::from_secs(1);
-/// A stamp of our own clock further back than this, or ahead by more than [`MAX_AHEAD`], is wrong.
+/// Stamps of our own clock older than this, or ahead by more than [`MAX_AHEAD`], are invalid.
 const MAX_AGE: Duration = Duration::from_secs(5);
-/// Room for what rounding does; nothing is sent before it happened.
+/// Tolerance for rounding. Apart from that, stamps cannot be in the future.
 const MAX_AHEAD: Duration = Duration::from_millis(1);
 
-/// Where a datagram belongs.
+/// Position of a datagram in the sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SequencePosition {
-    /// It begins a new scan or pose, and so many before it did not come.
+    /// It begins a new scan or value, after `n_lost` missing ones.
     New { n_lost: u64 },
-    /// It is of the newest one.
+    /// It belongs to the newest scan or value.
     Current,
-    /// It is of an older one.
+    /// It belongs to an older one.
     Late,
-    /// It is the first of a sender that counts anew.
+    /// It is the first after a restart of the sender.
     Restart,
 }
 
-/// The numbers and stamps of one sender.
+/// Sequence numbers and stamps of one sender.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct SequenceTracker {
     clock: ClockMap,
@@ -35,7 +35,7 @@ pub(crate) struct SequenceTracker {
 }
 
 impl SequenceTracker {
-    /// Where a datagram that arrived then belongs, by its number.
+    /// Determines the position of a datagram from its sequence number.
     pub(crate) fn position(&mut self, seq: u64, arrival: Stamp) -> SequencePosition {
         let Some((newest, since)) = self.newest else {
             self.newest = Some((seq, arrival));
@@ -53,12 +53,12 @@ impl SequenceTracker {
         position
     }
 
-    /// How often the sender's clock was found to have begun again, jumped, or not to count nanoseconds.
+    /// Number of times that the sender's clock restarted, jumped, or did not count nanoseconds.
     pub(crate) fn n_clock_restarts(&self) -> u64 {
         self.clock.n_restarts()
     }
 
-    /// Our time of what a new datagram tells; `None` where that cannot be, or is not after the newest.
+    /// Stamp of a new datagram on our clock. `None` if it is impossible or not after the newest one.
     pub(crate) fn stamp(&mut self, header: &DatagramHeader, arrival: Stamp) -> Option<Stamp> {
         let stamp = match header.clock {
             Clock::Monotonic => Stamp(header.stamp_nanos),
@@ -74,11 +74,11 @@ impl SequenceTracker {
     }
 }
 
-/// What may be wrong with a stamp that cannot be.
+/// Possible cause of an invalid stamp.
 pub(crate) fn hint(header: &DatagramHeader, arrival: Stamp) -> &'static str {
     match header.clock {
         Clock::Monotonic if Stamp(header.stamp_nanos) > arrival + MAX_AHEAD => {
-            ": \"monotonic\" is CLOCK_MONOTONIC of this computer; the time of day, or a clock elsewhere, is \"device\""
+            ": set \"clock\" to \"device\" unless stamps are of CLOCK_MONOTONIC on this computer"
         }
         _ => "",
     }
@@ -145,10 +145,10 @@ mod tests {
         assert!(hint(&wall_clock, Stamp(now)).contains("device"));
         assert_eq!(hint(&DatagramHeader { clock: Clock::Device, ..wall_clock }, Stamp(now)), "");
         assert_eq!(hint(&DatagramHeader { stamp_nanos: now - 7, ..wall_clock }, Stamp(now)), "");
-        // A clock of its own, at any time.
+        // A device clock may have any value.
         assert_eq!(at(Clock::Device, -5, now), Some(Stamp(now)));
         assert_eq!(at(Clock::Device, SEC - 5, now + SEC), Some(Stamp(now + SEC)));
-        assert_eq!(at(Clock::Device, SEC - 5, now + SEC + 1000), None, "the same instant again");
+        assert_eq!(at(Clock::Device, SEC - 5, now + SEC + 1000), None, "the same time again");
         for wild in [i64::MAX, i64::MIN, 0] {
             let mapped = at(Clock::Device, wild, now + 2 * SEC);
             assert!(mapped.is_none_or(|stamp| stamp <= Stamp(now + 2 * SEC)), "{wild}: {mapped:?}");

@@ -1,4 +1,4 @@
-//! Over a real socket of the loopback interface.
+//! Tests over a real socket of the loopback interface.
 
 use super::{DatagramCounts, UdpArm, UdpBase, UdpScanner};
 use crate::wire::datagram::{
@@ -9,11 +9,11 @@ use kinematics::Transform;
 use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
 
-/// Long, as a busy machine may be slow; nothing waits so long where all is well.
+/// Timeout for events that must happen; long because a machine may be busy.
 const LONG_TIMEOUT: Duration = Duration::from_secs(20);
-/// For what does not come.
+/// Timeout for events that must not happen.
 const SHORT_TIMEOUT: Duration = Duration::from_millis(150);
-/// Of poses that are taken, metres and radians.
+/// Limits for accepted poses, meters and radians.
 const MAX_SIGMA: [f64; 2] = [0.05, 0.03];
 const FREE_PORT: &str = "127.0.0.1:0";
 
@@ -32,7 +32,7 @@ fn now(seq: u64) -> DatagramHeader {
     DatagramHeader { seq, clock: Clock::Monotonic, stamp_nanos: clock::now().0 }
 }
 
-/// The part of a scan whose one echo is so far away.
+/// A part of a scan with one point at the given distance.
 fn part(header: DatagramHeader, part: u32, n_parts: u32, range_m: f32) -> Vec<u8> {
     let point = RangePoint { position_m: [range_m, 0.0, 0.0], ring: 2, offset_micros: 5 };
     encode_scan(&ScanPart { header, frame: "lidar".into(), part, n_parts, points: vec![point] })
@@ -55,13 +55,13 @@ fn scans_are_assembled_with_stamps() {
     assert_eq!((&*scan.scanner, scan.stamp.0), ("lidar", header.stamp_nanos));
     let expected = RangePoint { position_m: [1.5, 0.0, 0.0], ring: 2, offset_micros: 5 };
     assert_eq!(*scan.points, [expected]);
-    // In parts that come in any order.
+    // Parts may arrive in any order.
     let header = now(1);
     for (ix, range_m) in [(2, 3.0), (0, 1.0), (1, 2.0)] {
         send(&part(header, ix, 3, range_m));
     }
     assert_eq!(ranges(&mut scanner), [1.0, 2.0, 3.0]);
-    // A clock of its own: the stamp is the arrival's, at first.
+    // With a device clock, the first stamp is the arrival time.
     let before = clock::now();
     send(&part(DatagramHeader { seq: 2, clock: Clock::Device, stamp_nanos: -77 }, 0, 1, 1.0));
     let scan = scanner.next_scan(LONG_TIMEOUT).unwrap();
@@ -74,12 +74,12 @@ fn lost_duplicate_and_late_scans_are_counted() {
     let (mut scanner, send) = scanner();
     let (first, second, fifth, sixth) = (now(1), now(2), now(5), now(6));
     send(&part(first, 0, 1, 1.0));
-    send(&part(first, 0, 1, 1.0)); // Twice.
-    send(&part(second, 0, 2, 2.0)); // Its other half is lost ...
-    send(&part(second, 0, 2, 2.0)); // ... and this one comes twice.
-    send(&part(fifth, 1, 2, 5.0)); // Two scans are lost before it.
-    send(&part(second, 1, 2, 2.5)); // Too late now.
-    send(&part(fifth, 0, 3, 5.0)); // Contradicts itself.
+    send(&part(first, 0, 1, 1.0)); // Duplicate.
+    send(&part(second, 0, 2, 2.0)); // The other half is lost ...
+    send(&part(second, 0, 2, 2.0)); // ... and this one is a duplicate.
+    send(&part(fifth, 1, 2, 5.0)); // Two scans before it are lost.
+    send(&part(second, 1, 2, 2.5)); // Late.
+    send(&part(fifth, 0, 3, 5.0)); // Contradicts the other part.
     send(&part(fifth, 0, 2, 4.5));
     send(&part(sixth, 0, 1, 6.0));
     assert_eq!(ranges(&mut scanner), [1.0]);
@@ -116,7 +116,7 @@ fn malformed_datagrams_are_rejected() {
     assert_eq!(ranges(&mut scanner), [7.0]);
     let counts = scanner.counts();
     assert_eq!((counts.n_received, counts.n_rejected), (n_junk + 1, n_junk));
-    // Nothing but nonsense: the wait ends all the same.
+    // The wait also ends if only invalid datagrams arrive.
     for _ in 0..1000 {
         send(b"?");
     }

@@ -1,5 +1,5 @@
-//! The part of the kernel's V4L2 interface that cameras need: structures, numbers and request codes of `linux/videodev2.h`
-//! and `linux/v4l2-controls.h`, as 64-bit Linux has them.
+//! The part of the kernel's V4L2 interface that cameras need: structures, constants and request codes of
+//! `linux/videodev2.h` and `linux/v4l2-controls.h` on 64-bit Linux.
 
 use rustix::ioctl::{Opcode, opcode};
 
@@ -7,7 +7,7 @@ use rustix::ioctl::{Opcode, opcode};
 pub(super) const VIDEO_CAPTURE: u32 = 1;
 /// `V4L2_MEMORY_MMAP`.
 pub(super) const MEMORY_MMAP: u32 = 1;
-/// `V4L2_FIELD_ANY` and `V4L2_FIELD_NONE`: whole images, not every other row.
+/// `V4L2_FIELD_ANY` and `V4L2_FIELD_NONE`: progressive images, not interlaced ones.
 pub(super) const FIELD_ANY: u32 = 0;
 pub(super) const FIELD_NONE: u32 = 1;
 
@@ -17,7 +17,7 @@ pub(super) const CAP_STREAMING: u32 = 0x0400_0000;
 pub(super) const CAP_DEVICE_CAPS: u32 = 0x8000_0000;
 /// `V4L2_CAP_TIMEPERFRAME`, of `CaptureParm::capability`.
 pub(super) const CAP_TIMEPERFRAME: u32 = 0x1000;
-/// `V4L2_IN_CAP_DV_TIMINGS`: an input for digital video, as of HDMI grabbers.
+/// `V4L2_IN_CAP_DV_TIMINGS`: a digital video input, as on HDMI grabbers.
 pub(super) const INPUT_DV_TIMINGS: u32 = 0x2;
 
 /// `V4L2_BUF_FLAG_*`.
@@ -85,7 +85,7 @@ pub(super) struct PixFormat {
     pub(super) xfer_func: u32,
 }
 
-/// Seconds as a fraction.
+/// Fraction of a second.
 #[repr(C)]
 #[derive(Clone, Copy, Default)]
 pub(super) struct Fraction {
@@ -119,7 +119,7 @@ pub(super) struct FrameSize {
     pub(super) index: u32,
     pub(super) fourcc: u32,
     pub(super) kind: u32,
-    /// Discrete: width, height. Otherwise least, most, step of the width, then of the height.
+    /// Discrete: width, height. Otherwise minimum, maximum and step of the width, then of the height.
     pub(super) numbers: [u32; 6],
     pub(super) reserved: [u32; 2],
 }
@@ -132,7 +132,7 @@ pub(super) struct FrameInterval {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) kind: u32,
-    /// Discrete: the first. Otherwise least, most, step.
+    /// Discrete: the first one. Otherwise minimum, maximum, step.
     pub(super) fractions: [Fraction; 3],
     pub(super) reserved: [u32; 2],
 }
@@ -161,7 +161,7 @@ pub(super) struct Buffer {
     pub(super) timecode: [u32; 4],
     pub(super) sequence: u32,
     pub(super) memory: u32,
-    /// With `MEMORY_MMAP` where the buffer lies for `mmap`; the union is as long as a pointer.
+    /// With `MEMORY_MMAP`: offset of the buffer for `mmap`. The union has the size of a pointer.
     pub(super) offset: u32,
     pub(super) offset_padding: u32,
     pub(super) length: u32,
@@ -189,7 +189,7 @@ pub(super) struct QueryControl {
     pub(super) reserved: [u32; 2],
 }
 
-/// `struct v4l2_querymenu`, which is packed; its size is a multiple of 4 nevertheless.
+/// `struct v4l2_querymenu`. It is packed, but its size is a multiple of 4 anyway.
 #[repr(C)]
 #[derive(Clone, Copy, Default)]
 pub(super) struct QueryMenu {
@@ -213,7 +213,7 @@ pub(super) struct Input {
     pub(super) reserved: [u32; 4],
 }
 
-/// A structure of the kernel that consists of integers alone, so that any bytes the kernel writes are a value of it.
+/// A kernel structure that consists only of integers, so any bytes that the kernel writes are a valid value.
 pub(super) trait Plain: Copy {}
 impl Plain for Capability {}
 impl Plain for FormatDescription {}
@@ -229,7 +229,7 @@ impl Plain for QueryMenu {}
 impl Plain for Input {}
 impl Plain for u32 {}
 
-/// A request code for the structure that it carries; only this file makes them, from the kernel's own list.
+/// A request code and the type of its argument. Only this file creates them, from the list of the kernel.
 pub(super) struct Request<T> {
     code: Opcode,
     payload: std::marker::PhantomData<T>,
@@ -273,7 +273,7 @@ pub(super) const G_INPUT: Request<u32> = read_request(38);
 pub(super) const ENUM_FRAMESIZES: Request<FrameSize> = read_write_request(74);
 pub(super) const ENUM_FRAMEINTERVALS: Request<FrameInterval> = read_write_request(75);
 
-// The kernel finds the structure's size in the request code: one that is off would be refused as an unknown request.
+// Request codes contain the size of the structure. The kernel rejects a wrong size as an unknown request.
 const _: () = {
     assert!(size_of::<Capability>() == 104);
     assert!(size_of::<FormatDescription>() == 64);
@@ -289,7 +289,7 @@ const _: () = {
     assert!(size_of::<Input>() == 80);
 };
 
-/// Text that the kernel ends with a zero byte.
+/// Decodes null-terminated text.
 pub(super) fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).trim().to_owned()
@@ -299,12 +299,12 @@ pub(super) fn text(bytes: &[u8]) -> String {
 mod tests {
     use super::*;
 
-    /// Compiles a C program against the kernel's own header where there is a compiler, and compares request codes and places.
+    /// Compiles a C program against the kernel's header, if available, and compares request codes and field offsets.
     #[test]
     fn abi_matches_kernel_header() {
         let header = std::path::Path::new("/usr/include/linux/videodev2.h");
         if !header.exists() {
-            eprintln!("skipped: {header:?} is not there");
+            eprintln!("skipped: {header:?} does not exist");
             return;
         }
         macro_rules! rows {
@@ -345,10 +345,10 @@ mod tests {
         );
         let folder = tempfile::tempdir().expect("a folder");
         let (source, built) = (folder.path().join("abi.c"), folder.path().join("abi"));
-        std::fs::write(&source, program).expect("room on the disk");
+        std::fs::write(&source, program).expect("writing the C program");
         let compiler = std::process::Command::new("cc").arg(&source).arg("-o").arg(&built).status();
-        assert!(compiler.expect("a compiler, which Rust needs too").success());
-        let output = std::process::Command::new(&built).output().expect("it runs");
+        assert!(compiler.expect("a C compiler, which Rust also needs").success());
+        let output = std::process::Command::new(&built).output().expect("running the C program");
         let reported: Vec<u64> =
             String::from_utf8_lossy(&output.stdout).lines().map(|line| line.parse().expect("a number")).collect();
         assert_eq!(reported.len(), expected.len());

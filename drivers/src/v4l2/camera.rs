@@ -1,4 +1,4 @@
-//! A V4L2 camera as the rest of the program sees it: images while it is plugged in, waiting while it is not.
+//! A V4L2 camera that reconnects after an outage.
 
 use super::stream::V4l2Stream;
 use super::{Config, Problem};
@@ -7,40 +7,40 @@ use crate::{Camera, Error, Image};
 use kinematics::{Intrinsics, Stamp};
 use std::time::{Duration, Instant};
 
-/// Between two tries to find a lost camera again.
+/// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
-/// A stream that is silent for this long, or for so many images, is begun anew: cameras hang.
+/// A stream without images for this long, or for the time of this many images, is restarted, because cameras may hang.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 
-/// A V4L2 camera that streams.
+/// A streaming V4L2 camera.
 ///
-/// A camera that is unplugged, or hangs, is opened again with the same settings, for at most [`Config::reconnect_for`]: until
-/// then [`Camera::next_image`] says [`Error::Reconnecting`], after that what it was. Images that would have come meanwhile count
-/// as skipped. Dropping it ends the stream.
+/// A camera that is disconnected or hangs is reopened with the same settings for at most [`Config::reconnect_for`].
+/// During that time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Images missed in the
+/// meantime count as skipped. Dropping it stops the stream.
 #[derive(Debug)]
 pub struct V4l2Camera {
     config: Config,
     connection: Connection,
     counts: Counts,
-    /// Stamp of the last image, across reconnections.
+    /// Stamp of the last image, kept across reconnections.
     last: Option<Stamp>,
-    /// Set from a loss to the next image.
+    /// Set from the start of an outage until the next image.
     outage: Option<Outage>,
-    /// Whether an image was asked for yet.
+    /// Whether an image was requested yet.
     was_read: bool,
 }
 
-/// What became of the camera since it was opened.
+/// Statistics of a camera since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Images delivered.
+    /// Number of delivered images.
     pub n_images: u64,
-    /// Images lost, all of which were told in [`Image::n_skipped`].
+    /// Number of dropped images, all of which were reported in [`Image::n_skipped`].
     pub n_skipped: u64,
-    /// Of these: delivered by the device with damaged or too little data.
+    /// Dropped images that the device delivered with damaged or incomplete data.
     pub n_damaged: u64,
-    /// Times that it was found again.
+    /// Number of reconnections.
     pub n_reconnections: u32,
 }
 
@@ -51,12 +51,12 @@ enum Connection {
 }
 
 impl V4l2Camera {
-    /// Opens a camera, sets it up as the rig file says, reads that back, and starts its stream.
+    /// Opens a camera, applies the settings of the rig file, reads them back, and starts the stream.
     pub fn open(config: Config) -> Result<Self, Error> {
         if config.device.starts_with("/dev/video") {
             let Config { name, device, .. } = &config;
             log::warn!(
-                "camera {name:?}: {device} may be another camera tomorrow; `fieldrig devices` prints a name that stays"
+                "camera {name:?}: {device} may become another camera after a restart; `fieldrig devices` prints a stable name"
             );
         }
         let stream = V4l2Stream::start(&config)?;
@@ -71,12 +71,12 @@ impl V4l2Camera {
         })
     }
 
-    /// What became of it so far.
+    /// Statistics since the camera was opened.
     pub fn counts(&self) -> Counts {
         self.counts
     }
 
-    /// What the camera told when its settings were read back, names and counts; empty while it is gone.
+    /// Settings as read back from the camera, names and values. Empty while it is disconnected.
     pub fn read_back(&self) -> &[(&'static str, i32)] {
         match &self.connection {
             Connection::Connected(stream) => stream.read_back(),
@@ -84,7 +84,7 @@ impl V4l2Camera {
         }
     }
 
-    /// One step of waiting for an image of a camera that is there.
+    /// Waits once for an image of a connected camera.
     fn poll_image(&mut self, deadline: Instant) -> Result<Option<Image>, Error> {
         let Connection::Connected(stream) = &mut self.connection else { return Ok(None) };
         if !std::mem::replace(&mut self.was_read, true)
@@ -118,24 +118,24 @@ impl V4l2Camera {
         image
     }
 
-    /// Whether the image in hand is the first since the camera was opened, for the first time or again.
+    /// Whether the current image is the first one since the camera was opened or reopened.
     fn is_first_since_open(&self) -> bool {
         matches!(&self.connection, Connection::Connected(stream) if stream.n_images() == 1)
     }
 
-    /// Closes the device before it is looked for: a node in use keeps its number. Fails when it has been lost for too long: a camera
-    /// that can be opened and sends nothing is lost, too.
+    /// Closes the device before it is reopened, because an open node keeps its number. Fails if the camera has been
+    /// disconnected for too long; a camera that can be opened but sends nothing counts as disconnected.
     fn handle_disconnect(&mut self, cause: Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
         self.connection = Connection::Disconnected;
         if outage.n_tries > 0 {
             return self.fail_if_overdue(outage, cause);
         }
-        log::warn!("camera {:?}: {cause}; looking for it for {:?}", self.config.name, self.config.reconnect_for);
+        log::warn!("camera {:?}: {cause}; trying to reconnect for {:?}", self.config.name, self.config.reconnect_for);
         Ok(())
     }
 
-    /// The error of a camera that was lost for longer than the rig file allows.
+    /// Fails if the camera has been disconnected for longer than the rig file allows.
     fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, cause: Problem) -> Result<(), Error> {
         let (camera, waited) = (self.config.name.clone(), since.elapsed());
         if waited < self.config.reconnect_for {
@@ -145,7 +145,7 @@ impl V4l2Camera {
         Err(Error::V4l2 { camera, problem: Box::new(Problem::Lost { waited, n_tries, last: Box::new(cause) }) })
     }
 
-    /// One try to open a lost camera again, not before the pause since the last one is over.
+    /// Tries once to reopen a disconnected camera, after the pause since the last attempt.
     fn reconnect(&mut self, deadline: Instant) -> Result<(), Error> {
         let (Connection::Disconnected, Some(outage)) = (&self.connection, &mut self.outage) else { return Ok(()) };
         let pause = if outage.n_tries == 0 { Duration::ZERO } else { RETRY_PAUSE };
@@ -158,7 +158,7 @@ impl V4l2Camera {
                 let Outage { since, n_tries, .. } = outage;
                 let (camera, waited) = (&self.config.name, since.elapsed());
                 log::info!(
-                    "camera {camera:?}: there again after {waited:?} and {n_tries} tries: {}",
+                    "camera {camera:?}: reconnected after {waited:?} ({n_tries} attempts): {}",
                     stream.describe()
                 );
                 self.counts.n_reconnections += 1;
@@ -221,7 +221,7 @@ mod tests {
             delivery: super::super::Delivery::Every,
             reconnect_for: Duration::from_secs(1),
         };
-        let message = V4l2Camera::open(config).expect_err("nothing there").to_string();
+        let message = V4l2Camera::open(config).expect_err("the camera does not exist").to_string();
         assert!(message.contains("\"wrist\"") && message.contains("no such serial"), "{message}");
     }
 }

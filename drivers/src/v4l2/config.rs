@@ -1,42 +1,44 @@
-//! What a rig file says of a camera; and its controls from beside, for tests that provoke faults.
+//! Configuration of a V4L2 camera, and access to its controls for tests that provoke faults.
 
 use super::{Delivery, Settings, V4l2Format, device};
 use kinematics::Intrinsics;
 use std::path::Path;
 use std::time::Duration;
 
-/// What a rig file says of a V4L2 camera.
+/// Configuration of a V4L2 camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// Name in the rig file.
     pub name: String,
-    /// A path (best a link under `/dev/v4l`, whose name stays), a serial number on USB, or where it is plugged in as the
-    /// kernel tells (`usb-0000:00:14.0-2`).
+    /// A path (preferably a link under `/dev/v4l`, whose name is stable), a USB serial number, or the port as reported
+    /// by the kernel (`usb-0000:00:14.0-2`).
     pub device: String,
-    /// Pixel format; `None` takes the first that is offered at this size and rate, see [`V4l2Format::COLOR_FORMATS`].
+    /// Pixel format; `None` selects the first one available at this size and rate, see [`V4l2Format::COLOR_FORMATS`].
     pub format: Option<V4l2Format>,
-    /// Lens and size of the images.
+    /// Lens parameters and size of the images.
     pub intrinsics: Intrinsics,
-    /// Images a second.
+    /// Images per second.
     pub rate_hz: f64,
-    /// Metres per count of depth; needed for [`V4l2Format::Z16`].
+    /// Meters per count of depth; required for [`V4l2Format::Z16`].
     pub meters_per_count: Option<f64>,
     /// Exposure, gain, white balance, brightness.
     pub settings: Settings,
-    /// Which image a slow caller gets.
+    /// Which image the next call returns if the caller is slow.
     pub delivery: Delivery,
-    /// How long a camera that was lost is looked for.
+    /// How long to try to reconnect to a camera.
     pub reconnect_for: Duration,
 }
 
-/// Sets a control of a device by the kernel's number, beside whoever streams from it: for tests that provoke faults.
+/// Sets a control of a device by its kernel id, even while another process streams from it. For tests that provoke
+/// faults.
 ///
-/// Fails with the kernel's answer.
+/// # Errors
+/// If the kernel rejects it.
 pub fn set_control(node: &Path, id: u32, value: i32) -> std::io::Result<()> {
     Ok(device::Device::open(node)?.set_control(id, value)?)
 }
 
-/// The value of such a control.
+/// Reads a control of a device by its kernel id.
 pub fn control(node: &Path, id: u32) -> std::io::Result<i32> {
     Ok(device::Device::open(node)?.control_value(id)?)
 }

@@ -1,6 +1,6 @@
-//! Exposure, gain, white balance and brightness: what is set for a rig file, in which order, and what is read back.
+//! Sets exposure, gain, white balance and brightness from the rig file in the right order, and reads them back.
 //!
-//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls; numbers are the kernel's.
+//! Source: Linux `v4l2-controls.h` and its documentation of user and camera controls. Ids are those of the kernel.
 
 use super::Problem;
 use super::abi::{self, QueryControl};
@@ -8,12 +8,12 @@ use super::device::Device;
 use rustix::io::Errno;
 use std::io;
 
-/// Exposure counts of 100 us.
+/// Exposure is in units of 100 us.
 const MICROS_PER_COUNT: f64 = 100.0;
-/// Cameras round an exposure to the rows of their sensor: so much may it be off when read back.
+/// Maximum relative difference of the exposure when read back: cameras round it to rows of their sensor.
 const EXPOSURE_TOLERANCE_FRAC: f64 = 0.1;
 
-/// A control by the kernel's number.
+/// Kernel id of a control.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub(super) enum Id {
@@ -35,16 +35,17 @@ const EXPOSURE_MANUAL: i32 = 1;
 const EXPOSURE_SHUTTER_PRIORITY: i32 = 2;
 const EXPOSURE_APERTURE_PRIORITY: i32 = 3;
 
-/// What the rig file says of the picture; what it leaves open is automatic where the camera can do that, else left as it is.
+/// Image settings of the rig file. A missing setting is automatic if the camera supports that, else it is left
+/// unchanged.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Exposure time, microseconds; `None` lets the camera choose at the rate it was asked for.
+    /// Exposure time, microseconds; `None` for automatic exposure without lowering the rate.
     pub exposure_micros: Option<f64>,
-    /// Gain, counts of the camera.
+    /// Gain, in units of the camera.
     pub gain: Option<i32>,
     /// White balance, kelvin.
     pub white_balance_kelvin: Option<i32>,
-    /// Brightness, counts of the camera.
+    /// Brightness, in units of the camera.
     pub brightness: Option<i32>,
 }
 
@@ -54,24 +55,24 @@ struct Step {
     control: &'static str,
     id: Id,
     value: i32,
-    /// How far off it may read back.
+    /// Maximum difference when read back.
     tolerance: i32,
-    /// Asked for by the rig file; else a camera that refuses is told of and left as it is.
+    /// Whether the rig file requires it. Otherwise, a failure is only logged.
     is_required: bool,
 }
 
-/// What the camera is set to, as it told itself.
+/// Settings as read back from the camera.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct AppliedSettings {
-    /// Exposure time where it is fixed and told, seconds.
+    /// Exposure time in seconds, if it is fixed and known.
     pub(super) exposure_secs: Option<f64>,
-    /// Whether the exposure is automatic and can be asked for.
+    /// Whether the exposure is automatic and can be read.
     pub(super) reports_exposure: bool,
-    /// Names and values, for people.
+    /// Names and values for the log.
     pub(super) read_back: Vec<(&'static str, i32)>,
 }
 
-/// The controls of a camera: those of a [`Device`], and of tables in tests.
+/// Controls of a camera: of a [`Device`], or of tables in tests.
 pub(super) trait Controls {
     fn find(&self, id: Id) -> Option<QueryControl>;
     fn menu(&self, id: Id) -> Vec<i32>;
@@ -101,7 +102,7 @@ impl Controls for Device {
     }
 }
 
-/// Sets a camera, reads everything back, and compares.
+/// Applies the settings, reads them back, and checks them.
 pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
     let steps = plan(settings, camera)?;
     for step in &steps {
@@ -114,7 +115,8 @@ pub(super) fn apply(settings: &Settings, camera: &impl Controls) -> Result<Appli
     check(settings, camera, &steps)
 }
 
-/// Compares again once images come, for some cameras forget their settings when a stream begins; sets them once more if so.
+/// Checks the settings again after the stream has started, and reapplies them if necessary, because some cameras reset
+/// them at that point.
 pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<AppliedSettings, Problem> {
     match check(settings, camera, &plan(settings, camera)?) {
         Err(Problem::ReadBack { .. }) => apply(settings, camera),
@@ -122,7 +124,7 @@ pub(super) fn confirm(settings: &Settings, camera: &impl Controls) -> Result<App
     }
 }
 
-/// Reads back what was set, and compares.
+/// Reads the settings back and checks them.
 fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<AppliedSettings, Problem> {
     let mut applied = AppliedSettings::default();
     for step in steps {
@@ -137,19 +139,19 @@ fn check(settings: &Settings, camera: &impl Controls, steps: &[Step]) -> Result<
         if step.id == Id::ExposureAbsolute {
             applied.exposure_secs = Some(secs_of_counts(got));
         }
-        // What was not asked for and came out otherwise is to be seen there.
+        // Settings that are not required are included even if they differ.
         applied.read_back.push((step.control, got));
     }
     if settings.exposure_micros.is_none() {
         applied.reports_exposure = exposure_secs(camera).is_some();
     } else if applied.exposure_secs.is_none() {
-        // It cannot be set: then the rig file knows it.
+        // The exposure cannot be set, so the value of the rig file is used.
         applied.exposure_secs = settings.exposure_micros.map(|micros| micros * 1e-6);
     }
     Ok(applied)
 }
 
-/// The exposure time that a camera tells, seconds.
+/// Exposure time that a camera reports, seconds.
 pub(super) fn exposure_secs(camera: &impl Controls) -> Option<f64> {
     let counts = camera.get(Id::ExposureAbsolute).ok()?;
     (counts > 0).then(|| secs_of_counts(counts))
@@ -166,7 +168,7 @@ fn refused(control: &'static str, error: Errno) -> Problem {
     }
 }
 
-/// What is set, in order: what is automatic first, for a value that automation holds cannot be set.
+/// Controls to set, in order. Automatic modes come first, because a value cannot be set while it is automatic.
 fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Problem> {
     let mut steps = Vec::new();
     exposure(settings.exposure_micros, camera, &mut steps)?;
@@ -185,7 +187,7 @@ fn plan(settings: &Settings, camera: &impl Controls) -> Result<Vec<Step>, Proble
     Ok(steps)
 }
 
-/// A value that a camera may choose itself.
+/// A value with an automatic mode.
 struct AutoControl {
     auto: (&'static str, Id),
     fixed: (&'static str, Id),
@@ -205,7 +207,7 @@ impl AutoControl {
     }
 }
 
-/// A value that has to be within the range and on the steps of its control.
+/// A value, after checking it against the range and step of its control.
 fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> Result<Step, Problem> {
     let known = camera.find(id).ok_or(Problem::NoControl { control })?;
     let step = known.step.max(1);
@@ -223,11 +225,11 @@ fn fixed(control: &'static str, id: Id, value: i32, camera: &impl Controls) -> R
     Ok(Step { control, id, value, tolerance: 0, is_required: true })
 }
 
-/// Exposure: the mode, that automation keeps the rate, and the time where it is fixed.
+/// Plans the exposure mode, the option that keeps the rate under automatic exposure, and the time if it is fixed.
 fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) -> Result<(), Problem> {
     let entries = camera.menu(Id::ExposureAuto);
     let candidates = match micros {
-        // Cameras without an iris call "automatic" what photographers call aperture priority.
+        // Cameras without an iris report automatic exposure as aperture priority.
         None => [EXPOSURE_APERTURE_PRIORITY, EXPOSURE_FULLY_AUTOMATIC],
         Some(_) => [EXPOSURE_MANUAL, EXPOSURE_SHUTTER_PRIORITY],
     };
@@ -244,7 +246,7 @@ fn exposure(micros: Option<f64>, camera: &impl Controls, steps: &mut Vec<Step>) 
     let step = f64::from(known.step.max(1));
     let nearest =
         ((micros / MICROS_PER_COUNT - f64::from(known.minimum)) / step).round() * step + f64::from(known.minimum);
-    // A time shorter than half a step of the shortest is not what was asked for.
+    // Values that round to outside the range are rejected.
     let counts = (f64::from(known.minimum)..=f64::from(known.maximum)).contains(&nearest).then_some(nearest);
     #[expect(clippy::cast_possible_truncation, reason = "within the range of the control, which is 32 bits wide")]
     let value = counts.map(|counts| counts as i32).ok_or(Problem::ControlRange {
@@ -267,13 +269,13 @@ mod tests {
     use std::cell::RefCell;
     use std::collections::BTreeMap;
 
-    /// A camera by a table of its controls: number, least, most, step.
+    /// A camera defined by a table of controls: id, minimum, maximum, step.
     struct FakeControls {
         controls: &'static [(Id, i32, i32, i32)],
         exposure_modes: &'static [i32],
     }
 
-    /// Such a camera with the values it has now, by the kernel's numbers; it refuses to be set where it says so.
+    /// A camera with current values by kernel id. Setting the ids in `rejects` fails.
     struct FakeCamera {
         controls_table: FakeControls,
         values: RefCell<BTreeMap<u32, i32>>,
@@ -293,7 +295,7 @@ mod tests {
             if self.rejects.contains(&id) {
                 return Err(Errno::IO);
             }
-            // Sensors expose whole rows: what is near is what they take.
+            // Sensors expose whole rows, so they round the value.
             let taken = if id == Id::ExposureAbsolute { value - 1 } else { value };
             self.values.borrow_mut().insert(id as u32, taken);
             Ok(())
@@ -328,7 +330,7 @@ mod tests {
         }
     }
 
-    /// Logitech C920 as `v4l2-ctl -L` prints it (kernel 5.15, firmware 0.0.15).
+    /// Logitech C920, as printed by `v4l2-ctl -L` (kernel 5.15, firmware 0.0.15).
     const C920: FakeControls = FakeControls {
         controls: &[
             (Id::Brightness, 0, 255, 1),
@@ -349,7 +351,7 @@ mod tests {
     };
 
     fn planned(settings: &Settings, camera: &FakeControls) -> Vec<(Id, i32)> {
-        plan(settings, camera).expect("it can").iter().map(|step| (step.id, step.value)).collect()
+        plan(settings, camera).expect("the settings are supported").iter().map(|step| (step.id, step.value)).collect()
     }
 
     #[test]
@@ -384,28 +386,29 @@ mod tests {
 
     #[test]
     fn unsupported_settings_report_supported_range() {
-        let plan_error =
-            |settings: &Settings, camera: &FakeControls| plan(settings, camera).expect_err("it cannot").to_string();
+        let plan_error = |settings: &Settings, camera: &FakeControls| {
+            plan(settings, camera).expect_err("the setting is unsupported").to_string()
+        };
         let too_short_exposure = Settings { exposure_micros: Some(100.0), ..Settings::default() };
         assert_eq!(
             plan_error(&too_short_exposure, &C920),
-            "exposure_micros is 100, it takes 300 to 204700 in steps of 100"
+            "exposure_micros is 100, allowed: 300 to 204700 in steps of 100"
         );
         let too_high_gain = Settings { gain: Some(256), ..Settings::default() };
-        assert_eq!(plan_error(&too_high_gain, &C920), "v4l2.gain is 256, it takes 0 to 255 in steps of 1");
+        assert_eq!(plan_error(&too_high_gain, &C920), "v4l2.gain is 256, allowed: 0 to 255 in steps of 1");
         let unsupported_white_balance = Settings { white_balance_kelvin: Some(4600), ..Settings::default() };
         assert_eq!(
             plan_error(&unsupported_white_balance, &VIVID),
-            "it has no control for v4l2.white_balance_kelvin: leave the key out"
+            "it has no control for v4l2.white_balance_kelvin: remove the key"
         );
         const COARSE: FakeControls = FakeControls { controls: &[(Id::Gain, 0, 100, 10)], exposure_modes: &[] };
         let misaligned_gain = Settings { gain: Some(15), ..Settings::default() };
-        assert!(plan_error(&misaligned_gain, &COARSE).ends_with("it takes 0 to 100 in steps of 10"));
+        assert!(plan_error(&misaligned_gain, &COARSE).ends_with("allowed: 0 to 100 in steps of 10"));
     }
 
     #[test]
     fn camera_without_exposure_control_is_accepted() {
-        // The key then states what is known about it, as docs/reference/rig.md describes.
+        // The key then states the known exposure time, as described in docs/reference/rig.md.
         let known = Settings { exposure_micros: Some(4000.0), ..Settings::default() };
         assert_eq!(planned(&known, &VIVID), [(Id::AutoGain, 1)]);
     }
@@ -414,16 +417,16 @@ mod tests {
     fn settings_are_read_back_and_reapplied() {
         let settings = Settings { exposure_micros: Some(4000.0), gain: Some(12), ..Settings::default() };
         let camera = fake_camera(C920, &[]);
-        let applied = apply(&settings, &camera).expect("it takes all");
-        assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "what the camera made of it");
+        let applied = apply(&settings, &camera).expect("all settings are accepted");
+        assert_eq!(applied.exposure_secs, Some(secs_of_counts(39)), "the value read back");
         assert!(applied.read_back.contains(&("v4l2.gain", 12)) && !applied.reports_exposure);
         camera.values.borrow_mut().insert(Id::Gain as u32, 64);
-        assert!(confirm(&settings, &camera).expect("set again").read_back.contains(&("v4l2.gain", 12)));
+        assert!(confirm(&settings, &camera).expect("the setting is reapplied").read_back.contains(&("v4l2.gain", 12)));
         assert_eq!(camera.get(Id::Gain), Ok(12));
         assert!((secs_of_counts(39) - 0.0039).abs() < 1e-12, "counts of 100 us");
-        // With automatic exposure it is asked for with each image.
+        // With automatic exposure, the exposure time is read with each image.
         camera.values.borrow_mut().insert(Id::ExposureAbsolute as u32, 156);
-        let automatic = apply(&Settings::default(), &camera).expect("it takes all");
+        let automatic = apply(&Settings::default(), &camera).expect("all settings are accepted");
         assert!(automatic.reports_exposure && automatic.exposure_secs.is_none());
         assert_eq!(exposure_secs(&camera), Some(secs_of_counts(156)));
     }
@@ -431,13 +434,13 @@ mod tests {
     #[test]
     fn only_requested_settings_are_required() {
         let camera = fake_camera(C920, &[Id::ExposureAuto, Id::ExposureAutoPriority, Id::AutoWhiteBalance, Id::Gain]);
-        assert!(apply(&Settings::default(), &camera).is_ok(), "nothing was asked for");
+        assert!(apply(&Settings::default(), &camera).is_ok(), "no setting is required");
         let gain = Settings { gain: Some(12), ..Settings::default() };
-        let message = apply(&gain, &camera).expect_err("it refuses").to_string();
+        let message = apply(&gain, &camera).expect_err("the camera rejects the gain").to_string();
         assert!(message.contains("v4l2.gain"), "{message}");
-        // A camera that takes it and does otherwise.
-        let steps = plan(&gain, &C920).expect("it can");
-        let message = check(&gain, &camera, &steps).expect_err("it reads 0").to_string();
-        assert_eq!(message, "v4l2.gain was set to 12 and reads 0");
+        // A camera that accepts a value but does not use it.
+        let steps = plan(&gain, &C920).expect("the settings are supported");
+        let message = check(&gain, &camera, &steps).expect_err("the value read back is 0").to_string();
+        assert_eq!(message, "v4l2.gain was set to 12 and reads back as 0");
     }
 }

@@ -1,4 +1,4 @@
-//! One open V4L2 device: the kernel's requests as safe calls, and images in memory that the kernel shares.
+//! An open V4L2 device: safe calls for the requests of the kernel, and images in memory shared with the kernel.
 
 use super::abi::{self, Plain, Request};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -11,47 +11,47 @@ use std::ffi::c_void;
 use std::path::Path;
 use std::time::Duration;
 
-/// An open device. Dropping it ends its stream and closes it.
+/// An open device. Dropping it stops its stream and closes it.
 #[derive(Debug)]
 pub(super) struct Device {
     fd: OwnedFd,
 }
 
-/// What a device says it is.
+/// Identity reported by a device.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Identity {
-    /// What it calls itself.
+    /// Model name.
     pub(super) card: String,
-    /// Where it is plugged in.
+    /// Bus address.
     pub(super) bus: String,
-    /// The node gives images (others of the same camera may give metadata), and gives them by streaming.
+    /// Whether the node supports streaming images. Other nodes of the same camera may only deliver metadata.
     pub(super) streams_images: bool,
 }
 
-/// An image that the device has filled.
+/// An image buffer filled by the device.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FilledBuffer {
     index: u32,
     n_bytes: usize,
-    /// Images since the stream began, lost ones counted.
+    /// Sequence number since the stream started, including lost images.
     pub(super) sequence: u32,
-    /// When, on the clock that `is_monotonic` tells, nanoseconds.
+    /// Stamp in nanoseconds; its clock depends on `is_monotonic`.
     pub(super) stamp_nanos: i64,
-    /// Whether the device says that its stamps are of the kernel's monotonic clock.
+    /// Whether the device reports that its stamps are of the kernel's monotonic clock.
     pub(super) is_monotonic: bool,
-    /// The device says that the data are damaged.
+    /// Whether the device reports damaged data.
     pub(super) is_damaged: bool,
 }
 
-/// Carries a structure to the kernel and back.
+/// Passes a structure to the kernel and back.
 struct Exchange<'a, T> {
     code: Opcode,
     value: &'a mut T,
 }
 
-// SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs each code with its structure;
-// the sizes are asserted in `abi`. The structures are plain integers: whatever is written is a value of them.
-#[expect(unsafe_code, reason = "the kernel's border")]
+// SAFETY: the kernel writes at most the structure whose size is in the code, and `Request` pairs each code with its
+// structure; the sizes are asserted in `abi`. The structures consist of integers, so any written bytes are valid.
+#[expect(unsafe_code, reason = "system call")]
 unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
     type Output = ();
     const IS_MUTATING: bool = true;
@@ -70,27 +70,28 @@ unsafe impl<T: Plain> Ioctl for Exchange<'_, T> {
 }
 
 impl Device {
-    /// Opens a node, not waiting for it.
+    /// Opens a node in nonblocking mode.
     pub(super) fn open(path: &Path) -> rustix::io::Result<Self> {
         let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
         Ok(Self { fd: rustix::fs::open(path, flags, Mode::empty())? })
     }
 
-    /// One request; repeated when a signal cuts it short.
+    /// Executes a request. It is repeated if interrupted by a signal.
     fn ioctl<T: Plain>(&self, request: &Request<T>, value: &mut T) -> rustix::io::Result<()> {
         rustix::io::retry_on_intr(|| {
-            // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the call; none of the structures
-            // holds a pointer for the kernel to follow.
-            #[expect(unsafe_code, reason = "the kernel's border")]
+            // SAFETY: the code belongs to the structure `T` (see `Exchange`), which outlives the call; none of the
+            // structures contains a pointer that the kernel follows.
+            #[expect(unsafe_code, reason = "system call")]
             unsafe {
                 rustix::ioctl::ioctl(&self.fd, Exchange { code: request.code(), value: &mut *value })
             }
         })
     }
 
-    /// Asks with rising indices until the device has no more; a device without this request has none at all.
+    /// Enumerates entries with increasing indices until the device has no more. The list is empty if the device lacks
+    /// the request.
     fn list<T: Plain>(&self, request: &Request<T>, mut request_at: impl FnMut(u32) -> T) -> Vec<T> {
-        const MAX_ENTRIES: u32 = 1000; // A driver that never ends its list must not hold us.
+        const MAX_ENTRIES: u32 = 1000; // Terminates even if a driver never ends its list.
         let entry = |index| {
             let mut entry = request_at(index);
             self.ioctl(request, &mut entry).is_ok().then_some(entry)
@@ -114,24 +115,24 @@ impl Device {
         })
     }
 
-    /// Codes of the pixel formats on offer, in the device's order.
+    /// Codes of the supported pixel formats, in the order of the device.
     pub(super) fn fourccs(&self) -> Vec<u32> {
         let request_at = |index| abi::FormatDescription { index, kind: abi::VIDEO_CAPTURE, ..Default::default() };
         self.list(&abi::ENUM_FMT, request_at).iter().map(|format| format.fourcc).collect()
     }
 
-    /// Sizes on offer in a format.
+    /// Supported sizes of a format.
     pub(super) fn sizes(&self, fourcc: u32) -> Vec<abi::FrameSize> {
         self.list(&abi::ENUM_FRAMESIZES, |index| abi::FrameSize { index, fourcc, ..Default::default() })
     }
 
-    /// Times between images on offer in a format at a size.
+    /// Supported intervals between images of a format at a size.
     pub(super) fn intervals(&self, fourcc: u32, [width, height]: [u32; 2]) -> Vec<abi::FrameInterval> {
         let request_at = |index| abi::FrameInterval { index, fourcc, width, height, ..Default::default() };
         self.list(&abi::ENUM_FRAMEINTERVALS, request_at)
     }
 
-    /// Asks for a format and tells what the device made of it.
+    /// Requests a format and returns the one that the device selected.
     pub(super) fn set_format(&self, fourcc: u32, [width, height]: [u32; 2]) -> rustix::io::Result<abi::PixFormat> {
         let pix = abi::PixFormat { width, height, fourcc, field: abi::FIELD_NONE, ..Default::default() };
         let mut format = abi::Format { kind: abi::VIDEO_CAPTURE, padding: 0, pix, rest: [0; 19] };
@@ -139,7 +140,8 @@ impl Device {
         Ok(format.pix)
     }
 
-    /// Asks for a rate, images a second, and tells what the device made of it; `None` where it has a rate of its own.
+    /// Requests a rate in images per second and returns the one that the device selected, or `None` if the rate cannot
+    /// be set.
     pub(super) fn set_rate_hz(&self, rate_hz: f64) -> rustix::io::Result<Option<f64>> {
         let mut parm = abi::StreamParm { kind: abi::VIDEO_CAPTURE, capture: Default::default(), rest: [0; 40] };
         if self.ioctl(&abi::G_PARM, &mut parm).is_err() || parm.capture.capability & abi::CAP_TIMEPERFRAME == 0 {
@@ -150,7 +152,7 @@ impl Device {
         Ok(Some(super::format::rate_of(parm.capture.time_per_frame)))
     }
 
-    /// Whether what it receives are high-definition television signals, as of an HDMI grabber.
+    /// Whether the input is a high-definition television signal, as on an HDMI grabber.
     pub(super) fn is_hdtv(&self) -> bool {
         let mut index = 0;
         if self.ioctl(&abi::G_INPUT, &mut index).is_err() {
@@ -160,14 +162,14 @@ impl Device {
         self.ioctl(&abi::ENUMINPUT, &mut input).is_ok() && input.capabilities & abi::INPUT_DV_TIMINGS != 0
     }
 
-    /// What a control is; `None` where the device has none of this number that can be set.
+    /// Description of a control; `None` if the device has no writable control of this id.
     pub(super) fn control(&self, id: u32) -> Option<abi::QueryControl> {
         let mut control = abi::QueryControl { id, ..Default::default() };
         self.ioctl(&abi::QUERYCTRL, &mut control).ok()?;
         (control.flags & (abi::CONTROL_DISABLED | abi::CONTROL_READ_ONLY) == 0).then_some(control)
     }
 
-    /// The entries of a menu control that this device has.
+    /// Entries of a menu control that this device supports.
     pub(super) fn menu(&self, id: u32, range: std::ops::RangeInclusive<i32>) -> Vec<i32> {
         let has = |entry: &i32| {
             u32::try_from(*entry).is_ok_and(|index| {
@@ -187,7 +189,7 @@ impl Device {
         self.ioctl(&abi::S_CTRL, &mut abi::Control { id, value })
     }
 
-    /// Gives the device `n_buffers` to fill (it may take more or fewer) and lets it begin.
+    /// Allocates `n_buffers` buffers (the device may use more or fewer) and starts the stream.
     pub(super) fn stream(self, n_buffers: u32) -> Result<Stream, Refused> {
         let mut requested = abi::RequestBuffers {
             count: n_buffers,
@@ -208,16 +210,16 @@ impl Device {
     }
 }
 
-/// At which step a stream was refused.
+/// Step at which a stream was rejected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// No memory for images, or another program has them.
+    /// No memory for images, or another program uses the device.
     Buffers(Errno),
-    /// `STREAMON`: mostly the bandwidth of USB.
+    /// `STREAMON`, usually because of the USB bandwidth.
     Begin(Errno),
 }
 
-/// A device that sends images.
+/// A streaming device.
 #[derive(Debug)]
 pub(super) struct Stream {
     device: Device,
@@ -229,7 +231,7 @@ impl Stream {
         &self.device
     }
 
-    /// Waits until an image is there (`true`) or the time is over; fails when the device is gone.
+    /// Waits until an image is ready (`true`) or the timeout expires. Fails if the device is disconnected.
     pub(super) fn wait(&self, timeout: Duration) -> rustix::io::Result<bool> {
         let mut poll_fds = [PollFd::new(&self.device.fd, PollFlags::IN)];
         let timeout = Timespec {
@@ -239,11 +241,12 @@ impl Stream {
         match poll(&mut poll_fds, Some(&timeout)) {
             Err(Errno::INTR) => Ok(false),
             Err(error) => Err(error),
-            Ok(_) => Ok(!poll_fds[0].revents().is_empty()), // Errors too: taking the image tells which.
+            Ok(_) => Ok(!poll_fds[0].revents().is_empty()), // Includes errors: taking the image returns the error.
         }
     }
 
-    /// Takes the oldest filled image out of the queue; `None` when none is filled. It has to be given [back](Self::give_back).
+    /// Takes the oldest filled buffer out of the queue; `None` if none is filled. The buffer must be
+    /// [requeued](Self::requeue).
     pub(super) fn take(&mut self) -> rustix::io::Result<Option<FilledBuffer>> {
         let mut buffer = buffer_of(0);
         match self.device.ioctl(&abi::DQBUF, &mut buffer) {
@@ -261,14 +264,14 @@ impl Stream {
         }))
     }
 
-    /// The bytes of an image that was taken; fewer than it says where it says more than there is room for.
+    /// Bytes of a filled buffer, limited to the size of the buffer.
     pub(super) fn bytes(&self, filled: &FilledBuffer) -> &[u8] {
         let Some(mapping) = self.buffers.get(filled.index as usize) else { return &[] };
         let buffer_bytes = mapping.bytes();
         &buffer_bytes[..filled.n_bytes.min(buffer_bytes.len())]
     }
 
-    /// Lets the device fill it again.
+    /// Returns a buffer to the device.
     pub(super) fn requeue(&mut self, filled: FilledBuffer) -> rustix::io::Result<()> {
         self.device.ioctl(&abi::QBUF, &mut buffer_of(filled.index))
     }
@@ -276,7 +279,7 @@ impl Stream {
 
 impl Drop for Stream {
     fn drop(&mut self) {
-        // A device that is gone has stopped already.
+        // A disconnected device has already stopped.
         let _ = self.device.ioctl(&abi::STREAMOFF, &mut abi::VIDEO_CAPTURE.clone());
     }
 }
@@ -285,22 +288,22 @@ fn buffer_of(index: u32) -> abi::Buffer {
     abi::Buffer { index, kind: abi::VIDEO_CAPTURE, memory: abi::MEMORY_MMAP, ..Default::default() }
 }
 
-/// Memory of an image that the kernel shares with us.
+/// Memory of an image buffer shared with the kernel.
 #[derive(Debug)]
 struct Mapped {
     start: *mut c_void,
     n_bytes: usize,
 }
 
-// SAFETY: the mapping belongs to this value alone and may be read from any thread.
+// SAFETY: the mapping is owned by this value and may be read from any thread.
 #[expect(unsafe_code, reason = "a pointer into shared memory")]
 unsafe impl Send for Mapped {}
 
 impl Mapped {
     fn new(fd: impl AsFd, buffer: &abi::Buffer) -> rustix::io::Result<Self> {
         let n_bytes = buffer.length as usize;
-        // SAFETY: a new mapping, placed by the kernel, read only; it lives until `drop`.
-        #[expect(unsafe_code, reason = "the kernel's border")]
+        // SAFETY: a new read-only mapping placed by the kernel; it lives until `drop`.
+        #[expect(unsafe_code, reason = "system call")]
         let start = unsafe {
             rustix::mm::mmap(
                 std::ptr::null_mut(),
@@ -315,10 +318,11 @@ impl Mapped {
     }
 
     fn bytes(&self) -> &[u8] {
-        // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes only between `QBUF` and
-        // `DQBUF`, and `requeue` needs the stream for itself, so no slice is left then. A device that breaks this would show torn
-        // pixels: bytes have no invalid values, and nothing here decides twice on the same byte.
-        #[expect(unsafe_code, reason = "memory that the kernel shares")]
+        // SAFETY: `n_bytes` are mapped for reading as long as this value lives. The device writes only between `QBUF`
+        // and `DQBUF`, and `requeue` borrows the stream mutably, so no slice exists then. A device that violates this
+        // causes torn pixels: bytes have no invalid values, and nothing here reads the same byte twice to make a
+        // decision.
+        #[expect(unsafe_code, reason = "memory shared with the kernel")]
         unsafe {
             std::slice::from_raw_parts(self.start.cast::<u8>(), self.n_bytes)
         }
@@ -328,8 +332,8 @@ impl Mapped {
 impl Drop for Mapped {
     fn drop(&mut self) {
         // SAFETY: mapped in `new` with this length; no slice of it outlives `self`.
-        #[expect(unsafe_code, reason = "the kernel's border")]
+        #[expect(unsafe_code, reason = "system call")]
         let unmapped = unsafe { rustix::mm::munmap(self.start, self.n_bytes) };
-        debug_assert!(unmapped.is_ok(), "an own mapping can be taken away: {unmapped:?}");
+        debug_assert!(unmapped.is_ok(), "unmapping failed: {unmapped:?}");
     }
 }

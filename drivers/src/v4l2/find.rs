@@ -1,4 +1,4 @@
-//! Which V4L2 devices are plugged in, by names that stay the same from boot to boot.
+//! Lists connected V4L2 devices with names that are stable across reboots.
 
 use super::Problem;
 use super::V4l2Format;
@@ -6,54 +6,54 @@ use super::device::Device;
 use super::format::{self, Mode, Rates, Sizes};
 use std::path::{Path, PathBuf};
 
-/// One node of a V4L2 device that gives images.
+/// A node of a V4L2 device that delivers images.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FoundCamera {
-    /// The node, whose number may change: `/dev/video0`.
+    /// Path of the node, such as `/dev/video0`. The number may change.
     pub node: PathBuf,
-    /// What it calls itself.
+    /// Model name.
     pub name: String,
-    /// Where it is plugged in, as the kernel tells: `usb-0000:00:14.0-2`.
+    /// Bus address as reported by the kernel, such as `usb-0000:00:14.0-2`.
     pub bus: String,
-    /// Serial number on USB, where it has one.
+    /// USB serial number, if it has one.
     pub serial: Option<String>,
-    /// The links of udev that stay the same: by device, then by port.
+    /// Stable udev links: by device, then by port.
     pub links: Vec<PathBuf>,
-    /// Speed of its USB, megabits a second.
+    /// Speed of the USB connection, megabits per second.
     pub usb_mbits: Option<f64>,
-    /// All that it offers of what is read here.
+    /// All supported modes.
     pub modes: Vec<Mode>,
 }
 
 impl FoundCamera {
-    /// What to write into a rig file: a link of udev, else its serial number, else where it is plugged in.
+    /// Name for the rig file: a udev link, else the serial number, else the bus address.
     pub fn address(&self) -> String {
         let link = self.links.first().map(|link| link.display().to_string());
         link.or_else(|| self.serial.clone()).unwrap_or_else(|| self.bus.clone())
     }
 
-    /// Bytes a second that its USB carries to one camera; `None` elsewhere.
+    /// USB bandwidth available to one camera, bytes per second; `None` if not on USB.
     pub fn usb_bytes_per_sec(&self) -> Option<f64> {
         self.usb_mbits.map(format::usb_bytes_per_sec)
     }
 
-    /// What it offers that its USB cannot carry, for people.
+    /// Descriptions of modes that exceed the USB bandwidth.
     pub fn modes_exceeding_usb(&self) -> Vec<String> {
         self.usb_bytes_per_sec().map_or(Vec::new(), |bytes_per_sec| format::modes_exceeding(&self.modes, bytes_per_sec))
     }
 }
 
-/// What sysfs tells of a node without opening it.
+/// Attributes of a node in sysfs, available without opening it.
 #[derive(Clone, Debug, PartialEq)]
 struct Node {
     path: PathBuf,
-    /// Its USB device in sysfs; a camera's nodes share it.
+    /// Folder of its USB device in sysfs, which is shared by all nodes of a camera.
     usb: Option<PathBuf>,
     serial: Option<String>,
     usb_mbits: Option<f64>,
 }
 
-/// All that give images, and why the others cannot be opened; nodes of metadata are left out.
+/// All nodes that deliver images, and errors for nodes that cannot be opened. Metadata nodes are skipped.
 pub fn cameras() -> Vec<Result<FoundCamera, Problem>> {
     let root = Path::new("/");
     nodes(root).into_iter().filter_map(|node| describe(root, node).transpose()).collect()
@@ -74,7 +74,7 @@ fn describe(root: &Path, node: Node) -> Result<Option<FoundCamera>, Problem> {
     }))
 }
 
-/// All that a device offers of what is read here.
+/// All modes of a device with supported formats.
 pub(super) fn modes(device: &Device) -> Vec<Mode> {
     let mut modes = Vec::new();
     for fourcc in device.fourccs() {
@@ -88,7 +88,7 @@ pub(super) fn modes(device: &Device) -> Vec<Mode> {
     modes
 }
 
-/// The nodes that a rig file may mean by `device`: a path, or a serial number or place shared by a camera's nodes.
+/// Nodes that match `device` of a rig file: a path, or a serial number or bus address shared by the nodes of a camera.
 pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     if device.starts_with('/') {
         return Ok(vec![PathBuf::from(device)]);
@@ -101,7 +101,7 @@ pub(super) fn candidates(device: &str) -> Result<Vec<PathBuf>, Problem> {
     paths_of_one_camera(device, found)
 }
 
-/// Looks whether something that is plugged in goes by this name of a rig file, without opening it more than to ask.
+/// Checks whether a connected device matches `device` of a rig file. Nodes are only opened to read their bus address.
 pub fn check_connected(device: &str) -> Result<(), Problem> {
     match candidates(device)?.iter().any(|path| path.exists()) {
         true => Ok(()),
@@ -109,7 +109,7 @@ pub fn check_connected(device: &str) -> Result<(), Problem> {
     }
 }
 
-/// The paths of nodes once they are known to be of one camera: makers give serial numbers twice.
+/// Checks that all nodes belong to one camera, since serial numbers are not always unique, and returns their paths.
 fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, Problem> {
     let device = device.to_owned();
     let is_one = found.windows(2).all(|pair| pair[0].usb == pair[1].usb);
@@ -121,7 +121,7 @@ fn paths_of_one_camera(device: &str, found: Vec<Node>) -> Result<Vec<PathBuf>, P
     }
 }
 
-/// Every video node that sysfs knows, in the order of their numbers.
+/// All video nodes in sysfs, in the order of their numbers.
 fn nodes(root: &Path) -> Vec<Node> {
     let class = root.join("sys/class/video4linux");
     let number = |name: &str| name.strip_prefix("video")?.parse::<u32>().ok();
@@ -150,13 +150,13 @@ fn nodes(root: &Path) -> Vec<Node> {
         .collect()
 }
 
-/// The folder of the USB device that an interface belongs to.
+/// Folder of the USB device that an interface belongs to.
 fn usb_folder(device: &Path) -> Option<PathBuf> {
     let folder = device.canonicalize().ok()?;
     folder.ancestors().find(|ancestor| ancestor.join("idVendor").exists()).map(Path::to_owned)
 }
 
-/// The links of udev that lead to a node: those by device before those by port.
+/// Udev links to a node: by device, then by port.
 fn stable_links(root: &Path, node: &Path) -> Vec<PathBuf> {
     let Ok(node) = node.canonicalize() else { return Vec::new() };
     let links_in = |folder: &str| {
@@ -206,7 +206,7 @@ mod tests {
             Node { path: root.join("dev/video9"), usb: None, serial: None, usb_mbits: None },
             Node {
                 path: node.clone(),
-                usb: Some(usb.canonicalize().expect("it is there")),
+                usb: Some(usb.canonicalize().expect("the folder exists")),
                 serial: Some("A1B2".into()),
                 usb_mbits: Some(480.0),
             },
@@ -236,8 +236,8 @@ mod tests {
     fn no_device_found_when_none_connected() {
         let root = tempfile::tempdir().expect("a folder");
         assert_eq!(nodes(root.path()), []);
-        let message = candidates("no such serial").expect_err("nothing of that name").to_string();
+        let message = candidates("no such serial").expect_err("no camera has this name").to_string();
         assert!(message.contains("no such serial") && message.contains("fieldrig devices"), "{message}");
-        assert_eq!(candidates("/dev/video99").expect("a path is a path"), [PathBuf::from("/dev/video99")]);
+        assert_eq!(candidates("/dev/video99").expect("paths are returned unchanged"), [PathBuf::from("/dev/video99")]);
     }
 }

@@ -1,4 +1,4 @@
-//! Which pixel formats, sizes and rates V4L2 devices offer, and which of them is taken.
+//! Pixel formats, sizes and rates of V4L2 devices, and the choice among them.
 //!
 //! Source of the codes and layouts: Linux `videodev2.h` and its documentation of image formats.
 
@@ -6,11 +6,11 @@ use super::V4l2Format;
 use super::abi::{DISCRETE, Fraction, FrameInterval, FrameSize};
 use crate::{Error, PixelFormat, V4l2Colors, YuvColors, YuvLayout};
 
-/// Rates that differ by less than this share are the same: devices tell fractions of whole numbers.
+/// Rates with a smaller relative difference are considered equal, because devices report fractions of integers.
 const SAME_RATE_FRAC: f64 = 0.01;
 
 impl V4l2Format {
-    /// Codes of the kernel; some devices call MJPEG by another.
+    /// Kernel codes of the formats. Some devices use another one for MJPEG.
     const CODES: [(&[u8; 4], Self); 9] = [
         (b"YUYV", Self::Yuyv),
         (b"UYVY", Self::Uyvy),
@@ -23,18 +23,18 @@ impl V4l2Format {
         (b"Z16 ", Self::Z16),
     ];
 
-    /// The format of a code.
+    /// Format of a kernel code.
     pub(super) fn from_fourcc(fourcc: u32) -> Option<Self> {
         Self::CODES.iter().find(|(code, _)| u32::from_le_bytes(**code) == fourcc).map(|(_, format)| *format)
     }
 
-    /// The usual code of a format.
+    /// Default kernel code of a format.
     fn fourcc(self) -> u32 {
         let default_code = Self::CODES.iter().find(|(_, format)| *format == self);
         default_code.map_or(0, |(code, _)| u32::from_le_bytes(**code))
     }
 
-    /// Bytes a second of images of a size at a rate; `None` where compression decides.
+    /// Bytes per second of images of a size at a rate; `None` for compressed formats.
     pub fn bytes_per_sec(self, [width, height]: [u32; 2], rate_hz: f64) -> Option<f64> {
         let bytes_per_pixel = match self {
             Self::Mjpeg => return None,
@@ -46,7 +46,7 @@ impl V4l2Format {
         Some(bytes_per_pixel * f64::from(width) * f64::from(height) * rate_hz)
     }
 
-    /// How its bytes are read; `meters_per_count` counts for depth only.
+    /// Pixel format for decoding. `meters_per_count` is only used for depth.
     pub(super) fn pixels(self, colors: V4l2Colors, meters_per_count: f64) -> Result<PixelFormat, Error> {
         let yuv = |layout| Ok(PixelFormat::Yuv { layout, colors: YuvColors::from_v4l2(colors)? });
         match self {
@@ -62,53 +62,53 @@ impl V4l2Format {
     }
 }
 
-/// One thing that a device offers: a format at a size, with its rates.
+/// A mode of a device: a format with its sizes and rates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mode {
-    /// Its code, which the device is asked with.
+    /// Kernel code of the format.
     pub(super) fourcc: u32,
     /// The format.
     pub format: V4l2Format,
-    /// The sizes.
+    /// Supported sizes.
     pub sizes: Sizes,
-    /// Images a second at these sizes (at the largest, where there are several).
+    /// Images per second at these sizes (for a range of sizes, at the largest).
     pub rates: Rates,
 }
 
 /// Sizes of images, pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Sizes {
-    /// One.
+    /// A single size.
     One([u32; 2]),
-    /// Any from the least to the most, in steps, by width and height.
+    /// Any size in a range, in steps, for width and height separately.
     Range {
-        /// Least.
+        /// Minimum.
         min: [u32; 2],
-        /// Most.
+        /// Maximum.
         max: [u32; 2],
-        /// Steps.
+        /// Step.
         step: [u32; 2],
     },
 }
 
-/// Images a second.
+/// Rates, images per second.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Rates {
-    /// The device does not tell.
+    /// The device does not report rates.
     Unknown,
     /// One of these.
     List(Vec<f64>),
-    /// Any in this range.
+    /// Any rate in this range.
     Range {
-        /// Slowest.
+        /// Lowest rate.
         min_hz: f64,
-        /// Fastest.
+        /// Highest rate.
         max_hz: f64,
     },
 }
 
 impl Mode {
-    /// A format at one size with the rates of a list.
+    /// A format at one size with a list of rates.
     pub fn new(format: V4l2Format, size_px: [u32; 2], rates_hz: &[f64]) -> Self {
         Self { fourcc: format.fourcc(), format, sizes: Sizes::One(size_px), rates: Rates::List(rates_hz.to_vec()) }
     }
@@ -123,7 +123,7 @@ impl Sizes {
         }
     }
 
-    /// The largest.
+    /// Largest size.
     pub(super) fn max(&self) -> [u32; 2] {
         match self {
             Self::One(size) => *size,
@@ -165,7 +165,7 @@ impl Rates {
     }
 }
 
-/// The mode to take: of a format, if one is asked for, else the first in the order of [`V4l2Format::COLOR_FORMATS`].
+/// Selects a mode: of the given format, else of the first suitable one in [`V4l2Format::COLOR_FORMATS`].
 pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 2], rate_hz: f64) -> Option<&Mode> {
     let fits = |mode: &&Mode| mode.sizes.has(size_px) && mode.rates.has(rate_hz);
     let of = |format: V4l2Format| modes.iter().filter(move |mode| mode.format == format).find(fits);
@@ -175,15 +175,16 @@ pub(super) fn choose(modes: &[Mode], format: Option<V4l2Format>, size_px: [u32; 
     }
 }
 
-/// Place of a format in the order in which they are preferred; depth, which is asked for by name, comes last.
+/// Index of a format in order of preference. Depth comes last because it is only selected explicitly.
 pub(super) fn rank(format: V4l2Format) -> usize {
     V4l2Format::COLOR_FORMATS.iter().position(|(_, each)| *each == format).unwrap_or(V4l2Format::COLOR_FORMATS.len())
 }
 
-/// Bytes a second that USB carries to one camera, by the speed that sysfs tells: the largest isochronous transfer of an endpoint.
+/// USB bandwidth for one camera in bytes per second at the speed reported by sysfs: the largest isochronous transfer of
+/// an endpoint.
 ///
-/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes a millisecond, high speed 3072 bytes in 125 us), USB 3.2 section 8.12.6
-/// (48 KiB in 125 us; twice that at 10 Gbit/s).
+/// Source: USB 2.0 section 5.6.3 (full speed 1023 bytes per millisecond, high speed 3072 bytes in 125 us), USB 3.2
+/// section 8.12.6 (48 KiB in 125 us; twice that at 10 Gbit/s).
 pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     match mbits {
         mbits if mbits < 480.0 => 1023.0 * 1e3,
@@ -193,7 +194,7 @@ pub(super) fn usb_bytes_per_sec(mbits: f64) -> f64 {
     }
 }
 
-/// What of some modes takes more than so many bytes a second: the slowest rate of each that does, for people.
+/// Describes modes that exceed a bandwidth: for each, the lowest rate that does.
 pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String> {
     let exceeds = |mode: &Mode| {
         let [width, height] = mode.sizes.max();
@@ -215,17 +216,17 @@ pub(super) fn modes_exceeding(modes: &[Mode], bytes_per_sec: f64) -> Vec<String>
     modes.iter().filter_map(exceeds).collect()
 }
 
-/// Whether two rates, images a second, are one rate told in two ways.
+/// Whether two rates, in images per second, are considered equal.
 pub(super) fn is_same_rate(one_hz: f64, other_hz: f64) -> bool {
     (one_hz - other_hz).abs() <= SAME_RATE_FRAC * other_hz
 }
 
-/// Images a second of the time between two.
+/// Rate in images per second of an interval.
 pub(super) fn rate_of(interval: Fraction) -> f64 {
     f64::from(interval.denominator) / f64::from(interval.numerator.max(1))
 }
 
-/// Time between two images of a rate, in the kernel's fractions: exact for whole rates, to a millionth for others.
+/// Interval of a rate as a kernel fraction: exact for integer rates, otherwise accurate to one millionth.
 pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     const PARTS: f64 = 1e6;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a rig's rates are 0.01 to 1000")]
@@ -236,7 +237,7 @@ pub(super) fn interval_of(rate_hz: f64) -> Fraction {
     }
 }
 
-/// What some modes offer, for people: each format with its sizes and the highest rate at each.
+/// Describes modes for messages: each format with its sizes and the highest rate at each.
 pub fn summary(modes: &[Mode]) -> String {
     let size = |mode: &Mode| {
         let sizes = match &mode.sizes {
@@ -256,7 +257,7 @@ pub fn summary(modes: &[Mode]) -> String {
     };
     let formats = V4l2Format::COLOR_FORMATS.iter().map(|(_, format)| *format).chain([V4l2Format::Z16]);
     let all: Vec<_> = formats.filter_map(of_format).collect();
-    if all.is_empty() { "no format that is read here".to_owned() } else { all.join("; ") }
+    if all.is_empty() { "no supported format".to_owned() } else { all.join("; ") }
 }
 
 #[cfg(test)]
@@ -266,7 +267,7 @@ mod tests {
     #[test]
     fn uncompressed_format_is_preferred_at_sufficient_rate() {
         use V4l2Format::{Grey, Mjpeg, Yuyv, Z16};
-        // As a USB 2 webcam offers them.
+        // Modes of a typical USB 2 webcam.
         let modes = [
             Mode::new(Mjpeg, [1280, 720], &[30.0, 15.0]),
             Mode::new(Yuyv, [640, 480], &[30.0]),
@@ -282,7 +283,7 @@ mod tests {
         assert_eq!(chosen(None, [640, 480], 25.0), None);
         assert_eq!(chosen(Some(Yuyv), [1280, 720], 30.0), None);
         assert_eq!(chosen(Some(Z16), [848, 480], 30.0), Some(Z16));
-        assert_eq!(chosen(None, [848, 480], 30.0), Some(Grey), "depth is never taken for color");
+        assert_eq!(chosen(None, [848, 480], 30.0), Some(Grey), "depth is never selected as color");
     }
 
     #[test]
@@ -317,7 +318,7 @@ mod tests {
 
     #[test]
     fn modes_exceeding_usb_bandwidth_are_listed() {
-        let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("not compressed");
+        let bytes = V4l2Format::Yuyv.bytes_per_sec([2560, 1440], 30.0).expect("an uncompressed format");
         assert_eq!((bytes / 1e6).round(), 221.0);
         assert_eq!(V4l2Format::Mjpeg.bytes_per_sec([2560, 1440], 30.0), None);
         let modes = [
@@ -350,6 +351,6 @@ mod tests {
         ];
         let reported = "yuyv: 640x480 up to 29.97 Hz, 1280x720 up to 10 Hz; mjpeg: 1280x720 up to 30 Hz";
         assert_eq!(summary(&modes), reported);
-        assert_eq!(summary(&[]), "no format that is read here");
+        assert_eq!(summary(&[]), "no supported format");
     }
 }

@@ -1,8 +1,9 @@
-//! Cameras of the kernel's `Video4Linux2`: webcams, capture cards, and depth cameras without their makers' software.
+//! Cameras of the kernel's `Video4Linux2`: webcams, capture cards, and depth cameras without vendor software.
 //!
-//! `abi.rs` is the kernel's interface, `device.rs` the only place that crosses into it; `format.rs` and `controls.rs` are tables
-//! of what cameras offer and how they are set; `stream.rs` moves bytes, `camera.rs` survives an unplugged cable. Elsewhere than on
-//! Linux only the names are there, which rig files have everywhere.
+//! `abi.rs` declares the kernel interface, and only `device.rs` calls it. `config.rs` and `problem.rs` define
+//! configuration and errors. `find.rs` lists devices; `format.rs`, `pixel_format.rs` and `controls.rs` select formats
+//! and settings; `stream.rs` and `sequence.rs` read images; `camera.rs` handles disconnections. On other systems than
+//! Linux, only the names of the formats are available, since rig files need them everywhere.
 
 #[cfg(target_os = "linux")]
 mod abi;
@@ -40,10 +41,10 @@ pub use pixel_format::V4l2Format;
 #[cfg(target_os = "linux")]
 pub use problem::Problem;
 
-/// Which of several waiting images is delivered next.
+/// Which of several queued images is delivered next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Delivery {
-    /// The oldest: none is lost as long as the caller keeps up on the whole.
+    /// The oldest. No images are dropped as long as the caller keeps up on average.
     Every,
     /// The newest; older ones count as skipped.
     Newest,

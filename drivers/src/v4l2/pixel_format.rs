@@ -1,29 +1,29 @@
-//! Names of pixel formats, as rig files have them on every system.
+//! Names of pixel formats in rig files, on all systems.
 
-/// The pixel formats that are read.
+/// Supported pixel formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum V4l2Format {
-    /// `YUYV`: two bytes a pixel.
+    /// `YUYV`: two bytes per pixel.
     Yuyv,
-    /// `UYVY`: two bytes a pixel.
+    /// `UYVY`: two bytes per pixel.
     Uyvy,
     /// `NV12`: three bytes for two pixels.
     Nv12,
-    /// `RGB3`: three bytes a pixel.
+    /// `RGB3`: three bytes per pixel.
     Rgb,
-    /// `BGR3`: three bytes a pixel.
+    /// `BGR3`: three bytes per pixel.
     Bgr,
-    /// `MJPG` or `JPEG`: compressed, far less than a byte a pixel.
+    /// `MJPG` or `JPEG`: compressed, far less than one byte per pixel.
     Mjpeg,
-    /// `GREY`: one byte a pixel.
+    /// `GREY`: one byte per pixel.
     Grey,
-    /// `Z16`: depth, two bytes a pixel.
+    /// `Z16`: depth, two bytes per pixel.
     Z16,
 }
 
 impl V4l2Format {
-    /// Those of color with their names in rig files, in the order in which they are preferred: what is not compressed before
-    /// what is, colors before grey.
+    /// Formats of color images by their name in rig files, in order of preference: uncompressed before compressed,
+    /// color before gray.
     pub const COLOR_FORMATS: [(&str, Self); 7] = [
         ("yuyv", Self::Yuyv),
         ("uyvy", Self::Uyvy),
@@ -34,7 +34,7 @@ impl V4l2Format {
         ("grey", Self::Grey),
     ];
 
-    /// Its name in rig files.
+    /// Name in rig files.
     pub fn name(self) -> &'static str {
         Self::COLOR_FORMATS.iter().find(|(_, format)| *format == self).map_or("z16", |(name, _)| name)
     }

@@ -1,22 +1,22 @@
-//! What can be wrong with a V4L2 camera, and what to do about it.
+//! Problems with V4L2 cameras and their remedies.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// What is wrong with a V4L2 camera.
+/// Problem with a V4L2 camera.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Problem {
-    /// Nothing that is plugged in goes by this name.
-    #[error("no V4L2 camera goes by {device:?}: `fieldrig devices` lists those that are plugged in")]
+    /// No connected camera has this name.
+    #[error("no V4L2 camera named {device:?} found: `fieldrig devices` lists the connected cameras")]
     NoDevice {
-        /// Path, serial number or place of the rig file.
+        /// Path, serial number or bus address in the rig file.
         device: String,
     },
-    /// Several cameras go by this name.
-    #[error("several cameras go by {device:?} ({nodes:?}): name the port instead, by a link of /dev/v4l/by-path")]
+    /// Several cameras have this name.
+    #[error("several cameras match {device:?} ({nodes:?}): select one by its port, with a link in /dev/v4l/by-path")]
     Ambiguous {
-        /// Serial number or place of the rig file.
+        /// Serial number or bus address in the rig file.
         device: String,
         /// Their nodes.
         nodes: Vec<PathBuf>,
@@ -30,111 +30,111 @@ pub enum Problem {
     Open {
         /// The node.
         path: PathBuf,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The node is of another kind.
+    /// The node does not deliver images.
     #[error(
-        "{path:?} gives no images by streaming: one camera may have several nodes, the first is mostly that of images"
+        "{path:?} cannot stream images: a camera may have several nodes; use the first one, which usually delivers images"
     )]
     NotACamera {
         /// The node.
         path: PathBuf,
     },
-    /// It does not offer what is asked for.
+    /// The device does not support the requested mode.
     #[error("it does not offer {requested}; it offers {offered}")]
     NoMode {
-        /// Format, size and rate of the rig file.
+        /// Requested format, size and rate.
         requested: String,
-        /// All that it has.
+        /// All modes of the device.
         offered: String,
     },
-    /// It offers something, but does otherwise.
-    #[error("asked for {requested}, it gives {got}")]
+    /// The device selected another mode than the requested one.
+    #[error("requested {requested}, but it selected {got}")]
     OtherMode {
-        /// Asked for.
+        /// Requested mode.
         requested: String,
-        /// Told back.
+        /// Mode reported by the device.
         got: String,
     },
-    /// Depth without a scale.
-    #[error("its depth counts need camera.NAME.depth.meters_per_count in the rig file (0.001 for a RealSense D4xx)")]
+    /// The scale of depth is missing.
+    #[error("depth requires camera.NAME.depth.meters_per_count in the rig file (0.001 for a RealSense D4xx)")]
     NoDepthScale,
-    /// Another program holds it.
-    #[error("another program uses it: `fuser -v {}` names it", path.display())]
+    /// Another program uses the device.
+    #[error("another program uses it: `fuser -v {}` shows which", path.display())]
     Busy {
         /// The node.
         path: PathBuf,
     },
-    /// The kernel found no room for the stream on USB.
+    /// The USB bandwidth is not sufficient for the stream.
     #[error(
-        "USB has no bandwidth left for {mode}{}: choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or plug it into a port of another USB controller (`lsusb -t` shows them)",
+        "USB has no bandwidth left for {mode}{}: choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a port of another USB controller (`lsusb -t` lists them)",
         bytes_per_sec.map_or(String::new(), |bytes| format!(" ({:.0} MB/s)", bytes / 1e6))
     )]
     Bandwidth {
         /// Format, size and rate.
         mode: String,
-        /// What it needs, where compression does not decide.
+        /// Required bandwidth, bytes per second; `None` for compressed formats.
         bytes_per_sec: Option<f64>,
     },
-    /// A request failed.
-    #[error("it refuses to {what}: {source}")]
+    /// The device rejected a request.
+    #[error("it rejected {what}: {source}")]
     Refused {
-        /// What was asked.
+        /// Subject of the request.
         what: &'static str,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The rig file sets something that the camera does not have.
-    #[error("it has no control for {control}: leave the key out")]
+    /// The camera lacks a control that the rig file sets.
+    #[error("it has no control for {control}: remove the key")]
     NoControl {
         /// Name of the key.
         control: &'static str,
     },
-    /// The rig file sets something to a value that the camera does not know.
-    #[error("{control} is {requested}, it takes {min} to {max} in steps of {step}")]
+    /// A setting is outside the range of the camera.
+    #[error("{control} is {requested}, allowed: {min} to {max} in steps of {step}")]
     ControlRange {
         /// Name of the key.
         control: &'static str,
-        /// Asked for, in the units of the key.
+        /// Requested value, in the units of the key.
         requested: f64,
-        /// Least.
+        /// Minimum.
         min: f64,
-        /// Most.
+        /// Maximum.
         max: f64,
         /// Step.
         step: f64,
     },
-    /// It took a setting and tells another one.
-    #[error("{control} was set to {requested} and reads {got}")]
+    /// The camera reports a different value after a setting was written.
+    #[error("{control} was set to {requested} and reads back as {got}")]
     ReadBack {
         /// Name of the control.
         control: &'static str,
-        /// What was set, counts of the device.
+        /// Value that was set, in units of the device.
         requested: i32,
-        /// What it tells, counts of the device.
+        /// Value that was read back, in units of the device.
         got: i32,
     },
-    /// It was unplugged.
-    #[error("it was unplugged ({source})")]
+    /// The device was disconnected.
+    #[error("it was disconnected ({source})")]
     Unplugged {
-        /// What the kernel says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// It sends nothing.
-    #[error("it sent no whole image for {waited:?}")]
+    /// The device delivers no images.
+    #[error("it sent no complete image for {waited:?}")]
     Silent {
-        /// How long.
+        /// Time since the last image.
         waited: Duration,
     },
-    /// It went away and did not come back in time.
-    #[error("it was lost, and not there again after {waited:?} and {n_tries} tries: {last}")]
+    /// The device disconnected and did not reconnect in time.
+    #[error("it disconnected and did not reconnect within {waited:?} ({n_tries} attempts): {last}")]
     Lost {
-        /// Since when.
+        /// Time since it disconnected.
         waited: Duration,
-        /// How often it was tried.
+        /// Number of attempts to reopen it.
         n_tries: u32,
-        /// What came of the last try.
+        /// Problem at the last attempt.
         last: Box<Self>,
     },
 }

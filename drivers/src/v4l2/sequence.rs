@@ -1,15 +1,16 @@
-//! Counts the images that a device numbered and did not deliver.
+//! Detects missing images by their sequence numbers.
 
-/// Where a stream stands.
+/// Sequence number of the last image.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sequence {
     last: Option<u32>,
 }
 
 impl Sequence {
-    /// Takes the number of the next image; tells how many numbers before it never came.
+    /// Records the sequence number of the next image and returns the number of images missing before it.
     ///
-    /// Numbers may wrap. One that repeats or goes back tells nothing: some devices do not count, or begin anew.
+    /// Numbers may wrap. A number that repeats or decreases is not counted, because some devices do not count or
+    /// restart.
     pub(super) fn n_skipped_before(&mut self, number: u32) -> u64 {
         let ahead = self.last.replace(number).map_or(1, |last| number.wrapping_sub(last));
         if ahead > u32::MAX / 2 { 0 } else { u64::from(ahead.saturating_sub(1)) }
@@ -25,7 +26,7 @@ mod tests {
         let reported = [5, 6, 9, 10, u32::MAX - 1, 1, 1, 1, 2, 0, 1, 4];
         let mut sequence = Sequence::default();
         let skipped: Vec<u64> = reported.map(|number| sequence.n_skipped_before(number)).into();
-        // From 10 to almost the end of the numbers is further than half way round: the device began anew.
+        // The jump from 10 to almost the maximum is more than half of the number range, so it counts as a restart.
         assert_eq!(skipped, [0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 2]);
     }
 }

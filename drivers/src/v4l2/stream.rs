@@ -1,4 +1,4 @@
-//! A V4L2 device that streams: from the node to stamped images.
+//! Streams from a V4L2 device and converts buffers to stamped images.
 
 use super::abi::{FIELD_ANY, FIELD_NONE, PixFormat};
 use super::controls::{self, AppliedSettings};
@@ -13,14 +13,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Images that the device may fill while we copy one: a quarter of a second at 30 Hz.
+/// Number of image buffers: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
-/// A stamp so long before the stream began, or after now, is of another clock, whatever its flag says.
+/// A stamp that is earlier than the start of the stream or later than now by more than this is of another clock,
+/// whatever its flag says.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
-/// Asking for the exposure of each image may take this share of the time between two.
+/// Maximum duration of an exposure query, as a fraction of the time between two images.
 const MAX_EXPOSURE_QUERY_FRAC: f64 = 0.25;
 
-/// A device that streams.
+/// A streaming device.
 #[derive(Debug)]
 pub(super) struct V4l2Stream {
     stream: Stream,
@@ -32,7 +33,7 @@ pub(super) struct V4l2Stream {
     applied: AppliedSettings,
     sequence: Sequence,
     started_at: Stamp,
-    /// Lost and not told yet.
+    /// Number of lost images that are not reported yet.
     n_unreported: u64,
     n_images: u64,
     n_damaged: u64,
@@ -41,11 +42,12 @@ pub(super) struct V4l2Stream {
 }
 
 impl V4l2Stream {
-    /// Finds the device of a config and starts it.
+    /// Opens the device of a configuration and starts its stream.
     pub(super) fn start(config: &Config) -> Result<Self, Error> {
         let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
         let candidates = find::candidates(&config.device).map_err(named)?;
-        // A depth camera has nodes for color, infrared and depth under one serial number: the best that fits is meant.
+        // A depth camera has nodes for color, infrared and depth under one serial number. The node with the most
+        // preferred format is used.
         let rank = |path: &&PathBuf| {
             let modes = open(config, path).map(|device| find::modes(&device)).unwrap_or_default();
             let mode = format::choose(&modes, config.format, config.intrinsics.size_px, config.rate_hz);
@@ -97,7 +99,7 @@ impl V4l2Stream {
         })
     }
 
-    /// Node, mode and settings, for people.
+    /// Description of node, mode and settings for the log.
     pub(super) fn describe(&self) -> String {
         let settings: Vec<_> = self.applied.read_back.iter().map(|(name, value)| format!("{name} {value}")).collect();
         format!("{}, {}; read back: {}", self.path.display(), self.mode, settings.join(", "))
@@ -107,22 +109,22 @@ impl V4l2Stream {
         &self.applied.read_back
     }
 
-    /// Images given out since the start.
+    /// Number of images returned since the start.
     pub(super) fn n_images(&self) -> u64 {
         self.n_images
     }
 
-    /// Images since the start that came damaged; they are among the skipped ones.
+    /// Number of damaged images since the start. They also count as skipped.
     pub(super) fn n_damaged(&self) -> u64 {
         self.n_damaged
     }
 
-    /// Since when no whole image came.
+    /// Time since the last complete image.
     pub(super) fn time_since_image(&self) -> Duration {
         self.last_image_at.elapsed()
     }
 
-    /// Drops what came before anybody asked: it counts as lost no more than what came before the stream began.
+    /// Discards images that arrived before the first request. They do not count as lost.
     pub(super) fn discard_queued(&mut self) -> Result<(), Problem> {
         for _ in 0..N_BUFFERS {
             let Some(filled) = self.stream.take().map_err(lost)? else { break };
@@ -132,7 +134,8 @@ impl V4l2Stream {
         Ok(())
     }
 
-    /// The next image, or `None` when none came until the deadline; an error means that the device is lost.
+    /// Returns the next image, or `None` if none came before the deadline. An error means that the device was
+    /// disconnected.
     pub(super) fn next_image(&mut self, config: &Config, deadline: Instant) -> Result<Option<Image>, Problem> {
         loop {
             let Some(filled) = self.next_filled(config.delivery, deadline)? else { return Ok(None) };
@@ -161,7 +164,7 @@ impl V4l2Stream {
         }
     }
 
-    /// The image to hand out: the oldest that waits, or the newest, which gives the older ones back.
+    /// Takes the next buffer to deliver: the oldest, or the newest, in which case older ones are requeued.
     fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<FilledBuffer>, Problem> {
         let mut taken: Option<FilledBuffer> = None;
         loop {
@@ -186,7 +189,7 @@ impl V4l2Stream {
         }
     }
 
-    /// Copies an image out of the shared memory, without the padding of its rows.
+    /// Copies an image out of shared memory and removes the padding of its rows.
     fn image_of(&mut self, filled: &FilledBuffer, size_px: [u32; 2]) -> Result<Image, Error> {
         let stamp = self.stamp_of(filled);
         Image {
@@ -201,7 +204,8 @@ impl V4l2Stream {
         .pack_rows(self.bytes_per_line)
     }
 
-    /// The device's stamp where it is of our clock, else now. `stamp_to_mid_exposure_millis` of the rig file says what it means.
+    /// The stamp of the device if it is on our clock, else the current time. `stamp_to_mid_exposure_millis` of the rig
+    /// file defines its relation to the exposure.
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
@@ -211,14 +215,14 @@ impl V4l2Stream {
         }
         if !std::mem::replace(&mut self.has_warned_of_clock, true) {
             log::warn!(
-                "camera {:?}: its stamps are not of the monotonic clock; images are stamped as they arrive",
+                "camera {:?}: its stamps are not of the monotonic clock; images are stamped on arrival",
                 self.camera
             );
         }
         now
     }
 
-    /// Fixed, or what the camera tells now; not asked for again once asking fails or takes too long.
+    /// Exposure time, either fixed or read from the camera. If reading fails or takes too long, it is not read again.
     fn exposure_secs(&mut self, rate_hz: f64) -> Option<f64> {
         if !self.applied.reports_exposure {
             return self.applied.exposure_secs;
@@ -227,24 +231,27 @@ impl V4l2Stream {
         let exposure_secs = controls::exposure_secs(self.stream.device());
         let elapsed = started_at.elapsed();
         if exposure_secs.is_none() || elapsed.as_secs_f64() * rate_hz > MAX_EXPOSURE_QUERY_FRAC {
-            log::warn!("camera {:?}: asking for its exposure took {elapsed:?}; it is not told any more", self.camera);
+            log::warn!(
+                "camera {:?}: reading its exposure time failed or took too long ({elapsed:?}); it is no longer recorded",
+                self.camera
+            );
             self.applied.reports_exposure = false;
         }
         exposure_secs
     }
 }
 
-/// Why a stream did not begin; `ENOSPC` is how the kernel says that USB has no bandwidth left (`usb_submit_urb`).
+/// Converts the error of a stream that did not start. `ENOSPC` means that USB has no bandwidth left (`usb_submit_urb`).
 fn stream_problem(refused: Refused, path: &Path, mode: String, bytes_per_sec: Option<f64>) -> Problem {
     match refused {
         Refused::Begin(Errno::NOSPC) => Problem::Bandwidth { mode, bytes_per_sec },
         Refused::Buffers(Errno::BUSY) | Refused::Begin(Errno::BUSY) => Problem::Busy { path: path.to_owned() },
-        Refused::Buffers(error) => Problem::Refused { what: "share memory for images", source: error.into() },
-        Refused::Begin(error) => Problem::Refused { what: "begin its stream", source: error.into() },
+        Refused::Buffers(error) => Problem::Refused { what: "shared memory for images", source: error.into() },
+        Refused::Begin(error) => Problem::Refused { what: "the start of its stream", source: error.into() },
     }
 }
 
-/// A device that streamed and fails is unplugged, or as good as that.
+/// An error of a streaming device is treated as a disconnection.
 fn lost(error: Errno) -> Problem {
     Problem::Unplugged { source: error.into() }
 }
@@ -261,7 +268,7 @@ fn open(config: &Config, path: &Path) -> Result<Device, Problem> {
     }
 }
 
-/// Chooses the mode and sets it; the device must do exactly that.
+/// Selects and sets a mode, and checks that the device uses exactly that mode.
 fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixFormat), Problem> {
     let modes = find::modes(device);
     let (size_px, rate_hz) = (config.intrinsics.size_px, config.rate_hz);
@@ -271,7 +278,7 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
     })?;
     let refused = |error| match error {
         Errno::BUSY => Problem::Busy { path: path.to_owned() },
-        error => Problem::Refused { what: "take the format", source: std::io::Error::from(error) },
+        error => Problem::Refused { what: "the format", source: std::io::Error::from(error) },
     };
     let pix = device.set_format(mode.fourcc, size_px).map_err(refused)?;
     let got_hz = device.set_rate_hz(rate_hz).map_err(refused)?;
@@ -283,10 +290,13 @@ fn set_mode(config: &Config, path: &Path, device: &Device) -> Result<(Mode, PixF
         return Err(Problem::OtherMode { requested: requested(config, Some(mode.format)), got });
     }
     if ![FIELD_ANY, FIELD_NONE].contains(&pix.field) {
-        log::warn!("camera {:?}: it sends every other row at another time (interlaced)", config.name);
+        log::warn!(
+            "camera {:?}: it sends interlaced images; alternate rows are exposed at different times",
+            config.name
+        );
     }
     if got_hz.is_none() {
-        log::warn!("camera {:?}: its rate cannot be set; rate_hz of the rig file is taken for it", config.name);
+        log::warn!("camera {:?}: its rate cannot be set; assuming rate_hz of the rig file", config.name);
     }
     Ok((mode.clone(), pix))
 }
@@ -317,6 +327,6 @@ mod tests {
         let compressed = reported(Refused::Begin(Errno::NOSPC), "mjpeg 2560x1440 at 30 Hz", None);
         assert!(compressed.starts_with("USB has no bandwidth left for mjpeg 2560x1440 at 30 Hz: "), "{compressed}");
         assert!(reported(Refused::Buffers(Errno::BUSY), "", None).contains("fuser -v /dev/video0"));
-        assert!(reported(Refused::Begin(Errno::IO), "", None).starts_with("it refuses to begin its stream: "));
+        assert!(reported(Refused::Begin(Errno::IO), "", None).starts_with("it rejected the start of its stream: "));
     }
 }

@@ -1,4 +1,4 @@
-//! Functions of librealsense2 for software devices, which `realsense-sys` leaves out.
+//! Functions of librealsense2 for software devices that `realsense-sys` does not declare.
 //!
 //! Source: `include/librealsense2/h/rs_internal.h` of 2.56.
 

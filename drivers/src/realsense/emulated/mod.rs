@@ -1,7 +1,7 @@
-//! A RealSense camera that is played into a file: a software device of the library, recorded by the library's own recorder, so that
-//! the file is like any other that it writes.
+//! Emulates a RealSense camera by writing a file. A software device of the library is recorded by the library itself,
+//! so the file has the same format as any other recording.
 
-#![expect(unsafe_code, reason = "the border to a C library")]
+#![expect(unsafe_code, reason = "FFI to a C library")]
 
 mod abi;
 
@@ -19,13 +19,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Images that the library may still have to write: it drops what it cannot keep, so it is waited for.
+/// Maximum number of images that the library still has to write. We wait for it because it drops images that it cannot
+/// store.
 const MAX_QUEUED_IMAGES: usize = 16;
-/// A disk that takes no image for this long is full, or gone.
+/// If no image is written for this long, the disk is assumed to be full or disconnected.
 const MAX_WAIT: Duration = Duration::from_secs(30);
-/// How often it is looked for whether images were written.
+/// Interval of checks for written images.
 const POLL: Duration = Duration::from_millis(1);
-/// As the D400 family names its sensors; it counts the exposure of the second one in 100 us.
+/// Sensor names of the D400 family. The exposure of the RGB camera is in units of 100 us.
 const DEPTH_SENSOR: &CStr = c"Stereo Module";
 const IMAGE_SENSOR: &CStr = c"RGB Camera";
 const IMAGE_EXPOSURE_SECS: f64 = 100e-6;
@@ -33,41 +34,41 @@ const DEPTH_EXPOSURE_SECS: f64 = 1e-6;
 const NANOS_PER_MILLI: f64 = 1e6;
 const NANOS_PER_MICRO: i64 = 1000;
 
-/// The camera that a file pretends to be of.
+/// The camera that a file emulates.
 #[derive(Clone, Debug)]
 pub struct EmulatedCamera {
-    /// What it calls itself.
+    /// Model name.
     pub name: String,
     /// Its serial number.
     pub serial: String,
-    /// Images a second.
+    /// Images per second.
     pub rate_hz: u16,
-    /// Lens of the colour images.
+    /// Lens parameters of the color images.
     pub intrinsics: Intrinsics,
-    /// How their bytes are to be read: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes a pixel.
+    /// Format of the color images: [`PixelFormat::Rgb8`], `Bgr8`, or `Yuv` with two bytes per pixel.
     pub format: PixelFormat,
-    /// Its depth.
+    /// Its depth camera, if any.
     pub depth: Option<EmulatedDepth>,
 }
 
-/// Depth of such a camera.
+/// Depth camera of an emulated camera.
 #[derive(Clone, Debug)]
 pub struct EmulatedDepth {
-    /// Its lens.
+    /// Its lens parameters.
     pub intrinsics: Intrinsics,
-    /// Pose of the depth camera in the frame of the colour camera.
+    /// Pose of the depth camera in the frame of the color camera.
     pub camera_from_depth: Transform,
-    /// Metres per count.
+    /// Meters per count.
     pub meters_per_count: f64,
 }
 
-/// A file that is being written; [`BagWriter::finish`] ends it.
+/// Writes a file. [`BagWriter::finish`] completes it.
 #[derive(Debug)]
 pub struct BagWriter {
     path: PathBuf,
-    /// Among all files of this program.
+    /// Number of this file among all files of this process.
     number: u64,
-    /// The modes point into the recorder's sensors.
+    /// Modes point into the sensors of the recorder.
     _modes: Vec<Modes>,
     recorder: Device,
     queue: Queue,
@@ -77,7 +78,7 @@ pub struct BagWriter {
     _context: Context,
 }
 
-/// One stream of the played camera.
+/// One stream of the emulated camera.
 #[derive(Debug)]
 struct EmulatedStream {
     sensor: NonNull<sys::rs2_sensor>,
@@ -89,41 +90,42 @@ struct EmulatedStream {
     n_images: i32,
 }
 
-// SAFETY: the library may be called from any thread, and what these point to lives in `BagWriter::_device`.
+// SAFETY: the library may be called from any thread, and the pointers refer to objects owned by `BagWriter::_device`.
 unsafe impl Send for EmulatedStream {}
 
 impl BagWriter {
-    /// Begins a file; one of that name is replaced.
+    /// Starts a file. An existing file of that name is replaced.
     pub fn create(path: &Path, camera: &EmulatedCamera) -> Result<Self, Problem> {
         let context = Context::new()?;
-        let _ = std::fs::remove_file(path); // Not there, mostly; what cannot be removed the library cannot write, and says so.
+        let _ = std::fs::remove_file(path); // Usually missing. If removal fails, the library reports an error.
         let _guard = device_creation_lock();
-        // SAFETY: the device is checked and then ours; sensors and profiles live as long as it does.
+        // SAFETY: the device is checked and then owned here; sensors and profiles live as long as the device.
         let device = unsafe {
-            let device = call("make a software device", |error| abi::rs2_create_software_device(error))?;
+            let device = call("create a software device", |error| abi::rs2_create_software_device(error))?;
             register(device, camera)?;
             device
         };
-        // SAFETY: as above; sensors that are added live in the device.
+        // SAFETY: as above; added sensors live in the device.
         let (color, depth) = unsafe {
             let depth = camera.depth.as_ref().map(|depth| EmulatedStream::depth(device, camera, depth)).transpose()?;
             let color = EmulatedStream::color(device, camera)?;
             if let (Some(emulated), Some(depth)) = (&depth, &camera.depth) {
                 let extrinsics = lens::extrinsics(&depth.camera_from_depth);
-                call("place two cameras", |error| {
+                call("register extrinsics", |error| {
                     sys::rs2_register_extrinsics(emulated.profile.as_ptr(), color.profile.as_ptr(), extrinsics, error);
                 })?;
             }
             (color, depth)
         };
-        // SAFETY: nobody else frees it.
+        // SAFETY: the device is not freed elsewhere.
         let device = unsafe { Device::new(device)? };
         let file_problem = |reason: String| Problem::File { path: path.to_owned(), reason };
         let name = path_name(path).map_err(file_problem)?;
-        // SAFETY: device and name live; the recorder is then ours and keeps the device.
+        // SAFETY: device and name are alive; the recorder is then owned here and keeps the device alive.
         let recorder = unsafe {
-            let recorder =
-                call("record", |error| sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error));
+            let recorder = call("create a recorder", |error| {
+                sys::rs2_create_record_device_ex(device.as_ptr(), name.as_ptr(), 1, error)
+            });
             Device::new(recorder.map_err(|problem| file_problem(problem.to_string()))?)?
         };
         let mut writer = Self {
@@ -151,31 +153,33 @@ impl BagWriter {
         self.recorder.sensors.iter().try_for_each(|sensor: &Sensor| sensor.start(&self.queue))
     }
 
-    /// Writes one image, colour or depth; its stamp becomes mid-exposure by the camera's clock, in whole microseconds.
+    /// Writes one color or depth image. Its stamp is stored as mid-exposure time of the camera clock, in whole
+    /// microseconds.
     ///
-    /// Fails where the image is not what the camera was said to give, or the disk takes nothing more.
+    /// # Errors
+    /// If the format or size of the image differs from that of the emulated camera, or the disk accepts no more data.
     pub fn write(&mut self, image: &Image) -> Result<(), Problem> {
         let file_problem = |reason: String| Problem::File { path: self.path.clone(), reason };
         let emulated = match (image.is_depth(), &mut self.depth) {
             (true, Some(depth)) => depth,
-            (true, None) => return Err(file_problem("the played camera has no depth".into())),
+            (true, None) => return Err(file_problem("the emulated camera has no depth".into())),
             (false, _) => &mut self.color,
         };
         if image.format != emulated.format || image.size_px != emulated.size_px {
             let (got, expected) =
                 (format!("{:?} {:?}", image.format, image.size_px), (emulated.format, emulated.size_px));
             return Err(file_problem(format!(
-                "an image is {got}, the played camera gives {:?} {:?}",
+                "an image is {got}, expected {:?} {:?} for the emulated camera",
                 expected.0, expected.1
             )));
         }
         let bytes = image.raw_bytes().map_err(|error| file_problem(error.to_string()))?;
         emulated.send(self.number, image, bytes)?;
-        // What was recorded comes out of the recorder, too, and is lent as long as it is not freed.
+        // The recorder also queues recorded images for readers and keeps their memory until the queue is emptied.
         wait_until_written(&self.path, self.number, MAX_QUEUED_IMAGES, || self.queue.empty())
     }
 
-    /// Ends the file: everything is in it then.
+    /// Completes the file and waits until all images are written.
     pub fn finish(self) -> Result<(), Problem> {
         self.queue.empty()?;
         self.recorder.sensors.iter().for_each(Sensor::stop);
@@ -185,14 +189,14 @@ impl BagWriter {
     }
 }
 
-/// Tells the library who the camera is.
+/// Registers the identity of the camera with the library.
 ///
 /// # Safety
 /// The pointer must be a software device.
 unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Result<(), Problem> {
     let text = |text: &str| {
         CString::new(text)
-            .map_err(|error| Problem::Library { what: "take the name of a camera", reason: error.to_string() })
+            .map_err(|error| Problem::Library { what: "use the name of a camera", reason: error.to_string() })
     };
     let infos = [
         (sys::rs2_camera_info_RS2_CAMERA_INFO_NAME, text(&camera.name)?),
@@ -200,8 +204,8 @@ unsafe fn register(device: *mut sys::rs2_device, camera: &EmulatedCamera) -> Res
         (sys::rs2_camera_info_RS2_CAMERA_INFO_PRODUCT_LINE, c"D400".to_owned()),
     ];
     for (info, value) in &infos {
-        // SAFETY: the device lives by the caller's word, and the text is copied.
-        call("name a software device", |error| unsafe {
+        // SAFETY: the caller guarantees that the device is alive, and the text is copied.
+        call("set the name of a software device", |error| unsafe {
             abi::rs2_software_device_register_info(device, *info, value.as_ptr(), error);
         })?;
     }
@@ -220,12 +224,12 @@ impl EmulatedStream {
             _ => None,
         };
         let Some((format, bytes_per_pixel)) = format else {
-            let reason = format!("{:?} is no format of a RealSense camera", camera.format);
-            return Err(Problem::Library { what: "play images", reason });
+            let reason = format!("{:?} is not a format of RealSense cameras", camera.format);
+            return Err(Problem::Library { what: "emulate a camera", reason });
         };
         let stream = stream(sys::rs2_stream_RS2_STREAM_COLOR, 1, camera.rate_hz, &camera.intrinsics);
         let stream = VideoStream { bytes_per_pixel, format, ..stream };
-        // SAFETY: by the caller's word.
+        // SAFETY: guaranteed by the caller.
         unsafe { Self::add(device, IMAGE_SENSOR, stream, camera.format, IMAGE_EXPOSURE_SECS) }
     }
 
@@ -239,7 +243,7 @@ impl EmulatedStream {
         let stream = stream(sys::rs2_stream_RS2_STREAM_DEPTH, 2, camera.rate_hz, &depth.intrinsics);
         let stream = VideoStream { bytes_per_pixel: 2, format: sys::rs2_format_RS2_FORMAT_Z16, ..stream };
         let format = PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count };
-        // SAFETY: by the caller's word; the sensor lives in the device.
+        // SAFETY: guaranteed by the caller; the sensor lives in the device.
         unsafe {
             let emulated = Self::add(device, DEPTH_SENSOR, stream, format, DEPTH_EXPOSURE_SECS)?;
             let (units, scale) = (sys::rs2_option_RS2_OPTION_DEPTH_UNITS, narrow(depth.meters_per_count));
@@ -259,8 +263,8 @@ impl EmulatedStream {
         format: PixelFormat,
         exposure_secs_per_count: f64,
     ) -> Result<Self, Problem> {
-        const WHAT: &str = "make a stream";
-        // SAFETY: device and name live; sensors and streams that are added live in the device.
+        const WHAT: &str = "create a stream";
+        // SAFETY: device and name are alive; added sensors and streams live in the device.
         unsafe {
             let sensor = call(WHAT, |error| abi::rs2_software_device_add_sensor(device, name.as_ptr(), error))?;
             let sensor = non_null(WHAT, sensor)?;
@@ -279,16 +283,16 @@ impl EmulatedStream {
         }
     }
 
-    /// Lets the camera see an image.
+    /// Passes an image to the emulated camera.
     fn send(&mut self, file: u64, image: &Image, bytes: &[u8]) -> Result<(), Problem> {
         self.n_images += 1;
         let micros = image.stamp.0.div_euclid(NANOS_PER_MICRO);
         self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_SENSOR_TIMESTAMP, micros)?;
         self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_FRAME_COUNTER, self.n_images.into())?;
-        // The library divides by what it works out of two stamps where it is not told a rate.
+        // Without a rate, the library derives one from two stamps, which may divide by zero.
         self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_FPS, 0)?;
         if let Some(secs) = image.exposure_secs {
-            #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+            #[expect(clippy::cast_possible_truncation, reason = "the cast saturates as intended")]
             let counts = (secs / self.exposure_secs_per_count).round() as i64;
             self.set_metadata(sys::rs2_frame_metadata_value_RS2_FRAME_METADATA_ACTUAL_EXPOSURE, counts)?;
         }
@@ -306,21 +310,21 @@ impl EmulatedStream {
                 _ => 0.0,
             },
         };
-        // SAFETY: the sensor lives in the device; the pixels live until the library gives them back to `reclaim_pixels`.
-        call("take an image", |error| unsafe {
+        // SAFETY: the sensor lives in the device; the pixels live until the library returns them to `reclaim_pixels`.
+        call("write an image", |error| unsafe {
             abi::rs2_software_sensor_on_video_frame(self.sensor.as_ptr(), frame, error);
         })
     }
 
     fn set_metadata(&self, key: sys::rs2_frame_metadata_value, value: i64) -> Result<(), Problem> {
         // SAFETY: the sensor lives in the device.
-        call("take metadata", |error| unsafe {
+        call("write metadata", |error| unsafe {
             abi::rs2_software_sensor_set_metadata(self.sensor.as_ptr(), key, value, error);
         })
     }
 }
 
-/// What all streams have; format and bytes per pixel are the caller's.
+/// Properties common to all streams. The caller sets format and bytes per pixel.
 fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &Intrinsics) -> VideoStream {
     let intrinsics = lens::raw(intrinsics);
     VideoStream {
@@ -336,12 +340,12 @@ fn stream(stream: sys::rs2_stream, unique_id: i32, rate_hz: u16, intrinsics: &In
     }
 }
 
-/// Images by address, and beside each which file it is for.
+/// Images by address, each with the number of its file.
 type LentPixels = BTreeMap<usize, (u64, Box<[u8]>)>;
 
-/// Images that the library has: it says only where they were when it gives them back.
+/// Images that the library currently uses. It returns only their address.
 static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
-/// Files begun so far.
+/// Number of files started so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);
 
 fn lent_pixels() -> MutexGuard<'static, LentPixels> {
@@ -359,7 +363,7 @@ extern "C" fn reclaim_pixels(pixels: *mut c_void) {
     lent_pixels().remove(&pixels.addr());
 }
 
-/// Waits until the library has at most so many images of a file.
+/// Waits until the library holds at most this many images of a file.
 fn wait_until_written(
     path: &Path,
     file: u64,
@@ -382,7 +386,7 @@ fn wait_until_written(
     }
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "the library has single precision")]
+#[expect(clippy::cast_possible_truncation, reason = "the library uses single precision")]
 fn narrow(number: f64) -> f32 {
     number as f32
 }
