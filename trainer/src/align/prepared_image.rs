@@ -199,7 +199,8 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
         for row in y * edge..(y + 1) * edge {
             for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
                 is_valid &= pixel[3] > 0;
-                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]); // Sums to 256.
+                // The weights sum to 256.
+                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
             }
         }
         *value = if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN };

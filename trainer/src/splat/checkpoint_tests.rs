@@ -50,7 +50,7 @@ fn resuming_is_bit_exact() {
             let step = interrupted.progress().step;
             train(&mut interrupted, stop - step);
             if stop == 100 {
-                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth it waits for its splats in the checkpoint.
+                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth, it waits for its splats.
             }
             let before = checkpoint_of(&mut interrupted);
             before.write(&path).unwrap();

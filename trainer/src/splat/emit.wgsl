@@ -37,7 +37,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let bin = at.first_bin + lane;
         var begin = bin_starts[bin] + group_counts[at.block / GROUP * n_bins + bin];
         for (var i = 0u; i + 1u < GROUP; i++) {
-            let block = min(at.block / GROUP * GROUP + i, at.block); // Past the last block: the block itself, which is not counted.
+            let block = min(at.block / GROUP * GROUP + i, at.block); // Later blocks are clamped to this block, which is not counted.
             begin += select(0u, bin_counts[block * n_bins + bin], block < at.block);
         }
         wg_begins[lane] = begin;

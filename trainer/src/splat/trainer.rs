@@ -1061,7 +1061,7 @@ impl Method for SplatTrainer {
         self.grow_when_due(&learn)?;
         let max_millis = submit_millis(self.is_watched);
         let by_time = if self.step_millis > 0.0 { (max_millis / self.step_millis) as u64 } else { 1 };
-        let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at its multiples.
+        let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at these steps.
         let n_requested = n;
         let n = n
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))

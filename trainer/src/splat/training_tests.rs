@@ -307,7 +307,7 @@ fn wrong_lens_is_corrected_by_trial() {
     // correct about half of the error.
     assert!(
         (found_focal_px[0] / FOCAL_PX - 1.0).abs() < 0.6 * (FOCAL_ERROR - 1.0),
-        "{found_focal_px:?} expected {FOCAL_PX}"
+        "{found_focal_px:?}, expected {FOCAL_PX}"
     );
 }
 

@@ -180,11 +180,11 @@ fn learn(splat_ix: u32) -> CameraGradient {
         let point_mid_exposure = camera_from_world(view, mean);
         camera.translation = v_mid_exposure;
         camera.rotation = cross(point_mid_exposure, v_mid_exposure);
-        let unturned = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
+        let splat_axes = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
         let spin = p.tau * view.shutter_angular.xyz;
-        camera.rotation += p.scale.x * cross(unturned[0], v_axis_0 + cross(spin, v_axis_0));
-        camera.rotation += p.scale.y * cross(unturned[1], v_axis_1 + cross(spin, v_axis_1));
-        camera.rotation += p.scale.z * cross(unturned[2], v_axis_2 + cross(spin, v_axis_2));
+        camera.rotation += p.scale.x * cross(splat_axes[0], v_axis_0 + cross(spin, v_axis_0));
+        camera.rotation += p.scale.y * cross(splat_axes[1], v_axis_1 + cross(spin, v_axis_1));
+        camera.rotation += p.scale.z * cross(splat_axes[2], v_axis_2 + cross(spin, v_axis_2));
         camera.principal = sum.position.xy;
         camera.focal = sum.position.xy * p.point.xy / z + vec2f(dot(v_jacobian_x, p.jacobian_x), dot(v_jacobian_y, p.jacobian_y)) / f;
         v_mean = view.camera_row_0.xyz * v_mid_exposure.x + view.camera_row_1.xyz * v_mid_exposure.y + view.camera_row_2.xyz * v_mid_exposure.z;

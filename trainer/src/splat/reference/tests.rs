@@ -52,13 +52,13 @@ fn check_gradients(view: &View, splats: &[Splat], mismatches: &mut Mismatches) {
             view.linear_m[axis] += nudge;
             loss(&view, splats)
         };
-        let turned = |nudge: f64| {
+        let rotated = |nudge: f64| {
             let mut view = view.clone();
             view.angular_rad[axis] += nudge;
             loss(&view, splats)
         };
         let by_linear = (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE);
-        let by_angular = (turned(NUDGE) - turned(-NUDGE)) / (2.0 * NUDGE);
+        let by_angular = (rotated(NUDGE) - rotated(-NUDGE)) / (2.0 * NUDGE);
         mismatches.check(format!("linear {axis}"), grad.view.linear_m[axis], by_linear, ABS, REL);
         mismatches.check(format!("angular {axis}"), grad.view.angular_rad[axis], by_angular, ABS, REL);
     }
@@ -100,8 +100,8 @@ fn gradients_match_central_differences_at_clamps() {
         contributors.contains(&3) && center_of_3.opacity * (-sigma(&center_of_3, center_px)).exp() > MAX_ALPHA
     });
     assert!(clamped.count() > 0, "no pixel reaches the bound of alpha");
-    for beside in [0, 2] {
-        assert!(grad.splats[beside].mean.iter().all(|v| v.abs() > 1e-6), "a splat outside the image has a gradient");
+    for outside in [0, 2] {
+        assert!(grad.splats[outside].mean.iter().all(|v| v.abs() > 1e-6), "a splat outside the image has a gradient");
     }
 }
 
