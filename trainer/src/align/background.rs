@@ -1,4 +1,5 @@
-//! Alignment beside training: begun with the first step on a thread of its own, taken at a fixed step.
+//! Alignment in parallel with training: starts with the first step on its own thread; the result is applied at a
+//! fixed step.
 
 use super::{Alignment, align};
 use crate::splat::{CalibratedCamera, CameraCorrection, CameraRefinement};
@@ -6,23 +7,24 @@ use crate::{Error, Keyframe};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// The step at which the result is taken, waiting for it where needed: on a processor steps are as dear as alignment.
+/// Step at which the result is applied, after waiting for it if necessary. It is smaller on software adapters, where
+/// steps are as expensive as alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
-/// The step at which the result is taken.
+/// Step at which the result is applied.
 pub(crate) fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     let default_step = if is_software { SOFTWARE_ALIGNMENT_STEP } else { ALIGNMENT_STEP };
     default_step.min(n_planned_steps / 4).max(1)
 }
 
-/// Where alignment stands.
+/// State of the alignment.
 #[derive(Debug)]
 pub(crate) enum AlignmentTask {
-    /// It begins with the next step.
+    /// Starts with the next step.
     Requested,
     Running(JoinHandle<Option<Alignment>>),
-    /// With what came of it, where it could be done.
+    /// Finished, with the result if alignment was possible.
     Done(Option<Alignment>),
 }
 
@@ -50,13 +52,13 @@ impl AlignmentTask {
         matches!(self, Self::Done(_))
     }
 
-    /// Begins, on a thread of its own.
+    /// Starts alignment on its own thread.
     pub(crate) fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
         let choice = choice.clone();
         *self = Self::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
 
-    /// Waits for what was begun, and says whether keyframes are to be corrected.
+    /// Waits for the result. Returns whether keyframes must be corrected.
     pub(crate) fn finish(&mut self) -> Result<bool, Error> {
         let Self::Running(thread) = std::mem::replace(self, Self::Done(None)) else { return Ok(false) };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
@@ -72,7 +74,7 @@ impl AlignmentTask {
         self.result()?.corrections.get(camera)
     }
 
-    /// The keyframe with what alignment found; the same where that is nothing.
+    /// The keyframe with the corrections of alignment, if there are any.
     pub(crate) fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.correction(&keyframe.camera) {
             Some(correction) => Arc::new(correction.corrected(keyframe)),
@@ -80,7 +82,7 @@ impl AlignmentTask {
         }
     }
 
-    /// The camera of a keyframe with what alignment found and then what was learned with the splats.
+    /// The camera of a keyframe with the corrections of alignment, then those estimated with the splats.
     pub(crate) fn calibrated_camera(
         &self,
         keyframe: &Keyframe,
@@ -99,7 +101,8 @@ impl AlignmentTask {
     }
 }
 
-/// Works on threads of its own: training, which makes images smaller on all processors, is not to wait for it.
+/// Runs `work` in a thread pool of its own, so that training, which downscales images on all processors, does not
+/// wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {

@@ -1,4 +1,4 @@
-//! What was found so far, and how a step changes it.
+//! The current corrections, and how an optimizer step changes them.
 
 use super::layout::{CalibrationParam, Layout};
 use super::prepared_image::PreparedImage;
@@ -8,7 +8,7 @@ use kinematics::{Transform, Twist, transform};
 use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;
 
-/// One fix a camera.
+/// One correction per camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Corrections {
     pub(super) by_camera: Vec<CameraCorrection>,
@@ -19,16 +19,15 @@ impl Corrections {
         Self { by_camera: vec![CameraCorrection::default(); n_cameras] }
     }
 
-    /// The frames' cameras; every frame has depth.
+    /// Corrected cameras of the images, all of which have depth.
     pub(super) fn views(&self, images: &[PreparedImage], layout: &Layout) -> Vec<CorrectedView> {
         let view = |image: &PreparedImage| {
-            CorrectedView::new(image, &self.by_camera[image.camera], layout)
-                .expect("a frame is made of a keyframe with depth")
+            CorrectedView::new(image, &self.by_camera[image.camera], layout).expect("prepared images have depth")
         };
         images.par_iter().map(view).collect()
     }
 
-    /// The value of a term; the mount's as a motion of the camera, which is exact for small ones.
+    /// Value of a parameter. Extrinsics are given as a motion of the camera, which is exact for small motions.
     pub(super) fn value(&self, param: CalibrationParam) -> f64 {
         match param {
             CalibrationParam::Extrinsics(camera, part) if part < 3 => -self.by_camera[camera].translation_m[part],
@@ -46,7 +45,7 @@ impl Corrections {
         }
     }
 
-    /// Takes a step along the terms of a layout, in their units.
+    /// Applies a step in the parameters of a layout, in their units.
     pub(super) fn apply_step(&mut self, layout: &Layout, step: &DVector<f64>) {
         for (ix, param) in layout.params.iter().enumerate() {
             let delta = step[ix];
@@ -84,7 +83,7 @@ impl Corrections {
     }
 }
 
-/// Six numbers of a step as a motion: metres, then radians.
+/// Six consecutive numbers of a step as a motion: meters, then radians.
 pub(super) fn twist(step: &DVector<f64>, begin: usize) -> Twist {
     let part = |from: usize| Vector3::from_fn(|row, _| step[begin + from + row]);
     Twist { linear_m_s: part(0), angular_rad_s: part(3) }

@@ -1,4 +1,4 @@
-//! Shared terms from coarse to fine.
+//! Coarse-to-fine estimation of the shared parameters.
 
 use super::corrections::Corrections;
 use super::layout::Layout;
@@ -8,15 +8,15 @@ use super::solve::Solution;
 use super::sums::{self, Noise, PixelSubset, ResidualOptions};
 use nalgebra::DVector;
 
-/// Steps at each level, the finest first.
+/// Maximum number of steps at each level, the finest first.
 const MAX_ITERATIONS: [usize; 4] = [12, 4, 4, 4];
-/// By how much of its depth a point may be off before it counts as hidden, the finest first: errors are large at first.
+/// Relative depth error above which a point counts as occluded, the finest level first; errors are large at first.
 pub(super) const OCCLUSION_FRAC: [f64; 4] = [0.04, 0.05, 0.07, 0.1];
-/// A step below this many standard deviations ends a level.
+/// A step smaller than this number of standard deviations ends a level.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.2, 2.0, 2.0, 2.0];
 pub(super) const INITIAL_NOISE: Noise = Noise { photo: 20.0, depth: 0.005 };
 
-/// What came of a fit.
+/// Result of a fit.
 #[derive(Debug)]
 pub(super) struct Fit {
     pub(super) corrections: Corrections,
@@ -25,7 +25,8 @@ pub(super) struct Fit {
     pub(super) noise: Noise,
 }
 
-/// Finds the terms of a layout, from given corrections on; none where the pairs show nothing.
+/// Estimates the parameters of a layout, starting from given corrections; `None` if the pairs have no valid
+/// residuals.
 pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, start: &Corrections) -> Option<Fit> {
     let mut corrections = start.clone();
     let n_levels = images.iter().map(|image| image.levels.len()).max()?;
@@ -39,7 +40,7 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], layout: Layout, star
     let mut last = None;
     for level in (0..n_levels).rev() {
         (options.level, options.occlusion_frac) = (level, OCCLUSION_FRAC[level]);
-        // Coarse levels only have to come near: a part of the pairs does.
+        // At coarse levels, an approximate result from a subset of the pairs is sufficient.
         let stride = if level == 0 { 1 } else { pairs.len().div_ceil(120).max(1) };
         let subset: Vec<Pair> = pairs.iter().copied().step_by(stride).collect();
         for _ in 0..MAX_ITERATIONS[level] {

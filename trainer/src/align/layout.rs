@@ -1,32 +1,33 @@
-//! Which numbers are sought, in which order, and how large each may be.
+//! The parameters to estimate, their order, and their scales.
 
 use super::prepared_image::PreparedImage;
 use crate::splat::ParamSet;
 
-/// How large an error may be before one would call it a mistake: what the solver damps towards, and the scale on which a
-/// direction counts as seen or not.
+/// Typical magnitudes of calibration errors. The solver damps with these scales, and they determine whether a
+/// direction counts as observable.
 mod prior {
     pub(super) const ROTATION_RAD: f64 = 0.0175; // 1 degree.
     pub(super) const TRANSLATION_M: f64 = 0.005;
     pub(super) const TIME_OFFSET_SECS: f64 = 0.02;
-    pub(super) const JOINT: f64 = 0.01; // Of a radian or metre.
-    pub(super) const LENS: f64 = 0.01; // Of the focal length.
+    pub(super) const JOINT: f64 = 0.01; // Radians or meters.
+    pub(super) const LENS: f64 = 0.01; // Fraction of the focal length.
     pub(super) const DEPTH_SCALE: f64 = 0.01;
     pub(super) const READOUT_SECS: f64 = 0.01;
 }
 
-/// One number that is sought.
+/// One parameter to estimate. The first number is the index of the camera, or of the joint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CalibrationParam {
-    /// Motion of a camera on what carries it, in its own axes: 0 to 2 metres, 3 to 5 radians.
+    /// Motion of a camera relative to its parent, in its own axes: parts 0 to 2 in meters, 3 to 5 in radians.
     Extrinsics(usize, usize),
     /// Seconds.
     TimeOffset(usize),
-    /// Of all cameras the arm carries: radians or metres.
+    /// Offset of a joint that carries cameras: radians or meters.
     Joint(usize),
-    /// Motion of the depth frame in the axes of its camera, as for the mount.
+    /// Motion of the depth frame in the axes of its camera, with the same parts as the extrinsics.
     DepthPose(usize, usize),
-    /// 0 and 1: logarithm of the factors on the focal lengths; 2 and 3: shift of the principal point in focal lengths.
+    /// Parts 0 and 1: logarithm of the factors on the focal lengths; 2 and 3: offset of the principal point in focal
+    /// lengths.
     Lens(usize, usize),
     /// Logarithm of the factor on depth.
     DepthScale(usize),
@@ -35,7 +36,7 @@ pub(super) enum CalibrationParam {
 }
 
 impl CalibrationParam {
-    /// How large it may be, in its own unit.
+    /// Typical magnitude, in the parameter's own unit.
     pub(super) fn scale(self) -> f64 {
         match self {
             Self::Extrinsics(_, part) | Self::DepthPose(_, part) if part < 3 => prior::TRANSLATION_M,
@@ -49,7 +50,7 @@ impl CalibrationParam {
     }
 }
 
-/// The numbers that are sought, in order.
+/// The parameters to estimate, in order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Layout {
     pub(super) params: Vec<CalibrationParam>,
@@ -57,7 +58,7 @@ pub(super) struct Layout {
     joints: Option<usize>,
 }
 
-/// Where the terms of a camera begin.
+/// Indices of the first parameters of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct CameraParamOffsets {
     pub(super) extrinsics: Option<usize>,
@@ -69,7 +70,8 @@ pub(super) struct CameraParamOffsets {
 }
 
 impl Layout {
-    /// The terms of a set that the frames have: a camera that never moves has no delay, one without joints no offsets.
+    /// The parameters of a set that apply to the images: a static camera has no time offset, one without joints no
+    /// joint offsets.
     pub(super) fn new(set: ParamSet, images: &[PreparedImage], n_cameras: usize) -> Self {
         let mut layout = Self::default();
         for camera in 0..n_cameras {
@@ -110,7 +112,7 @@ impl Layout {
         self.by_camera.get(camera).copied().unwrap_or_default()
     }
 
-    /// Where the joints' offsets begin.
+    /// Index of the first joint offset.
     pub(super) fn joints(&self) -> Option<usize> {
         self.joints
     }

@@ -1,11 +1,13 @@
-//! What is wrong with cameras, found before a scene is learned: pairs of keyframes with depth are laid over each other.
+//! Estimates calibration errors of cameras before a scene is trained, by registering pairs of keyframes with depth.
 //!
-//! Few causes explain most errors of poses: how a camera is mounted, by how much its poses lag, where joints have their zero, the
-//! lens, where depth sits. Their effect on each pair of images is known, so a handful of numbers explains thousands of small
-//! differences, by Gauss and Newton's steps from coarse to fine. A term stays when it predicts images better that were not
-//! used for finding it; what the motion does not show is named and stays at zero.
+//! Few causes explain most pose errors: extrinsics, time offsets, joint offsets, intrinsics and the pose of the depth
+//! camera. Their effect on each pair of images is known, so a few parameters explain thousands of small differences.
+//! They are estimated by Gauss-Newton steps from coarse to fine. A parameter is kept if it improves the prediction of
+//! images that were not used to estimate it. Parameters that the motion does not make observable are reported and
+//! stay at zero.
 //!
-//! Pure functions of keyframes: no clock, no I/O, and sums in a fixed order however many threads there are.
+//! All functions are pure functions of keyframes: no clock, no I/O, and sums in a fixed order for any number of
+//! threads.
 
 mod background;
 mod corrections;
@@ -41,29 +43,30 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use sums::PixelSubset;
 
-/// Frames that shared terms are found from, and partners of each.
+/// Maximum number of images for estimating the shared parameters; the next constant is the number of partners of each
+/// image.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
-/// Selection images that decide, and fewest that can.
+/// Maximum number of validation images; the next constant is the minimum for a decision.
 const MAX_VALIDATION_IMAGES: usize = 32;
 const MIN_VALIDATION_IMAGES: usize = 4;
 const MIN_PAIRS: usize = 4;
-/// A correction below this many standard deviations is none.
+/// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
 
-/// Frames and the pairs that are looked at.
+/// Prepared images and the pairs to register.
 struct AlignmentScene {
     images: Vec<PreparedImage>,
     cameras: Vec<Arc<str>>,
-    /// For shared terms.
+    /// Pairs for the shared parameters.
     pairs: Vec<Pair>,
-    /// For poses of images: all that are learned from.
+    /// Pairs of all training images, for image poses.
     all_pairs: Vec<Pair>,
-    /// From images that are learned from to selection images.
+    /// Pairs from training images to validation images.
     validation_pairs: Vec<Pair>,
 }
 
-/// What alignment can find, the likelier first.
+/// All parameter sets that alignment can estimate, the more likely ones first.
 pub fn candidates() -> Vec<ParamSet> {
     vec![
         ParamSet { extrinsics: true, ..ParamSet::NONE },
@@ -77,9 +80,10 @@ pub fn candidates() -> Vec<ParamSet> {
     ]
 }
 
-/// Finds what is asked for; none where keyframes have no depth, or too few of them see the same.
+/// Estimates the requested parameters; `None` if the keyframes have no depth or too few of them overlap.
 ///
-/// Only keyframes for training are learned from, selection keyframes judge, test keyframes are not looked at.
+/// Parameters are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not
+/// used.
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     let scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
     let uncorrected =
@@ -109,10 +113,10 @@ fn includes_image_poses(choice: &CameraRefinement) -> bool {
     }
 }
 
-/// Corrections of a set of terms.
+/// Corrections for a set of parameters.
 struct CalibrationModel {
     set: ParamSet,
-    /// Of the shared terms.
+    /// Fit of the shared parameters.
     fit: Option<Fit>,
     corrections: Corrections,
 }
@@ -151,7 +155,7 @@ impl AlignmentScene {
         (pairs.len() >= MIN_PAIRS).then_some(Self { images, cameras, pairs, all_pairs, validation_pairs })
     }
 
-    /// The corrections of a set of terms, starting from those of another.
+    /// Estimates the corrections of a set of parameters, starting from those of another set.
     fn model(&self, set: ParamSet, from: &CalibrationModel) -> Option<CalibrationModel> {
         let shared = ParamSet { image_poses: false, image_gains: false, ..set };
         let layout = Layout::new(shared, &self.images, self.cameras.len());
@@ -168,7 +172,7 @@ impl AlignmentScene {
         Some(CalibrationModel { set, fit, corrections })
     }
 
-    /// Gives selection images poses of their own, too, when all is decided: they are learned from later.
+    /// Estimates individual poses of the validation images, too, after all decisions: they will be trained on later.
     fn with_validation_poses(&self, mut model: CalibrationModel) -> CalibrationModel {
         let images_of_split = |split: Split| -> Vec<usize> {
             (0..self.images.len()).filter(|ix| self.images[*ix].keyframe.split == split).collect()
@@ -193,7 +197,7 @@ impl AlignmentScene {
         model
     }
 
-    /// What given corrections say about the terms of a layout, and nothing about others.
+    /// The given corrections, restricted to the parameters of a layout.
     fn restricted(&self, layout: &Layout, given: &Corrections) -> Corrections {
         let mut restricted = Corrections::none(self.cameras.len());
         let values = layout.params.iter().map(|param| given.value(*param));
@@ -201,9 +205,10 @@ impl AlignmentScene {
         restricted
     }
 
-    /// Adds one candidate after the other where it pays, then takes away what no longer does.
+    /// Adds each candidate whose gain is significant, then removes those whose gain no longer is.
     ///
-    /// A hand-eye transform that is not corrected may be wrong all the same where the motion does not show it: that is added to `unobservable`.
+    /// Extrinsics that are not corrected may still be wrong if the motion does not make them observable. These
+    /// directions are added to `unobservable`.
     fn select_params(
         &self,
         candidates: &[ParamSet],
@@ -246,7 +251,7 @@ impl AlignmentScene {
         kept
     }
 
-    /// How much better a set of terms predicts the selection images.
+    /// Evaluates how much better a set of parameters predicts the validation images.
     fn evaluate(&self, params: ParamSet, baseline: &CalibrationModel, variant: &CalibrationModel) -> Trial {
         let noise = variant.fit.as_ref().map_or(sums::Noise { photo: 5.0, depth: 0.005 }, |fit| fit.noise);
         let comparison = validation::PairedComparison {
@@ -265,7 +270,8 @@ impl AlignmentScene {
         match (params.image_poses, baseline.set.image_poses) {
             (true, _) => trial(comparison.scores_with_free_poses()),
             (false, false) => trial(comparison.scores()),
-            // Images that move on their own hide what all share: it goes only where neither way shows it.
+            // Individual image poses hide shared errors, so a parameter is rejected only if neither comparison shows
+            // a gain.
             (false, true) => Some(trial(comparison.scores()))
                 .filter(|trial| trial.kept)
                 .unwrap_or_else(|| trial(comparison.scores_with_free_poses())),
@@ -274,7 +280,7 @@ impl AlignmentScene {
 }
 
 impl CalibrationModel {
-    /// Whether any of the terms is clearly not zero.
+    /// Whether any of the parameters differs significantly from zero.
     fn has_significant(&self, params: &Layout) -> bool {
         let Some(fit) = &self.fit else { return false };
         let is_significant = |ix: usize| {

@@ -1,26 +1,28 @@
-//! Which frames are compared with which: those that see the same surface, from near and from far.
+//! Selection of pairs of images to compare: images that show the same surface from near and distant viewpoints.
 
 use super::prepared_image::{PreparedImage, depth_at, point};
 use super::view::CorrectedView;
 use rayon::prelude::*;
 
-/// Share of a frame's spots that its partner must show.
+/// Minimum fraction of an image's samples that its partner must show.
 const MIN_OVERLAP: f64 = 0.3;
-/// Spots that are looked up for the overlap.
+/// Number of samples that are tested for the overlap.
 const N_PROBES: usize = 40;
-/// Readings that differ by more show another surface; poses may be wrong by centimetres.
+/// Readings that differ by more than this fraction are of another surface; poses may be wrong by centimeters.
 const SAME_SURFACE_FRAC: f64 = 0.1;
-/// A partner that hardly moved tells nothing: radians, and the share of the depth.
+/// Minimum distance of a partner, in radians plus the translation divided by the depth; smaller ones carry no
+/// information.
 const MIN_MOTION: f64 = 0.01;
 
-/// Spots of frame `from` are looked at in frame `to`.
+/// Samples of image `from` are compared with image `to`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Pair {
     pub(super) from: usize,
     pub(super) to: usize,
 }
 
-/// At most `max_partners` partners among `candidates` for each frame of `targets`, spread over how far they have turned and moved.
+/// Chooses at most `max_partners` partners among `candidates` for each image of `targets`, spread evenly over their
+/// distances.
 pub(super) fn choose(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -49,7 +51,8 @@ pub(super) fn choose(
     targets.par_iter().map(partners_of).collect::<Vec<_>>().concat()
 }
 
-/// How far `from` is from `to`: the turn in radians plus the way in depths; none where they do not see the same.
+/// Distance between two images: the rotation in radians plus the translation in mean depths; `None` without
+/// sufficient overlap.
 fn distance(images: &[PreparedImage], views: &[CorrectedView], from: usize, to: usize) -> Option<f64> {
     let (i, j) = (&views[from], &views[to]);
     let depth = images[to].keyframe.depth.as_ref()?;

@@ -1,4 +1,4 @@
-//! A small motion of every image on its own: many unknowns, of which each pair ties two together.
+//! Estimation of individual pose corrections of images: many unknowns, with each pair constraining two images.
 
 use super::corrections::{Corrections, rotation_and_translation, twist};
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -14,16 +14,18 @@ use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
 use std::collections::BTreeMap;
 
-/// How far an image's pose may be off, metres and radians, and what is taken for none: the poses of an arm are that good.
+/// Bounds of the expected pose error of an image, meters and radians. The lower bound corresponds to the accuracy of
+/// arms.
 const MAX_POSE_ERROR: [f64; 2] = [0.02, 0.02];
 const MIN_POSE_ERROR: [f64; 2] = [2e-4, 3.5e-4];
 const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
 const MAX_STEP: f64 = 2.0;
 
-/// Finds the poses of all images that pairs tie together, from given corrections on; others drift with their neighbours as
-/// far as drift was found.
+/// Estimates the poses of all images that are connected by pairs, starting from given corrections. Other images get
+/// the interpolated drift of their neighbors, weighted by its predictability.
 ///
-/// How far poses are off is learned from the poses themselves, level by level: where all are nearly right, noise moves none.
+/// The expected pose error is estimated from the corrections themselves, level by level: if almost all poses are
+/// right, noise moves none.
 pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
@@ -33,7 +35,7 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
         ixs.dedup();
         ixs.into_iter().enumerate().map(|(slot, ix)| (ix, slot)).collect()
     };
-    // Metres and radians.
+    // Meters and radians.
     let mut total = vec![Vector6::zeros(); slot_of_image.len()];
     let mut pose_error = MAX_POSE_ERROR;
     let n_levels = images.iter().map(|image| image.levels.len()).max()?;
@@ -75,8 +77,9 @@ pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) 
     Some(corrections)
 }
 
-/// Finds the pose of one image by others that stay, `pairs` all being to it, on a part of its pixels: its camera's fix with
-/// an entry for it. None where the others do not show it.
+/// Estimates the pose of one image relative to others that stay fixed, from a subset of its pixels. All `pairs` must
+/// lead to this image. Returns its camera's correction with an entry for it; `None` if the other images do not show
+/// the same surfaces.
 pub(super) fn fit_one(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -86,7 +89,7 @@ pub(super) fn fit_one(
 ) -> Option<CameraCorrection> {
     let image = &images[pairs.first()?.to];
     let mut image_correction = correction.clone();
-    // Where it is now, as an entry of its own.
+    // Start from its current drift, as an entry of its own.
     image_correction.drift.insert(image.keyframe.stamp.0, correction.drift_at(image.keyframe.stamp));
     let scales = scales(MAX_POSE_ERROR);
     let mut total = Vector6::zeros();
@@ -135,9 +138,11 @@ fn median_depth_m(images: &[PreparedImage]) -> f64 {
     if depths.is_empty() { 1.0 } else { *depths.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
-/// Takes from the steps what would give a camera's images a mean that is no accident of a few: that is another term.
+/// Removes from the steps the significant part of the mean correction of a camera's images, because other parameters
+/// explain it.
 ///
-/// Images that err independently have a mean, too, and forbidding it would leave them apart.
+/// A mean within its tolerance stays: independent errors have a nonzero mean, too, and removing it would leave the
+/// images misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
     total: &[Vector6<f64>],
@@ -162,9 +167,10 @@ fn remove_mean(
     }
 }
 
-/// Moves a frame's camera in its own axes: metres, then radians.
+/// Moves the camera of an image in its own axes: meters, then radians.
 fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &Vector6<f64>) {
-    // Drift comes before the mount, so the motion is that of the unmounted camera.
+    // Drift is applied before the extrinsics correction, so the motion is converted to the axes before that
+    // correction.
     let extrinsics = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
     let motion: Twist = twist(&DVector::from_column_slice(step.as_slice()), 0).of_attached(&extrinsics);
     let drift = correction.drift.entry(image.keyframe.stamp.0).or_default();
@@ -174,10 +180,10 @@ fn apply_step(correction: &mut CameraCorrection, image: &PreparedImage, step: &V
     *drift = [rotation[0], rotation[1], rotation[2], translation[0], translation[1], translation[2]];
 }
 
-/// Blocks of the normal equations in units of what a pose may be off.
+/// Blocks of the normal equations, scaled by the expected pose errors.
 struct NormalEquations {
     diagonal: Vec<Matrix6<f64>>,
-    /// Of a pair: the rows of its first frame, the columns of its second.
+    /// For each pair: the slots of its first image (rows) and second image (columns), and the block.
     off_diagonal: Vec<(usize, usize, Matrix6<f64>)>,
     rhs: Vec<Vector6<f64>>,
 }

@@ -1,8 +1,8 @@
-//! What alignment sees of a keyframe: brightness at several sizes, and spots on surfaces.
+//! Preparation of a keyframe for alignment: a brightness pyramid, and depth samples on surfaces.
 #![expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "places in images are rounded down on purpose, after they were found to lie inside"
+    reason = "coordinates in images are rounded down on purpose, after a check that they are inside"
 )]
 
 use crate::splat::shares_lens;
@@ -10,50 +10,50 @@ use crate::{DepthMap, Keyframe};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// The finest brightness is no wider than this: a hundredth of a pixel of it is far below what calibrations need.
+/// Maximum width of the finest level: a hundredth of its pixels is far below the accuracy that calibrations need.
 const MAX_COLUMNS: u32 = 400;
-/// The coarsest is no smaller than this.
+/// Minimum side of the coarsest level.
 const MIN_SIDE: usize = 40;
 const MAX_LEVELS: usize = 4;
-/// Spots of an image: the most telling of each cell of a grid.
+/// Grid of an image; each cell contributes its most informative sample.
 const GRID_CELLS: [usize; 2] = [20, 15];
-/// Depth a spot's neighbours may differ by, and that readings which are interpolated between may differ by.
+/// Maximum relative difference of a sample's depth from its neighbors, and between readings that are interpolated.
 const SMOOTH_FRAC: f64 = 0.03;
 
-/// One keyframe, prepared.
+/// A keyframe prepared for alignment.
 #[derive(Debug)]
 pub(super) struct PreparedImage {
     pub(super) keyframe: Arc<Keyframe>,
-    /// Index of the camera, in the order of their names.
+    /// Index of the camera, in the order of names.
     pub(super) camera: usize,
     pub(super) levels: Vec<GrayImage>,
-    /// Where brightness changes most.
+    /// Samples with the largest brightness gradients.
     pub(super) samples: Vec<DepthSample>,
-    /// Evenly over the image.
+    /// Samples spread evenly over the image.
     pub(super) uniform_samples: Vec<DepthSample>,
-    /// Whether an error of the lens is one of depth, too.
+    /// Whether lens errors affect depth, too.
     pub(super) shares_lens: bool,
 }
 
-/// A reading of depth.
+/// A depth reading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct DepthSample {
-    /// In the depth image.
+    /// Pixel in the depth image.
     pub(super) pixel: [f64; 2],
     pub(super) z_m: f64,
 }
 
-/// Brightness, 0 to 255, with its slopes.
+/// Brightness, 0 to 255, with its gradient.
 #[derive(Debug)]
 pub(super) struct GrayImage {
     size: [usize; 2],
-    /// Pixels of the keyframe in one of these, along each side.
+    /// Pixels of the keyframe per texel, along each side.
     pixels: f64,
-    /// Value, and its slopes in pixels of the keyframe; not a number where nothing was seen.
+    /// Brightness and its gradient per pixel of the keyframe; NaN in masked areas.
     texels: Vec<[f32; 3]>,
 }
 
-/// Brightness somewhere: the value and its slopes along x and y.
+/// An interpolated value with its gradient along x and y.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SampledValue {
     pub(super) value: f64,
@@ -81,31 +81,32 @@ impl PreparedImage {
         Some(image)
     }
 
-    /// Brightness at a level, or at the coarsest there is.
+    /// Brightness at a level, or at the coarsest level if there are fewer.
     pub(super) fn level(&self, level: usize) -> &GrayImage {
         &self.levels[level.min(self.levels.len() - 1)]
     }
 }
 
-/// The color pixel of a spot as the input has the cameras; the shutter's shear does not matter for choosing.
+/// Color pixel of a sample with the uncorrected cameras. The rolling shutter is ignored, because this is only used
+/// for selection.
 fn color_pixel(keyframe: &Keyframe, depth: &DepthMap, sample: &DepthSample) -> Option<[f64; 2]> {
     let in_depth = point(depth.focal_px, depth.principal_px, sample);
     let at = keyframe.world_from_camera.inverse() * depth.world_from_camera * nalgebra::Point3::from(in_depth);
     (at.z > 0.0).then(|| [0, 1].map(|axis| keyframe.focal_px[axis] * at[axis] / at.z + keyframe.principal_px[axis]))
 }
 
-/// Where a spot is in its depth camera, before any factor on depth.
+/// Position of a sample in its depth camera, before any depth scale.
 pub(super) fn point(focal_px: [f64; 2], principal_px: [f64; 2], sample: &DepthSample) -> Vector3<f64> {
     let ray = [0, 1].map(|axis| (sample.pixel[axis] - principal_px[axis]) / focal_px[axis]);
     Vector3::new(ray[0], ray[1], 1.0) * sample.z_m
 }
 
-/// The steepest and the middle spot of every cell.
+/// Selects the sample with the largest gradient, and the central one, of every cell.
 fn select_samples(
     depth: &DepthMap,
     gradient_norm: impl Fn(&DepthSample) -> Option<f64>,
 ) -> (Vec<DepthSample>, Vec<DepthSample>) {
-    const CANDIDATES_PER_SIDE: usize = 6; // Candidates along each side of a cell.
+    const CANDIDATES_PER_SIDE: usize = 6; // Per cell.
     let [width, height] = depth.size_px.map(|side| side as usize);
     let (mut strongest, mut uniform) = (Vec::new(), Vec::new());
     for cell in 0..GRID_CELLS[0] * GRID_CELLS[1] {
@@ -134,7 +135,7 @@ fn select_samples(
     (strongest, uniform)
 }
 
-/// The spot at a pixel; none at holes and edges.
+/// The sample at a pixel; `None` at holes and edges.
 fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
     const RADIUS: usize = 2;
     let [width, height] = depth.size_px.map(|side| side as usize);
@@ -153,7 +154,8 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
             if (neighbor - z_m).abs() > SMOOTH_FRAC * z_m {
                 return None;
             }
-            // Opposite readings in pairs, so that a slope does not shift the mean; of inverses, which are straight on a plane.
+            // Uses readings in opposite pairs, so that a slanted surface does not bias the mean. Averages inverse
+            // depths, which are linear on a plane.
             if at(x + RADIUS - dx, y + RADIUS - dy) > 0.0 {
                 sum += 1.0 / neighbor;
                 n += 1.0;
@@ -163,7 +165,8 @@ fn sample(depth: &DepthMap, x: usize, y: usize) -> Option<DepthSample> {
     Some(DepthSample { pixel: [x as f64 + 0.5, y as f64 + 0.5], z_m: n / sum })
 }
 
-/// A reading between pixels, whose inverses are straight on a plane, and its slopes along x and y; none at holes and edges.
+/// Depth interpolated between pixels, and its gradient along x and y; `None` at holes and edges. Interpolates inverse
+/// depths, which are linear on a plane.
 pub(super) fn depth_at(depth: &DepthMap, pixel: [f64; 2]) -> Option<SampledValue> {
     let [width, height] = depth.size_px.map(|side| side as usize);
     let [x, y] = pixel.map(|coordinate| coordinate - 0.5);
@@ -196,7 +199,8 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
         for row in y * edge..(y + 1) * edge {
             for pixel in keyframe.rgba_srgb[4 * (row * width + x * edge)..].chunks_exact(4).take(edge) {
                 is_valid &= pixel[3] > 0;
-                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]); // Of 256.
+                // The weights sum to 256.
+                sum += 77 * u32::from(pixel[0]) + 150 * u32::from(pixel[1]) + 29 * u32::from(pixel[2]);
             }
         }
         *value = if is_valid { sum as f32 / (256 * edge * edge) as f32 } else { f32::NAN };
@@ -218,8 +222,8 @@ fn levels(keyframe: &Keyframe) -> Vec<GrayImage> {
     levels
 }
 
-/// Binomial, five pixels wide: means between pixels have less noise than pixels have, and without a blur that would draw
-/// images half a pixel apart.
+/// Binomial blur, five pixels wide. Interpolated values have less noise than values at pixel centers; without the
+/// blur, this would bias images towards half-pixel offsets.
 fn blurred([width, height]: [usize; 2], values_in: &[f32]) -> Vec<f32> {
     const WEIGHTS: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
     let blur_along = |values: &[f32], n: usize, stride: usize, coordinate: &dyn Fn(usize) -> usize| -> Vec<f32> {
@@ -249,12 +253,12 @@ impl GrayImage {
         Self { size, pixels, texels: (0..width * height).map(texel).collect() }
     }
 
-    /// Pixels of the keyframe along each side of one of these.
+    /// Pixels of the keyframe along each side of a texel.
     pub(super) fn texel_px(&self) -> f64 {
         self.pixels
     }
 
-    /// Brightness at a place of the keyframe, in its pixels.
+    /// Brightness at a pixel position of the keyframe.
     pub(super) fn at(&self, pixel: [f64; 2]) -> Option<SampledValue> {
         let [x, y] = pixel.map(|coordinate| coordinate / self.pixels - 0.5);
         if !(x >= 1.0 && y >= 1.0 && x < (self.size[0] - 2) as f64 && y < (self.size[1] - 2) as f64) {

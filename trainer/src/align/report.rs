@@ -1,4 +1,4 @@
-//! What alignment found, in words and numbers a person can use.
+//! Results of alignment, as data and as text.
 
 use super::fit::Fit;
 use super::layout::CalibrationParam;
@@ -9,106 +9,107 @@ use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// What alignment found.
+/// Result of alignment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Alignment {
-    /// By camera; empty where nothing was kept.
+    /// Corrections by camera; empty if none were accepted.
     pub corrections: BTreeMap<String, CameraCorrection>,
-    /// What was kept, with its uncertainty.
+    /// Accepted corrections with their uncertainties.
     pub estimates: Vec<Estimate>,
-    /// What the motion does not show of what was kept; it stays at zero.
+    /// Directions of the accepted parameters that the motion does not make observable; corrections along them are
+    /// zero.
     pub unobservable: Vec<Unobservable>,
-    /// What was tried, and how much better it predicts the selection images.
+    /// Tested parameter sets, and how much better they predict the validation images.
     pub trials: Vec<Trial>,
-    /// Pairs of images that were compared.
+    /// Number of compared pairs of images.
     pub n_pairs: usize,
 }
 
-/// A correction. Deviations are standard ones.
+/// One estimated correction. Each sigma is a standard deviation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "parameter", rename_all = "kebab-case")]
 pub enum Estimate {
-    /// The camera sits elsewhere on what carries it: a turn about an axis and a way, both in its own axes as the input has them.
+    /// Correction of the camera pose relative to its parent, in the uncorrected axes of the camera.
     HandEye(PoseEstimate),
-    /// The depth frame sits elsewhere in the color frame, in whose axes this is told.
+    /// Correction of the pose of the depth frame in the color frame, in the axes of the color frame.
     DepthPose(PoseEstimate),
-    /// Images were taken later than their stamps say.
+    /// Time by which images were taken later than their stamps, seconds.
     TimeOffset(ScalarEstimate),
-    /// Readings of depth want this factor, less 1.
+    /// Factor to apply to depth readings, minus 1.
     DepthScale(ScalarEstimate),
-    /// The readout takes longer, seconds.
+    /// Increase of the readout time, seconds.
     Readout(ScalarEstimate),
-    /// What is to be added to a joint's reading.
+    /// Offset to add to a joint's readings.
     Joint {
-        /// In the order of the chain's moving joints.
+        /// Index of the joint among the chain's moving joints.
         joint_ix: usize,
-        /// Radians or metres.
+        /// Offset, radians or meters.
         value: f64,
-        /// Radians or metres.
+        /// Standard deviation, radians or meters.
         sigma: f64,
-        /// Share of it that only shows together with something else, 0 to 1.
+        /// Share of the offset that is not observable separately from other parameters, 0 to 1.
         unobservable_frac: f64,
     },
-    /// The lens.
+    /// Correction of the intrinsics.
     Lens {
         /// Name of the camera.
         camera: String,
-        /// Factors on the focal lengths, less 1.
+        /// Factors on the focal lengths, minus 1.
         focal_frac: [f64; 2],
-        /// Their deviations.
+        /// Standard deviations of the factors.
         focal_sigma: [f64; 2],
-        /// Shift of the principal point, in focal lengths.
+        /// Offset of the principal point, in focal lengths.
         principal_offset_focals: [f64; 2],
-        /// Their deviations.
+        /// Standard deviations of the offset.
         principal_offset_sigma: [f64; 2],
     },
-    /// Images that were moved on their own.
+    /// Individual pose corrections of images.
     ImagePoses {
         /// Name of the camera.
         camera: String,
-        /// How many.
+        /// Number of images.
         n_images: usize,
-        /// Root of the mean square, metres.
+        /// Root mean square of the translations, meters.
         rms_m: f64,
-        /// Root of the mean square, radians.
+        /// Root mean square of the rotations, radians.
         rms_rad: f64,
     },
 }
 
-/// A rigid motion.
+/// A rigid motion with its uncertainty.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseEstimate {
     /// Name of the camera.
     pub camera: String,
-    /// Radians.
+    /// Angle of rotation, radians.
     pub rotation_rad: f64,
-    /// Radians.
+    /// Standard deviation, radians.
     pub rotation_sigma_rad: f64,
-    /// Of length one; zero where nothing turned.
+    /// Unit vector, or zero without rotation.
     pub rotation_axis: [f64; 3],
-    /// Metres.
+    /// Length of the translation, meters.
     pub translation_m: f64,
-    /// Metres.
+    /// Standard deviation, meters.
     pub translation_sigma_m: f64,
-    /// Of length one; zero where nothing moved.
+    /// Unit vector, or zero without translation.
     pub translation_axis: [f64; 3],
 }
 
-/// One number of one camera.
+/// An estimate of one parameter of one camera.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ScalarEstimate {
     /// Name of the camera.
     pub camera: String,
-    /// Seconds, or a share of one.
+    /// Value, in seconds or as a fraction.
     pub value: f64,
-    /// In the same unit.
+    /// Standard deviation, in the unit of the value.
     pub sigma: f64,
 }
 
-/// A direction that the motion does not show: a change of all these together leaves every pair as it is.
+/// A direction that the motion does not make observable: changing all its parts together changes no residual.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Unobservable {
-    /// Words, one part each.
+    /// Descriptions of the parts.
     pub parts: Vec<String>,
 }
 
@@ -148,7 +149,7 @@ pub(super) fn alignment(
     Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
 }
 
-/// What is said where a term's first number stands.
+/// Estimate for a parameter; `None` unless it is the first of its group.
 fn estimate(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -229,7 +230,7 @@ fn pose_estimate(
     }
 }
 
-/// Directions that a fit cannot tell.
+/// Directions that are not observable in a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
     let is_not_translation = |ix: usize| {
         !matches!(fit.layout.params[ix], CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3))
@@ -239,7 +240,7 @@ pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservabl
 }
 
 fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVector<f64>) -> Unobservable {
-    /// Parts below this share of the largest are left out.
+    /// Parts smaller than this fraction of the largest are omitted.
     const MIN_SHARE: f64 = 0.1;
     let scaled: Vec<f64> = params.iter().enumerate().map(|(ix, param)| direction[ix] / param.scale()).collect();
     let largest = scaled.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
@@ -256,20 +257,20 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
                 Some(format!("translation of camera {:?} along {} of its own axes", name(camera), axis(ix)))
             }
             CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("turn of camera {:?} about {} of its own axes", name(camera), axis(ix)))
+                Some(format!("rotation of camera {:?} about {} of its own axes", name(camera), axis(ix)))
             }
             CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => {
                 Some(format!("translation of the depth frame of camera {:?} along {}", name(camera), axis(ix)))
             }
             CalibrationParam::DepthPose(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("turn of the depth frame of camera {:?} about {}", name(camera), axis(ix)))
+                Some(format!("rotation of the depth frame of camera {:?} about {}", name(camera), axis(ix)))
             }
             CalibrationParam::Joint(joint) if is_significant(ix, 1) => Some(format!("offset of joint {joint}")),
             CalibrationParam::TimeOffset(camera) if is_significant(ix, 1) => {
-                Some(format!("delay of camera {:?}", name(camera)))
+                Some(format!("time offset of camera {:?}", name(camera)))
             }
             CalibrationParam::DepthScale(camera) if is_significant(ix, 1) => {
-                Some(format!("scale of the depth of camera {:?}", name(camera)))
+                Some(format!("depth scale of camera {:?}", name(camera)))
             }
             CalibrationParam::Readout(camera) if is_significant(ix, 1) => {
                 Some(format!("readout time of camera {:?}", name(camera)))
@@ -290,39 +291,39 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
 }
 
 impl Alignment {
-    /// Whether anything was kept.
+    /// Whether any correction was accepted.
     pub fn has_corrections(&self) -> bool {
         !self.corrections.is_empty()
     }
 
-    /// Whether there were enough images to tell what pays.
+    /// Whether there were enough validation images for decisions.
     pub fn has_enough_validation_images(&self) -> bool {
         self.trials.iter().all(|trial| trial.n_images >= MIN_VALIDATION_IMAGES)
     }
 
-    /// Whether images got poses of their own.
+    /// Whether individual image poses were accepted.
     pub fn has_image_poses(&self) -> bool {
         let is_image_poses = |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.image_poses);
         self.trials.iter().any(|trial| trial.kept && is_image_poses(&trial.candidate))
     }
 
-    /// One line each: what was found, what cannot be seen, what was tried and not needed.
+    /// Text lines with the estimates, unobservable directions and trials.
     pub fn lines(&self) -> Vec<String> {
         let mut lines: Vec<String> = self.estimates.iter().map(ToString::to_string).collect();
         lines.extend(
-            self.unobservable.iter().map(|unobservable| format!("cannot be seen in this motion: {unobservable}")),
+            self.unobservable.iter().map(|unobservable| format!("not observable with this motion: {unobservable}")),
         );
         for trial in &self.trials {
             lines.push(format!(
-                "{}: {:+.2} dB (standard error {:.2}) on {} selection images: {}",
+                "{}: {:+.2} dB (standard error {:.2}) on {} validation images: {}",
                 trial.candidate,
                 trial.gain_db,
                 trial.standard_error_db,
                 trial.n_images,
                 match trial.kept {
-                    true => "kept",
-                    false if trial.n_images < MIN_VALIDATION_IMAGES => "too few to judge by",
-                    false => "not needed",
+                    true => "accepted",
+                    false if trial.n_images < MIN_VALIDATION_IMAGES => "too few images",
+                    false => "rejected",
                 }
             ));
         }
@@ -342,7 +343,7 @@ impl std::fmt::Display for PoseEstimate {
         let [sx, sy, sz] = self.translation_axis;
         write!(
             f,
-            "turned by {:.3} +- {:.3} degrees about ({ax:.2} {ay:.2} {az:.2}), moved by {:.2} +- {:.2} mm along ({sx:.2} {sy:.2} {sz:.2})",
+            "rotated by {:.3} +- {:.3} degrees about ({ax:.2} {ay:.2} {az:.2}), moved by {:.2} +- {:.2} mm along ({sx:.2} {sy:.2} {sz:.2})",
             self.rotation_rad.to_degrees(),
             self.rotation_sigma_rad.to_degrees(),
             1e3 * self.translation_m,
@@ -357,19 +358,19 @@ impl std::fmt::Display for Estimate {
             Self::HandEye(pose_estimate) => write!(f, "hand-eye of {}: {pose_estimate}", pose_estimate.camera),
             Self::DepthPose(pose_estimate) => write!(f, "depth frame of {}: {pose_estimate}", pose_estimate.camera),
             Self::TimeOffset(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "delay of {camera}: {:.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
+                write!(f, "time offset of {camera}: {:.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
             }
             Self::DepthScale(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "depth of {camera}: times {:.4} +- {sigma:.4}", 1.0 + value)
+                write!(f, "depth scale of {camera}: {:.4} +- {sigma:.4}", 1.0 + value)
             }
             Self::Readout(ScalarEstimate { camera, value, sigma }) => {
-                write!(f, "readout of {camera}: {:+.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
+                write!(f, "readout time of {camera}: {:+.2} +- {:.2} ms", 1e3 * value, 1e3 * sigma)
             }
             Self::Joint { joint_ix, value, sigma, unobservable_frac } => {
                 let (value, sigma) = (value.to_degrees(), sigma.to_degrees());
                 write!(f, "offset of joint {joint_ix}: {value:+.3} +- {sigma:.3} degrees")?;
                 if *unobservable_frac > 0.1 {
-                    f.write_str(", of which a part cannot be told from something else")
+                    f.write_str(", partly indistinguishable from other parameters")
                 } else {
                     Ok(())
                 }
@@ -378,7 +379,7 @@ impl std::fmt::Display for Estimate {
                 let percent = |value: f64| 100.0 * value;
                 write!(
                     f,
-                    "lens of {camera}: focal lengths {:+.3} +- {:.3} % and {:+.3} +- {:.3} %, principal point by {:+.3} +- {:.3} % and {:+.3} +- {:.3} % of them",
+                    "lens of {camera}: focal lengths {:+.3} +- {:.3} % and {:+.3} +- {:.3} %, principal point {:+.3} +- {:.3} % and {:+.3} +- {:.3} % of the focal lengths",
                     percent(focal_frac[0]),
                     percent(focal_sigma[0]),
                     percent(focal_frac[1]),
@@ -391,7 +392,7 @@ impl std::fmt::Display for Estimate {
             }
             Self::ImagePoses { camera, n_images, rms_m, rms_rad } => write!(
                 f,
-                "poses of {n_images} images of {camera}: moved by {:.2} mm and {:.3} degrees (root mean square)",
+                "poses of {n_images} images of {camera}: corrected by {:.2} mm and {:.3} degrees (root mean square)",
                 1e3 * rms_m,
                 rms_rad.to_degrees()
             ),

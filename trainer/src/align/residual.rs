@@ -1,27 +1,28 @@
-//! A spot of one frame in another: differences of brightness and of depth, and how they change with every term.
+//! Photometric and depth residuals of a sample of one image in another image, and their Jacobians.
 //!
-//! A reading of depth becomes a point in the world. Its brightness where frame `i` shows it is compared with that where frame
-//! `j` shows it, and its distance along z from `j`'s depth camera with the reading there. Source: Kerbl, Sturm and Cremers 2013
-//! (the two residuals), Schoeps et al. 2019 (both cameras move); that depth has its own pose, and the shutter, are ours.
+//! A depth reading becomes a point in the world. Its brightness in image `i` is compared with that in image `j`, and
+//! its distance along the z axis of `j`'s depth camera with the reading there. Source: Kerbl, Sturm and Cremers 2013
+//! (the two residuals), Schoeps et al. 2019 (both cameras move). The separate pose of the depth camera and the
+//! rolling shutter are our additions.
 
 use super::prepared_image::{DepthSample, GrayImage, PreparedImage, depth_at, point};
 use super::view::CorrectedView;
 use nalgebra::Vector3;
 
-/// One image is as fine as another up to this factor.
+/// Two images count as equally fine up to this factor.
 const HALF_OCTAVE: f64 = std::f64::consts::SQRT_2;
 
-/// A frame with its cameras.
+/// An image with its corrected view.
 #[derive(Clone, Copy)]
 pub(super) struct Side<'a> {
     pub(super) image: &'a PreparedImage,
     pub(super) view: &'a CorrectedView,
 }
 
-/// A point as one of the two frames has it.
+/// A point as observed in one of the two images.
 #[derive(Clone, Copy, Debug)]
 struct ObservedPoint {
-    /// In the color camera at mid-exposure.
+    /// Position in the color camera at mid-exposure.
     still: Vector3<f64>,
     /// When its row is read.
     read: Vector3<f64>,
@@ -32,12 +33,12 @@ struct ObservedPoint {
     gradient: [f64; 2],
 }
 
-/// A spot of frame `i` in frame `j`.
+/// A sample of image `i` projected into image `j`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Correspondence {
     i: ObservedPoint,
     j: ObservedPoint,
-    /// The spot in the depth camera of `i`, and the point in that of `j`.
+    /// Position of the sample in the depth camera of `i`, then in that of `j`.
     point_in_depth_i: Vector3<f64>,
     in_depth: Vector3<f64>,
     depth_pixel: [f64; 2],
@@ -46,7 +47,7 @@ pub(super) struct Correspondence {
     depth_weight: f64,
 }
 
-/// How brightness of `i` becomes that of `j`: exposures differ.
+/// Map from the brightness of `i` to that of `j`, which have different exposures.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Tone {
     pub(super) gain: f64,
@@ -54,7 +55,8 @@ pub(super) struct Tone {
 }
 
 impl Correspondence {
-    /// None where `j` does not show it: outside, hidden, at edges and holes. Readings may be off by `occlusion_frac` of depth.
+    /// Projects a sample; `None` if it is outside `j`, occluded, or at an edge or hole. Readings may differ by
+    /// `occlusion_frac` of the depth.
     pub(super) fn new(
         i: Side<'_>,
         j: Side<'_>,
@@ -87,12 +89,12 @@ impl Correspondence {
             depth_pixel,
             reading_m,
             reading_gradient,
-            // Along the normal instead of along z; noise of depth grows with its square.
+            // Projects the difference along z onto the normal; depth noise grows with the square of the depth.
             depth_weight: 1.0 / ((1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1]).sqrt() * reading_m * reading_m),
         })
     }
 
-    /// Where `j` shows it.
+    /// Pixel in `j`.
     pub(super) fn pixel(&self) -> [f64; 2] {
         self.j.pixel
     }
@@ -101,17 +103,17 @@ impl Correspondence {
         [self.i.brightness, self.j.brightness]
     }
 
-    /// Of 255.
+    /// Photometric residual, on a scale of 0 to 255.
     pub(super) fn photo(&self, tone: Tone) -> f64 {
         self.j.brightness - tone.gain * self.i.brightness - tone.offset
     }
 
-    /// Along the normal at 1 m, metres.
+    /// Depth residual along the normal, normalized to a depth of 1 m, meters.
     pub(super) fn depth(&self) -> f64 {
         self.depth_weight * (self.reading_m - self.in_depth.z)
     }
 
-    /// Slopes of [`Correspondence::photo`] along the terms; those of gain and offset come after them.
+    /// Jacobian of [`Correspondence::photo`] with respect to the parameters, followed by gain and offset.
     pub(super) fn photo_jacobian(&self, i: &ParamColumns<'_>, j: &ParamColumns<'_>, tone: Tone, row: &mut [f64]) {
         row.fill(0.0);
         let read_j = row_held_gradient(j.view, &self.j, &gradient_by_point(j.view, &self.j, 1.0));
@@ -134,7 +136,7 @@ impl Correspondence {
         (row[n - 2], row[n - 1]) = (-self.i.brightness, -1.0);
     }
 
-    /// Slopes of [`Correspondence::depth`] along the terms; gain and offset have none.
+    /// Jacobian of [`Correspondence::depth`] with respect to the parameters; zero for gain and offset.
     pub(super) fn depth_jacobian(&self, i: &ParamColumns<'_>, j: &ParamColumns<'_>, row: &mut [f64]) {
         row.fill(0.0);
         let weight = self.depth_weight;
@@ -166,8 +168,8 @@ impl Correspondence {
     }
 }
 
-/// Levels at which both images show a surface about equally fine, neither finer than asked for: a near view has detail that a
-/// far one cannot have.
+/// Levels at which both images have about the same resolution on the surface, neither finer than `level`: a near view
+/// has detail that a distant one lacks.
 fn levels([i, j]: [Side<'_>; 2], [z_i, z_j]: [f64; 2], level: usize) -> [usize; 2] {
     let texel_m = |side: Side<'_>, z_m: f64| z_m * side.image.level(level).texel_px() / side.view.focal_px[0];
     let (of_i, of_j) = (texel_m(i, z_i), texel_m(j, z_j));
@@ -184,7 +186,7 @@ impl ObservedPoint {
     }
 }
 
-/// Where the terms of a view lie in the rows of a pair.
+/// Columns of a pair's Jacobian that belong to the parameters of one view.
 #[derive(Debug)]
 pub(super) struct ParamColumns<'a> {
     view: &'a CorrectedView,
@@ -196,7 +198,7 @@ pub(super) struct ParamColumns<'a> {
 }
 
 impl<'a> ParamColumns<'a> {
-    /// `column_of` says where in the rows a term lies.
+    /// `column_of` maps a parameter's index to its column.
     pub(super) fn new(view: &'a CorrectedView, column_of: impl Fn(usize) -> usize) -> Self {
         Self {
             columns: view
@@ -212,7 +214,7 @@ impl<'a> ParamColumns<'a> {
         }
     }
 
-    /// Only the motion of the camera itself: metres, then radians, from `begin` on.
+    /// Columns for the motion of the camera only: meters, then radians, starting at `begin`.
     pub(super) fn free(view: &'a CorrectedView, begin: usize) -> Self {
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
         let motion = |part: usize| match part {
@@ -223,19 +225,20 @@ impl<'a> ParamColumns<'a> {
         Self { columns, ..Self::still(view) }
     }
 
-    /// Nothing changes.
+    /// No columns: the camera is fixed.
     pub(super) fn still(view: &'a CorrectedView) -> Self {
         Self { view, columns: Vec::new(), depth_pose: None, lens: None, depth_scale: None, readout: None }
     }
 }
 
-/// How `factor` times the brightness changes with the point at the time its row is read.
+/// Gradient of `factor` times the brightness with respect to the point at its readout time.
 fn gradient_by_point(view: &CorrectedView, observed: &ObservedPoint, factor: f64) -> Vector3<f64> {
     let [sx, sy] = [0, 1].map(|axis| factor * observed.gradient[axis] * view.focal_px[axis] / observed.read.z);
     Vector3::new(sx, sy, -(sx * observed.read.x + sy * observed.read.y) / observed.read.z)
 }
 
-/// The same with the point as it moves while the row that reads it is held: a point that moves on meets another row.
+/// Gradient with respect to a displacement of the point at fixed readout time. Accounts for the row, and thus the
+/// readout time, changing with the displacement.
 fn row_held_gradient(view: &CorrectedView, observed: &ObservedPoint, gradient: &Vector3<f64>) -> Vector3<f64> {
     let drift = -view.readout_secs * view.twist.apparent_velocity(&observed.still);
     let z = observed.read.z;
@@ -243,7 +246,7 @@ fn row_held_gradient(view: &CorrectedView, observed: &ObservedPoint, gradient: &
     gradient - row * (gradient.dot(&drift) / (view.height_px + row.dot(&drift)))
 }
 
-/// The same with the point at mid-exposure.
+/// Gradient with respect to the point at mid-exposure.
 fn mid_exposure_gradient(view: &CorrectedView, observed: &ObservedPoint, row_held: &Vector3<f64>) -> Vector3<f64> {
     row_held - row_held.cross(&view.twist.angular_rad_s) * (observed.share * view.readout_secs)
 }
@@ -269,7 +272,7 @@ fn add_twist(row: &mut [f64], point: &Vector3<f64>, gradient: &Vector3<f64>, sig
     }
 }
 
-/// What moves the point of a spot within its own color camera.
+/// Adds the derivatives of parameters that move the sample's point within its own color camera.
 fn add_depth(i: &ParamColumns<'_>, correspondence: &Correspondence, gradient: &Vector3<f64>, row: &mut [f64]) {
     if let Some(pose) = i.depth_pose {
         add_twist(&mut row[pose..pose + 6], &correspondence.i.still, gradient, 1.0);

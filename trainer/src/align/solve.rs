@@ -1,34 +1,34 @@
-//! One step of the shared terms, how sure it is, and which directions cannot be seen.
+//! One Gauss-Newton step of the shared parameters, its uncertainty, and unobservable directions.
 
 use super::pairs::Pair;
 use super::sums::PairSums;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-/// Residuals of neighbouring spots err together: they say as much as this many times fewer would. Only for damping and for
-/// what counts as seen; what is reported is measured, see [`Solution::variance`].
+/// Residuals of neighboring samples are correlated and carry as much information as this many times fewer independent
+/// ones. Used only for damping and observability; reported uncertainties are measured, see [`Solution::variance`].
 pub(super) const INFLATION: f64 = 10.0;
-/// A direction is seen when its standard deviation is below this share of what the term may be.
+/// A direction is observable if its standard deviation is below this fraction of the parameters' scales.
 const OBSERVABLE_FRAC: f64 = 0.3;
-/// The most a step may change, in shares of what the terms may be.
+/// Maximum step, relative to the parameters' scales.
 const MAX_STEP: f64 = 2.0;
 
-/// The normal equations, each term in units of what it may be, and their eigenvectors.
+/// The normal equations in units of the parameters' scales, and their eigenvectors.
 #[derive(Debug)]
 pub(super) struct Solution {
     scales: DVector<f64>,
     eigen: SymmetricEigen<f64, nalgebra::Dyn>,
-    /// Of the eigenvectors, in order.
+    /// For each eigenvector, in order.
     is_observable: Vec<bool>,
-    /// In units of the terms.
+    /// In units of the parameters.
     pub(super) step: DVector<f64>,
     covariance: DMatrix<f64>,
 }
 
 impl Solution {
-    /// Gauss and Newton's step with a pull to zero; directions that are not seen go to zero.
+    /// Gauss-Newton step with damping towards zero. Components along unobservable directions become zero.
     ///
-    /// * `scales`: how large each term may be.
-    /// * `values`: what the terms are now.
+    /// * `scales`: typical magnitude of each parameter.
+    /// * `values`: current values of the parameters.
     pub(super) fn new(scales: DVector<f64>, values: &DVector<f64>, pairs: &[Pair], sums: &[PairSums]) -> Self {
         let n = scales.len();
         let (mut information, mut gradient) = (DMatrix::zeros(n, n), DVector::zeros(n));
@@ -64,10 +64,11 @@ impl Solution {
         solution
     }
 
-    /// Covariance from the scatter of what the pairs say, in scaled units: pairs that share a frame err together, and each on
-    /// its own; where only one of both is so it comes out too large by at most two.
+    /// Covariance from the scatter of the pairs' gradients, in scaled units. Assumes that pairs sharing an image have
+    /// correlated errors and that each pair has independent errors. If only one of these holds, the covariance is too
+    /// large by a factor of at most two.
     ///
-    /// Source: White 1980 (the sandwich); Aronow, Samii and Assenova 2015 (pairs that share a member).
+    /// Source: White 1980 (sandwich estimator); Aronow, Samii and Assenova 2015 (pairs that share a member).
     fn covariance(&self, pairs: &[Pair], sums: &[PairSums]) -> DMatrix<f64> {
         let n = self.scales.len();
         let n_images = pairs.iter().map(|pair| pair.from.max(pair.to) + 1).max().unwrap_or(0);
@@ -88,7 +89,7 @@ impl Solution {
         &inverse * meat * &inverse * (n_active / (n_active - 1.0).max(1.0))
     }
 
-    /// Inverse of the information over what is seen, in scaled units.
+    /// Inverse of the information matrix over the observable directions, in scaled units.
     fn inverse(&self) -> DMatrix<f64> {
         let n = self.scales.len();
         let mut inverse = DMatrix::zeros(n, n);
@@ -99,20 +100,20 @@ impl Solution {
         inverse
     }
 
-    /// Variance of the sum of the terms, each times its weight.
+    /// Variance of the weighted sum of the parameters.
     pub(super) fn variance(&self, weights: &DVector<f64>) -> f64 {
         let scaled = weights.component_mul(&self.scales);
         (&self.covariance * &scaled).dot(&scaled).max(0.0)
     }
 
-    /// Standard deviation of one term.
+    /// Standard deviation of one parameter.
     pub(super) fn sigma(&self, param: usize) -> f64 {
         let mut weights = DVector::zeros(self.scales.len());
         weights[param] = 1.0;
         self.variance(&weights).sqrt()
     }
 
-    /// Share of a term that lies in directions that cannot be seen, 0 to 1.
+    /// Share of a parameter that lies in unobservable directions, 0 to 1.
     pub(super) fn unobservable_frac(&self, param: usize) -> f64 {
         self.unobservable_columns().map(|ix| self.eigen.eigenvectors[(param, ix)].powi(2)).sum()
     }
@@ -121,7 +122,8 @@ impl Solution {
         self.is_observable.iter().enumerate().filter(|(_, observable)| !**observable).map(|(ix, _)| ix)
     }
 
-    /// Directions that cannot be seen, in the units of the terms; of several the ones that move `to_minimize` least come first.
+    /// Unobservable directions in the units of the parameters, ordered by how little they change the parameters
+    /// selected by `to_minimize`.
     pub(super) fn unobservable(&self, to_minimize: impl Fn(usize) -> bool) -> Vec<DVector<f64>> {
         let columns: Vec<usize> = self.unobservable_columns().collect();
         if columns.is_empty() {
@@ -138,7 +140,7 @@ impl Solution {
         order.into_iter().map(direction).collect()
     }
 
-    /// The step in standard deviations, the most over the terms.
+    /// Largest component of the step in standard deviations, over the observable parameters.
     pub(super) fn step_in_sigmas(&self) -> f64 {
         let in_sigmas = |(ix, step): (usize, &f64)| step.abs() / self.sigma(ix).max(f64::MIN_POSITIVE);
         self.step

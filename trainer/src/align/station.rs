@@ -1,9 +1,9 @@
-//! Where a base that walks came to stand: what its camera sees there is laid over what it saw before.
+//! Correction of a mobile base's pose at a new station, by registering its camera's images to earlier ones.
 //!
-//! The six numbers of the base's pose are found like the terms of cameras: spots with depth of one image in another, differences
-//! of brightness and depth, Gauss and Newton's steps from coarse to fine. A pair has one image of the new stand and one of
-//! earlier ones; which of both shows the other's spots does not matter, for a near view lies within a far one and not the other
-//! way round.
+//! The six parameters of the base's pose are estimated like those of cameras: from depth samples of one image in
+//! another, differences of brightness and depth, and Gauss-Newton steps from coarse to fine. Each pair has one image
+//! from the new station and one from earlier ones. Pairs are formed in both directions, because a near view is
+//! contained in a distant one but not vice versa.
 
 use super::corrections::Corrections;
 use super::fit::{INITIAL_NOISE, OCCLUSION_FRAC};
@@ -24,49 +24,50 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// How large an error of the base's pose may be before one would call it a mistake, metres and radians.
+/// Typical errors of the base's pose, meters and radians.
 const PRIOR_TRANSLATION_M: f64 = 0.02;
 const PRIOR_ROTATION_RAD: f64 = 0.0175;
 
-/// Most steps at each level: weights that change with the residuals make the way slower than Gauss and Newton's.
+/// Maximum number of steps at each level. Weights that depend on the residuals make convergence slower than plain
+/// Gauss-Newton.
 const MAX_ITERATIONS: usize = 20;
-/// A step below this many standard deviations ends a level, the finest first.
+/// A step smaller than this number of standard deviations ends a level, the finest first.
 const CONVERGED_STEP_SIGMAS: [f64; 4] = [0.1, 0.3, 0.3, 0.3];
-/// Brightness errs in the same way in all pairs across two stands, near what hides other things and where light is reflected, and
-/// depth does not: by so many times its scatter it is taken to be less sure.
+/// Factor on the noise of brightness. Between two stations, brightness has the same errors in all pairs, near
+/// occlusions and reflections; depth does not.
 const BRIGHTNESS_NOISE_INFLATION: f64 = 4.0;
 
-/// What the source of a base's poses got wrong on the way to a stand. Deviations are standard ones.
+/// Correction of the reported pose of a base at a station. Each sigma is a standard deviation.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StationCorrection {
-    /// The base stands so far from where its source has it, metres, along the axes of the world.
+    /// Translation from the reported to the estimated position of the base, along the axes of the world, meters.
     pub translation_m: [f64; 3],
-    /// Metres.
+    /// Standard deviations, meters.
     pub translation_sigma_m: [f64; 3],
-    /// It is turned so, about its own place: a rotation vector in the axes of the world, radians.
+    /// Rotation of the base about its own position: rotation vector in the axes of the world, radians.
     pub rotation_rad: [f64; 3],
-    /// Radians.
+    /// Standard deviations, radians.
     pub rotation_sigma_rad: [f64; 3],
-    /// Directions that the images do not show, in words; nothing was found along them.
+    /// Descriptions of directions that are not observable; the correction along them is zero.
     pub unobservable: Vec<String>,
-    /// How much better the corrected poses predict selection images across the stands, dB.
+    /// How much better the corrected poses predict validation images across the stations, dB.
     pub gain_db: f64,
-    /// Its standard error, dB.
+    /// Standard error of the gain, dB.
     pub standard_error_db: f64,
-    /// Selection images that judged.
+    /// Number of validation images.
     pub n_validation_images: usize,
-    /// Pairs of images that were compared.
+    /// Number of compared pairs of images.
     pub n_pairs: usize,
-    /// Whether it is clearly not zero and pays.
+    /// Whether the correction and its gain are significant.
     pub kept: bool,
 }
 
-/// Finds where a base stands from the keyframes of the new stand (`new`) and of earlier ones (`reference`); none where they have no depth, or
-/// too few of them see the same.
+/// Estimates the pose of the base from the keyframes of the new station (`new`) and of earlier ones (`reference`);
+/// `None` if they have no depth or too little overlap.
 ///
-/// Training keyframes are learned from, selection keyframes judge, test keyframes are not looked at.
+/// Poses are estimated from training keyframes and evaluated on validation keyframes; test keyframes are not used.
 ///
-/// * `world_from_base`: the pose of the base that the keyframes of the new stand were placed with.
+/// * `world_from_base`: the reported base pose from which the poses of the new station's keyframes were computed.
 pub fn register_station(
     reference: &[Arc<Keyframe>],
     new: &[Arc<Keyframe>],
@@ -95,9 +96,10 @@ pub fn register_station(
 }
 
 impl StationCorrection {
-    /// What poses on the base are to be multiplied by from the left, where its source has it at `world_from_base`.
+    /// Transform to apply from the left to poses on the base that is reported at `world_from_base`; identity unless
+    /// the correction is accepted.
     ///
-    /// * `share`: of the way to the stand that was walked, 0 to 1: the error grew with the way.
+    /// * `share`: fraction of the path to the station, 0 to 1, because the error grows along the path.
     pub fn map_from_odom(&self, world_from_base: &Transform, share: f64) -> Transform {
         if !self.kept {
             return Transform::identity();
@@ -112,7 +114,7 @@ impl std::fmt::Display for StationCorrection {
         let length = |of: [f64; 3]| Vector3::from(of).norm();
         write!(
             f,
-            "moved by {:.1} +- {:.1} mm, turned by {:.2} +- {:.2} degrees ({:+.2} dB, standard error {:.2}, on {} selection images)",
+            "moved by {:.1} +- {:.1} mm, rotated by {:.2} +- {:.2} degrees ({:+.2} dB, standard error {:.2}, on {} validation images)",
             1e3 * length(self.translation_m),
             1e3 * length(self.translation_sigma_m),
             length(self.rotation_rad).to_degrees(),
@@ -124,14 +126,14 @@ impl std::fmt::Display for StationCorrection {
     }
 }
 
-/// The motion of what a base carries when the base is shifted, and turned about its own place.
+/// Motion of everything on a base that is translated and rotated about its own position.
 fn base_motion(world_from_base: &Transform, translation_m: &Vector3<f64>, rotation_rad: &Vector3<f64>) -> Transform {
     let position = world_from_base.translation.vector;
     let rotation = UnitQuaternion::from_scaled_axis(*rotation_rad);
     Transform::from_parts((position + translation_m - rotation * position).into(), rotation)
 }
 
-/// A direction that cannot be seen.
+/// Describes an unobservable direction.
 fn describe(direction: &DVector<f64>) -> String {
     const MIN_SHARE: f64 = 0.1;
     let vector = |begin: usize| Vector3::from_fn(|row, _| direction[begin + row]);
@@ -146,21 +148,21 @@ fn describe(direction: &DVector<f64>) -> String {
         parts.push(format!("translation along {}", along(translation)));
     }
     if sizes[1] > MIN_SHARE * sizes[0] {
-        parts.push(format!("turn about {}", along(rotation)));
+        parts.push(format!("rotation about {}", along(rotation)));
     }
     parts.join(" together with ")
 }
 
-/// The frames of the new stand and of earlier ones, and the pairs across.
+/// Images of the new station and of earlier ones, and the pairs between them.
 struct StationScene {
     images: Vec<PreparedImage>,
-    /// From here on they are of the new stand.
+    /// Index of the first image of the new station.
     first_new: usize,
-    /// As the keyframes have them.
+    /// Views with uncorrected poses.
     initial_views: Vec<CorrectedView>,
     world_from_base: Transform,
     pairs: Vec<Pair>,
-    /// Between a training and a selection image.
+    /// Pairs of a training and a validation image.
     validation_pairs: Vec<Pair>,
 }
 
@@ -205,11 +207,12 @@ impl StationScene {
         (scene.pairs.len() >= MIN_PAIRS).then_some(scene)
     }
 
-    /// The cameras with the base shifted and turned: those of the new stand moved along, with what a further motion does.
+    /// Views with the base moved by the estimate. Those of the new station move along, with columns for a further
+    /// motion.
     fn views(&self, estimate: &DVector<f64>) -> Vec<CorrectedView> {
         let part = |begin: usize| Vector3::from_fn(|row, _| estimate[begin + row]);
         let motion = base_motion(&self.world_from_base, &part(0), &part(3));
-        // Axes of the world, in the place of the base.
+        // The axes of the world, at the position of the base.
         let world_from_pivot = Transform::from_parts(
             (self.world_from_base.translation.vector + part(0)).into(),
             UnitQuaternion::identity(),
@@ -221,7 +224,7 @@ impl StationScene {
         self.initial_views.iter().enumerate().map(view).collect()
     }
 
-    /// Shift, then turn, from coarse to fine.
+    /// Estimates translation, then rotation, from coarse to fine.
     fn fit(&self) -> Option<(DVector<f64>, Solution, Noise)> {
         let scales = DVector::from_fn(6, |ix, _| if ix < 3 { PRIOR_TRANSLATION_M } else { PRIOR_ROTATION_RAD });
         let mut estimate = DVector::zeros(6);
@@ -243,7 +246,7 @@ impl StationScene {
                 let solution = Solution::new(scales.clone(), &estimate, &self.pairs, &sums);
                 estimate = compose_step(&estimate, &solution.step);
                 let n_sigmas = solution.step_in_sigmas();
-                log::debug!("stand: level {level}, {noise:?}, step of {n_sigmas:.2} sigma");
+                log::debug!("station: level {level}, {noise:?}, step of {n_sigmas:.2} sigma");
                 last = Some(solution);
                 if n_sigmas < CONVERGED_STEP_SIGMAS[level] {
                     break;
@@ -253,7 +256,7 @@ impl StationScene {
         Some((estimate, last?, noise))
     }
 
-    /// How much better the selection images of either side are predicted from the other.
+    /// Evaluates how much better validation images of each side are predicted from the other.
     fn evaluate(&self, estimate: &DVector<f64>, noise: Noise) -> Trial {
         let views = [&DVector::zeros(6), estimate].map(|estimate| self.views(estimate));
         let validation_image_of = |pair: &Pair| {
@@ -261,12 +264,12 @@ impl StationScene {
         };
         let (baseline_db, variant_db) =
             validation::scores(&self.images, &self.validation_pairs, &views, noise, validation_image_of);
-        log::debug!("stand: without {baseline_db:.2?}, with {variant_db:.2?} dB");
+        log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
         Trial::of(Candidate::Cameras(ParamSet::NONE), &baseline_db, &variant_db)
     }
 }
 
-/// A motion that is followed by a small one.
+/// Composes a motion with a small one that follows it.
 fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
     let rotation = |of: &DVector<f64>| UnitQuaternion::from_scaled_axis(Vector3::from_fn(|row, _| of[3 + row]));
     let composed_rotation = (rotation(step) * rotation(estimate)).scaled_axis();
@@ -278,18 +281,18 @@ mod tests {
     use super::*;
     use crate::align::tests::{Miscalibration, capture};
 
-    /// Where the base was told to be at the second stand.
+    /// Reported pose of the base at the second station.
     fn reported_base() -> Transform {
         Transform::new(Vector3::new(0.3, -0.2, 0.1), Vector3::new(0.0, 0.0, 0.2))
     }
 
-    /// What was told of the base is what it was, moved by this.
+    /// The reported pose of the base is the true one moved by this drift.
     fn drift() -> Transform {
         base_motion(&reported_base(), &Vector3::new(0.014, -0.013, 0.004), &Vector3::new(0.005, -0.004, 0.016))
             .inverse()
     }
 
-    /// The images of two stands, the second as a wrong base pose places them.
+    /// Images of two stations, those of the second one with a wrong base pose.
     fn keyframes_of_two_stations(odom_from_true: &Transform, noise: f64) -> [Vec<Arc<Keyframe>>; 2] {
         let all = capture(&Miscalibration { noise, ..Miscalibration::none() });
         let (first, second) = all.split_at(all.len() / 2);
@@ -299,7 +302,7 @@ mod tests {
         ]
     }
 
-    /// Millimetres at the base, and degrees, that a pose is off.
+    /// Error of a pose, in millimeters at the base and in degrees.
     fn pose_error(remaining: &Transform) -> (f64, f64) {
         let position = reported_base().translation.vector;
         (
@@ -315,11 +318,11 @@ mod tests {
         assert!(estimate.kept && estimate.unobservable.is_empty() && estimate.gain_db > 3.0, "{estimate:?}");
         let (mm, degrees) = pose_error(&(estimate.map_from_odom(&reported_base(), 1.0) * drift()));
         let (mm_before, degrees_before) = pose_error(&drift());
-        assert!(mm_before > 15.0 && degrees_before > 0.9, "{mm_before} mm, {degrees_before} degrees to begin with");
+        assert!(mm_before > 15.0 && degrees_before > 0.9, "{mm_before} mm, {degrees_before} degrees before correction");
         assert!(mm < 0.3 && degrees < 0.03, "{mm} mm, {degrees} degrees left: {estimate}");
         let sigma_mm = 1e3 * Vector3::from(estimate.translation_sigma_m).norm();
-        assert!((0.02..1.0).contains(&sigma_mm), "{sigma_mm} mm of deviation, {mm} mm of error");
-        // Half way it is off by half of it.
+        assert!((0.02..1.0).contains(&sigma_mm), "standard deviation {sigma_mm} mm, error {mm} mm");
+        // At half of the path, half of the error is corrected.
         let half = estimate.map_from_odom(&reported_base(), 0.5);
         let (mm_half, degrees_half) = pose_error(&half);
         assert!((mm_half / mm_before - 0.5).abs() < 0.02 && (degrees_half / degrees_before - 0.5).abs() < 0.02);

@@ -1,4 +1,4 @@
-//! Normal equations of pairs: robustly weighted, with gain and offset of each pair taken out.
+//! Normal equations of pairs: robustly weighted, with gain and offset of each pair eliminated.
 
 use super::pairs::Pair;
 use super::prepared_image::{DepthSample, PreparedImage};
@@ -7,37 +7,38 @@ use super::view::CorrectedView;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
-/// Residuals of this many standard deviations count half (Cauchy's weights; 95 % as good as squares where noise is normal).
+/// Residuals of this many standard deviations get a weight of one half (Cauchy weights; 95 % as efficient as least
+/// squares for normal noise).
 const CAUCHY_SCALE: f64 = 2.385;
-/// Gains further from 1 than this, and offsets beyond this, are pulled back.
+/// Standard deviations of the priors on gain (around 1) and offset (around 0).
 const PRIOR_GAIN_DEVIATION: f64 = 0.2;
 const PRIOR_OFFSET: f64 = 30.0;
-/// Fewer spots tell nothing about a pair.
+/// Minimum number of samples of a pair.
 const MIN_SAMPLES: usize = 12;
 
-/// Scatter of the residuals: brightness of 255, depth in metres at 1 m.
+/// Scatter of the residuals: brightness on a scale of 0 to 255, depth in meters at 1 m.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Noise {
     pub(super) photo: f64,
     pub(super) depth: f64,
 }
 
-/// What is looked at, and how finely.
+/// Level, tolerance, noise and pixels of the residuals.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ResidualOptions {
-    /// Of the pyramid; 0 is the finest.
+    /// Pyramid level; 0 is the finest.
     pub(super) level: usize,
-    /// By how much readings may differ before they count as another surface's.
+    /// Relative depth difference above which a reading belongs to another surface.
     pub(super) occlusion_frac: f64,
     pub(super) noise: Noise,
     pub(super) part: PixelSubset,
 }
 
-/// Which pixels of the second image of a pair are looked at.
+/// Subset of the pixels of a pair's second image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelSubset {
     All,
-    /// One half of its blocks, as of a checkerboard: what is found on one is judged on the other.
+    /// Blocks of one color of a checkerboard: poses estimated on one half are evaluated on the other.
     Blocks {
         odd: bool,
     },
@@ -56,19 +57,19 @@ impl PixelSubset {
     }
 }
 
-/// What one pair says.
+/// Contribution of one pair to the normal equations.
 #[derive(Debug)]
 pub(super) struct PairSums {
-    /// Indices of the terms that it knows of.
+    /// Indices of the parameters that affect the pair.
     pub(super) params: Vec<usize>,
     pub(super) information: DMatrix<f64>,
-    /// Downhill.
+    /// Negative gradient of the cost.
     pub(super) gradient: DVector<f64>,
     photo: Vec<f64>,
     depth: Vec<f64>,
 }
 
-/// The spots of the first of two frames that both show, in the part of the second that is looked at.
+/// Correspondences of the first image's samples in the second image, within the selected pixels.
 pub(super) fn correspondences(
     [i, j]: [Side<'_>; 2],
     samples: &[DepthSample],
@@ -82,12 +83,12 @@ pub(super) fn correspondences(
         .collect()
 }
 
-/// The frames of a pair.
+/// The images of a pair with their views.
 pub(super) fn sides<'a>(images: &'a [PreparedImage], views: &'a [CorrectedView], pair: Pair) -> [Side<'a>; 2] {
     [pair.from, pair.to].map(|ix| Side { image: &images[ix], view: &views[ix] })
 }
 
-/// Gain and offset by weighted squares, weights by what was left before.
+/// Gain and offset by iteratively reweighted least squares.
 pub(super) fn tone<'a>(correspondences: impl Iterator<Item = &'a Correspondence> + Clone, noise: f64) -> Tone {
     const MAX_ITERATIONS: usize = 3;
     let mut tone = Tone { gain: 1.0, offset: 0.0 };
@@ -117,7 +118,7 @@ fn weight(residual: f64, noise: f64) -> f64 {
     1.0 / (1.0 + (residual / (CAUCHY_SCALE * noise)).powi(2))
 }
 
-/// What every pair says about the terms of the views, in the order of the pairs.
+/// Contribution of every pair to the normal equations of the views' parameters, in the order of the pairs.
 pub(super) fn of_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -136,7 +137,7 @@ pub(super) fn of_pairs(
     pairs.par_iter().map(of).collect()
 }
 
-/// What every pair says about the motion of its two cameras: six numbers of the first, six of the second.
+/// Contribution of every pair to the motions of its two cameras: six parameters of the first, then six of the second.
 pub(super) fn of_free_pairs(
     images: &[PreparedImage],
     views: &[CorrectedView],
@@ -150,7 +151,7 @@ pub(super) fn of_free_pairs(
     pairs.par_iter().map(of).collect()
 }
 
-/// What a pair says about the motion of its second camera, where the first stays.
+/// Contribution of a pair to the motion of its second camera, with the first one fixed.
 pub(super) fn of_second(sides: [Side<'_>; 2], options: &ResidualOptions) -> PairSums {
     let param_columns = [ParamColumns::still(sides[0].view), ParamColumns::free(sides[1].view, 0)];
     of_pair(sides, &param_columns, (0..6).collect(), options)
@@ -217,9 +218,9 @@ fn of_pair(
     sums
 }
 
-/// Scatter of the residuals of all pairs, by their median; none where nothing was seen.
+/// Scatter of the residuals of all pairs, from their median; `None` without residuals.
 pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
-    /// What a perfect sensor would be taken for: rounding to bytes and to a tenth of a millimetre.
+    /// Noise of a perfect sensor: rounding to bytes and to a tenth of a millimeter.
     const MIN_NOISE: Noise = Noise { photo: 0.3, depth: 5e-5 };
     let scatter = |of: fn(&PairSums) -> &[f64]| {
         let mut all: Vec<f64> = sums.iter().flat_map(|pair| of(pair).iter().copied()).collect();

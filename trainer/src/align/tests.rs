@@ -1,4 +1,5 @@
-//! A room of textured planes seen by a camera on an arm of four joints, with one thing wrong at a time.
+//! Tests in a room of textured planes, observed by a camera on an arm with four joints, with one calibration error at
+//! a time.
 
 use super::*;
 use crate::splat::CameraCorrection;
@@ -14,13 +15,13 @@ const READOUT_SECS: f64 = 0.02;
 
 pub(crate) type Joints = [f64; 4];
 
-/// Azimuth, elevation, roll (radians) and reach (metres).
+/// Azimuth, elevation, roll (radians) and reach (meters).
 fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
     let rotation = |axis: Vector3<f64>, angle: f64| {
         Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_scaled_axis(axis * angle))
     };
     let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
-    // At zero the flange looks along x, with x to the right: -y of the base.
+    // At zero, the flange looks along x, with its x axis to the right: -y of the base.
     let look_at =
         UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
     rotation(Vector3::z(), azimuth)
@@ -39,7 +40,7 @@ fn camera_at(joints: Joints) -> Transform {
     base_from_flange(joints) * flange_from_camera()
 }
 
-/// A scan in all joints, or about the azimuth alone; seconds.
+/// Joint positions of a scan at a time in seconds, with all joints or with the azimuth only.
 fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     let wave = |size: f64, hz: f64, phase: f64| size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin();
     match azimuth_only {
@@ -48,7 +49,7 @@ fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
     }
 }
 
-/// How the camera moves with a change of the joints along a direction.
+/// Twist of the camera when the joints move along a direction.
 fn twist_along(joints: Joints, direction: Joints) -> Twist {
     const STEP: f64 = 1e-5;
     let at = |sign: f64| camera_at(std::array::from_fn(|ix| joints[ix] + sign * STEP * direction[ix]));
@@ -82,14 +83,14 @@ fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
     (nearest, brightness.clamp(0.0, 255.0))
 }
 
-/// What is wrong, and how noisy images are.
+/// Calibration errors and image noise.
 #[derive(Clone)]
 pub(crate) struct Miscalibration {
-    /// The input has the camera at the true pose times this.
+    /// The input camera pose is the true pose times this.
     pub(crate) extrinsics: Transform,
     pub(crate) time_offset_secs: f64,
     pub(crate) joints: Joints,
-    /// The input has the depth frame at the true pose times this.
+    /// The input pose of the depth frame is the true pose times this.
     pub(crate) depth_pose: Transform,
     pub(crate) focal_frac: f64,
     pub(crate) depth_frac: f64,
@@ -118,7 +119,7 @@ impl Miscalibration {
     }
 }
 
-/// Normal noise by hashing.
+/// Normally distributed noise from a hash.
 fn noise(key: u64) -> f64 {
     let mut state = key.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0xd1b5_4a32_d192_ed03;
     let mut uniform = || {
@@ -225,7 +226,7 @@ pub(crate) fn wrong_extrinsics() -> Transform {
     Transform::new(Vector3::new(0.003, -0.0035, 0.002), Vector3::new(0.01, 0.012, -0.008))
 }
 
-/// Turn and way of what is left of a mount, degrees and millimetres.
+/// Rotation and translation that remain of an extrinsics error, degrees and millimeters.
 pub(crate) fn remaining(correction: &CameraCorrection, miscalibration: &Transform) -> (f64, f64) {
     let estimated = crate::splat::rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
     let remaining = miscalibration * estimated.inverse();
@@ -255,7 +256,7 @@ fn wrong_joint_offsets_are_found() {
     for joint in 1..4 {
         assert!((offsets[joint] - miscalibration.joints[joint]).abs() < 5e-4, "{offsets:?}");
     }
-    // The first joint turns the whole world.
+    // The first joint rotates the whole world.
     assert!(offsets[0].abs() < 1e-4 && alignment.unobservable.len() == 1, "{offsets:?} {:?}", alignment.unobservable);
     assert_eq!(alignment.unobservable[0].parts, ["offset of joint 0"]);
 }
@@ -266,7 +267,7 @@ fn wrong_depth_pose_is_found() {
     let alignment =
         align_given(&Miscalibration { depth_pose: deviation, ..Miscalibration::none() }, |set| set.depth_pose = true);
     let correction = &alignment.corrections["wrist"];
-    // The input has true * off; the fix stands on the left of color_from_depth.
+    // The input is true * deviation; the correction is applied on the left of color_from_depth.
     let base = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
     let estimated =
         crate::splat::rigid_transform(correction.depth_rotation_rad.into(), correction.depth_translation_m.into())
@@ -307,7 +308,10 @@ fn unobservable_extrinsics_are_reported_even_if_correct() {
     assert!(!alignment.has_corrections(), "{alignment:?}");
     let parts: Vec<_> = alignment.unobservable.iter().flat_map(|unobservable| &unobservable.parts).collect();
     assert!(parts.iter().any(|part| part.starts_with("translation of camera \"wrist\" along")), "{parts:?}");
-    assert!(align_by_trials(&Miscalibration::none()).unobservable.is_empty(), "a full motion shows all");
+    assert!(
+        align_by_trials(&Miscalibration::none()).unobservable.is_empty(),
+        "all directions are observable with full motion"
+    );
 }
 
 #[test]
@@ -318,7 +322,7 @@ fn rotation_about_one_axis_leaves_extrinsics_unobservable() {
     assert_eq!(alignment.unobservable.len(), 2, "{:?}", alignment.unobservable);
     assert_eq!(alignment.unobservable[0].parts.len(), 1);
     assert!(alignment.unobservable[0].parts[0].starts_with("translation of camera \"wrist\" along"));
-    // Up in the base, in the camera's axes; nothing was found along it.
+    // Vertical direction of the base in the camera's axes; the correction along it is zero.
     let up = (camera_at(joints_at(0.0, true)) * miscalibration.extrinsics).rotation.inverse() * Vector3::z();
     let translation: Vector3<f64> = alignment.corrections["wrist"].translation_m.into();
     assert!(translation.dot(&up).abs() < 1e-4, "{translation:?} along {up:?}");
@@ -343,8 +347,8 @@ fn only_the_cause_is_corrected() {
             .map(|trial| trial.candidate.to_string())
             .collect()
     };
-    assert_eq!(kept(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() }), ["camera mounts"]);
-    assert_eq!(kept(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }), ["delays"]);
+    assert_eq!(kept(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() }), ["extrinsics"]);
+    assert_eq!(kept(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }), ["time offsets"]);
 }
 
 #[test]
@@ -382,7 +386,7 @@ fn result_does_not_depend_on_thread_count() {
     assert_eq!(with_threads(1), with_threads(3));
 }
 
-/// Brightness that rises evenly, so that it and its slopes are exact between pixels.
+/// Sets a linear brightness ramp, so that interpolated brightness and its gradient are exact.
 fn set_linear_brightness(image: &mut PreparedImage) {
     let [width, height] = SIZE_PX.map(|side| side as usize);
     let value = |ix: usize| 40.0 + 0.5 * (ix % width) as f32 + 0.7 * (ix / width) as f32;
@@ -390,17 +394,18 @@ fn set_linear_brightness(image: &mut PreparedImage) {
         vec![prepared_image::GrayImage::new([width, height], 1.0, &(0..width * height).map(value).collect::<Vec<_>>())];
 }
 
-/// Differences between slopes of a pair's residuals and central differences, as shares of the largest slope of the term.
-/// A few spots cross from one reading to the next and have a kink there: nine tenths are better than what comes back.
+/// Differences between a pair's Jacobian and central differences, as fractions of the largest derivative of each
+/// parameter. The result is the 90th percentile, because a few samples cross between depth readings and have a kink
+/// there.
 fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationParam, f64, f64)> {
-    const STEP: f64 = 1e-3; // Of what a term may be.
+    const STEP: f64 = 1e-3; // Relative to the parameter's scale.
     let miscalibration = Miscalibration { noise: 0.0, has_rolling_shutter, ..Miscalibration::none() };
     let mut scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
     scene.images.iter_mut().for_each(set_linear_brightness);
     let all = candidates().into_iter().fold(ParamSet::default(), ParamSet::and);
     let layout = Layout::new(all, &scene.images, 1);
     let mut here = Corrections::none(1);
-    // Joints start at zero: their columns are those of the joints as read, to first order.
+    // Joint offsets are zero: their columns are those at the measured joint positions, to first order.
     let displaced = layout.params.iter().enumerate().map(|(ix, param)| match param {
         layout::CalibrationParam::Joint(_) => 0.0,
         param => 0.3 * param.scale() * (ix as f64 * 1.3).sin(),
@@ -447,7 +452,7 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
         let share = |kind: usize| {
             let deviation = &mut deviation[kind].clone();
             deviation.sort_by(f64::total_cmp);
-            // A first joint changes nothing between images, and rounding of brightness to f32 is all there is.
+            // The first joint does not affect pairs, so the only difference is the rounding of brightness to f32.
             deviation[deviation.len() * 9 / 10] / max_gradients[kind].max([0.1, 1e-3][kind])
         };
         (param, share(0), share(1))
@@ -457,8 +462,9 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
 
 #[test]
 fn jacobians_match_central_differences() {
-    const TOLERANCE: f64 = 0.01; // Readings are kept in f32, and the weight of one is held in the slope.
-    // Left out: the lens moves points to other rows, and a mount elsewhere moves otherwise during the readout.
+    const TOLERANCE: f64 = 0.01; // Readings are stored in f32, and the Jacobian treats the depth weight as constant.
+    // The Jacobian ignores that the lens moves points to other rows, and that other extrinsics change the motion
+    // during readout.
     const ROLLING_TOLERANCE: f64 = 0.05;
     for (has_rolling_shutter, tolerance) in [(false, TOLERANCE), (true, ROLLING_TOLERANCE)] {
         let max_errors = max_jacobian_errors(has_rolling_shutter);
@@ -477,7 +483,7 @@ fn too_few_or_depthless_keyframes_give_none() {
     assert_eq!(align(&keyframes[..2], &choice), None);
     let flat = |keyframe: &Arc<Keyframe>| Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() });
     assert_eq!(align(&keyframes.iter().map(flat).collect::<Vec<_>>(), &choice), None);
-    // Test keyframes are not looked at: spoiling them changes nothing.
+    // Test keyframes are not used: corrupting them changes nothing.
     let corrupted = |keyframe: &Arc<Keyframe>| match keyframe.split {
         Split::Test => Arc::new(Keyframe { world_from_camera: Transform::identity(), ..keyframe.as_ref().clone() }),
         Split::Train | Split::Validation => keyframe.clone(),
@@ -494,7 +500,7 @@ fn drifting_image_poses_are_corrected() {
     let keyframes: Vec<Arc<Keyframe>> = capture(&Miscalibration::none())
         .iter()
         .map(|keyframe| {
-            // Errs by millimetres, smoothly, as a SLAM system does; nothing is known about the motion.
+            // Smooth errors of millimeters, as of a SLAM system; the motion is unknown.
             let secs = keyframe.stamp.0 as f64 * 1e-9;
             let wave = |hz: f64, phase: f64| (6.3 * hz * secs + phase).sin();
             let drift = Transform::new(
@@ -517,7 +523,8 @@ fn drifting_image_poses_are_corrected() {
     assert!(has_poses && trial.kept && trial.gain_db > 3.0, "{:?}", alignment.lines());
 }
 
-/// The capture with every pose but the test images' off on its own: millimetres along each axis, and a tenth of a degree each.
+/// The capture with random errors in every pose except those of test images: `mm` millimeters along each axis, and a
+/// tenth of a degree per millimeter about each axis.
 fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
     let moved = |(ix, keyframe): (usize, &Arc<Keyframe>)| {
         if keyframe.split == Split::Test {
@@ -539,7 +546,8 @@ fn noisy(mm: f64, from_joints: bool) -> Vec<Arc<Keyframe>> {
     capture(&Miscalibration::none()).iter().enumerate().map(moved).collect()
 }
 
-/// Pose errors relative to each other, after the common motion that takes most of them away: means, millimetres and degrees.
+/// Mean pose errors relative to each other, after removing the common motion that minimizes them: millimeters and
+/// degrees.
 fn relative_pose_errors(estimates: &[Transform], expected: &[Transform]) -> (f64, f64) {
     let mut common = Transform::identity();
     for _ in 0..10 {
@@ -589,7 +597,7 @@ fn noisy_image_poses_are_corrected_except_test_images() {
             );
         }
         let (test_mm, test_degrees) = remaining(Split::Test);
-        assert!(test_mm < 1e-6 && test_degrees < 1e-6, "{mm} mm of noise: test images were right: {test_mm} mm");
+        assert!(test_mm < 1e-6 && test_degrees < 1e-6, "{mm} mm of noise: test poses changed by {test_mm} mm");
         assert!(correction.drift_weight == 0.0, "{}", correction.drift_weight);
     }
 }

@@ -1,4 +1,4 @@
-//! Whether corrections pay: selection images predicted from training images, with them and without.
+//! Evaluation of corrections: prediction of validation images from training images, with and without them.
 
 use super::corrections::Corrections;
 use super::layout::Layout;
@@ -11,42 +11,44 @@ use super::view::CorrectedView;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Differences beyond this are another surface's or a highlight, of 255.
+/// Differences beyond this are due to another surface or a highlight, on a scale of 0 to 255.
 const CLIP: f64 = 50.0;
-/// Noise of an image, of 255: what lies below it does not show in pictures. The blurred images that are compared have less.
+/// Noise of an image on a scale of 0 to 255: smaller differences are invisible. The blurred images that are compared
+/// have less noise.
 const IMAGE_NOISE: f64 = 2.0;
 const OCCLUSION_FRAC: f64 = 0.04;
-/// Fewer spots make no score.
+/// Minimum number of samples of a score.
 const MIN_SAMPLES: usize = 30;
 
-/// What is compared: selection images as their partners predict them, without a correction and with it.
+/// A comparison of the predictions of validation images without (baseline) and with (variant) a correction.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PairedComparison<'a> {
     pub(super) images: &'a [PreparedImage],
-    /// From training images to selection images.
+    /// From training images to validation images.
     pub(super) pairs: &'a [Pair],
     pub(super) baseline: &'a Corrections,
     pub(super) variant: &'a Corrections,
     pub(super) noise: Noise,
 }
 
-/// Spots, and squares of what is left without and with.
+/// Number of samples, and sums of squared residuals of the baseline and the variant.
 type PairedErrors = (usize, f64, f64);
 
 impl PairedComparison<'_> {
-    /// PSNR, dB, of each selection image where the corrections have it, without and with: at the same spots.
+    /// PSNR in dB of each validation image for baseline and variant, at the same samples.
     pub(super) fn scores(&self) -> (Vec<f64>, Vec<f64>) {
         scores(self.images, self.pairs, &self.views(), self.noise, |pair| pair.to)
     }
 
-    /// The same where each selection image has a pose of its own, found on one half of its blocks and scored on the other, and
-    /// the other way round.
+    /// Like [`Self::scores`], but each validation image gets an individual pose, estimated on one half of its blocks
+    /// and evaluated on the other half, then vice versa.
     ///
-    /// This asks whether the training images agree better with each other: from images that are apart no single pose fits what
-    /// all of them predict. To ask nothing else, the selection image may move without the correction just as with it: by the same
-    /// residuals, prior and number of steps, towards the same partners, and both are scored at the spots that both show. So the
-    /// freedom of a pose is on both sides, what it learns from noise costs it on the half that it has not seen, and it never
-    /// matters whether the selection image's own pose can be guessed. The correction itself has seen nothing of these images.
+    /// This tests whether the training images are more consistent with each other: if they are misaligned, no single
+    /// pose fits the predictions of all of them. To test nothing else, the baseline estimates the individual pose,
+    /// too, with the same residuals, prior, number of steps and partners, and both are evaluated at samples that both
+    /// show. Both therefore have the same freedom, overfitting to noise lowers the score on the other half, and the
+    /// accuracy of the validation image's own pose does not matter. The correction itself was not estimated from
+    /// these images.
     pub(super) fn scores_with_free_poses(&self) -> (Vec<f64>, Vec<f64>) {
         let views = self.views();
         let mut by_image: BTreeMap<usize, Vec<Pair>> = BTreeMap::new();
@@ -83,9 +85,9 @@ impl PairedComparison<'_> {
     }
 }
 
-/// PSNR, dB, of the images that judge, under two sets of cameras: at the same spots.
+/// PSNR in dB of the validation images with two sets of views, at the same samples.
 ///
-/// * `validation_image_of`: which image a pair tells of.
+/// * `validation_image_of`: returns the validation image of a pair.
 pub(super) fn scores(
     images: &[PreparedImage],
     pairs: &[Pair],
@@ -105,7 +107,7 @@ pub(super) fn scores(
     by_image.into_values().map(psnr).unzip()
 }
 
-/// Of a pair, without and with, at the spots that both show.
+/// Errors of a pair with baseline and variant, at the samples that both show.
 fn errors(sides: [[Side<'_>; 2]; 2], noise: Noise, part: PixelSubset) -> PairedErrors {
     let options = ResidualOptions { level: 0, occlusion_frac: OCCLUSION_FRAC, noise, part };
     let correspondences = sides.map(|sides| sums::correspondences(sides, &sides[0].image.uniform_samples, &options));

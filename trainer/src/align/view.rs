@@ -1,4 +1,4 @@
-//! A frame's cameras as the corrections at hand have them, and how they move with each term.
+//! Views of images with the current corrections, and their motions with each parameter.
 
 use super::layout::Layout;
 use super::prepared_image::PreparedImage;
@@ -6,7 +6,7 @@ use crate::splat::CameraCorrection;
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Vector3};
 
-/// A rigid motion as a matrix: faster on many points.
+/// A rigid motion with a rotation matrix, which is faster on many points.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RigidTransform {
     pub(super) rotation: Matrix3<f64>,
@@ -30,14 +30,14 @@ impl RigidTransform {
     }
 }
 
-/// A frame under the corrections at hand.
+/// View of an image with the current corrections.
 #[derive(Clone, Debug)]
 pub(super) struct CorrectedView {
     pub(super) world_from_camera: RigidTransform,
     pub(super) color_from_depth: RigidTransform,
     pub(super) focal_px: [f64; 2],
     pub(super) principal_px: [f64; 2],
-    /// As the keyframe has it: what the terms of the lens are shares of.
+    /// Focal lengths of the keyframe; lens parameters are relative to them.
     pub(super) keyframe_focal_px: [f64; 2],
     pub(super) height_px: f64,
     pub(super) twist: Twist,
@@ -45,7 +45,7 @@ pub(super) struct CorrectedView {
     pub(super) depth_focal_px: [f64; 2],
     pub(super) depth_principal_px: [f64; 2],
     pub(super) depth_factor: f64,
-    /// How the camera moves, in its own axes, with a term: index, metres and radians.
+    /// Motion of the camera with each parameter, in its own axes: index, meters and radians.
     pub(super) columns: Vec<(usize, Vector3<f64>, Vector3<f64>)>,
     pub(super) depth_pose: Option<usize>,
     pub(super) lens: Option<usize>,
@@ -106,7 +106,8 @@ impl CorrectedView {
         })
     }
 
-    /// The camera elsewhere, carried along by the motions of a frame: terms 0 to 5 are its metres, then radians, in its own axes.
+    /// The view with another camera pose, moving rigidly with a frame. Parameters 0 to 5 are the motion of the frame
+    /// in its own axes: meters, then radians.
     pub(super) fn moved_with_frame(&self, world_from_camera: &Transform, world_from_frame: &Transform) -> Self {
         let frame_from_camera = world_from_frame.inverse() * world_from_camera;
         let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
@@ -120,7 +121,7 @@ impl CorrectedView {
         Self { world_from_camera, columns: (0..6).map(column).collect(), ..self.clone() }
     }
 
-    /// Indices of all terms that move it, ascending.
+    /// Indices of all parameters that affect the view, ascending.
     pub(super) fn params(&self) -> Vec<usize> {
         let mut params: Vec<usize> = self.columns.iter().map(|(param, _, _)| *param).collect();
         let range = |begin: Option<usize>, n: usize| begin.into_iter().flat_map(move |begin| begin..begin + n);
@@ -132,7 +133,8 @@ impl CorrectedView {
         params
     }
 
-    /// Where a point at rest in the camera's mid-exposure frame is when its row is read: it, and the share of the readout.
+    /// Position of a static point at the readout time of its row, from its position at mid-exposure; and the share of
+    /// the readout.
     pub(super) fn at_readout(&self, still: &Vector3<f64>) -> (Vector3<f64>, f64) {
         if self.readout_secs == 0.0 {
             return (*still, 0.0);

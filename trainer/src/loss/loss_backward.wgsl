@@ -1,9 +1,10 @@
-// loss_backward: the slope of the loss towards every pixel's color, transmittance and depth.
+// loss_backward: compute the gradient of the loss with respect to every pixel's color, transmittance and depth.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, gains (of the picture before it is compared), status, image, depth [n_pixels] (premultiplied), target_image, target_depth [n_pixels] (metres, 0: none), slopes
-// writes    upstream [n_pixels] (v of rgb; w: v of depth), rest [n_pixels] (see backward.wgsl; y: absolute error), gain_sums [n_tiles] (slope
-//           towards the logarithm of the gains; w: sum of the absolute errors)
+// reads     view, supervision, gains (applied to the picture before the comparison), status, image, depth [n_pixels]
+//           (premultiplied), target_image, target_depth [n_pixels] (meters, 0: none), ssim_gradients
+// writes    upstream [n_pixels] (v of rgb; w: v of depth), pixel_totals [n_pixels] (see backward.wgsl; y: absolute error),
+//           gain_sums [n_tiles] (gradient with respect to the logarithms of the gains; w: sum of the absolute errors)
 // twin      loss/reference.rs
 
 #import view
@@ -69,13 +70,13 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         pixel_totals[at] = vec2f(dot(color.rgb, v_color) + depth_sum * v_depth + color.w * v_transmittance, error);
     }
     wg_gains[lane] = vec4f(v_log_gain, error);
-    workgroupBarrier(); // All are there.
+    workgroupBarrier(); // All values are written.
     if lane < 16u {
         var sum = vec4f(0.0);
         for (var i = 0u; i < 16u; i++) { sum += wg_gains[lane * 16u + i]; }
-        wg_gains[lane * 16u] = sum; // Each lane writes only the first of those it has read.
+        wg_gains[lane * 16u] = sum; // Each lane writes only the first of the values that it has read.
     }
-    workgroupBarrier(); // The 16 partial sums are there.
+    workgroupBarrier(); // All 16 partial sums are written.
     if lane == 0u && in_grid {
         var sum = vec4f(0.0);
         for (var i = 0u; i < 16u; i++) { sum += wg_gains[i * 16u]; }

@@ -1,3 +1,3 @@
-//! How far a rendered image is from a keyframe.
+//! The training loss: difference between a rendered image and a keyframe.
 
 pub mod reference;

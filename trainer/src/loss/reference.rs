@@ -1,38 +1,40 @@
-//! The plain CPU version of the training loss in f64: absolute difference, structure (SSIM) and depth, with gradients.
+//! Plain CPU version of the training loss in f64: absolute difference, structural similarity (SSIM) and depth, with
+//! gradients.
 //!
-//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by all pixels, seen
-//! or not, and our depth residual is not divided by the coverage, so that it stays linear in the image.
+//! Source: Kerbl et al. 2023, equation 7; SSIM of Wang et al. 2004 with a Gaussian window. We divide by the number of
+//! all pixels, masked or not, and do not divide our depth residual by the coverage, so that it stays linear in the
+//! image.
 
 use crate::splat::reference::{RenderedImage, Upstream};
 
-/// Pixels of the SSIM window to either side of its center.
+/// Radius of the SSIM window, pixels.
 pub const WINDOW_RADIUS: usize = 5;
 /// Standard deviation of the SSIM window, pixels.
 pub const WINDOW_SIGMA_PX: f64 = 1.5;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// What the render should look like, row by row.
+/// The target of a render, row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Target {
     /// Width and height, pixels.
     pub size_px: [usize; 2],
     /// Color, 0 to 1.
     pub rgb: Vec<[f64; 3]>,
-    /// Which pixels have a color; the others say nothing about color, but may have a depth.
+    /// Whether each pixel has a color; masked pixels have no color loss, but may have a depth.
     pub visible: Vec<bool>,
-    /// Depth along z, metres; 0 where there is none. Empty where the camera has no depth.
+    /// Depth along z, meters; 0 if unknown. Empty if the camera has no depth.
     pub depth_m: Vec<f64>,
 }
 
-/// How much each part of the loss counts.
+/// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Share of the structure term in the color loss; the rest is the absolute difference.
+    /// Weight of D-SSIM in the color loss; the rest is the absolute difference.
     pub dssim_frac: f64,
-    /// Weight of the depth term, per metre.
+    /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
-    /// Depth residuals beyond this pull no more, metres.
+    /// Depth residuals beyond this have no gradient, meters.
     pub depth_clip_m: f64,
     /// Color behind the splats.
     pub background_rgb: [f64; 3],
@@ -47,11 +49,11 @@ pub struct Loss {
     pub l1: f64,
     /// One minus the mean SSIM.
     pub dssim: f64,
-    /// Mean clipped residual of depth, metres.
+    /// Mean clipped depth residual, meters.
     pub depth_m: f64,
 }
 
-/// Loss of a rendered image, and its gradient by the image.
+/// Loss of a rendered image, and its gradient with respect to the image.
 pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss, Upstream) {
     let n_pixels = target.rgb.len();
     let (rendered, truth) = (composed(image, target, weights), masked(&target.rgb, target));
@@ -77,14 +79,15 @@ pub fn loss(image: &RenderedImage, target: &Target, weights: &Weights) -> (Loss,
     (loss, upstream)
 }
 
-/// Mean absolute difference and its gradient by `rendered`; 0 where the two are equal.
+/// Mean absolute difference and its gradient with respect to `rendered`, which is 0 where the two are equal.
 fn mean_abs(rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
     let residuals = rendered.iter().zip(truth).map(|(rendered, truth)| rendered - truth);
     (residuals.clone().map(f64::abs).sum::<f64>() / n_pixels, residuals.map(|r| sign(r) / n_pixels).collect())
 }
 
-/// Mean SSIM over all pixels of one channel and its gradient by `rendered`; both images are 0 outside their borders.
+/// Mean SSIM over all pixels of one channel and its gradient with respect to `rendered`; both images are 0 outside
+/// their borders.
 pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, Vec<f64>) {
     let n_pixels = rendered.len() as f64;
     let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
@@ -103,7 +106,7 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
         let denominator = luminance.1 * contrast.1;
         let ssim = luminance.0 * contrast.0 / denominator;
         sum += ssim;
-        // The variances hold the mean too, so the mean is reached on three ways.
+        // The variances depend on the mean, too, so its gradient has three parts.
         let (v_variance, v_covariance) = (-ssim / contrast.1, 2.0 * luminance.0 / denominator);
         let v_luminance = 2.0 * y * contrast.0 / denominator - 2.0 * x * ssim / luminance.1;
         v_mean_x.push((v_luminance - 2.0 * x * v_variance - y * v_covariance) / n_pixels);
@@ -116,12 +119,12 @@ pub fn mean_ssim(size_px: [usize; 2], rendered: &[f64], truth: &[f64]) -> (f64, 
     (sum / n_pixels, v.collect())
 }
 
-/// Mean clipped residual of depth over all pixels; adds its weighted gradient to `upstream`.
+/// Mean clipped depth residual over all pixels; adds its weighted gradient to `upstream`.
 fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &mut Upstream) -> f64 {
     let n_pixels = target.rgb.len() as f64;
     let mut sum = 0.0;
     for (pixel_ix, &depth_m) in target.depth_m.iter().enumerate().filter(|(_, depth_m)| **depth_m > 0.0) {
-        // What the render's share of the pixel weighs, against the same share of the true depth.
+        // Compares the rendered depth with the true depth, both weighted by the coverage.
         let residual_m = image.depth[pixel_ix] - (1.0 - image.transmittance[pixel_ix]) * depth_m;
         sum += residual_m.abs().min(weights.depth_clip_m);
         if residual_m.abs() < weights.depth_clip_m {
@@ -133,7 +136,7 @@ fn depth(image: &RenderedImage, target: &Target, weights: &Weights, upstream: &m
     sum / n_pixels
 }
 
-/// The render over the background, black where the target is not seen.
+/// The render over the background; black where the target is masked.
 fn composed(image: &RenderedImage, target: &Target, weights: &Weights) -> Vec<[f64; 3]> {
     let over = |(rgb, transmittance): (&[f64; 3], &f64)| {
         std::array::from_fn(|channel| rgb[channel] + transmittance * weights.background_rgb[channel])
@@ -184,8 +187,8 @@ mod tests {
     const WEIGHTS: Weights =
         Weights { dssim_frac: 0.2, depth_per_m: 0.5, depth_clip_m: 0.3, background_rgb: [0.3, 0.6, 0.1] };
 
-    /// A render and a target that differ, with unseen pixels, pixels without depth, and depths far off; no residual
-    /// lies near zero or near the clip.
+    /// A render and a target that differ, with masked pixels, pixels without depth, and large depth errors. No
+    /// residual is close to zero or to the clip threshold.
     fn image_and_target() -> (RenderedImage, Target) {
         let mut random = Random::new(11);
         let mut image = RenderedImage::default();
@@ -210,7 +213,7 @@ mod tests {
         (image, target)
     }
 
-    /// Compares the gradient, times `factor`, with central differences; numbers without influence are left out.
+    /// Compares the gradient, times `factor`, with central differences; skips numbers without influence.
     fn checked_gradient(factor: f64) -> Mismatches {
         const NUDGE: f64 = 1e-5;
         const ABS: f64 = 1e-10; // Rounding of a loss of about 1, divided by the nudge.
@@ -249,7 +252,7 @@ mod tests {
     #[test]
     fn gradient_error_of_one_in_ten_thousand_is_detected() {
         let n_mismatches = checked_gradient(1.0001).n_mismatches();
-        assert!(n_mismatches > 4 * N_PIXELS * 8 / 10, "only {n_mismatches} of about {} are noticed", 4 * N_PIXELS);
+        assert!(n_mismatches > 4 * N_PIXELS * 8 / 10, "only {n_mismatches} of about {} are detected", 4 * N_PIXELS);
     }
 
     #[test]
@@ -301,7 +304,8 @@ mod tests {
 
     #[test]
     fn flat_image_gives_known_values() {
-        // A render 0.25 too bright everywhere, seen fully; one pixel's depth 0.1 m off, another's beyond the clip.
+        // A fully opaque render that is 0.25 too bright everywhere. The depth of one pixel is off by 0.1 m, that of
+        // another beyond the clip threshold.
         let n = N_PIXELS;
         let mut depth_m = vec![0.0; n];
         (depth_m[3], depth_m[4]) = (2.0, 2.0);

@@ -1,14 +1,17 @@
-// ssim: the structural similarity of picture and keyframe, and its slopes towards the window's statistics.
+// ssim: compute the gradients of the structural similarity of picture and keyframe with respect to the window
+// statistics.
 //
 // threads   one per pixel, a workgroup per 16 x 16 pixels
-// reads     view, supervision, gains, status, image [n_pixels] (premultiplied rgb, transmittance), target [n_pixels] (rgba8; a = 0: masked)
-// writes    slopes [3 channels, 3, n_pixels]: of E[x], E[x x], E[x y]
+// reads     view, supervision, gains, status, image [n_pixels] (premultiplied rgb, transmittance), target_image [n_pixels]
+//           (rgba8; a = 0: masked)
+// writes    ssim_gradients [3 channels, 3, n_pixels]: with respect to E[x], E[x x], E[x y]
 // twin      loss/reference.rs
-// source    Wang et al. 2004; gaussian 11, sigma 1.5, zeros outside; one pass over shared memory as in Mallick et al. 2024
+// source    Wang et al. 2004; Gaussian of 11 pixels, sigma 1.5, zeros outside; one pass over shared memory as in Mallick
+//           et al. 2024
 
 #import ssim_bindings
 
-alias Value = f32;         // a pixel a lane
+alias Value = f32;         // one pixel per lane
 
 var<workgroup> wg_pair: array<vec2f, 676>;        // picture, keyframe
 var<workgroup> wg_means: array<vec4f, 416>;       // along rows: x, y, x x, y y
@@ -36,7 +39,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             }
             wg_pair[i] = pair;
         }
-        workgroupBarrier(); // The window's pixels are there.
+        workgroupBarrier(); // The window's pixels are written.
         for (var i = lane; i < SPAN * TILE_PX; i += 256u) {
             let at = (i / TILE_PX) * SPAN + i % TILE_PX;
             var means = vec4f(0.0);
@@ -49,7 +52,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             wg_means[i] = means;
             wg_products[i] = product;
         }
-        workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
+        workgroupBarrier(); // The rows are written; the next channel overwrites them only after its own first barrier.
         let pixel = vec2u(corner) + vec2u(lane % TILE_PX, lane / TILE_PX);
         if pixel.x < view.size_px.x && pixel.y < view.size_px.y {
             var m = vec4f(0.0);

@@ -1,17 +1,17 @@
-// ssim_strips: what `ssim` does, on adapters whose lanes read memory one after the other.
+// ssim_strips: `ssim` for adapters whose lanes access memory one after another.
 //
-// threads   8 per color and two tiles of 16 x 16 pixels below each other (see `rows_and_columns`)
-// reads     as `ssim`
-// writes    as `ssim`
+// threads   8 per color and two vertically adjacent tiles of 16 x 16 pixels (see `rows_and_columns`)
+// reads     same as `ssim`
+// writes    same as `ssim`
 // twin      loss/reference.rs
-// source    as `ssim`
+// source    same as `ssim`
 
 #import ssim_bindings
 #import rows_and_columns
 
-alias Value = vec4f;       // 4 pixels a lane
+alias Value = vec4f;       // 4 pixels per lane
 
-// Picture and keyframe, 0 where there is no image.
+// Picture and keyframe, 0 outside the image and in masked areas.
 fn pair_at(pixel: vec2i, channel: u32, background: f32) -> vec2f {
     if any(pixel < vec2i(0)) || any(pixel >= vec2i(view.size_px)) { return vec2f(0.0); }
     let at = u32(pixel.y) * view.size_px.x + u32(pixel.x);

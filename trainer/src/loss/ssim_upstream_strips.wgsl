@@ -1,8 +1,8 @@
-// ssim_upstream_strips: the slope of the structural similarity towards every pixel's color, before `loss_backward` on
-// adapters whose lanes read memory one after the other.
+// ssim_upstream_strips: compute the gradient of the structural similarity with respect to every pixel's color, before
+// `loss_backward`, for adapters whose lanes access memory one after another.
 //
-// threads   8 per color and two tiles of 16 x 16 pixels below each other (see `rows_and_columns`)
-// reads     view, supervision, gains, status, image, target_image, slopes, as `loss_backward`
+// threads   8 per color and two vertically adjacent tiles of 16 x 16 pixels (see `rows_and_columns`)
+// reads     view, supervision, gains, status, image, target_image, ssim_gradients, same as `loss_backward`
 // writes    upstream [n_pixels]: rgb
 // twin      loss/reference.rs
 

@@ -1,3 +1,3 @@
-//! Steps of the optimiser.
+//! Optimizer steps.
 
 pub mod reference;

@@ -1,4 +1,4 @@
-//! The plain CPU version of the optimiser in f64.
+//! Plain CPU version of the optimizer in f64.
 //!
 //! Source: Kingma and Ba 2015, algorithm 1, with both bias corrections; one second moment for several parameters as in
 //! Zhang et al. 2024 (Adam-mini).
@@ -10,7 +10,7 @@ pub struct Adam {
     pub beta1: f64,
     /// Decay of the mean squared gradient per step.
     pub beta2: f64,
-    /// Added to the root of the mean square, so that a zero gradient moves nothing.
+    /// Added to the root of the mean square, so that a zero gradient changes nothing.
     pub epsilon: f64,
 }
 
@@ -31,7 +31,7 @@ pub struct Moments {
 }
 
 impl Adam {
-    /// Moves one parameter against its gradient at the given `rate`; `step` counts from 1.
+    /// Takes one step for a parameter at the given `rate`; `step` counts from 1.
     pub fn update(&self, step: u32, rate: f64, param: &mut f64, gradient: f64, moments: &mut Moments) {
         moments.first = self.beta1 * moments.first + (1.0 - self.beta1) * gradient;
         moments.second = self.beta2 * moments.second + (1.0 - self.beta2) * gradient * gradient;
@@ -41,17 +41,21 @@ impl Adam {
         *param -= rate * first / (second.sqrt() + self.epsilon);
     }
 
-    /// Moves several parameters, each at its own rate.
+    /// Takes one step for several parameters, each at its own rate.
     ///
     /// All slices have the length of `params`.
     pub fn update_all(&self, step: u32, rates: &[f64], params: &mut [f64], gradients: &[f64], moments: &mut [Moments]) {
-        assert_eq!([rates.len(), gradients.len(), moments.len()], [params.len(); 3], "one of each per parameter");
+        assert_eq!(
+            [rates.len(), gradients.len(), moments.len()],
+            [params.len(); 3],
+            "rates, gradients and moments must have the length of the parameters"
+        );
         for (ix, param) in params.iter_mut().enumerate() {
             self.update(step, rates[ix], param, gradients[ix], &mut moments[ix]);
         }
     }
 
-    /// Moves parameters that share one running mean of the squared gradient, and have none of the gradient itself.
+    /// Takes one step for parameters that share one running mean of the squared gradient and have no first moment.
     pub fn update_shared(&self, step: u32, rate: f64, params: &mut [f64], gradients: &[f64], second: &mut f64) {
         let mean_square = gradients.iter().map(|gradient| gradient * gradient).sum::<f64>() / gradients.len() as f64;
         *second = self.beta2 * *second + (1.0 - self.beta2) * mean_square;
@@ -92,7 +96,7 @@ mod tests {
 
     #[test]
     fn each_parameter_uses_its_own_rate() {
-        // The first step is the rate itself, whatever the size of the gradient; a zero gradient moves nothing.
+        // The first step equals the rate for any size of the gradient; a zero gradient changes nothing.
         let mut params = [1.0, 2.0, 3.0];
         let mut moments = [Moments::default(); 3];
         Adam::default().update_all(1, &[0.1, 0.02, 0.5], &mut params, &[1e-6, -40.0, 0.0], &mut moments);

@@ -1,15 +1,15 @@
-// digit: which eight bits of the key a pass looks at. For kernels that bind digit and status.
+// digit: the eight bits of the key that a pass sorts by. For kernels that bind digit and status.
 //
-// Keys are cut to 16 bits: their place between the least and the largest, as finely as 16 bits allow.
+// Keys are reduced to 16 bits: their offset from the smallest key, relative to the range, as precisely as 16 bits allow.
 
 struct Digit {
     shift: u32,
     counter: u32,       // index into status of the number of keys
-    largest: u32,       // of the largest key; behind it the least, inverted
-    max_blocks: u32,    // blocks the counts have room for
+    largest: u32,       // index of the largest key; the smallest key, inverted, follows it
+    max_blocks: u32,    // capacity of the counts, in blocks
 }
 
-const LAST_KEY = 0xffffffffu; // Comes after all others, and counts in neither.
+const LAST_KEY = 0xffffffffu; // Sorted after all other keys, and not part of their range.
 
 struct KeyRange {
     min_key: u32,

@@ -1,7 +1,8 @@
-//! Stable radix sort of 32-bit keys on the GPU, in two passes of eight bits: the keys are cut to 16 bits between the least and
-//! the largest of them. Yields the places the keys had before.
+//! Stable radix sort of 32-bit keys on the GPU, in two passes of eight bits: keys are reduced to 16 bits between the
+//! smallest and the largest key. Returns the original indices of the sorted keys.
 //!
-//! Two forms with the same result: `parallel` ranks by subgroup ballots, `sequential` gives each thread a block of its own.
+//! There are two variants with the same result: `parallel` ranks keys by subgroup ballots, `sequential` assigns one
+//! block of keys to each thread.
 
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Kernel, Passes, Pipeline, Source};
@@ -39,7 +40,7 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("radix_scatter_sequential"),
 ];
 
-/// Which eight bits a pass sorts by; the layout of `Digit` in digit.wgsl.
+/// The eight bits that a pass sorts by; the layout of `Digit` in digit.wgsl.
 #[repr(C)]
 #[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
 struct Digit {
@@ -49,7 +50,7 @@ struct Digit {
     max_blocks: u32,
 }
 
-/// Compiled kernels of one form.
+/// Compiled kernels of one variant.
 #[derive(Debug)]
 pub struct RadixSort {
     parallel: bool,
@@ -59,12 +60,12 @@ pub struct RadixSort {
     scatter_indices: Pipeline,
 }
 
-/// Memory of one sort: keys and values twice, and the digits' counts.
+/// Buffers of one sort: keys and values twice, and the digits' counts.
 #[derive(Debug)]
 pub struct SortBuffers {
-    /// Keys and values; sorting goes back and forth between the two.
+    /// Keys; sorting alternates between the two buffers.
     pub keys: [Buffer; 2],
-    /// Likewise.
+    /// Values; sorting alternates between the two buffers.
     pub values: [Buffer; 2],
     counts: Buffer,
     totals: Buffer,
@@ -73,7 +74,7 @@ pub struct SortBuffers {
 }
 
 impl RadixSort {
-    /// Compiles the form that suits the adapter.
+    /// Compiles the variant that suits the adapter.
     pub fn new(gpu: &Gpu) -> Result<Self, Error> {
         let parallel = !gpu.is_software() && gpu.optional().subgroup_lanes.is_some_and(|lanes| lanes >= 16);
         Self::with_form(gpu, parallel)
@@ -99,8 +100,9 @@ impl RadixSort {
         })
     }
 
-    /// Memory for up to `n_max` keys; `status[counter]` will hold how many there are, `status[largest]` the largest and the
-    /// next word the inverted least of those that are not all ones; all ones come last.
+    /// Allocates buffers for up to `n_max` keys. When sorting, `status[counter]` must hold the number of keys,
+    /// `status[largest]` the largest key, and the next word the smallest key, inverted. Keys with all bits set are
+    /// ignored in both and sorted last.
     pub fn buffers(
         &self,
         gpu: &Gpu,
@@ -122,8 +124,8 @@ impl RadixSort {
         })
     }
 
-    /// Sorts; keys and values end in the first half of the buffers. The values become the places the keys had before: what
-    /// they held does not matter.
+    /// Records the passes of a sort. The results are in the first keys and values buffers. The values are replaced by
+    /// the original indices of the keys; their previous content does not matter.
     pub fn sort(&self, gpu: &Gpu, passes: &mut Passes, buffers: &SortBuffers, status: &Buffer) {
         let n_groups = if self.parallel { buffers.max_blocks } else { buffers.max_blocks.div_ceil(8) };
         for (pass, digit) in buffers.digits.iter().enumerate() {
@@ -183,7 +185,7 @@ mod tests {
         let key_range = [counted_keys().min().unwrap(), counted_keys().max().unwrap()];
         let shift = (32 - (key_range[1] - key_range[0]).leading_zeros()).saturating_sub(16);
         let mut expected: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
-        // Stable, as the GPU's must be.
+        // Stable, like the sort on the GPU.
         expected.sort_by_key(|(key, _)| match *key {
             u32::MAX => 0xffff,
             key => ((key - key_range[0]) >> shift).min(0xfffe),

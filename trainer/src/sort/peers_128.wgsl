@@ -2,7 +2,7 @@
 
 alias Lanes = vec4u;
 
-// Lanes of the subgroup whose digit is this lane's.
+// Lanes of the subgroup with the same digit as this lane.
 fn peers_of(key_digit: u32, valid: bool) -> Lanes {
     var peers = subgroupBallot(valid);
     for (var bit = 0u; bit < 8u; bit++) {
@@ -18,7 +18,7 @@ fn n_bits(mask: Lanes) -> u32 {
     return n.x + n.y + n.z + n.w;
 }
 
-// The lanes below `lane`.
+// Mask of the lanes below `lane`.
 fn lanes_below(lane: u32) -> Lanes {
     let first = vec4u(0u, 32u, 64u, 96u);
     let n = clamp(vec4i(i32(lane)) - vec4i(first), vec4i(0), vec4i(32));

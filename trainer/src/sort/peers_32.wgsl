@@ -2,7 +2,7 @@
 
 alias Lanes = u32;
 
-// Lanes of the subgroup whose digit is this lane's.
+// Lanes of the subgroup with the same digit as this lane.
 fn peers_of(key_digit: u32, valid: bool) -> Lanes {
     var peers = subgroupBallot(valid).x;
     for (var bit = 0u; bit < 8u; bit++) {
@@ -17,7 +17,7 @@ fn n_bits(mask: Lanes) -> u32 {
     return countOneBits(mask);
 }
 
-// The lanes below `lane`.
+// Mask of the lanes below `lane`.
 fn lanes_below(lane: u32) -> Lanes {
     return (1u << lane) - 1u;
 }

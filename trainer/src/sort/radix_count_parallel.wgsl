@@ -1,4 +1,4 @@
-// radix_count_parallel: how often each digit occurs in each block of 2048 keys.
+// radix_count_parallel: count the occurrences of each digit in each block of 2048 keys.
 //
 // threads   256 per block
 // reads     digit, status, keys [n]
@@ -20,11 +20,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let key_range = key_range();
     let block = folded(wg, n_wgs);
     atomicStore(&wg_counts[lane], 0u);
-    workgroupBarrier(); // All are zero before anyone counts.
+    workgroupBarrier(); // All counts are zero before the first `atomicAdd`.
     for (var i = 0u; i < 8u; i++) {
         let at = block * 2048u + i * 256u + lane;
         if at < n { atomicAdd(&wg_counts[digit_of(keys[at], key_range)], 1u); } // Integer sums: the order does not matter.
     }
-    workgroupBarrier(); // All have counted.
+    workgroupBarrier(); // All keys are counted.
     if block < digit.max_blocks { counts[lane * digit.max_blocks + block] = atomicLoad(&wg_counts[lane]); }
 }

@@ -1,10 +1,10 @@
-// radix_count_sequential: how often each digit occurs in each block of 256 keys, one thread a block.
+// radix_count_sequential: count the occurrences of each digit in each block of 256 keys, one thread per block.
 //
 // threads   one per block
 // reads     digit, status, keys [n]
 // writes    counts [max_blocks, 256 digits]
 //
-// No barrier, no subgroup operation: for adapters without them, and for processors, where barriers are dear.
+// Uses no barriers or subgroup operations: for adapters without them, and for CPUs, where barriers are expensive.
 
 #import view
 #import digit

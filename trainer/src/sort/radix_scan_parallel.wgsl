@@ -1,4 +1,4 @@
-// radix_scan_parallel: per digit, how many keys lie in earlier blocks; and how many there are in all.
+// radix_scan_parallel: for each digit, count the keys in earlier blocks and the total.
 //
 // threads   one workgroup of 256 per digit
 // reads     digit, status

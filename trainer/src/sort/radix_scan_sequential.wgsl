@@ -1,6 +1,6 @@
-// radix_scan_sequential: where the first key of each block and digit goes.
+// radix_scan_sequential: compute the destination of the first key of each block and digit.
 //
-// threads   one workgroup of 256, a lane a digit
+// threads   one workgroup of 256, one lane per digit
 // reads     digit, status
 // writes    counts (in place)
 

@@ -1,4 +1,4 @@
-// radix_scatter_parallel: move each key and its value to its place; equal digits keep their order.
+// radix_scatter_parallel: move each key and its value to its destination; equal digits keep their order.
 //
 // threads   256 per block of 2048 keys; each subgroup owns consecutive keys
 // reads     digit, status, keys [n], values [n], counts (scanned), totals [256]
@@ -52,7 +52,7 @@ fn main(
         ranks[round] = base + n_bits(peers & lanes_below(sub_lane));
         digits[round] = key_digit;
     }
-    workgroupBarrier(); // All subgroups have counted.
+    workgroupBarrier(); // All keys are counted.
 
     var total = 0u;
     var offset = exclusive_scan(lane, totals[lane], &total);
@@ -62,7 +62,7 @@ fn main(
         atomicStore(&wg_ranks[i * 256u + lane], offset);
         offset += count;
     }
-    workgroupBarrier(); // Each digit's place per subgroup is known.
+    workgroupBarrier(); // Each subgroup's first destination per digit is known.
 
     for (var round = 0u; round < ROUNDS; round++) {
         let at = first + round * sub_size;

@@ -1,8 +1,8 @@
-// radix_scatter_sequential: move each key and its value to its place; equal digits keep their order.
+// radix_scatter_sequential: move each key and its value to its destination; equal digits keep their order.
 //
 // threads   one per block of 256 keys
 // reads     digit, status, keys [n], values [n]
-// writes    counts (used up), keys_out [n], values_out [n]
+// writes    counts (overwritten), keys_out [n], values_out [n]
 
 #import view
 #import digit

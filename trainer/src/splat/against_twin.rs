@@ -1,4 +1,4 @@
-//! The kernels against their f64 twin: pictures, gradients, and what hostile input does.
+//! Tests of the kernels against their f64 twin: pictures, gradients and invalid input.
 #![expect(clippy::needless_range_loop, reason = "channels and axes index several arrays at once")]
 
 use super::arrays::SplatArrays;
@@ -16,11 +16,11 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// Colors are near 1 and f32 carries 24 bits; sums of a few dozen terms and `exp` cost a few of them.
+/// Colors are near 1 and f32 has 24 bits of precision; sums of a few dozen terms and `exp` lose a few bits.
 const COLOR_ABS: f64 = 2e-5;
-/// Gradients sum over hundreds of pixels in f32.
+/// Gradients are f32 sums over hundreds of pixels.
 const GRADIENT_REL: f64 = 2e-3;
-/// Where a decision is this close to its threshold, f32 may decide otherwise.
+/// This close to a threshold, f32 and f64 may decide differently.
 const MARGIN: f64 = 1e-4;
 
 pub(super) struct KernelFixture {
@@ -109,7 +109,7 @@ impl KernelFixture {
     }
 }
 
-/// Both forms: with the adapter's optional features, and without any.
+/// Options for both variants: with the adapter's optional features, and without any.
 fn adapter_options() -> [GpuOptions; 2] {
     [GpuOptions::default(), GpuOptions { optional_features: false, ..GpuOptions::default() }]
 }
@@ -119,7 +119,7 @@ pub(super) fn unambiguous_pixels(view: &View, splats: &[Splat]) -> Vec<bool> {
         reference::rasterize::threshold_margins(view, splats).iter().map(|margin| *margin > MARGIN).collect();
     assert!(
         unambiguous.iter().filter(|unambiguous| **unambiguous).count() * 10 > unambiguous.len() * 9,
-        "the scene hides too much behind thresholds"
+        "too many pixels of the scene are close to a threshold"
     );
     unambiguous
 }
@@ -164,7 +164,7 @@ fn pictures_match_the_twin() {
 
 pub(super) fn target_of(image: &RenderedImage, size_px: [u32; 2]) -> loss_reference::Target {
     let n = image.rgb.len();
-    // Far from the picture everywhere, so that no absolute difference changes sign by rounding.
+    // Far from the picture everywhere, so that rounding does not change the sign of any absolute difference.
     let byte = |value: f64| ((value + 0.25).rem_euclid(1.0) * 255.0).round() / 255.0;
     loss_reference::Target {
         size_px: size_px.map(|size| size as usize),
@@ -200,7 +200,7 @@ fn gradients_match_the_twin() {
     }
 }
 
-/// What a picture is compared with, on the GPU.
+/// The target image and depth on the GPU, with the weights of the loss.
 pub(super) struct TargetBuffers {
     image: Buffer,
     depth: Buffer,
@@ -374,7 +374,8 @@ fn moving_keyframe() -> Keyframe {
     }
 }
 
-/// The pose against the twin's gradient; the lens by central differences of the twin's picture.
+/// Checks the gradients of the pose against the twin, and those of the lens against central differences of the twin's
+/// picture.
 fn check_camera_gradients(
     got: &[f64],
     view: &View,
@@ -432,8 +433,8 @@ fn check_camera_gradients(
     mismatches.assert_none();
 }
 
-/// A pile of opaque splats saturates its tile long before the list ends; what lies behind learns nothing from it, and in
-/// particular not what an earlier step left in its slots.
+/// A stack of opaque splats saturates its tile long before the end of the list. The splats behind get no gradient, in
+/// particular none left over from an earlier step in their slots.
 #[test]
 fn hidden_splats_have_no_gradient() {
     const N_VISIBLE: usize = 8;
@@ -464,10 +465,10 @@ fn hidden_splats_have_no_gradient() {
         view_passes.update(&mut passes, &gradients_only, &rule, true);
         passes.submit(gpu);
         let got = fixture.splats.read(gpu).unwrap();
-        let learns = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);
-        assert!(learns(0), "the front splat is seen");
-        let hidden: Vec<usize> = (N_VISIBLE..stack.len()).filter(|ix| learns(*ix)).collect();
-        assert!(hidden.is_empty(), "hidden splats learn: {hidden:?}");
+        let has_gradient = |ix: usize| got.sh[16 * ix].iter().any(|value| *value != 0.0);
+        assert!(has_gradient(0), "the front splat is visible");
+        let hidden: Vec<usize> = (N_VISIBLE..stack.len()).filter(|ix| has_gradient(*ix)).collect();
+        assert!(hidden.is_empty(), "hidden splats have gradients: {hidden:?}");
     }
 }
 
@@ -496,7 +497,8 @@ fn invalid_splats_are_not_drawn() {
     assert!(image.as_flattened().iter().chain(&depth).all(|value| value.is_finite()));
 }
 
-/// Terms of nothing change nothing; the first step of Adam is as long as the rate, for the terms that are learned only.
+/// Camera parameters of zero change nothing. Adam's first step has the length of the learning rate, for the enabled
+/// parameters only.
 #[test]
 fn camera_params_start_at_zero_and_step_by_their_rate() {
     let view = scene::tilted_view();
@@ -529,12 +531,12 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();
         for (ix, (got, expected)) in corrected.iter().zip(bytemuck::cast_slice::<_, f32>(&[base])).enumerate() {
-            assert!((got - expected).abs() <= 1e-6 * expected.abs().max(1.0), "word {ix}: {got} for {expected}");
+            assert!((got - expected).abs() <= 1e-6 * expected.abs().max(1.0), "word {ix}: {got}, expected {expected}");
         }
         let steps: Vec<f64> = cameras.param_values(gpu);
         for (param, step) in steps.iter().enumerate() {
             let rate = if (7..11).contains(&param) { 1e-3 } else { 0.0 };
-            assert!((step.abs() - rate).abs() < 1e-5, "camera term {param} moved by {step}");
+            assert!((step.abs() - rate).abs() < 1e-5, "camera parameter {param} changed by {step}");
         }
     }
 }

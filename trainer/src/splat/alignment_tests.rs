@@ -1,4 +1,5 @@
-//! Training with alignment: what it finds is in every camera, and stopping in between changes no bit.
+//! Tests of training with alignment: the correction is applied to every camera, and resuming from a checkpoint is
+//! bit-exact.
 
 use super::training_tests::train;
 use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer};
@@ -31,11 +32,11 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
     let keyframes = capture(&miscalibration);
     let mut uninterrupted = new_trainer(&gpu, &keyframes);
-    // The step at which the result is taken is step 0 of the new model.
+    // The step at which the result is applied is step 0 of the new model.
     train(&mut uninterrupted, ALIGNMENT_STEP);
     assert!(uninterrupted.alignment().is_none());
     uninterrupted.step(1).unwrap();
-    assert_eq!(uninterrupted.progress().step, 1, "training began anew");
+    assert_eq!(uninterrupted.progress().step, 1, "training restarted");
     let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
     let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
@@ -43,7 +44,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
     train(&mut uninterrupted, 9);
 
-    // Stopped before the result was taken, and after.
+    // Interrupted before and after the result is applied.
     let mut interrupted = new_trainer(&gpu, &keyframes);
     train(&mut interrupted, 10);
     for n_steps in [21, 6, 3] {
@@ -62,7 +63,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     assert_eq!(interrupted.alignment(), uninterrupted.alignment());
     assert!(interrupted.arrays().unwrap() == uninterrupted.arrays().unwrap(), "splats differ");
 
-    // The model on disk knows it, too.
+    // The saved model contains the correction, too.
     let folder = tempfile::tempdir().unwrap();
     uninterrupted.save(folder.path()).unwrap();
     let arrays = uninterrupted.arrays().unwrap();

@@ -1,4 +1,4 @@
-// allocate: where each bin's list and each block's intersections begin, and whether they fit.
+// allocate: compute where each bin's list and each block's intersections begin, and whether they fit in the buffers.
 //
 // threads   one workgroup of 256
 // reads     view, model, capacity, bin_totals [n_bins]
@@ -29,7 +29,7 @@ fn main(@builtin(local_invocation_index) lane: u32) {
         status[NEED_ENTRIES] = max(status[NEED_ENTRIES], n_entries);
         status[NEED_SLOTS] = max(status[NEED_SLOTS], n_slots);
         let fits = n_entries <= capacity.n_entries && (n_slots <= capacity.n_slots || capacity.n_slots == 0u);
-        status[FURTHEST] = 0u; // For the next view; this one is sorted.
+        status[FURTHEST] = 0u; // Reset for the next view; this one is sorted already.
         status[NEAREST] = 0u;
         status[N_ENTRIES] = select(0u, n_entries, fits);
         if !fits { status[FAILED] = 1u; }
@@ -49,7 +49,7 @@ fn scan_totals(lane: u32, n: u32) -> u32 {
     return before;
 }
 
-// Four blocks a lane: there are thousands.
+// Each lane handles four blocks, because there are thousands of blocks.
 fn scan_slots(lane: u32, n: u32) -> u32 {
     var before = 0u;
     for (var first = 0u; first < n; first += 1024u) {

@@ -1,32 +1,36 @@
-//! Splats as plain arrays, as files hold them.
+//! Splats as plain arrays, in the layout of files.
 
 use crate::Error;
 
-/// Colour coefficients a splat has at most (degree 3).
+/// Maximum number of color coefficients per splat (degree 3).
 const MAX_COEFFICIENTS: usize = 16;
 
-/// A cloud of splats in the world frame: raw optimised values, one entry a splat.
+/// A cloud of splats in the world frame: raw optimized values, one entry per splat.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SplatArrays {
-    /// Centres, metres.
+    /// Centers, meters.
     pub means: Vec<[f32; 3]>,
-    /// Logarithms of the standard deviations along the splat's own axes, metres.
+    /// Logarithms of the standard deviations along the splat's own axes, meters.
     pub log_scales: Vec<[f32; 3]>,
-    /// Rotations of the splat's axes, w first; any length but zero.
+    /// Rotations of the splats' axes, w first; any nonzero length.
     pub rotations_wxyz: Vec<[f32; 4]>,
     /// Opacities before the logistic function.
     pub opacity_logits: Vec<f32>,
-    /// Colour coefficients, red green blue; those of one splat stand together, the constant one first.
+    /// Color coefficients in the order red, green, blue; those of one splat are contiguous, the constant one first.
     pub sh: Vec<[f32; 3]>,
-    /// Degree of the colour coefficients, 0 to 3.
+    /// Degree of the color coefficients, 0 to 3.
     pub sh_degree: u32,
 }
 
 impl SplatArrays {
-    /// Refuses arrays of different lengths, degrees above 3, values that are not finite and rotations of length zero.
+    /// Returns the arrays unchanged if they are valid.
+    ///
+    /// # Errors
+    ///
+    /// Fails if lengths differ, the degree exceeds 3, a value is not finite, or a rotation has length zero.
     pub fn checked(self) -> Result<Self, Error> {
         if self.n_coefficients() > MAX_COEFFICIENTS {
-            return Err(Error::SplatArrays(format!("colour degree {}, at most 3", self.sh_degree)));
+            return Err(Error::SplatArrays(format!("color degree {}, at most 3", self.sh_degree)));
         }
         self.check_lengths()?;
         self.check_finite()?;
@@ -36,12 +40,12 @@ impl SplatArrays {
         }
     }
 
-    /// How many splats there are.
+    /// Number of splats.
     pub fn n_splats(&self) -> usize {
         self.means.len()
     }
 
-    /// Colour coefficients of one splat: 1, 4, 9 or 16.
+    /// Number of color coefficients of one splat: 1, 4, 9 or 16.
     pub fn n_coefficients(&self) -> usize {
         (self.sh_degree as usize + 1).pow(2)
     }
@@ -52,7 +56,7 @@ impl SplatArrays {
             ("log scales", self.log_scales.len(), n_splats),
             ("rotations", self.rotations_wxyz.len(), n_splats),
             ("opacities", self.opacity_logits.len(), n_splats),
-            ("colour coefficients", self.sh.len(), n_splats * self.n_coefficients()),
+            ("color coefficients", self.sh.len(), n_splats * self.n_coefficients()),
         ];
         for (what, got, expected) in arrays {
             if got != expected {
@@ -69,7 +73,7 @@ impl SplatArrays {
             ("log scale", not_finite(self.log_scales.as_flattened()), 3),
             ("rotation", not_finite(self.rotations_wxyz.as_flattened()), 4),
             ("opacity", not_finite(&self.opacity_logits), 1),
-            ("colour", not_finite(self.sh.as_flattened()), 3 * self.n_coefficients()),
+            ("color", not_finite(self.sh.as_flattened()), 3 * self.n_coefficients()),
         ];
         for (what, position, values_per_splat) in arrays {
             if let Some(position) = position {
@@ -96,7 +100,7 @@ mod tests {
         }
     }
 
-    /// What the check says about two splats changed so.
+    /// Error message of the check after `change` to two valid splats.
     fn error_after(change: impl FnOnce(&mut SplatArrays)) -> String {
         let mut splats = two_splats();
         change(&mut splats);
@@ -112,10 +116,10 @@ mod tests {
     #[test]
     fn each_invalid_array_is_named() {
         assert_eq!(error_after(|s| s.log_scales.truncate(1)), "splats: 1 log scales for 2 means, expected 2");
-        assert_eq!(error_after(|s| s.sh.truncate(5)), "splats: 5 colour coefficients for 2 means, expected 8");
-        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: colour degree 4, at most 3");
+        assert_eq!(error_after(|s| s.sh.truncate(5)), "splats: 5 color coefficients for 2 means, expected 8");
+        assert_eq!(error_after(|s| s.sh_degree = 4), "splats: color degree 4, at most 3");
         assert_eq!(error_after(|s| s.means[1][2] = f32::NAN), "splats: mean of splat 1 is not finite");
-        assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: colour of splat 1 is not finite");
+        assert_eq!(error_after(|s| s.sh[4][0] = f32::INFINITY), "splats: color of splat 1 is not finite");
         assert_eq!(error_after(|s| s.rotations_wxyz[0] = [0.0; 4]), "splats: rotation of splat 0 has length zero");
     }
 }

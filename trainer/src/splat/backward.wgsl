@@ -1,15 +1,16 @@
-// backward: the gradient of every intersection of splat and tile.
+// backward: compute the gradient of every intersection of a splat with a tile.
 //
-// threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, tile_bits, entries, drawn, upstream [n_pixels] (slope towards rgb
-//           and depth), rest [n_pixels] (color . v_color + depth v_depth + transmittance v_transmittance of the finished
+// threads   32 per tile; each lane handles two pixels in each quarter of the tile
+// reads     view, status, bin_starts, tile_bits, entries, projected_splats, upstream [n_pixels] (gradient with respect to rgb
+//           and depth), pixel_totals [n_pixels] (color . v_color + depth v_depth + transmittance v_transmittance of the finished
 //           pixel; y: absolute error), last
-// writes    gradients [n_slots]: every slot by its only owner
+// writes    gradients [n_slots]: each slot is written only by its owner
 // twin      splat/reference/rasterize.rs
 // source    Kerbl et al. 2023, appendix A
 //
-// The splats pass front to back, as they were blended, over lanes that keep the state of their pixels: nothing is stored
-// between the two kernels but `last`. A splat's sums over the pixels meet in a fixed order (`sums`).
+// Splats are processed front to back, in the order in which they were blended. Lanes keep the state of their pixels,
+// so only `last` is stored between the two kernels. A splat's contributions from all pixels are summed in a fixed
+// order (`sums`).
 
 #import backward_bindings
 #import pixels
@@ -42,28 +43,28 @@ fn backward(tile_ix: u32, lane: u32) {
         wg_tile = tile_at(tile_ix);
         atomicStore(&wg_past_last, 0u);
     }
-    let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before anyone raises it.
+    let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before the first `atomicMax`.
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    // Four by name and not an array: what is indexed by a variable lies in memory.
+    // Four named variables instead of an array, because arrays indexed by a variable live in memory.
     var a = pixels_at(tile, first);
     var b = pixels_at(tile, first + vec2u(8u, 0u));
     var c = pixels_at(tile, first + vec2u(0u, 8u));
     var d = pixels_at(tile, first + vec2u(8u, 8u));
     atomicMax(&wg_past_last, max(max(max_last(a.last), max_last(b.last)), max(max_last(c.last), max_last(d.last))));
-    workgroupBarrier(); // All have told their last.
+    workgroupBarrier(); // Every lane has contributed its `last`.
     if lane == 0u { wg_past = atomicLoad(&wg_past_last); }
     let past_last = workgroupUniformLoad(&wg_past);
     for (var word = tile.begin / 32u; word * 32u < tile.end; word += WORDS) {
         let n_queued = queue_words(lane, word, tile);
         for (var batch = 0u; batch < n_queued; batch += BATCH) {
-            workgroupBarrier(); // Nobody reads the last batch's slots any more.
+            workgroupBarrier(); // No lane reads the previous batch's slots any more.
             if batch + lane < n_queued { wg_slots[lane] = slot_of(wg_queue[batch + lane], tile); }
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             if bitcast<u32>(wg_splats[0].color.w) >= past_last {
-                // All of them are hidden in this tile.
+                // All splats of the batch are hidden in this tile.
                 for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
                     write_zero_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT);
                 }

@@ -1,13 +1,13 @@
-// backward_strips: what `backward` does, on adapters whose lanes read memory one after the other.
+// backward_strips: `backward` for adapters whose lanes access memory one after another.
 //
-// threads   a workgroup of 8 per tile (see `strips`); of 32 splats at a time a lane owns four
-// reads     as `backward`
-// writes    gradients [n_slots]: every slot by its only owner
+// threads   a workgroup of 8 per tile (see `strips`); each lane owns four of the 32 splats of a batch
+// reads     same as `backward`
+// writes    gradients [n_slots]: each slot is written only by its owner
 // twin      splat/reference/rasterize.rs
-// source    as `backward`
+// source    same as `backward`
 //
-// Strip after strip, the pixels' state stays in their lanes while 32 splats pass in order; each splat's gradient is summed
-// over the strip's pixels by shuffles and kept by its owner.
+// Strips are processed one after another. The state of a strip's pixels stays in their lanes while 32 splats are
+// processed in order. Shuffles sum each splat's gradient over the strip's pixels, and the owning lane keeps the sum.
 
 #import backward_bindings
 #import strips
@@ -15,25 +15,25 @@
 #import coverage
 
 const BATCH = 32u;
-// What lies around the splats at hand, between two batches.
+// State of a strip's pixels between two batches.
 struct StripState {
     transmittance: Px,
     behind: Px,
 }
 var<workgroup> wg_strip_states: array<StripState, 64>; // [N_STRIPS, LANES]
 
-// Eight of the batch's splats, one a lane, and the sum of their gradients so far.
+// Eight of the batch's splats, one per lane, and the sums of their gradients so far.
 struct Owned {
-    entry: u32,        // past the list where the lane has none
+    entry: u32,        // past the end of the list if the lane owns no splat
     splat: ProjectedSplat,
-    half: vec4f,       // its conic, `halved`
-    sum: Gradient,     // still before `finished`
+    half: vec4f,       // its conic, processed by `halved`
+    sum: Gradient,     // before `finished`
 }
 
 fn owned_splat(at: u32, n_queued: u32) -> Owned {
     var owned: Owned;
     owned.entry = 0xffffffffu;
-    owned.splat.conic.w = -1.0; // Reaches nothing.
+    owned.splat.conic.w = -1.0; // Reaches no pixel.
     if at < n_queued {
         owned.entry = wg_queue[at];
         owned.splat = projected_splats[entries[owned.entry].x];
@@ -42,23 +42,23 @@ fn owned_splat(at: u32, n_queued: u32) -> Owned {
     return owned;
 }
 
-// The lane's pixels of a strip.
+// A lane's pixels of one strip.
 struct Strip {
     center_x: Px,
     center_y: f32,
-    top: f32,          // centre of the strip's first row
-    begin: u32,        // of the bin's list
+    top: f32,          // center of the strip's first row
+    begin: u32,        // start of the bin's list
     past_last: u32,    // the largest `last` of the strip
 }
 
-// Lets eight splats pass the strip's pixels, in order.
+// Processes eight splats, in order, for the strip's pixels.
 fn pass_strip(lane: u32, owned: ptr<function, Owned>, strip: Strip, pixels: ptr<function, Pixels>) {
     let splat = (*owned).splat;
     let rank = (*owned).entry - strip.begin;
     let reaches = rank < strip.past_last && splat.conic.w >= 0.0 && reaches_strip(splat.position, splat.conic, strip.top);
     var reaching = or_of_lanes(select(0u, 1u << lane, reaches));
     loop {
-        let some = reaching != 0u; // The loop's body runs at least once.
+        let some = reaching != 0u; // The loop body runs at least once.
         let i = firstTrailingBit(reaching) & 7u;
         reaching &= reaching - 1u;
         let passing = ProjectedSplat(subgroupShuffle(splat.position, i), subgroupShuffle((*owned).half, i), subgroupShuffle(splat.color, i));
@@ -103,12 +103,13 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let queued = queue_entries(lane, next, tile);
         next = queued.y;
         for (var batch = 0u; batch < queued.x; batch += BATCH) {
-            // Four by name and not an array: the compiler then keeps them out of memory that is read lane after lane.
+            // Four named variables instead of an array, so that the compiler keeps them out of memory, which lanes
+            // access one after another.
             var a = owned_splat(batch + lane, queued.x);
             var b = owned_splat(batch + lane + LANES, queued.x);
             var c = owned_splat(batch + lane + 2u * LANES, queued.x);
             var d = owned_splat(batch + lane + 3u * LANES, queued.x);
-            let reached = wg_queue[batch] - tile.begin < past_last; // Else they are hidden: nothing but zeros.
+            let reached = wg_queue[batch] - tile.begin < past_last; // Otherwise the batch is hidden and its gradients are zero.
             for (var strip_ix = 0u; strip_ix < N_STRIPS && reached; strip_ix++) {
                 let first = tile.corner + strip_px(strip_ix, lane);
                 var pixels = pixels_at(tile, first);

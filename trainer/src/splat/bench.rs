@@ -1,7 +1,7 @@
-//! Times drawing and learning on a given cloud: one picture, one step, pass by pass.
+//! Times rendering and training steps on a given cloud, in total and pass by pass.
 //!
-//! The setting is that of the peer's benchmark: a pinhole camera at [`Eye::Outside`] looking along z with a focal length of
-//! 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
+//! The setup matches the benchmark of the peer implementation: a pinhole camera at [`Eye::Outside`] looking along z
+//! with a focal length of 0.9 image widths, a target of uniform noise, L1 loss, every splat updated in every step.
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
@@ -14,42 +14,44 @@ use kinematics::Transform;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-/// Learning rate of every parameter: small, so that the cloud stays the cloud.
+/// Learning rate of every parameter: small, so that the cloud hardly changes.
 const RATE: f32 = 1e-5;
 
-/// Figures of one size and cloud.
+/// Results for one image size and cloud.
 #[derive(Clone, Debug)]
 pub struct KernelFigures {
-    /// Intersections of splats and tiles.
+    /// Intersections of splats with tiles.
     pub n_intersections: u64,
-    /// GPU time of a picture from the first pass to the last, milliseconds, median; wall time where there are no timestamps.
+    /// Median GPU time of a picture from the first pass to the last, milliseconds; wall time if timestamps are
+    /// unavailable.
     pub render_millis: f64,
-    /// GPU time of a step that updates every splat, milliseconds, median.
+    /// Median GPU time of a step that updates every splat, milliseconds.
     pub step_millis: f64,
-    /// Likewise of one that updates only the splats it sees.
+    /// Median GPU time of a step that updates only visible splats, milliseconds.
     pub step_visible_millis: f64,
-    /// Splats it sees.
+    /// Number of visible splats.
     pub n_visible: u64,
-    /// Likewise of one that updates every splat, but whose gradients meet in any order; `None` where the adapter cannot.
+    /// Median GPU time of a step that updates every splat and sums gradients in any order, milliseconds; `None` if
+    /// the adapter does not support it.
     pub step_unordered_millis: Option<f64>,
-    /// Wall time of a picture, mean of a row of them back to back, milliseconds.
+    /// Mean wall time of consecutive pictures, milliseconds.
     pub render_wall_millis: f64,
-    /// Wall time of a step, likewise.
+    /// Mean wall time of consecutive steps, milliseconds.
     pub step_wall_millis: f64,
     /// Mean color of the first picture.
     pub mean_rgb: [f64; 3],
-    /// Most bytes of GPU buffers alive at once.
+    /// Peak size of all GPU buffers, bytes.
     pub peak_bytes: u64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
 }
 
-/// Where the camera stands on the z axis, metres.
+/// Position of the camera on the z axis, meters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Eye {
-    /// -3.2, as the peer's: it sees the whole cloud.
+    /// -3.2, as in the peer's benchmark: the whole cloud is visible.
     Outside,
-    /// 0: within the cloud, as in a room, it sees a part.
+    /// 0: inside the cloud, as in a room; a part of the cloud is visible.
     Inside,
 }
 
@@ -62,16 +64,16 @@ impl Eye {
     }
 }
 
-/// How often things are repeated.
+/// Numbers of repetitions.
 #[derive(Clone, Copy, Debug)]
 pub struct Repeats {
-    /// Before the clock starts, at least.
+    /// Minimum number of warm-up runs.
     pub n_warm_up: usize,
-    /// Likewise, where a hundred times as many fit into it.
+    /// Minimum duration of the warm-up, unless it takes more than 100 times `n_warm_up` runs.
     pub warm_up: Duration,
-    /// With timestamps.
+    /// Runs timed with timestamps.
     pub n_timed: usize,
-    /// Back to back for the wall clock.
+    /// Consecutive runs timed with the wall clock.
     pub n_consecutive: usize,
 }
 
@@ -94,10 +96,10 @@ struct KernelBench {
     size_px: [u32; 2],
 }
 
-/// What a step without an order of its sums needs.
+/// Resources of a step that sums gradients in any order.
 struct Unordered {
     pipelines: UnorderedPipelines,
-    /// 12 f32 a splat.
+    /// 12 f32 per splat.
     sums: Buffer,
 }
 
@@ -189,7 +191,7 @@ impl KernelBench {
         })
     }
 
-    /// Finds how large the intersection buffers must be.
+    /// Measures how large the intersection buffers must be, and allocates them.
     fn size_buffers(&mut self) -> Result<(), Error> {
         for _ in 0..2 {
             let mut passes = Passes::default();
@@ -242,7 +244,7 @@ impl KernelBench {
         self.record_end(passes);
     }
 
-    /// As [`Self::record_step`] where there are no pipelines without an order.
+    /// Same as [`Self::record_step`] if there are no unordered pipelines.
     fn record_step_unordered(&self, passes: &mut Passes) {
         let Some(Unordered { pipelines, sums }) = &self.unordered else { return self.record_step(passes) };
         let view = self.record_gradients(passes);
@@ -250,7 +252,7 @@ impl KernelBench {
         self.record_end(passes);
     }
 
-    /// Draws and compares.
+    /// Records the passes that draw the picture and compare it with the target.
     fn record_gradients(&self, passes: &mut Passes) -> ViewPasses<'_> {
         let view = self.view_passes();
         view.draw(passes, &self.draw);
@@ -284,7 +286,7 @@ impl KernelBench {
     }
 
     fn time(&self, passes: &mut Passes, repeats: Repeats, record: fn(&Self, &mut Passes)) -> Result<(f64, f64), Error> {
-        // For tenths of a second after large buffers were freed, some GPUs are busy with them.
+        // Some GPUs stay busy for tenths of a second after large buffers were freed.
         let warming = Instant::now();
         let mut n_warm = 0;
         while n_warm < repeats.n_warm_up || (warming.elapsed() < repeats.warm_up && n_warm < 100 * repeats.n_warm_up) {
@@ -354,10 +356,11 @@ mod tests {
     use crate::mismatches::Mismatches;
     use crate::splat::cloud::synthetic_cloud;
 
-    /// Sums of a few hundred f32 terms in another order, against the largest sum: a hundred times their rounding.
+    /// Tolerance for f32 sums of a few hundred terms in another order, relative to the largest sum: a hundred times
+    /// their rounding.
     const ORDER_TOLERANCE: f64 = 1e-5;
 
-    /// The slopes towards all means, scales and constant colors, in place of the parameters.
+    /// Gradients with respect to all means, scales and constant colors.
     fn gradients(unordered: bool) -> Vec<f64> {
         let gpu = Gpu::open(&GpuOptions { float_atomics: true, ..GpuOptions::default() }).unwrap();
         let cloud = synthetic_cloud(3000, 0);
@@ -366,11 +369,12 @@ mod tests {
         let mut passes = Passes::default();
         let view = bench.record_gradients(&mut passes);
         if unordered {
-            let unordered = bench.new_unordered(&[("GRADIENTS_ONLY", 1.0)]).unwrap().expect("lavapipe adds atomically");
+            let unordered =
+                bench.new_unordered(&[("GRADIENTS_ONLY", 1.0)]).unwrap().expect("lavapipe supports float atomics");
             view.backward_and_update_unordered(&mut passes, &unordered.pipelines, &bench.rule, &unordered.sums);
             passes.submit(&gpu);
             let sums: Vec<f32> = gpu.read(&unordered.sums, 12 * cloud.n_splats()).unwrap();
-            assert!(sums.iter().all(|sum| *sum == 0.0), "zeros are left for the next step");
+            assert!(sums.iter().all(|sum| *sum == 0.0), "the sums are reset to zero for the next step");
         } else {
             let update = LearnPipelines::gradients_only(&gpu).unwrap();
             view.backward(&mut passes, &bench.learn);

@@ -1,4 +1,4 @@
-//! GPU memory of the model, of one view's intersections, and of one picture.
+//! GPU buffers of the model, of one view's intersections, and of one picture.
 
 use super::arrays::SplatArrays;
 use super::kernels::DrawPipelines;
@@ -7,20 +7,21 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::sort::SortBuffers;
 
-/// Splats of a block, neighbours in depth; bins a workgroup looks at; blocks of a group: as in shared/bins.wgsl.
+/// Splats per block, consecutive in depth. This and the next two constants equal those in shared/bins.wgsl: bins per
+/// workgroup, and blocks per group.
 pub(crate) const BLOCK: u32 = 256;
 pub(crate) const WINDOW_BINS: u32 = 256;
 pub(crate) const GROUP: u32 = 16;
 
-/// Buffers with an entry a splat.
+/// Number of buffers with one entry per splat.
 pub(crate) const N_PLANAR_BUFFERS: usize = 9;
 
-/// Floats of the spherical harmonics past the constant one.
+/// Number of floats of the spherical harmonics past the constant one.
 pub(crate) fn n_sh_rest(sh_degree: u32) -> u32 {
     3 * ((sh_degree + 1) * (sh_degree + 1) - 1)
 }
 
-/// The model: parameters and Adam's moments, with room for `capacity` splats.
+/// The model: parameters and Adam's moments, with capacity for `capacity` splats.
 #[derive(Debug)]
 pub(crate) struct SplatBuffers {
     pub(crate) n_splats: u32,
@@ -40,7 +41,7 @@ pub(crate) struct SplatBuffers {
 }
 
 impl SplatBuffers {
-    /// Empty, with room for `capacity` splats of `sh_degree`.
+    /// Creates an empty model with capacity for `capacity` splats of `sh_degree`.
     pub(crate) fn new(gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
         let capacity = capacity.max(1);
         let n = u64::from(capacity);
@@ -69,7 +70,7 @@ impl SplatBuffers {
         self.planes().iter().map(|(buffer, _, _)| buffer.bytes()).sum()
     }
 
-    /// A copy with room for `capacity` splats of `sh_degree`; the moments come along.
+    /// Returns a copy with capacity for `capacity` splats of `sh_degree`, including the moments.
     pub(crate) fn resized(&self, gpu: &Gpu, capacity: u32, sh_degree: u32) -> Result<Self, Error> {
         let mut larger = Self::new(gpu, capacity, sh_degree)?;
         let (stride_from, stride_to) = (u64::from(self.capacity), u64::from(larger.capacity));
@@ -89,13 +90,13 @@ impl SplatBuffers {
         Ok(larger)
     }
 
-    /// Says how many splats there are.
+    /// Sets the number of splats.
     pub(crate) fn set_n_splats(&mut self, gpu: &Gpu, n_splats: u32) {
         self.n_splats = n_splats;
         self.write_model(gpu);
     }
 
-    /// Says which degree of spherical harmonics is in use; there is memory for `sh_degree`.
+    /// Sets the active degree of spherical harmonics, at most `sh_degree`, for which memory is allocated.
     pub(crate) fn set_active_degree(&mut self, gpu: &Gpu, degree: u32) {
         if self.active_degree != degree.min(self.sh_degree) {
             self.active_degree = degree.min(self.sh_degree);
@@ -114,7 +115,8 @@ impl SplatBuffers {
         gpu.write(&self.model, 0, bytemuck::bytes_of(&model));
     }
 
-    /// Appends splats; there must be room. Functions past this model's degree are left out, missing ones are zero.
+    /// Appends splats, for which there must be capacity. Coefficients past this model's degree are dropped; missing
+    /// ones become zero.
     pub(crate) fn append(&mut self, gpu: &Gpu, arrays: &SplatArrays) {
         let first = u64::from(self.n_splats);
         let n_new = arrays.means.len();
@@ -148,7 +150,7 @@ impl SplatBuffers {
         if !zeros.is_empty() {
             zeros.submit(gpu);
         }
-        let n_new = u32::try_from(n_new).expect("the caller has made room for u32 many");
+        let n_new = u32::try_from(n_new).expect("the caller ensured a capacity that fits into u32");
         self.set_n_splats(gpu, self.n_splats + n_new);
     }
 
@@ -186,7 +188,7 @@ impl SplatBuffers {
         })
     }
 
-    /// The parameters by the names that kernels bind.
+    /// The parameters, with the names under which kernels bind them.
     pub(crate) fn parameters(&self) -> [(&'static str, &Buffer); 5] {
         [
             ("means", &self.means),
@@ -197,12 +199,12 @@ impl SplatBuffers {
         ]
     }
 
-    /// The optimiser's moments, likewise.
+    /// The optimizer's moments, with the names under which kernels bind them.
     pub(crate) fn all_moments(&self) -> [(&'static str, &Buffer); 3] {
         [("moments", &self.moments), ("sh_dc_moments", &self.sh_dc_moments), ("sh_rest_moments", &self.sh_rest_moments)]
     }
 
-    /// Every per-splat buffer with its planes and bytes an entry.
+    /// Every per-splat buffer with its number of planes and its bytes per entry.
     pub(crate) fn planes(&self) -> [(&Buffer, u32, u64); N_PLANAR_BUFFERS] {
         let rest = n_sh_rest(self.sh_degree);
         [
@@ -219,7 +221,7 @@ impl SplatBuffers {
     }
 }
 
-/// What one view of the model needs while it is drawn, and learned from.
+/// Buffers that one view of the model needs while it is drawn and trained on.
 #[derive(Debug)]
 pub(crate) struct Scratch {
     pub(crate) n_entries: u32,
@@ -241,13 +243,13 @@ pub(crate) struct Scratch {
     pub(crate) camera_sums: Buffer,
 }
 
-/// Room a [`Scratch`] has.
+/// Capacities of a [`Scratch`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ScratchSize {
     pub(crate) n_splats: u32,
-    /// Of the bins' lists.
+    /// Entries of the bins' lists.
     pub(crate) n_entries: u32,
-    /// Intersections of splats and tiles; 0 where nothing is learned.
+    /// Intersections of splats with tiles; 0 if the view is only drawn.
     pub(crate) n_slots: u32,
     pub(crate) n_bins: u32,
 }
@@ -280,7 +282,7 @@ impl Scratch {
     }
 }
 
-/// Memory of one picture, and of its slopes where it is learned from.
+/// Buffers of one picture, and of its gradients if it is trained on.
 #[derive(Debug)]
 pub(crate) struct ImageBuffers {
     pub(crate) n_pixels: u32,
@@ -298,7 +300,7 @@ pub(crate) struct ImageBuffers {
 }
 
 impl ImageBuffers {
-    /// Memory for pictures of up to `size_px`.
+    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`; those of gradients only if `learned`.
     pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, learned: bool) -> Result<Self, Error> {
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
         let gradient_buffer =
@@ -321,12 +323,12 @@ impl ImageBuffers {
     }
 }
 
-/// Bins of 4 x 4 tiles of an image.
+/// Number of bins of 4 x 4 tiles in an image.
 pub(crate) fn n_bins(size_px: [u32; 2]) -> u32 {
     size_px[0].div_ceil(4 * TILE_PX) * size_px[1].div_ceil(4 * TILE_PX)
 }
 
-/// Tiles of an image.
+/// Number of tiles in an image.
 pub(crate) fn n_tiles(size_px: [u32; 2]) -> u32 {
     size_px[0].div_ceil(TILE_PX) * size_px[1].div_ceil(TILE_PX)
 }

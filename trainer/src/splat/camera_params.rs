@@ -1,7 +1,7 @@
-//! What may be wrong about cameras: where they sit, when they look, their lens and their exposure, learned with the splats.
+//! Per-camera parameters that are optimized together with the splats: extrinsics, time offset, lens and exposure.
 //!
-//! Terms of a camera are shared by its images; an image may have its own. Nothing is read back: `correct_view` prepares
-//! the view of a step, `refine_camera` takes the step of its terms.
+//! All images of a camera share its parameters; each image can have its own in addition. Nothing is read back during
+//! training: `correct_view` prepares the view of a step, and `refine_camera` updates its parameters.
 
 use super::kernels::LearnPipelines;
 use super::params::{CameraRule, Lens, N_PARAMS};
@@ -14,13 +14,14 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// Which terms are learned.
+/// The set of camera parameters to estimate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct ParamSet {
-    /// How each camera is mounted: rotation and translation between camera and what carries it (hand-eye).
+    /// Extrinsics of each camera: rotation and translation relative to its parent (hand-eye if the parent is the
+    /// flange).
     pub extrinsics: bool,
-    /// By how much the poses of each camera lag behind its images.
+    /// Time by which the poses of each camera lag behind its images.
     pub time_offset: bool,
     /// Focal lengths and principal point of each camera.
     pub lens: bool,
@@ -28,18 +29,19 @@ pub struct ParamSet {
     pub image_poses: bool,
     /// Gains of red, green and blue of each image.
     pub image_gains: bool,
-    /// What is added to the reading of each joint that carries a camera. Like the following, by alignment only.
+    /// Offset added to the reading of each joint that carries a camera. Only alignment estimates this parameter and
+    /// the following ones.
     pub joints: bool,
-    /// Where the depth frame sits in the camera's.
+    /// Pose of the depth frame in the camera frame.
     pub depth_pose: bool,
-    /// Factor on the readings of depth.
+    /// Factor on depth readings.
     pub depth_scale: bool,
-    /// Time from the first row's exposure to the last row's.
+    /// Time from the exposure of the first row to that of the last row.
     pub readout: bool,
 }
 
 impl ParamSet {
-    /// Nothing is learned.
+    /// No parameters.
     pub const NONE: Self = Self {
         extrinsics: false,
         time_offset: false,
@@ -52,12 +54,12 @@ impl ParamSet {
         readout: false,
     };
 
-    /// Whether anything is learned.
+    /// Whether the set contains any parameter.
     pub fn any(self) -> bool {
         self != Self::NONE
     }
 
-    /// All of both.
+    /// Union of both sets.
     #[must_use]
     pub fn and(self, other: Self) -> Self {
         Self {
@@ -87,14 +89,14 @@ impl ParamSet {
 impl std::fmt::Display for ParamSet {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let names = [
-            (self.extrinsics, "camera mounts"),
-            (self.time_offset, "delays"),
+            (self.extrinsics, "extrinsics"),
+            (self.time_offset, "time offsets"),
             (self.lens, "lenses"),
-            (self.image_poses, "poses of images"),
-            (self.image_gains, "gains of images"),
+            (self.image_poses, "image poses"),
+            (self.image_gains, "image gains"),
             (self.joints, "joint offsets"),
-            (self.depth_pose, "poses of depth"),
-            (self.depth_scale, "scales of depth"),
+            (self.depth_pose, "depth poses"),
+            (self.depth_scale, "depth scales"),
             (self.readout, "readout times"),
         ];
         let names: Vec<&str> = names.into_iter().filter(|(on, _)| *on).map(|(_, name)| name).collect();
@@ -102,41 +104,45 @@ impl std::fmt::Display for ParamSet {
     }
 }
 
-/// What was learned about one camera.
+/// Estimated calibration correction of one camera.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default)]
 pub struct CameraCorrection {
-    /// Rotation vector in the camera's own axes, radians: `camera_from_world` becomes turn and shift after it.
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
+    /// `camera_from_world`.
     pub rotation_rad: [f64; 3],
-    /// Metres, in the camera's axes.
+    /// Translation in the camera's axes, meters.
     pub translation_m: [f64; 3],
-    /// The poses belong to this much later, seconds.
+    /// Time from the nominal pose of an image to its exposure, seconds.
     pub time_offset_secs: f64,
     /// Logarithm of the factor on the focal lengths.
     pub log_focal: [f64; 2],
-    /// Shift of the principal point, in focal lengths.
+    /// Offset of the principal point, in focal lengths.
     pub principal_offset_focals: [f64; 2],
-    /// What is added to the readings of the joints that carry the camera, radians or metres; empty where nothing is.
+    /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be empty.
     pub joint_offsets: Vec<f64>,
-    /// Rotation vector in the camera's own axes, radians: `color_from_depth` becomes turn and shift after it.
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
+    /// `color_from_depth`.
     pub depth_rotation_rad: [f64; 3],
-    /// Metres, in the camera's axes.
+    /// Translation in the camera's axes, meters.
     pub depth_translation_m: [f64; 3],
-    /// Logarithm of the factor on depth.
+    /// Logarithm of the factor on depth readings.
     pub log_depth_scale: f64,
-    /// What is added to the readout time, seconds.
+    /// Offset added to the readout time, seconds.
     pub readout_secs: f64,
-    /// Turn and shift of the images learned from, by stamp in nanoseconds: between two of them poses drift evenly.
+    /// Rotation vector (radians) and translation (meters) of each training image, by stamp in nanoseconds;
+    /// interpolated linearly in between.
     pub drift: BTreeMap<i64, [f64; 6]>,
-    /// How much of the drift between them holds for images that are not among them, 0 to 1.
+    /// Share of the interpolated drift that is applied to images that were not trained on, 0 to 1.
     pub drift_weight: f64,
-    /// Logarithms of the gains of red, green and blue of the images learned from, likewise.
+    /// Logarithms of the gains of red, green and blue of each training image, by stamp in nanoseconds.
     pub log_gains: BTreeMap<i64, [f64; 3]>,
-    /// What a neural field knows of light and exposure of the images learned from, likewise; what the numbers mean is its own affair.
+    /// Appearance embeddings of each training image in a neural field, by stamp in nanoseconds. The values have no
+    /// meaning outside the field.
     pub appearance_embeddings: BTreeMap<i64, [f64; EMBEDDING_DIM]>,
 }
 
-/// Numbers of an image's code.
+/// Dimension of an appearance embedding.
 pub const EMBEDDING_DIM: usize = 1;
 
 impl Default for CameraCorrection {
@@ -160,25 +166,25 @@ impl Default for CameraCorrection {
     }
 }
 
-/// A pinhole camera somewhere.
+/// A pinhole camera with its pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CalibratedCamera {
-    /// Pose.
+    /// Pose of the camera in the world.
     pub world_from_camera: Transform,
     /// Focal length, pixels.
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
-    /// How it moves while its rows are read, where known.
+    /// Motion of the camera while its rows are read out, if known.
     pub shutter: Option<Shutter>,
-    /// Pose of the depth frame in this one, where there is depth.
+    /// Pose of the depth frame in the camera frame, if there is depth.
     pub color_from_depth: Option<Transform>,
-    /// What red, green and blue of a picture are multiplied with to look like the image: its exposure and white balance.
+    /// Factors on red, green and blue of a picture that match it to the image: exposure and white balance.
     pub gains: [f64; 3],
 }
 
 impl CalibratedCamera {
-    /// As the keyframe has it.
+    /// The camera of a keyframe without any correction.
     pub fn of(keyframe: &Keyframe) -> Self {
         Self {
             world_from_camera: keyframe.world_from_camera,
@@ -195,7 +201,7 @@ impl CalibratedCamera {
 }
 
 impl CameraCorrection {
-    /// The camera of a keyframe as it is, where the input has it as [`CalibratedCamera::of`].
+    /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
     pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
         let lens = CalibratedCamera::of(keyframe);
         let time_offset = self.time_corrected_from_input(keyframe);
@@ -227,26 +233,26 @@ impl CameraCorrection {
         }
     }
 
-    /// Turn and shift of an image: its own, or as far as poses drift those between its neighbours in time.
+    /// Drift of an image: its own, or the weighted interpolation between its neighbors in time.
     pub(crate) fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
         let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_weight };
         interpolate(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
     }
 
-    /// From the camera as the input has it to the camera at the time the image was taken.
+    /// Transform from the uncorrected camera to the camera at the exposure of the image.
     pub(crate) fn time_corrected_from_input(&self, keyframe: &Keyframe) -> Transform {
         keyframe.twist.map_or(Transform::identity(), |twist| {
             rigid_transform(-self.time_offset_secs * twist.angular_rad_s, -self.time_offset_secs * twist.linear_m_s)
         })
     }
 
-    /// Where the depth frame of a keyframe is in its color frame.
+    /// Corrected pose of a keyframe's depth frame in its color frame.
     pub fn color_from_depth(&self, keyframe: &Keyframe, depth: &DepthMap) -> Transform {
         let rigid_transform = rigid_transform(self.depth_rotation_rad.into(), self.depth_translation_m.into());
         rigid_transform * keyframe.world_from_camera.inverse() * depth.world_from_camera
     }
 
-    /// The keyframe as it would be had the input been right.
+    /// The keyframe with corrected pose, intrinsics, depth and readout time.
     pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
         let CalibratedCamera { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
         let depth = keyframe.depth.as_ref().map(|depth| {
@@ -280,7 +286,7 @@ impl CameraCorrection {
     }
 }
 
-/// What holds at a stamp, from the entries before and after it; `None` of nothing.
+/// Linear interpolation at a stamp between the entries before and after it; `None` if there are no entries.
 pub(crate) fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
     let before = known.range(..=stamp.0).next_back();
     let after = known.range(stamp.0..).next();
@@ -294,14 +300,17 @@ pub(crate) fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp
     }
 }
 
-/// How much of the drift between images holds for another image, 0 to 1: each image is left out and guessed from its neighbours
-/// in time, and the share is 1 less what is left of all corrections, by squares.
+/// Share of the drift between images that also applies to other images, 0 to 1.
 ///
-/// 0 where each image errs on its own, where a guess leaves more than nothing would, and where there are too few to tell.
+/// Leaves out each image, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the squared
+/// prediction errors to the squared drifts.
 ///
-/// * `scene_size_m`: what makes a turn a way.
+/// Returns 0 if the errors of images are independent, if predicting is worse than assuming no drift, or if there are
+/// too few images.
+///
+/// * `scene_size_m`: lever arm that converts rotations to lengths.
 pub(crate) fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
-    /// Less may be chance.
+    /// Smaller weights may be due to chance.
     const MIN_WEIGHT: f64 = 0.2;
     let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
     let squares = |parts: [f64; 6]| {
@@ -319,12 +328,13 @@ pub(crate) fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -
     if share < MIN_WEIGHT { 0.0 } else { share }
 }
 
-/// Turn, then shift.
+/// Rotation, then translation.
 pub(crate) fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) -> Transform {
     Transform::from_parts(Translation3::from(translation_m), UnitQuaternion::from_scaled_axis(rotation_rad))
 }
 
-/// Whether depth was registered to the color image, or comes through the same lens: what is wrong with that is wrong with both.
+/// Whether the depth image has the lens of the color image, for example because it was registered to it. If so, lens
+/// corrections apply to both.
 pub(crate) fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
     const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
     [0, 1].into_iter().all(|axis| {
@@ -335,32 +345,32 @@ pub(crate) fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
     })
 }
 
-/// The first of the gains among the terms, as in `shared/camera_params.wgsl`.
+/// Index of the first gain among the parameters, as in `shared/camera_params.wgsl`.
 const LOG_GAIN: u32 = 11;
-/// Rate of rotations at the start, radians a step; the others follow from it.
+/// Initial learning rate of rotations, radians per step; the other rates are derived from it.
 const ROTATION_RATE: f64 = 1e-3;
-/// What is left of the rates at the end of the plan.
+/// Fraction of the rates that remains at the end of the planned steps.
 const FINAL_FRAC: f64 = 0.01;
 const IMAGE_DECAY: f64 = 0.001;
 
-/// The terms on the GPU.
+/// The camera parameters on the GPU.
 #[derive(Debug)]
 pub(crate) struct CameraParams {
     pub(crate) set: ParamSet,
     pub(crate) params: Buffer,
     rule: Buffer,
-    /// The view of the step at hand.
+    /// View of the current step.
     pub(crate) corrected: Buffer,
     pub(crate) gains: Buffer,
     cameras: BTreeMap<Arc<str>, Slots>,
     n_used: u32,
 }
 
-/// Per camera: the slot of its terms, and those of its images by stamp in nanoseconds.
+/// For each camera, the slot of its parameters and the slots of its images by stamp in nanoseconds.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub(crate) struct CameraSlots(BTreeMap<String, (u32, BTreeMap<i64, u32>)>);
 
-/// Where the terms of a camera and of its images lie, in slots of [`N_PARAMS`].
+/// Slots of [`N_PARAMS`] parameters for a camera and for its images.
 #[derive(Debug)]
 struct Slots {
     camera: u32,
@@ -380,12 +390,13 @@ impl CameraParams {
         })
     }
 
-    /// Learns more.
+    /// Adds parameters to the set that is optimized.
     pub(crate) fn enable(&mut self, more: ParamSet) {
         self.set = self.set.and(more);
     }
 
-    /// The lens of a keyframe, with slots for its camera's terms and its own.
+    /// Uploads the lens of a keyframe; allocates slots for the parameters of its camera and of the image if they are
+    /// new.
     pub(crate) fn lens(&mut self, gpu: &Gpu, keyframe: &Keyframe) -> Result<Buffer, Error> {
         let camera = match self.cameras.get(&keyframe.camera) {
             Some(slots) => slots.camera,
@@ -416,7 +427,7 @@ impl CameraParams {
         Ok(gpu.uniform_with("splat.lens", &lens))
     }
 
-    /// Lets the gains of an image begin at these logarithms.
+    /// Sets the initial logarithms of the gains of an image.
     pub(crate) fn initialize_gains(&self, gpu: &Gpu, keyframe: &Keyframe, log_gains: [f64; 3]) {
         let slot = self.cameras.get(&keyframe.camera).and_then(|slots| slots.images.get(&keyframe.stamp));
         let values = log_gains.map(|value| [f32_of(value), 0.0, 0.0, 0.0]);
@@ -429,14 +440,14 @@ impl CameraParams {
         }
     }
 
-    /// A copy of all terms.
+    /// Copies all parameters.
     pub(crate) fn copy(&self, gpu: &Gpu) -> Result<Buffer, Error> {
         let copy = gpu.storage("splat.camera_params", self.params.bytes())?;
         gpu.copy((&self.params, 0), (&copy, 0), self.params.bytes());
         Ok(copy)
     }
 
-    /// Goes back to a copy; slots handed out since then keep their place, with nothing learned.
+    /// Restores a copy. Slots allocated since then stay allocated, with parameters of zero.
     pub(crate) fn restore_snapshot(&mut self, gpu: &Gpu, (set, params): (ParamSet, Buffer)) -> Result<(), Error> {
         self.set = set;
         if params.bytes() < self.used_bytes() {
@@ -459,7 +470,7 @@ impl CameraParams {
         Ok(self.n_used - 1)
     }
 
-    /// Says how fast the terms learn; `progress` is the share of the plan that lies behind.
+    /// Uploads the learning rates; `progress` is the completed fraction of the planned steps.
     pub(crate) fn write_rule(&self, gpu: &Gpu, progress: f64, scene_size_m: f64) {
         let rate = ROTATION_RATE * FINAL_FRAC.powf(progress.clamp(0.0, 1.0));
         let rule = CameraRule {
@@ -475,7 +486,7 @@ impl CameraParams {
         gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
 
-    /// Lists the pass that prepares the view of a step.
+    /// Records the pass that prepares the view of a step.
     pub(crate) fn correct(&self, gpu: &Gpu, passes: &mut Passes, learn: &LearnPipelines, base: &Buffer, lens: &Buffer) {
         let buffers = [
             ("base", base),
@@ -488,7 +499,7 @@ impl CameraParams {
         passes.dispatch(gpu, &learn.correct_view, 1, &buffers);
     }
 
-    /// Lists the pass that takes the step of the terms.
+    /// Records the pass that updates the parameters.
     pub(crate) fn refine(&self, view: &ViewPasses<'_>, passes: &mut Passes, learn: &LearnPipelines, lens: &Buffer) {
         self.refine_with(view, passes, &learn.refine_camera, lens);
     }
@@ -507,7 +518,7 @@ impl CameraParams {
         passes.dispatch(view.gpu, refine, 1, &buffers);
     }
 
-    /// The values of the first camera's terms.
+    /// Values of the first camera's parameters.
     #[cfg(test)]
     pub(crate) fn param_values(&self, gpu: &Gpu) -> Vec<f64> {
         let params: Vec<[f32; 4]> = gpu.read(&self.params, N_PARAMS as usize).unwrap();
@@ -519,7 +530,7 @@ impl CameraParams {
         SLOT_BYTES * u64::from(self.n_used)
     }
 
-    /// Where the terms lie, for a checkpoint.
+    /// Slot assignment, for a checkpoint.
     pub(crate) fn slots(&self) -> CameraSlots {
         let images = |slots: &Slots| slots.images.iter().map(|(stamp, slot)| (stamp.0, *slot)).collect();
         CameraSlots(
@@ -527,7 +538,7 @@ impl CameraParams {
         )
     }
 
-    /// Takes over what a checkpoint holds.
+    /// Restores the parameters from a checkpoint.
     pub(crate) fn restore(
         &mut self,
         gpu: &Gpu,
@@ -539,7 +550,9 @@ impl CameraParams {
         let all = slots.0.values().flat_map(|(camera, images)| std::iter::once(camera).chain(images.values()));
         self.n_used = all.map(|slot| slot + 1).max().unwrap_or(0);
         if (self.n_used as usize) < n_slots {
-            return Err(Error::CheckpointState { reason: "two cameras share their terms".to_owned() });
+            return Err(Error::CheckpointState {
+                reason: "two cameras or images share a slot of camera parameters".to_owned(),
+            });
         }
         let bytes = checkpoint.array("camera_params", self.used_bytes())?;
         self.params = gpu.storage_with("splat.camera_params", bytes)?;
@@ -555,7 +568,7 @@ impl CameraParams {
         Ok(())
     }
 
-    /// What the terms, or a copy of them, tell about each camera.
+    /// Corrections of all cameras from the parameters or from a copy of them.
     pub(crate) fn corrections(
         &self,
         gpu: &Gpu,
@@ -563,7 +576,7 @@ impl CameraParams {
         params: &Buffer,
         scene_size_m: f64,
     ) -> Result<BTreeMap<String, CameraCorrection>, Error> {
-        // A copy may be older than the last slots.
+        // A copy may be older than the newest slots.
         let mut params: Vec<[f32; 4]> = gpu.read(params, (self.used_bytes().min(params.bytes()) / 16) as usize)?;
         params.resize((self.n_used * N_PARAMS) as usize, [0.0; 4]);
         let value = |slot: u32, param: u32, learned: u32| {
@@ -600,5 +613,5 @@ impl CameraParams {
     }
 }
 
-/// Bytes of the terms of one camera, or of one image.
+/// Bytes of the parameters of one camera or image.
 const SLOT_BYTES: u64 = 16 * N_PARAMS as u64;

@@ -1,4 +1,4 @@
-//! The kernels that bin, move and multiply splats, against their f64 twins.
+//! Tests of the kernels that bin, update and grow splats, against their f64 twins.
 
 use super::against_twin::{KernelFixture, TargetBuffers, arrays_of, target_of, unambiguous_pixels};
 use super::arrays::SplatArrays;
@@ -10,7 +10,7 @@ use crate::gpu::{Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
 
-/// A small scene whose splats all have the same number of coefficients, and values that f32 holds.
+/// A small scene in which all splats have the same number of coefficients and values that f32 represents exactly.
 fn full_degree_scene(seed: u64, n: usize) -> Vec<Splat> {
     let mut splats = scene::small_scene(seed, n);
     for splat in &mut splats {
@@ -30,7 +30,7 @@ fn splats_of(arrays: &SplatArrays) -> Vec<Splat> {
     (0..arrays.n_splats()).map(one).collect()
 }
 
-/// Checks every value; `of_*` are the tolerances of means, log scales, rotations, opacities and colors.
+/// Checks every value. `tolerances` are those of means, log scales, rotations, opacities and colors.
 fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     let [of_mean, of_scale, of_rotation, of_opacity, of_color] = tolerances;
     let mut mismatches = Mismatches::default();
@@ -58,7 +58,7 @@ fn check(got: &[Splat], expected: &[Splat], tolerances: [f64; 5]) {
     mismatches.assert_none();
 }
 
-/// Large enough against the gradients that none decides a step by its sign alone.
+/// Large enough relative to the gradients that no step is decided by the sign alone.
 const EPSILON: f32 = 1e-4;
 const RULE: Rule = Rule {
     mean_rate_m: 1e-2,
@@ -86,7 +86,7 @@ fn optimizer_steps_match_the_twin() {
     const N_STEPS: u32 = 3;
     let view = scene::rolling_view();
     let mut splats = full_degree_scene(7, 40);
-    splats[3].opacity_logit = -5.5; // Barely seen: noise moves it.
+    splats[3].opacity_logit = -5.5; // Barely visible: noise moves it.
     splats = splats_of(&arrays_of(&splats));
     let fixture = KernelFixture::new(&GpuOptions::default(), &view, &arrays_of(&splats));
     let gpu = &fixture.gpu;
@@ -121,7 +121,8 @@ fn optimizer_steps_match_the_twin() {
         passes.submit(gpu);
         gpu.write(&fixture.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }
-    // A step is at most about a rate long; gradients agree to a few thousandths of the largest, and EPSILON damps small ones.
+    // A step is at most about as long as the rate. Gradients agree to a few thousandths of the largest, and EPSILON
+    // damps small ones.
     let of = |rate: f32| 0.02 * f64::from(rate);
     let tolerances =
         [RULE.mean_rate_m, RULE.log_scale_rate, RULE.rotation_rate, RULE.opacity_rate, RULE.sh_dc_rate].map(of);
@@ -142,7 +143,7 @@ fn growth_buffers(gpu: &Gpu, growth: &Growth) -> GrowthBuffers {
 
 #[test]
 fn growth_matches_the_twin() {
-    const N_BEFORE: u32 = 700; // Three blocks, the last one part full.
+    const N_BEFORE: u32 = 700; // Three blocks, the last one partly filled.
     const N_AFTER: u32 = 900;
     let mut splats = full_degree_scene(8, N_BEFORE as usize);
     for ix in [0, 255, 256, 699] {
@@ -164,9 +165,9 @@ fn growth_matches_the_twin() {
         unused: 0.0,
     };
     let expected = change::grow(&splats, &errors.iter().map(|error| f64::from(*error)).collect::<Vec<_>>(), &growth);
-    assert!(expected.margin > 1e-6, "a choice of f32 may differ: {}", expected.margin);
+    assert!(expected.margin > 1e-6, "f32 may choose another parent: {}", expected.margin);
     let n_children = expected.parents.iter().flatten().count();
-    assert_eq!(n_children, 204, "the dead and the new");
+    assert_eq!(n_children, 204, "the number of dead and new splats");
 
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let n_planes = 6 * growth.capacity as usize;
@@ -191,16 +192,16 @@ fn growth_matches_the_twin() {
         }
     }
     let sums: Vec<f32> = gpu.read(&fixture.splats.error_sums, N_AFTER as usize).unwrap();
-    assert!(sums.iter().all(|sum| *sum == 0.0), "errors are counted anew");
+    assert!(sums.iter().all(|sum| *sum == 0.0), "error sums are reset");
     check(&splats_of(&fixture.splats.read(&gpu).unwrap()), &expected.splats, [2e-5, 2e-4, 1e-6, 1e-3, 1e-6]);
 }
 
-/// Rounded sums lead to some of the dead, which another thread may be giving a new place: whether that has happened must not
-/// count.
+/// Rounded sums sometimes lead to a dead splat, to which another thread may be assigning a new position. The result
+/// must not depend on whether this has happened.
 #[test]
 fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
-    const N_AFTER: u32 = 1_200_000; // Some of a million choices are rounded into the dead.
+    const N_AFTER: u32 = 1_200_000; // A few of a million choices are rounded to dead splats.
     let mut random = scene::Random::new(12);
     let n = N_BEFORE as usize;
     let is_dead: Vec<bool> = (0..n).map(|_| random.uniform(0.0, 1.0) < 0.5).collect();
@@ -237,17 +238,17 @@ fn dead_splats_have_no_children() {
     assert_eq!(of_dead, 0);
     let n_children = parents.iter().filter(|parent| **parent != u32::MAX).count();
     let n_expected = is_dead.iter().filter(|is_dead| **is_dead).count() + (N_AFTER - N_BEFORE) as usize;
-    assert!(n_children <= n_expected && n_expected - n_children < 100, "{n_children} of {n_expected} found a parent");
+    assert!(n_children <= n_expected && n_expected - n_children < 100, "{n_children} of {n_expected} have a parent");
 }
 
 fn column(entries: &[[u32; 4]], part: usize) -> Vec<u32> {
     entries.iter().map(|entry| entry[part]).collect()
 }
 
-/// Bins by hand: a splat belongs to a tile when it reaches one of its pixels.
+/// Checks the bins against a direct computation: a splat belongs to a tile if it reaches one of its pixels.
 #[test]
 fn tile_lists_are_complete_and_depth_ordered() {
-    /// Squared Mahalanobis distance within which f32 may decide either way.
+    /// Squared Mahalanobis distance from the threshold within which f32 may decide either way.
     const MARGIN: f64 = 1e-3;
     let view = scene::tilted_view();
     let splats = full_degree_scene(10, 300);
@@ -265,7 +266,7 @@ fn tile_lists_are_complete_and_depth_ordered() {
         masks.iter().zip(&slots).flat_map(|(tiles, slot)| *slot..*slot + tiles.count_ones()).collect();
     taken.sort_unstable();
     assert!(taken.iter().copied().eq(0..u32::try_from(taken.len()).unwrap()), "every slot has one owner");
-    // 16 bits over the range of depths: their octaves, each of as many steps.
+    // Depth keys have 16 bits over the range of depths, divided into octaves with equal numbers of steps.
     let depths = || projected_splats.iter().map(|[position, ..]| position[2]).filter(|z| *z > 0.0);
     let octaves = (depths().fold(0.0, f32::max) / depths().fold(f32::INFINITY, f32::min)).log2();
     let key_step = (octaves + 1.0).log2().ceil().exp2() / 65536.0;

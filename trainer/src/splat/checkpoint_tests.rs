@@ -1,4 +1,4 @@
-//! Checkpoints: a model that stopped and went on is, bit for bit, one that never stopped.
+//! Tests of checkpoints: a model that was interrupted and resumed is bit-identical to one that was not.
 
 use super::training_tests::{keyframes, options, train};
 use super::{SplatOptions, SplatTrainer};
@@ -7,7 +7,7 @@ use crate::gpu::{Gpu, GpuOptions};
 use crate::{Error, Keyframe, Method};
 use std::sync::Arc;
 
-/// Past a change of the splat count and of the degree, and in the middle between two.
+/// Stops before the first change of the splat count and of the degree, and between later changes.
 const STOPS: [u64; 3] = [7, 230, 310];
 const END: u64 = 340;
 
@@ -24,7 +24,7 @@ fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>], max_splats: u32) -> 
     trainer
 }
 
-/// The whole state, its arrays' names only: a difference should not print megabytes.
+/// Compares the whole state. Prints only the names of arrays, because a difference could be megabytes long.
 fn assert_same(one: &Checkpoint, other: &Checkpoint) {
     assert_eq!(one.state, other.state);
     for (one, other) in one.arrays.iter().zip(&other.arrays) {
@@ -50,7 +50,7 @@ fn resuming_is_bit_exact() {
             let step = interrupted.progress().step;
             train(&mut interrupted, stop - step);
             if stop == 100 {
-                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth it waits for its splats in the checkpoint.
+                interrupted.push(keyframes[9].clone()).unwrap(); // Without depth, it waits for its splats.
             }
             let before = checkpoint_of(&mut interrupted);
             before.write(&path).unwrap();
@@ -58,7 +58,7 @@ fn resuming_is_bit_exact() {
             let untrained;
             (interrupted, untrained) =
                 SplatTrainer::resume(gpu.clone(), &Checkpoint::read(&path).unwrap(), &keyframes).unwrap();
-            assert_eq!(untrained.len(), if stop < 100 { 3 } else { 2 }, "two are for testing, one is yet to come");
+            assert_eq!(untrained.len(), if stop < 100 { 3 } else { 2 }, "two are test images, one has not arrived yet");
             assert_same(&checkpoint_of(&mut interrupted), &before);
         }
         assert_same(&checkpoint_of(&mut interrupted), &checkpoint_of(&mut uninterrupted));

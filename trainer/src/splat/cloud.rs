@@ -1,4 +1,4 @@
-//! Clouds for measuring kernels: synthetic ones, and those of a peer.
+//! Clouds for kernel benchmarks: synthetic ones, and files written by a peer implementation.
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
@@ -9,10 +9,11 @@ use std::path::Path;
 const SH_DEGREE: u32 = 3;
 const N_COEFFICIENTS: usize = 16;
 
-/// `n_splats` random splats of colour degree 3; the same for the same seed.
+/// Generates `n_splats` random splats of color degree 3; the same for the same seed.
 ///
-/// Means are uniform in the cube from -1 to 1; log scales normal about `ln(0.6 / n^(1/3))`, deviation 0.3; rotations
-/// normal in four dimensions; opacity logits normal, deviation 1.5; colour normal, deviation 0.2, constant part 0.5.
+/// Means are uniform in the cube from -1 to 1. Log scales are normal around `ln(0.6 / n^(1/3))` with a standard
+/// deviation of 0.3, rotations normal in four dimensions, and opacity logits normal with a standard deviation of 1.5.
+/// Color coefficients are normal with standard deviations of 0.5 for the constant one and 0.2 for the others.
 #[expect(clippy::cast_possible_truncation, reason = "drawn in f64, used in f32")]
 pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let mut random = Random::new(seed);
@@ -31,7 +32,8 @@ pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     splats
 }
 
-/// Reads a cloud a peer wrote with numpy: `means`, `quats` (w first), `log_scales`, `opacities_logit`, `sh` (n, 16, 3), f32.
+/// Reads a cloud written with numpy: `means`, `quats` (w first), `log_scales`, `opacities_logit`, `sh` (n, 16, 3),
+/// all f32.
 pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
     let read = || -> candle_core::Result<SplatArrays> {
         let file = NpzTensors::new(path)?;
@@ -47,7 +49,7 @@ pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
     read().map_err(|error| Error::SplatFile { path: path.to_owned(), reason: error.to_string() })?.checked()
 }
 
-/// An array of f32 whose shape is (n, `inner_shape`), in rows of `N`.
+/// Reads an f32 array of shape (n, `inner_shape`) as rows of `N`.
 fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) -> candle_core::Result<Vec<[f32; N]>> {
     let array = file.get(name)?.ok_or_else(|| candle_core::Error::Msg(format!("array {name:?} is missing")))?;
     if array.dims().split_first().is_none_or(|(_, inner)| inner != inner_shape) {
@@ -57,10 +59,10 @@ fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) ->
     Ok(array.flatten_all()?.to_vec1::<f32>()?.as_chunks::<N>().0.to_vec())
 }
 
-/// A fixed random sequence. Source: Steele, Lea, Flood 2014 (`SplitMix64`); Box, Muller 1958.
+/// A fixed pseudo-random sequence. Source: Steele, Lea, Flood 2014 (`SplitMix64`); Box, Muller 1958.
 struct Random {
     state: u64,
-    /// Box and Muller make two at once.
+    /// The Box-Muller method generates two numbers at once.
     spare: Option<f64>,
 }
 
@@ -77,13 +79,13 @@ impl Random {
         mixed ^ (mixed >> 31)
     }
 
-    /// From 0 up to, not including, 1.
+    /// Uniform in 0 <= x < 1.
     fn uniform(&mut self) -> f64 {
         // 53 bits fill an f64 exactly.
         (self.next() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
-    /// Mean 0, deviation 1.
+    /// Normal with mean 0 and standard deviation 1.
     fn normal(&mut self) -> f64 {
         if let Some(spare) = self.spare.take() {
             return spare;
@@ -100,7 +102,7 @@ mod tests {
     use super::*;
     use candle_core::{DType, Device, Tensor};
 
-    /// Mean and deviation.
+    /// Mean and standard deviation.
     fn moments(values: &[f32]) -> (f64, f64) {
         let n = values.len() as f64;
         let mean = values.iter().copied().map(f64::from).sum::<f64>() / n;
@@ -108,7 +110,7 @@ mod tests {
         (mean, variance.sqrt())
     }
 
-    /// Of 20 000 splats: five standard errors of the deviation of the smallest array.
+    /// For 20 000 splats: five standard errors of the standard deviation of the smallest array.
     const DEVIATION_FRAC: f64 = 0.03;
 
     fn assert_spread(what: &str, values: &[f32], mean: f64, deviation: f64) {
@@ -131,8 +133,8 @@ mod tests {
         let (constant, rest): (Vec<_>, Vec<_>) =
             cloud.sh.iter().enumerate().partition(|(ix, _)| ix % N_COEFFICIENTS == 0);
         let flat = |part: Vec<(usize, &[f32; 3])>| part.iter().flat_map(|(_, color)| **color).collect::<Vec<_>>();
-        assert_spread("constant colour", &flat(constant), 0.0, 0.5);
-        assert_spread("colour", &flat(rest), 0.0, 0.2);
+        assert_spread("constant color", &flat(constant), 0.0, 0.5);
+        assert_spread("color", &flat(rest), 0.0, 0.2);
     }
 
     #[test]
@@ -141,7 +143,7 @@ mod tests {
         assert_ne!(synthetic_cloud(50, 7), synthetic_cloud(50, 8));
     }
 
-    /// Writes the arrays of a cloud as numpy does, leaving one out.
+    /// Writes the arrays of a cloud in numpy's format, except for `omitted`.
     fn write_npz(path: &Path, cloud: &SplatArrays, omitted: &str) {
         let n = cloud.n_splats();
         let array = |values: &[f32], shape: &[usize]| Tensor::from_slice(values, shape, &Device::Cpu).unwrap();

@@ -1,9 +1,9 @@
-// contribute: add what each splat is worth to one picture: the sum of its blending weights.
+// contribute: add each splat's contribution to one picture, the sum of its blending weights.
 //
 // threads   256 per block of 256 splats
-// reads     model, status, tile_counts, slot_begins, gradients (of a `backward` whose every pixel had an error of one)
-// writes    contributions [n_splats], adds to them
-// source    the measure of Fan et al. 2024 (LightGaussian) and of Fang and Wang 2024 (Mini-Splatting), summed over views
+// reads     model, status, tile_counts, slot_begins, gradients (from a `backward` pass with an error of one at every pixel)
+// writes    contributions [n_splats] (accumulated)
+// source    measure of Fan et al. 2024 (LightGaussian) and of Fang and Wang 2024 (Mini-Splatting), summed over views
 
 #import view
 #import model

@@ -1,7 +1,7 @@
-// correct_view: the view of an image as its camera's terms have it now, and the gain of its colors.
+// correct_view: apply the current camera parameters to the view of an image, and compute its color gains.
 //
 // threads   one
-// reads     base (the view as the input has it), lens, rule, terms
+// reads     base (uncorrected view), lens, rule, params
 // writes    corrected (a `View`), gains
 
 #import view

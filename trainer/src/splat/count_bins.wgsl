@@ -1,7 +1,7 @@
-// count_bins: which tiles each splat touches, and how many splats of each block reach each bin.
+// count_bins: find the tiles that each splat touches, and count the splats of each block that reach each bin.
 //
-// threads   256 per block of 256 splats, taken in order of depth, and window of 256 bins
-// reads     view, model, depth_keys (sorted), by_depth, drawn
+// threads   256 per block of 256 splats in order of depth, and per window of 256 bins
+// reads     view, model, depth_keys (sorted), by_depth, projected_splats
 // writes    tile_counts [n_splats]; in order of depth: touched [n_splats], slot_offsets [n_splats] (within the block),
 //           block_slots [n_blocks] (intersections of the block), bin_counts [n_blocks, n_bins]
 
@@ -23,7 +23,7 @@
 @group(0) @binding(8) var<storage, read_write> block_slots: array<u32>;
 @group(0) @binding(9) var<storage, read_write> bin_counts: array<u32>;
 
-const INVISIBLE = 0xffffffffu; // As in project.
+const INVISIBLE = 0xffffffffu; // Same value as in project.wgsl.
 @compute @workgroup_size(BLOCK)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = block_and_window(folded(wg, n_wgs), model.n_splats, view.n_tiles);

@@ -1,8 +1,9 @@
-// emit: list every splat in the bins it reaches, in order of depth.
+// emit: list every splat in the bins that it reaches, in order of depth.
 //
-// threads   256 per block of 256 splats, taken in order of depth, and window of 256 bins
+// threads   256 per block of 256 splats in order of depth, and per window of 256 bins
 // reads     view, model, by_depth, touched, bin_counts, group_counts (offsets), bin_starts, slot_offsets, block_slots, status
-// writes    entries [n_entries] (splat; mask of the bin's tiles; slot of the lowest, the others follow), slot_begins [n_splats]
+// writes    entries [n_entries] (splat; mask of the bin's tiles; slot of the first tile, followed by the others),
+//           slot_begins [n_splats]
 
 #import view
 #import model
@@ -23,7 +24,7 @@
 @group(0) @binding(10) var<storage, read_write> entries: array<vec4u>;
 @group(0) @binding(11) var<storage, read_write> slot_begins: array<u32>;
 
-var<workgroup> wg_begins: array<u32, WINDOW_BINS>; // of the block's entries of a bin
+var<workgroup> wg_begins: array<u32, WINDOW_BINS>; // start of the block's entries in each bin
 
 @compute @workgroup_size(BLOCK)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -36,7 +37,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let bin = at.first_bin + lane;
         var begin = bin_starts[bin] + group_counts[at.block / GROUP * n_bins + bin];
         for (var i = 0u; i + 1u < GROUP; i++) {
-            let block = min(at.block / GROUP * GROUP + i, at.block); // Its own, which does not count, where none is left.
+            let block = min(at.block / GROUP * GROUP + i, at.block); // Later blocks are clamped to this block, which is not counted.
             begin += select(0u, bin_counts[block * n_bins + bin], block < at.block);
         }
         wg_begins[lane] = begin;
@@ -50,7 +51,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     for (var row = reached.z; row < reached.w; row++) {
         for (var column = reached.x; column < reached.y; column++) {
             let tiles = tiles_in_bin(touches, column, row);
-            let bin = row * at.bins.x + column - at.first_bin; // Wraps where the bin is before the window.
+            let bin = row * at.bins.x + column - at.first_bin; // Wraps around if the bin is before the window.
             if bin < at.n_bins && tiles != 0u {
                 entries[wg_begins[bin] + n_reaching(bin, lane)] = vec4u(splat_ix, tiles, slot, 0u);
             }

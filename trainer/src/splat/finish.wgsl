@@ -1,8 +1,8 @@
-// finish: a picture for people: color over the background in 8 bits, depth in metres.
+// finish: write the picture for display: color over the background in 8 bits, and depth in meters.
 //
 // threads   one per pixel
 // reads     view, supervision, image (premultiplied rgb, transmittance), depth (premultiplied)
-// writes    pixels [n_pixels] (rgba8; a: coverage), depths [n_pixels] (metres along z; 0 where less than half is covered)
+// writes    pixels [n_pixels] (rgba8; a: coverage), depths [n_pixels] (meters along z; 0 if coverage is at most one half)
 
 #import view
 #import supervision

@@ -1,17 +1,17 @@
-// gather: copy the entries that stay from one buffer of the model to another.
+// gather: copy the kept entries from one buffer of the model to another.
 //
-// threads   one per word of the new buffer's used part, 256 a workgroup
+// threads   one per word of the new buffer's used part, 256 per workgroup
 // reads     gathering, kept [n_kept] (indices of entries), from_words
 // writes    to_words
-// twin      a loop in splat/buffers.rs (tests)
+// twin      a loop in splat/trainer/model_size.rs (tests)
 
 #import view
 
 struct Gathering {
     n_kept: u32,
     n_planes: u32,
-    words: u32,            // an entry
-    from_capacity: u32,    // entries between planes
+    words: u32,            // per entry
+    from_capacity: u32,    // entries between the starts of two planes
     to_capacity: u32,
 }
 

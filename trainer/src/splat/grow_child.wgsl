@@ -1,11 +1,12 @@
-// grow_child: give each dead or new splat a parent, chosen by error, and a place within it.
+// grow_child: assign each dead or new splat a parent, chosen by error, and sample a position within the parent.
 //
 // threads   one per splat up to n_after
 // reads     growth, weights, cumulative, block_weights
-// writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared before), parents [n_after]
+// writes    means, rotations, shapes, sh_dc, sh_rest, all moments of the child; n_children [n_before] (cleared by the
+//           caller), parents [n_after]
 //
-// A child is never a parent: what weighs nothing is not taken, so nobody reads what is written here. Sums that are rounded
-// may lead to one that weighs nothing all the same, a choice or two in a million.
+// A child is never a parent: dead splats have weight zero and are not chosen, so no thread reads what another one
+// writes. Rounding of the sums can still select a splat of weight zero, in one or two choices per million.
 
 #import view
 #import growth
@@ -37,7 +38,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n_blocks = (growth.n_before + 255u) / 256u;
     let total = block_weights[n_blocks - 1u];
     let threshold = uniform3(vec3u(child, growth.key, 7u)).x * total;
-    // The first block, then the first splat, whose sum passes the number.
+    // Find the first block, then the first splat, whose cumulative sum exceeds the threshold.
     var low = 0u;
     var high = n_blocks - 1u;
     while low < high {
@@ -53,7 +54,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         if cumulative[middle] > within_block { high = middle; } else { parent = middle + 1u; }
     }
     if weights[parent] <= 0.0 {
-        // Nothing to learn from yet: invisible until the next change of the count.
+        // No error has been recorded yet: a new splat stays invisible until the next change of the splat count.
         if child >= growth.n_before {
             means[child] = vec4f(0.0);
             rotations[child] = vec4f(1.0, 0.0, 0.0, 0.0);

@@ -1,9 +1,9 @@
-// grow_family: share a parent's light among it and its children, and start counting errors anew.
+// grow_family: share a parent's opacity among it and its children, and reset the error sums.
 //
 // threads   one per splat up to n_after
 // reads     growth, n_children, parents
 // writes    shapes, moments, error_sums
-// source    Kheradmand et al. 2024 (3DGS-MCMC), equation 9: n splats in one place look as the one did
+// source    Kheradmand et al. 2024 (3DGS-MCMC), equation 9: n splats at one position look like the original one
 
 #import view
 #import growth
@@ -32,7 +32,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let shared_opacity = clamp(1.0 - pow(1.0 - opacity, 1.0 / f32(n)), 0.005, 0.9999);
     var weight = 0.0;
     for (var i = 1u; i <= n; i++) {
-        var choose = 1.0;    // (i - 1) over k
+        var choose = 1.0;    // binomial coefficient (i - 1 choose k)
         var power = shared_opacity;
         for (var k = 0u; k < i; k++) {
             weight += select(choose, -choose, (k & 1u) == 1u) * power / sqrt(f32(k) + 1.0);
@@ -42,6 +42,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
     let shrink = log(clamp(opacity / weight, 0.05, 1.0));
     shapes[splat_ix] = vec4f(shape.xyz + shrink, log(shared_opacity / (1.0 - shared_opacity)));
-    // Adam forgets, so a family's first steps are three times as long as usual and more: it finds its place sooner.
+    // Resetting Adam's moments makes a family's first steps at least three times as long as usual, so that it
+    // converges faster.
     for (var plane = 0u; plane < 6u; plane++) { moments[plane * growth.capacity + splat_ix] = vec4f(0.0); }
 }

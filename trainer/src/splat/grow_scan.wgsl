@@ -1,4 +1,4 @@
-// grow_scan: the blocks' weights summed from the first on.
+// grow_scan: compute inclusive prefix sums of the blocks' weights.
 //
 // threads   one workgroup of 256
 // reads     growth

@@ -1,4 +1,4 @@
-//! The kernels of this model, compiled.
+//! The kernels of the splat model and their pipelines.
 
 use crate::Error;
 use crate::gpu::{Gpu, Kernel, Pipeline, Source};
@@ -45,7 +45,7 @@ const SHARED: &[Source] = &[
     source!("ssim_bindings"),
     source!("ssim_upstream", "ssim_upstream_window"),
 ];
-/// What the kernels of the loss import where windows of pixels stay in the lanes.
+/// Imports of the loss kernels for adapters that keep windows of pixels in their lanes.
 const LOSS_STRIPS: &[Source] = &[
     VIEW,
     STATUS,
@@ -55,7 +55,7 @@ const LOSS_STRIPS: &[Source] = &[
     source!("ssim_upstream", "ssim_upstream_given"),
     source!("rows_and_columns"),
 ];
-/// What `update` imports.
+/// Imports of `update`.
 macro_rules! update_sources {
     ($gradient_sum:expr, $camera_sums:literal) => {
         &[
@@ -71,13 +71,13 @@ macro_rules! update_sources {
         ]
     };
 }
-/// Where cameras are learned, too.
+/// Imports of `update` if camera parameters are optimized, too.
 const WITH_CAMERA: &[Source] = update_sources!(GRADIENT_SUM, "camera_sums_tree");
-/// Where gradients meet unordered.
+/// Imports of `update` if gradients are summed in any order.
 const UPDATE_UNORDERED: &[Source] =
     update_sources!(source!("gradient_sum", "gradient_sum_unordered"), "camera_sums_none");
 
-/// What the kernels over pixels import.
+/// Imports of the kernels over pixels.
 macro_rules! blend_sources {
     ($($source:expr),*) => {
         &[
@@ -104,7 +104,7 @@ const BLEND_STRIPS: &[Source] = blend_sources!(
     source!("strips"),
     source!("lane_sums", "lane_sums_tree")
 );
-/// What `backward` imports where gradients meet unordered, in both forms.
+/// Imports of both variants of `backward` if gradients are summed in any order.
 const BACKWARD_UNORDERED: &[Source] = blend_sources!(
     source!("gradients", "gradients_unordered"),
     source!("pixels", "pixels_2"),
@@ -133,18 +133,18 @@ macro_rules! kernel {
     };
 }
 
-/// The kernels over pixels in the form that suits the adapter.
+/// The kernels over pixels, in the variant that suits the adapter.
 struct Blend {
     rasterize: Kernel,
     backward: Kernel,
-    /// Lanes of a subgroup, where `backward` must know.
+    /// Number of lanes of a subgroup, if `backward` needs it.
     subgroup: Option<u32>,
     in_strips: bool,
 }
 
 fn blend(gpu: &Gpu) -> Blend {
     match gpu.optional().subgroup_lanes {
-        // Software adapters: no processor made for pictures has subgroups of 8 and no other.
+        // Software adapters: no GPU has subgroups of exactly 8 lanes.
         Some(8) => Blend {
             rasterize: kernel!("rasterize_strips", BLEND_STRIPS),
             backward: kernel!("backward_strips", BLEND_STRIPS),
@@ -203,7 +203,7 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("gather"),
 ];
 
-/// What drawing needs.
+/// Pipelines for drawing.
 #[derive(Debug)]
 pub(crate) struct DrawPipelines {
     pub(crate) sort: RadixSort,
@@ -235,21 +235,21 @@ impl DrawPipelines {
     }
 }
 
-/// The structural similarity in the form that suits the adapter.
+/// Pipelines of the structural similarity, in the variant that suits the adapter.
 #[derive(Debug)]
 pub(crate) enum Ssim {
-    /// One kernel; `loss` gathers its slopes.
+    /// One kernel; `loss` gathers its gradients.
     Tiles(Pipeline),
-    /// Of a few lanes, for software adapters.
+    /// Workgroups of a few lanes, for software adapters.
     Strips {
-        /// The slopes towards the means over windows.
+        /// Gradients with respect to the means over windows.
         means: Pipeline,
-        /// From there to the pixels, for `loss`.
+        /// Propagates these gradients to the pixels, for `loss`.
         upstream: Pipeline,
     },
 }
 
-/// What learning needs on top.
+/// Additional pipelines for training.
 #[derive(Debug)]
 pub(crate) struct LearnPipelines {
     pub(crate) ssim: Ssim,
@@ -304,21 +304,21 @@ impl LearnPipelines {
         })
     }
 
-    /// The update kernel that hands out gradients in place of new values, for comparison with the twin.
+    /// The update kernel that returns gradients instead of new values, for comparison with the twin.
     #[cfg(test)]
     pub(crate) fn gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("update", WITH_CAMERA), &[("GRADIENTS_ONLY", 1.0)])
     }
 
-    /// Likewise for the terms of cameras.
+    /// The kernel of the camera parameters that returns gradients instead of new values.
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
     }
 }
 
-/// The kernels of a step whose gradients meet by atomic additions and `subgroupAdd`, in any order. Learning never uses
-/// them: they tell what the written order costs.
+/// Pipelines of a step that sums gradients by atomic additions and `subgroupAdd`, in any order. They are used only in
+/// benchmarks, to measure the cost of a fixed order.
 #[derive(Debug)]
 pub(crate) struct UnorderedPipelines {
     pub(crate) backward: Pipeline,
@@ -326,7 +326,8 @@ pub(crate) struct UnorderedPipelines {
 }
 
 impl UnorderedPipelines {
-    /// `None` where the adapter offers no atomic additions of floats, no subgroups, or they were not asked for.
+    /// Compiles the pipelines. Returns `None` if the adapter lacks atomic additions of floats or suitable subgroups,
+    /// or if float atomics were not requested.
     pub(crate) fn new(gpu: &Gpu, overrides_of_update: &[(&str, f64)]) -> Result<Option<Self>, Error> {
         let backward = match gpu.optional().subgroup_lanes {
             _ if !gpu.optional().float_atomics => return Ok(None),
@@ -345,7 +346,7 @@ impl UnorderedPipelines {
 mod tests {
     use crate::gpu::{reflect, resolve};
 
-    /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
+    /// Names and offsets of a struct's fields and its size in WGSL; checks that all kernels that use it agree.
     fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
         let layouts = super::KERNELS.iter().filter_map(|kernel| {
             let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! Scenes of 3D Gaussians.
+//! Scenes of 3D Gaussians (splats).
 
 #[cfg(test)]
 mod against_twin;

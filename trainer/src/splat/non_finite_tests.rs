@@ -1,4 +1,4 @@
-//! What is not a number, or no image, or no splat: training goes on, and nothing of it reaches a parameter.
+//! Tests with invalid keyframes and splats: training continues, and no non-finite value reaches a parameter.
 
 use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
@@ -9,7 +9,7 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
-/// Spoiled keyframes among good ones: whatever is wrong with them, the others are learned from as if they were not there.
+/// Trains on corrupted keyframes among valid ones; the result must be about as good as without them.
 #[test]
 fn invalid_keyframes_do_not_affect_training() {
     const N_STEPS: u64 = 120;
@@ -57,10 +57,10 @@ fn invalid_keyframes_do_not_affect_training() {
         test_psnr(&mut trainer, &valid_keyframes)
     };
     let (without, with) = (learned(&[]), learned(&corrupted));
-    assert!(with > without - 1.5, "{with:.2} dB beside spoiled keyframes, {without:.2} dB without");
+    assert!(with > without - 1.5, "{with:.2} dB with corrupted keyframes, {without:.2} dB without");
 }
 
-/// Splats that a file may hold: on the camera's plane, without rotation, huge, almost transparent.
+/// Splats that a file may contain: on the camera plane, without rotation, huge, almost transparent.
 #[test]
 fn invalid_splats_stay_finite_in_training() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -93,5 +93,5 @@ fn invalid_splats_stay_finite_in_training() {
         &learned.opacity_logits,
     ];
     assert!(numbers.into_iter().flatten().all(|number| number.is_finite()));
-    assert!(learned.means[20..] != arrays.means[20..], "the others learn");
+    assert!(learned.means[20..] != arrays.means[20..], "the other splats are trained");
 }

@@ -1,4 +1,4 @@
-//! How a splat model learns.
+//! Options of the splat model.
 
 use super::trials::{CameraRefinement, CountPolicy};
 use serde::{Deserialize, Serialize};
@@ -9,39 +9,42 @@ use serde::{Deserialize, Serialize};
 pub struct SplatOptions {
     /// Seeds every random choice.
     pub seed: u64,
-    /// Most splats the model may have.
+    /// Maximum number of splats.
     pub max_splats: u32,
-    /// How many it takes.
+    /// How the number of splats is chosen.
     pub count: CountPolicy,
-    /// Most bytes of GPU memory the model (parameters and the optimiser's moments) may take.
+    /// Maximum GPU memory of the model (parameters and the optimizer's moments), bytes.
     pub max_bytes: Option<u64>,
     /// Highest degree of spherical harmonics, 0 to 3.
     pub sh_degree: u32,
-    /// Steps over which learning rates fall and the model grows.
+    /// Steps over which learning rates decay and the model grows.
     pub n_planned_steps: u64,
-    /// Share of D-SSIM in the color loss.
+    /// Weight of D-SSIM in the color loss, 0 to 1.
     pub dssim_frac: f64,
-    /// Weight of the depth loss, per metre.
+    /// Weight of the depth loss, per meter.
     pub depth_per_m: f64,
-    /// How bright the background may be that changes every step: enough to keep black things solid. Up to 1 costs 1 dB
-    /// in the first few hundred steps, while much is still bare.
+    /// Maximum brightness of the random background, which changes at every step and keeps dark objects opaque. A
+    /// value of 1 costs 1 dB in the first few hundred steps, while large parts of the image are uncovered.
     pub random_background: f64,
-    /// Opacity and size cost the square of this over the number of images, against the color loss: the fewer images there
-    /// are, the more must speak for a splat. 0: they cost nothing.
+    /// The costs of opacity and size relative to the color loss are `(cost_images / n_images)^2`: with fewer images,
+    /// more evidence is needed for a splat. 0 disables the costs.
     pub cost_images: f64,
-    /// Growth at each change of the splat count, as a share of it.
+    /// Growth at each change of the splat count, as a fraction of the count.
     pub growth_frac: f64,
-    /// How far places wander at random, against their learning rate: the fainter a splat, the further.
+    /// Scale of the random motion of means relative to their learning rate; the more transparent a splat, the further
+    /// it moves.
     pub noise: f64,
-    /// Steps at a quarter of the resolution, and past which step the full one is used; `None`: few on a GPU, many on a
-    /// processor, where a step takes as long as the image has pixels.
+    /// Number of steps at a quarter of the resolution, and step from which the full resolution is used. `None`
+    /// selects few coarse steps on a GPU and many on a CPU, where the time of a step is proportional to the number of
+    /// pixels.
     pub coarse_steps: Option<[u64; 2]>,
-    /// What is learned about cameras.
+    /// Camera parameters that are optimized with the splats.
     pub cameras: CameraRefinement,
-    /// What is found about cameras by laying keyframes with depth over each other, before it is learned from the splats.
+    /// Camera parameters that are estimated by registering keyframes with depth, before the splats are trained on
+    /// them.
     #[serde(default)]
     pub align: CameraRefinement,
-    /// Splats that one depth image may add; `None`: fewer on a processor.
+    /// Maximum number of splats added for one depth image; `None` selects fewer on a CPU.
     pub seeds_per_image: Option<f64>,
 }
 
@@ -69,13 +72,13 @@ impl Default for SplatOptions {
 }
 
 impl SplatOptions {
-    /// Bytes of one splat: parameters, Adam's moments (one for all colors past the constant) and the sum of errors.
+    /// Bytes per splat: parameters, Adam's moments (one for all colors past the constant) and the error sum.
     pub fn bytes_per_splat(&self) -> u64 {
         let n_floats = 12 + 3; // Means, rotations and shapes are padded to 4 each.
         4 * (3 * n_floats + u64::from(super::buffers::n_sh_rest(self.sh_degree)) + 1 + 1)
     }
 
-    /// Most splats that both caps allow.
+    /// Maximum number of splats allowed by both limits.
     pub(crate) fn cap(&self) -> u32 {
         let by_bytes = self.max_bytes.map_or(u64::MAX, |bytes| bytes / self.bytes_per_splat());
         self.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)

@@ -1,4 +1,4 @@
-//! Small structs the kernels read, with the layouts of their WGSL twins.
+//! Small structs that the kernels read, with the layouts of their WGSL counterparts.
 
 use crate::gpu::{f32_of, f32s_of};
 use crate::{Aabb, RenderRequest, Shutter};
@@ -28,7 +28,7 @@ pub(crate) struct View {
     pub(crate) crop_max: [f32; 4],
 }
 
-/// What a [`View`] is made of.
+/// Camera parameters from which a [`View`] is computed.
 #[derive(Clone, Debug)]
 pub(crate) struct Camera {
     pub(crate) world_from_camera: Transform,
@@ -47,7 +47,7 @@ pub(crate) struct Camera {
 pub(crate) const LOW_PASS_PX2: f64 = 0.3;
 
 impl Camera {
-    /// The pinhole camera that a picture is asked from.
+    /// The pinhole camera of a requested picture.
     pub(crate) fn from_request(request: &RenderRequest, focal_px: [f64; 2], principal_px: [f64; 2]) -> Self {
         Self {
             world_from_camera: request.world_from_camera,
@@ -62,19 +62,19 @@ impl Camera {
         }
     }
 
-    /// The same camera with an image `2^level` times smaller; rows and columns left over at the edges are cut.
+    /// The same camera with an image smaller by `2^level`; leftover rows and columns at the far edges are cropped.
     pub(crate) fn at_level(&self, level: u32) -> Self {
         let share = 0.5f64.powi(i32::try_from(level).expect("a few levels"));
         Self {
             size_px: self.size_px.map(|size| (size >> level).max(1)),
             focal_px: self.focal_px.map(|focal| focal * share),
             principal_px: self.principal_px.map(|principal| principal * share),
-            low_pass_px2: self.low_pass_px2 * share * share, // The same width in the world: what is learned small is drawn large.
+            low_pass_px2: self.low_pass_px2 * share * share, // Keeps the width in the world constant.
             ..self.clone()
         }
     }
 
-    /// What the kernels read.
+    /// The view that the kernels read.
     pub(crate) fn view(&self) -> View {
         let shutter = |of: fn(&Shutter) -> nalgebra::Vector3<f64>| {
             self.shutter.as_ref().map_or([0.0; 3], |shutter| f32s_of((of(shutter) * shutter.readout_secs).into()))
@@ -131,7 +131,7 @@ pub(crate) struct Capacity {
     pub(crate) unused: [u32; 2],
 }
 
-/// `Rule` of update.wgsl: how parameters learn.
+/// `Rule` of update.wgsl: learning rates and costs.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Rule {
@@ -155,7 +155,7 @@ pub(crate) struct Rule {
     pub(crate) unused: u32,
 }
 
-/// Terms of a camera or of an image, as in `shared/camera_params.wgsl`.
+/// Number of parameters of a camera or an image, as in `shared/camera_params.wgsl`.
 pub(crate) const N_PARAMS: u32 = 16;
 
 /// `Lens` of `shared/camera_params.wgsl`.
@@ -183,7 +183,7 @@ pub(crate) struct CameraRule {
     pub(crate) image_decay: f32,
 }
 
-/// `Supervision` of shared/supervision.wgsl: what a picture is compared with and how.
+/// `Supervision` of shared/supervision.wgsl: background and loss weights.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Supervision {
@@ -221,7 +221,7 @@ pub(crate) struct Growth {
     pub(crate) unused: f32,
 }
 
-/// `Gathering` of gather.wgsl: which entries are copied from where to where.
+/// `Gathering` of gather.wgsl: counts and strides of a copy of selected entries.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub(crate) struct Gathering {

@@ -1,11 +1,11 @@
-//! The stages of drawing and learning, as lists of passes.
+//! The stages of drawing and training, as lists of passes.
 
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
 use super::kernels::{DrawPipelines, LearnPipelines, Ssim, UnorderedPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
-/// What the passes of one view touch.
+/// Buffers that the passes of one view use.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ViewPasses<'a> {
     pub(crate) gpu: &'a Gpu,
@@ -17,19 +17,19 @@ pub(crate) struct ViewPasses<'a> {
     pub(crate) size_px: [u32; 2],
 }
 
-/// What a picture is compared with.
+/// The target that a picture is compared with.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Target<'a> {
     pub(crate) image: &'a Buffer,
     pub(crate) depth: &'a Buffer,
     pub(crate) supervision: &'a Buffer,
-    /// Of the picture's red, green and blue before it is compared.
+    /// Gains applied to the picture's red, green and blue before the comparison.
     pub(crate) gains: &'a Buffer,
     /// Whether D-SSIM is part of the loss.
     pub(crate) ssim: bool,
 }
 
-/// Memory of one change of the splat count.
+/// Buffers of one change of the splat count.
 #[derive(Debug)]
 pub(crate) struct GrowthBuffers {
     pub(crate) growth: Buffer,
@@ -40,7 +40,8 @@ pub(crate) struct GrowthBuffers {
     pub(crate) parents: Buffer,
 }
 
-/// Hands out children of the splats whose error is largest: to dead splats, and to new ones past `n_before`.
+/// Replaces dead splats by children of other splats and appends more children after `n_before`. Parents are chosen by
+/// their error.
 pub(crate) fn grow(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -102,7 +103,8 @@ pub(crate) fn grow(
     );
 }
 
-/// Workgroups of the kernels that import `rows_and_columns`: each has a color of two tiles below each other.
+/// Number of workgroups of the kernels that import `rows_and_columns`: each handles one color of two vertically
+/// adjacent tiles.
 fn n_color_strips(size_px: [u32; 2]) -> u64 {
     3 * u64::from(size_px[0].div_ceil(TILE_PX)) * u64::from(size_px[1].div_ceil(2 * TILE_PX))
 }
@@ -195,7 +197,7 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// Packs the picture for people.
+    /// Packs the picture for display.
     pub(crate) fn finish(&self, passes: &mut Passes, pipelines: &DrawPipelines, supervision: &Buffer) {
         let n_pixels = self.size_px[0] * self.size_px[1];
         passes.dispatch(
@@ -213,7 +215,7 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// Compares the picture with its target: the slopes towards every pixel.
+    /// Compares the picture with its target and computes the gradient with respect to every pixel.
     pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
         let Self { gpu, image_buffers, status, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
@@ -255,7 +257,7 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// Carries the slopes from the pixels to the intersections.
+    /// Propagates the gradients from the pixels to the intersections.
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines) {
         self.backward_into(passes, &pipelines.backward, &self.scratch.gradients);
     }
@@ -281,7 +283,8 @@ impl ViewPasses<'_> {
         );
     }
 
-    /// After [`ViewPasses::backward`] of an error of one everywhere: adds what each splat is worth to the picture.
+    /// Adds each splat's contribution to the picture. Requires a previous [`ViewPasses::backward`] with an error of
+    /// one at every pixel.
     pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &LearnPipelines, contributions: &Buffer) {
         let buffers = [
             ("model", &self.splats.model),
@@ -295,8 +298,8 @@ impl ViewPasses<'_> {
         passes.dispatch(self.gpu, &pipelines.contribute, n_blocks.into(), &buffers);
     }
 
-    /// Carries the slopes from the intersections to the parameters and takes the optimiser's step; with `camera`, the
-    /// kernel that also sums the slopes towards the camera.
+    /// Propagates the gradients from the intersections to the parameters and takes one optimizer step. Set `camera`
+    /// if `update` is the kernel that also sums the gradients with respect to the camera.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
         let mut buffers = vec![("slot_begins", &self.scratch.slot_begins), ("gradients", &self.scratch.gradients)];
         if camera {
@@ -305,8 +308,8 @@ impl ViewPasses<'_> {
         self.update_from(passes, update, rule, buffers);
     }
 
-    /// `backward` and `update` by way of sums of a splat each, 12 f32, in which gradients meet in any order. They must be
-    /// zeros before, and are zeros after.
+    /// Runs `backward` and `update` with one sum of 12 f32 per splat, to which gradients are added in any order. The
+    /// sums must be zero before and are reset to zero afterwards.
     pub(crate) fn backward_and_update_unordered(
         &self,
         passes: &mut Passes,

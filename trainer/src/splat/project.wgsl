@@ -1,8 +1,8 @@
-// project: place every splat on the image plane and color it.
+// project: project every splat onto the image plane and compute its color.
 //
 // threads   one per splat
 // reads     view, model, means, rotations, shapes, sh_dc, sh_rest
-// writes    drawn [n_splats], depth_keys [n_splats] (all ones where unseen), status (nearest and furthest)
+// writes    projected_splats [n_splats], depth_keys [n_splats] (all ones if invisible), status (nearest and furthest)
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4
 
@@ -14,11 +14,11 @@
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> model: Model;
-@group(0) @binding(2) var<storage, read> means: array<vec4f>;       // in world, metres; w unused
+@group(0) @binding(2) var<storage, read> means: array<vec4f>;       // in world, meters; w unused
 @group(0) @binding(3) var<storage, read> rotations: array<vec4f>;   // w x y z, any length
 @group(0) @binding(4) var<storage, read> shapes: array<vec4f>;      // log_scale.xyz, opacity_logit
 @group(0) @binding(5) var<storage, read> sh_dc: array<f32>;         // 3 planes of `capacity`
-@group(0) @binding(6) var<storage, read> sh_rest: array<f32>;       // 3 planes a basis function
+@group(0) @binding(6) var<storage, read> sh_rest: array<f32>;       // 3 planes per basis function
 @group(0) @binding(7) var<storage, read_write> projected_splats: array<ProjectedSplat>;
 @group(0) @binding(8) var<storage, read_write> depth_keys: array<u32>;
 
@@ -37,20 +37,20 @@ fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: 
     (*sums).color += basis * vec3f(sh_rest[at], sh_rest[at + model.capacity], sh_rest[at + 2u * model.capacity]);
 }
 
-// Places and colors a splat; its depth key.
+// Projects and colors a splat. Returns its depth key.
 fn project(splat_ix: u32) -> u32 {
     let mean = means[splat_ix].xyz;
     let shape = shapes[splat_ix];
     let projection = project_splat(view, mean, rotations[splat_ix], shape.xyz);
     let opacity = sigmoid(shape.w);
-    // Written so that a NaN anywhere is not seen.
+    // Written so that a splat with a NaN anywhere is invisible.
     let visible = projection.visible && opacity > MIN_ALPHA && projection.determinant > 0.0 && inside_crop(view, mean)
         && abs(projection.mean_px.x) < 1e6 && abs(projection.mean_px.y) < 1e6 && projection.covariance.x + projection.covariance.z < 1e12;
     if !visible { return INVISIBLE; }
 
     let conic = vec3f(projection.covariance.z, -projection.covariance.y, projection.covariance.x) / projection.determinant;
     let reach = 2.0 * log(255.0 * opacity);
-    // The box around the ellipse where anything is drawn, and half a pixel more.
+    // Bounding box of the ellipse within which the splat is drawn, plus half a pixel.
     let half_px = sqrt(max(vec2f(reach) * projection.covariance.xz, vec2f(0.0))) + 0.5;
     let last = projection.mean_px + half_px;
     let first = projection.mean_px - half_px;
@@ -61,7 +61,7 @@ fn project(splat_ix: u32) -> u32 {
     each_sh(&sums, normalize(mean - view.center_in_world.xyz), model.sh_degree);
     let color = max(sums.color, vec3f(0.0));
     projected_splats[splat_ix] = ProjectedSplat(vec4f(projection.mean_px, projection.point.z, opacity), vec4f(conic, reach), vec4f(color, 0.0));
-    return bitcast<u32>(projection.point.z); // Positive floats order as their bits do.
+    return bitcast<u32>(projection.point.z); // Positive floats sort like their bit patterns.
 }
 
 @compute @workgroup_size(256)
@@ -73,10 +73,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         depth_keys[splat_ix] = key;
     }
     wg_depth_range[lane] = select(vec2u(key, ~key), vec2u(0u), key == INVISIBLE);
-    workgroupBarrier(); // All ends are there.
+    workgroupBarrier(); // All keys are written.
     for (var stride = 128u; stride > 0u; stride /= 2u) {
         if lane < stride { wg_depth_range[lane] = max(wg_depth_range[lane], wg_depth_range[lane + stride]); }
-        workgroupBarrier(); // This half holds what the other knew.
+        workgroupBarrier(); // The lower half of the lanes holds the maxima of both halves.
     }
     if lane == 0u {
         atomicMax(&status[FURTHEST], wg_depth_range[0].x);

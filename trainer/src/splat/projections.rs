@@ -1,4 +1,4 @@
-//! Pictures of any projection from pinhole pictures: of all directions from the six faces of a cube.
+//! Pictures of any projection, composed of pinhole pictures: panoramas from the six faces of a cube.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
@@ -10,7 +10,7 @@ use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Draws the request with `draw`, which draws pinhole cameras and adds depth if the request wants it.
+/// Renders the request with `draw`, which draws pinhole cameras, with depth if the request includes it.
 pub(crate) fn render(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,
@@ -21,10 +21,10 @@ pub(crate) fn render(
     }
 }
 
-/// Draws the cube's faces with `draw` and looks each direction up in them.
+/// Draws the cube's faces with `draw` and samples them for each direction.
 ///
-/// Longitude runs along x from -180 to 180 degrees, latitude along y from up to down; the camera's z axis is the middle.
-/// Depth is the distance from the camera's center, not along an axis.
+/// Longitude increases along x from -180 to 180 degrees, latitude decreases along y from 90 to -90 degrees; the
+/// camera's z axis is at the center. Depth is the distance from the camera's center, not the distance along an axis.
 fn all_directions(
     request: &RenderRequest,
     mut draw: impl FnMut(&Camera) -> Result<Picture, Error>,

@@ -1,9 +1,9 @@
 // rasterize: blend each tile's splats front to back.
 //
-// threads   32 per tile, two pixels in each of its quarters a lane
-// reads     view, status, bin_starts, tile_bits, entries, drawn
+// threads   32 per tile; each lane handles two pixels in each quarter of the tile
+// reads     view, status, bin_starts, tile_bits, entries, projected_splats
 // writes    image [n_pixels] (premultiplied rgb, transmittance), depth [n_pixels] (premultiplied), last [n_pixels]
-//           (past the last contributor, counted from the first of the bin's list)
+//           (one past the last contributor, counted from the start of the bin's list)
 // twin      splat/reference/rasterize.rs
 // source    Kerbl et al. 2023, section 6
 
@@ -32,11 +32,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         wg_tile = tile_at(folded(wg, n_wgs));
         atomicStore(&wg_n_done, 0u);
     }
-    let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before anyone adds.
+    let tile = workgroupUniformLoad(&wg_tile); // Also orders the zeroing before the first `atomicAdd`.
     let first = tile.corner + lane_px(lane);
     let center_x = f32(first.x) + 0.5 + RAMP;
     let center_y = f32(first.y) + 0.5;
-    // Four by name and not an array: what is indexed by a variable lies in memory.
+    // Four named variables instead of an array, because arrays indexed by a variable live in memory.
     var a = unblended(on_image(tile, first));
     var b = unblended(on_image(tile, first + vec2u(8u, 0u)));
     var c = unblended(on_image(tile, first + vec2u(0u, 8u)));
@@ -62,7 +62,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 counted = true;
                 atomicAdd(&wg_n_done, 1u);
             }
-            workgroupBarrier(); // All have counted themselves done.
+            workgroupBarrier(); // Every finished lane has been counted.
             if lane == 0u { wg_all_done = atomicLoad(&wg_n_done); }
             all_done = workgroupUniformLoad(&wg_all_done) == LANES;
         }

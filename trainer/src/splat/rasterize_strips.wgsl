@@ -1,16 +1,16 @@
-// rasterize_strips: what `rasterize` does, on adapters whose lanes read memory one after the other.
+// rasterize_strips: `rasterize` for adapters whose lanes access memory one after another.
 //
-// threads   a workgroup of 8 per tile, strip after strip (see `strips`)
-// reads     as `rasterize`
-// writes    as `rasterize`
+// threads   a workgroup of 8 per tile, which processes strips one after another (see `strips`)
+// reads     same as `rasterize`
+// writes    same as `rasterize`
 // twin      splat/reference/rasterize.rs
-// source    as `rasterize`
+// source    same as `rasterize`
 
 #import rasterize_bindings
 #import strips
 #import coverage
 
-var<workgroup> wg_blends: array<Blend, 64>; // [N_STRIPS, LANES], between two queues
+var<workgroup> wg_blends: array<Blend, 64>; // [N_STRIPS, LANES], state between two queues
 
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(subgroup_invocation_id) lane: u32) {
@@ -40,7 +40,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                 let owned = part + lane < queued.x;
                 var reaching = or_of_lanes(select(0u, 1u << lane, owned && reaches_strip(position, conic, top)));
                 loop {
-                    let some = reaching != 0u; // The loop's body runs at least once.
+                    let some = reaching != 0u; // The loop body runs at least once.
                     let i = firstTrailingBit(reaching) & 7u;
                     reaching &= reaching - 1u;
                     let at = subgroupShuffle(position, i);

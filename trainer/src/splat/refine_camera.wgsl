@@ -1,11 +1,12 @@
-// refine_camera: sum the slopes towards the camera of one image, and take a step of its terms.
+// refine_camera: sum the gradients with respect to the camera of one image, and take one optimizer step of its
+// parameters.
 //
 // threads   one workgroup of 256
 // reads     view, model, lens, rule, camera_sums [3, n_blocks], gain_sums [n_tiles], status
-// writes    terms
+// writes    params
 // twin      splat/reference/project.rs (the view's gradient); optim/reference.rs
 //
-// The terms of an image are pulled towards nothing, so that it is the camera's that explain what all images share.
+// Per-image parameters decay towards zero, so that the camera's parameters explain what all its images share.
 
 #import view
 #import model
@@ -22,7 +23,7 @@
 @group(0) @binding(6) var<storage, read_write> params: array<vec4f>;
 @group(0) @binding(7) var<uniform> rule: CameraRule;
 
-override GRADIENTS_ONLY: bool = false;   // Stored as the terms' values, for tests.
+override GRADIENTS_ONLY: bool = false;   // Stores the gradients as the parameters' values, for tests.
 var<workgroup> wg_sums: array<vec4f, 1024>; // [256, 4]
 
 fn gradient_of(param: u32) -> f32 {
@@ -59,22 +60,22 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     }
     for (var tile = lane; tile < view.n_tiles.x * view.n_tiles.y; tile += 256u) { sums[3] += gain_sums[tile]; }
     for (var part = 0u; part < 4u; part++) { wg_sums[part * 256u + lane] = sums[part]; }
-    workgroupBarrier(); // All have told.
+    workgroupBarrier(); // All sums are written.
     for (var stride = 128u; stride > 0u; stride /= 2u) {
         if lane < stride {
             for (var part = 0u; part < 4u; part++) { wg_sums[part * 256u + lane] += wg_sums[part * 256u + lane + stride]; }
         }
-        workgroupBarrier(); // This half holds what the other knew.
+        workgroupBarrier(); // The lower half of the lanes holds the sums of both halves.
     }
     let total = array<vec4f, 4>(wg_sums[0], wg_sums[256], wg_sums[512], wg_sums[768]);
-    workgroupBarrier(); // All have read before the first four are overwritten.
+    workgroupBarrier(); // All lanes have read the totals before the first four sums are overwritten.
     if lane == 0u {
         wg_sums[0] = total[0];
         wg_sums[1] = total[1];
         wg_sums[2] = total[2];
         wg_sums[3] = total[3];
     }
-    workgroupBarrier(); // The totals are where `gradient_of` looks.
+    workgroupBarrier(); // The totals are where `gradient_of` reads them.
     let param = min(lane, N_PARAMS - 1u);
     let gradient = gradient_of(param);
     let learns = lane < N_PARAMS && status[FAILED] == 0u && is_finite(gradient);

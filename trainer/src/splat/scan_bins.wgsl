@@ -1,4 +1,4 @@
-// scan_bins: per bin, how many entries come from earlier groups of blocks; and how many there are in all.
+// scan_bins: for each bin, count the entries of earlier groups of blocks and the total.
 //
 // threads   one workgroup of 256 per bin
 // reads     view, model

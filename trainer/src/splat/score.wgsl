@@ -1,8 +1,9 @@
-// score: how a picture compares with an image, in 8 bits.
+// score: compare a picture with an image, both in 8 bits.
 //
-// threads   one per pixel, 256 a workgroup
-// reads     view, pixels [n_pixels] (rgba8, as `finish` writes them), target_image [n_pixels] (rgba8; a = 0: not seen)
-// writes    products [n_workgroups, 3 colors]: sums over the seen pixels of picture^2, picture x image, image^2; how many
+// threads   one per pixel, 256 per workgroup
+// reads     view, pixels [n_pixels] (rgba8, as written by `finish`), target_image [n_pixels] (rgba8; a = 0: masked out)
+// writes    products [n_workgroups, 3 colors]: sums over the unmasked pixels of picture^2, picture x image, image^2, and
+//           the number of these pixels
 // twin      eval/psnr.rs
 
 #import view
@@ -24,12 +25,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let picture = (pixels[at] >> (8u * color)) & 255u;
         let image = (target_image[at] >> (8u * color)) & 255u;
         wg_sums[lane] = select(vec4u(0u), vec4u(picture * picture, picture * image, image * image, 1u), visible);
-        workgroupBarrier(); // All have told.
+        workgroupBarrier(); // All products are written.
         for (var stride = 128u; stride > 0u; stride /= 2u) {
             if lane < stride { wg_sums[lane] += wg_sums[lane + stride]; }
-            workgroupBarrier(); // This half holds what the other knew.
+            workgroupBarrier(); // The lower half of the lanes holds the sums of both halves.
         }
         if lane == 0u && group * 256u < n_pixels { products[group * 3u + color] = wg_sums[0]; }
-        workgroupBarrier(); // The sums were read before the next color overwrites them.
+        workgroupBarrier(); // The sums are read before the next color overwrites them.
     }
 }

@@ -1,7 +1,7 @@
-//! First splats: flat discs on what depth shows, or a cloud in the cameras' common view.
+//! Initial splats: flat discs at depth readings, or a random cloud in the cameras' common field of view.
 #![expect(
     clippy::cast_possible_truncation,
-    reason = "pixels, cells and draws are rounded down on purpose, within ranges checked beside them"
+    reason = "pixels, cells and random draws are rounded down on purpose, within ranges that are checked"
 )]
 
 use super::arrays::SplatArrays;
@@ -13,28 +13,28 @@ use rayon::prelude::*;
 use std::collections::HashSet;
 use std::sync::Arc;
 
-/// Neighbours whose depths differ by more than this share lie on different surfaces.
+/// Neighbors whose depths differ by more than this fraction are on different surfaces.
 const EDGE_FRAC: f64 = 0.04;
-/// Standard deviation of a disc in spacings of the grid: neighbours overlap without blurring.
+/// Standard deviation of a disc in grid spacings: neighbors overlap without blurring.
 const SPREAD: f64 = 0.6;
-/// Thickness of a disc in spacings.
+/// Thickness of a disc in grid spacings.
 const THICKNESS: f64 = 0.15;
 const SEED_OPACITY: f64 = 0.7;
-/// Splats of a start without depth.
+/// Number of splats of a start without depth.
 const N_RANDOM: usize = 50_000;
 const RANDOM_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
 
-/// Remembers which places have been given splats.
+/// Creates discs and remembers the positions that already have splats.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
-    /// Octave of the spacing, and the cell of that size.
+    /// Octave of the spacing, and the occupied cell at that size.
     occupied_cells: HashSet<(i32, [i32; 3])>,
-    /// Where the discs lie, in world.
+    /// Positions of the discs in the world.
     positions: Vec<Point3<f64>>,
 }
 
-/// A disc that a depth image asks for.
+/// A disc proposed for a depth image.
 struct Disc {
     position: Point3<f64>,
     spacing_m: f64,
@@ -43,20 +43,20 @@ struct Disc {
     color: [f64; 3],
 }
 
-/// How many discs an image is given where it is all new.
+/// Number of discs per image if no part of it is covered yet.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Density {
-    /// At most.
+    /// Maximum number of discs.
     pub(crate) max_discs: f64,
-    /// Pixels of one at least, where there are more than [`MIN_DISCS`].
+    /// Minimum number of pixels per disc, unless this results in fewer than [`MIN_DISCS`].
     pub(crate) px_per_disc: f64,
 }
 
-/// Discs that an image is given however few pixels it has.
+/// Number of discs that an image may get regardless of its number of pixels.
 const MIN_DISCS: f64 = 4000.0;
 
 impl Density {
-    /// Between two of them, whole pixels.
+    /// Distance between discs, whole pixels.
     fn stride_px(self, size_px: [u32; 2]) -> f64 {
         let n_pixels = f64::from(size_px[0]) * f64::from(size_px[1]);
         let n = self.max_discs.min((n_pixels / self.px_per_disc).max(MIN_DISCS));
@@ -65,11 +65,11 @@ impl Density {
 }
 
 impl Seeder {
-    /// Discs for what these keyframes see in their depth and nobody has seen at this fineness; those without depth ask for
-    /// none.
+    /// Creates discs at the depth readings of these keyframes that no disc of similar spacing covers yet. Keyframes
+    /// without depth get none.
     ///
-    /// The keyframes come in waves: each looks for what no earlier wave has covered, all at once; then they take their
-    /// places one after the other, so that the result does not depend on how many processors there are.
+    /// Keyframes are processed in batches. All keyframes of a batch propose discs in parallel, based on the earlier
+    /// batches; positions are then claimed sequentially, so the result does not depend on the number of processors.
     pub(crate) fn discs(&mut self, keyframes: &[Arc<Keyframe>], density: Density) -> SplatArrays {
         const BATCH: usize = 32;
         let mut seeds = Seeds::new();
@@ -85,7 +85,7 @@ impl Seeder {
         seeds.arrays
     }
 
-    /// What one keyframe asks for where nobody has taken the place yet.
+    /// Discs that a keyframe proposes at unoccupied positions.
     fn candidate_discs(&self, keyframe: &Keyframe, density: Density) -> Vec<Disc> {
         let Some(depth) = &keyframe.depth else { return Vec::new() };
         let mut discs = Vec::new();
@@ -115,7 +115,7 @@ impl Seeder {
                 let down =
                     depth.point(x, y + stride, filled(neighbors[3])) - depth.point(x, y - stride, filled(neighbors[2]));
                 let normal = across.cross(&down).try_normalize(1e-12).unwrap_or_else(Vector3::z);
-                // Seen at a slant the grid is wider apart on the surface.
+                // At an oblique angle, the grid is wider on the surface.
                 let slant = (normal.dot(&here.normalize()).abs()).max(0.3);
                 let size_m =
                     [SPREAD * spacing_m / slant.sqrt(), SPREAD * spacing_m / slant.sqrt(), THICKNESS * spacing_m];
@@ -125,7 +125,8 @@ impl Seeder {
         discs
     }
 
-    /// Discs for what a keyframe without depth sees and no disc covers, as far away as the discs around it in the image.
+    /// Creates discs for parts of a keyframe without depth that no disc covers, at the depths of the discs around
+    /// them in the image. Depths default to `default_m`.
     pub(crate) fn discs_without_depth(&mut self, keyframe: &Keyframe, density: Density, default_m: f64) -> SplatArrays {
         let mut seeds = Seeds::new();
         let [width, height] = keyframe.size_px.map(f64::from);
@@ -166,21 +167,21 @@ impl Seeder {
         seeds.arrays
     }
 
-    /// Bytes of a place and of a cell in a checkpoint.
+    /// Bytes of a position in a checkpoint, and of a cell.
     pub(crate) const POSITION_BYTES: u64 = 24;
     pub(crate) const CELL_BYTES: u64 = 16;
 
-    /// How many places have been given splats; each has its place and its cell.
+    /// Number of positions that have splats; each has a position and a cell.
     pub(crate) fn n_seeds(&self) -> usize {
         self.positions.len()
     }
 
-    /// A copy of what is remembered.
+    /// Copies the state.
     pub(crate) fn snapshot(&self) -> SeedSnapshot {
         SeedSnapshot { positions: self.positions.clone(), cells: self.occupied_cells.iter().copied().collect() }
     }
 
-    /// What [`SeedSnapshot::into_bytes`] gave, or another whole number of places and cells.
+    /// Restores the output of [`SeedSnapshot::into_bytes`], or any whole number of positions and cells.
     pub(crate) fn from_bytes(positions: &[u8], cells: &[u8]) -> Self {
         let positions = positions.as_chunks::<8>().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
         let cells = cells.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes));
@@ -213,14 +214,14 @@ fn cell_of(position: &Point3<f64>, octave: i32) -> (i32, [i32; 3]) {
     (octave, std::array::from_fn(|axis| (position[axis] / 2f64.powi(octave)).floor() as i32))
 }
 
-/// What a [`Seeder`] remembers, on its way into a checkpoint.
+/// The state of a [`Seeder`] for a checkpoint.
 pub(crate) struct SeedSnapshot {
     positions: Vec<Point3<f64>>,
     cells: Vec<(i32, [i32; 3])>,
 }
 
 impl SeedSnapshot {
-    /// Places in the order they were given splats, x y z as f64; cells in ascending order, octave x y z as i32.
+    /// Positions in the order in which they were seeded, x y z as f64; cells in ascending order, octave x y z as i32.
     pub(crate) fn into_bytes(mut self) -> (Vec<u8>, Vec<u8>) {
         self.cells.sort_unstable();
         let positions =
@@ -230,7 +231,7 @@ impl SeedSnapshot {
     }
 }
 
-/// Inverse depth per cell of an image, 0 where none is known.
+/// Inverse depth per cell of an image, 0 if unknown.
 struct InverseDepths {
     n_cells: [usize; 2],
     per_m: Vec<f64>,
@@ -241,13 +242,13 @@ impl InverseDepths {
         Self { n_cells, per_m: vec![0.0; n_cells[0] * n_cells[1]] }
     }
 
-    /// The nearest counts.
+    /// Sets a cell's inverse depth unless a nearer one is known.
     fn set_nearest(&mut self, [column, row]: [usize; 2], per_m: f64) {
         let known = &mut self.per_m[row * self.n_cells[0] + column];
         *known = known.max(per_m);
     }
 
-    /// Whether the cell or one of the eight around it is known.
+    /// Whether the inverse depth of the cell or one of its eight neighbors is known.
     fn is_known_nearby(&self, [column, row]: [usize; 2]) -> bool {
         let rows = row.saturating_sub(1)..(row + 2).min(self.n_cells[1]);
         rows.into_iter().any(|row| {
@@ -256,7 +257,8 @@ impl InverseDepths {
         })
     }
 
-    /// Unknown cells get the mean of the known ones of the smallest square of 2, 4, 8, ... cells that knows any.
+    /// Fills unknown cells with the mean of the known ones in the smallest enclosing square of 2, 4, 8, ... cells
+    /// that has any.
     fn filled(&self, default_per_m: f64) -> Vec<f64> {
         let [width, height] = self.n_cells;
         if width * height <= 1 {
@@ -276,7 +278,7 @@ impl InverseDepths {
     }
 }
 
-/// A cloud along the rays of all keyframes, densest around the point that the cameras look at together.
+/// Creates a random cloud along the rays of all keyframes, densest around their common focus.
 pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
     let mut seeds = Seeds::new();
     let focus = common_focus(keyframes);
@@ -289,7 +291,7 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
         let y = ((random.next() * f64::from(height)) as u32).min(height - 1);
         let camera = keyframe.world_from_camera.translation.vector;
         let distance_m = (focus - camera).norm().max(1e-3);
-        // From a third of the way to three times as far, evenly in inverse depth beyond the focus.
+        // From a third of the distance to three times the distance, uniform in inverse depth beyond the focus.
         let share = random.next();
         let z = distance_m * if share < 0.5 { 0.35 + 1.3 * share } else { 1.0 / (1.0 - 0.66 * (2.0 * share - 1.0)) };
         let ray = Vector3::new(
@@ -311,7 +313,7 @@ pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> 
     seeds.arrays
 }
 
-/// The point nearest to all optical axes in the sense of least squares, kept in front of the cameras.
+/// Point with the smallest sum of squared distances to all optical axes.
 pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
     let mut normal_matrix = Matrix3::identity() * 1e-6;
     let mut rhs = Vector3::zeros();
@@ -325,7 +327,7 @@ pub(crate) fn common_focus(keyframes: &[&Keyframe]) -> Vector3<f64> {
     normal_matrix.lu().solve(&rhs).unwrap_or_else(Vector3::zeros)
 }
 
-/// Color of the keyframe where it sees `position`; `None` outside and where it is masked.
+/// Color of the keyframe at the projection of `position`; `None` outside the image and in masked areas.
 fn color_at(keyframe: &Keyframe, position: &Point3<f64>) -> Option<[f64; 3]> {
     let point = keyframe.world_from_camera.inverse() * position;
     if point.z <= 0.0 {
@@ -344,7 +346,7 @@ struct Seeds {
 }
 
 impl Seeds {
-    /// Their colors are the same in every direction.
+    /// Creates an empty list of splats whose colors do not depend on the direction.
     fn new() -> Self {
         Self { arrays: SplatArrays { sh_degree: 0, ..SplatArrays::default() } }
     }
@@ -362,7 +364,7 @@ impl Seeds {
     }
 }
 
-/// Splitmix64 (Steele et al. 2014): numbers of 0 <= x < 1.
+/// `SplitMix64` (Steele et al. 2014): uniform numbers in 0 <= x < 1.
 struct Random(u64);
 
 impl Random {
@@ -384,7 +386,8 @@ mod tests {
     const WALL_M: f64 = 2.0;
     const DENSE: Density = Density { max_discs: 2000.0, px_per_disc: 1.0 };
 
-    /// A grey wall ahead; the camera's image is `size_px` wide and high, its axis in the middle.
+    /// A white wall in front of the camera. The image is `size_px` wide and high, with the principal point at its
+    /// center.
     fn wall_keyframe(size_px: [u32; 2], with_depth: bool) -> Keyframe {
         let principal_px = size_px.map(|px| f64::from(px) / 2.0);
         let n = (size_px[0] * size_px[1]) as usize;
@@ -429,15 +432,15 @@ mod tests {
         assert!(discs.means.len() > 1000);
         let wide = wall_keyframe([200, 80], false);
         let new_discs = seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0);
-        // Half of the wide image is bare, but for a rim of a cell or two.
+        // Half of the wide image is uncovered, except for a border of a cell or two.
         assert!((1500..=2100).contains(&new_discs.means.len()), "{} discs", new_discs.means.len());
         for mean in &new_discs.means {
-            assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "as far away as the wall around: {mean:?}");
-            assert!(f64::from(mean[0]).abs() > 0.9, "outside of what the camera with depth saw: {mean:?}");
+            assert!((f64::from(mean[2]) - WALL_M).abs() < 1e-3, "expected at the depth of the wall: {mean:?}");
+            assert!(f64::from(mean[0]).abs() > 0.9, "expected outside the view of the camera with depth: {mean:?}");
         }
         assert!(
             seeder.discs_without_depth(&wide, Density { max_discs: 4000.0, px_per_disc: 1.0 }, 7.0).means.is_empty(),
-            "a second look finds nothing bare"
+            "a second pass finds no uncovered area"
         );
     }
 

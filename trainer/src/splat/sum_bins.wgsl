@@ -1,6 +1,6 @@
-// sum_bins: how many entries each group of 16 blocks has in each bin.
+// sum_bins: count the entries of each group of 16 blocks in each bin.
 //
-// threads   256 per group and window of 256 bins, a lane a bin
+// threads   256 per group and window of 256 bins, one lane per bin
 // reads     view, model, bin_counts [n_blocks, n_bins]
 // writes    group_counts [n_groups, n_bins]
 

@@ -1,8 +1,8 @@
-// tile_bits: from one mask of tiles an entry to one bit an entry for each of the 16 tiles.
+// tile_bits: convert one mask of tiles per entry to one bit per entry for each of the 16 tiles.
 //
 // threads   256 per 512 entries
 // reads     status, entries [n_entries]
-// writes    tile_bits [16, n_words]: bit i of word w tells of entry 32 w + i
+// writes    tile_bits [16, n_words]: bit i of word w belongs to entry 32 w + i
 
 #import view
 #import status
@@ -11,7 +11,7 @@
 @group(0) @binding(1) var<storage, read> entries: array<vec4u>;
 @group(0) @binding(2) var<storage, read_write> tile_bits: array<u32>;
 
-var<workgroup> wg_masks: array<u32, 528>; // 16 rows of 32 and one, so that the rows begin in different banks
+var<workgroup> wg_masks: array<u32, 528>; // 16 rows of 32, padded by one so that the rows begin in different banks
 
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -22,7 +22,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         if first + i < n { mask = entries[first + i].y; }
         wg_masks[i / 32u * 33u + i % 32u] = mask;
     }
-    workgroupBarrier(); // The masks are there.
+    workgroupBarrier(); // All masks are written.
     let n_words = arrayLength(&tile_bits) / 16u;
     let word = first / 32u + lane % 16u;
     if word * 32u >= n || word >= n_words { return; } // Past the last barrier.

@@ -1,4 +1,4 @@
-//! The splat model as a [`Method`]: seeds, steps, growth, pictures.
+//! The splat model as a [`Method`]: seeding, training steps, growth and rendering.
 #![expect(clippy::cast_possible_truncation, reason = "counts derived from caps that are u32, and bits of a seed")]
 
 mod alignment_task;
@@ -31,34 +31,35 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Instant;
 
-/// Steps between changes of the splat count, and before the first.
+/// Steps between changes of the splat count; the next constant is the step of the first change.
 const GROWTH_PERIOD: u64 = 100;
 const GROWTH_START: u64 = 200;
-/// Share of the planned steps after which the count stays.
+/// Fraction of the planned steps after which the splat count stays constant.
 const GROWTH_END_FRAC: f64 = 0.75;
-/// Steps between degrees of spherical harmonics.
+/// Steps between increases of the active degree of spherical harmonics.
 const SH_PERIOD: u64 = 300;
-/// Most steps of a submit.
+/// Maximum number of steps per submit.
 const MAX_STEPS_PER_SUBMIT: u64 = 64;
-/// Maximum bytes of images on a software adapter: its memory is the host's, which already holds all keyframes.
+/// Maximum bytes of images on a software adapter, which shares the host memory that already holds all keyframes.
 const SOFTWARE_IMAGE_BYTES: u64 = 256 << 20;
-/// Number of images made at once when all views are needed in turn.
+/// Number of images uploaded together when all views are processed in turn.
 const VIEWS_AT_ONCE: usize = 16;
-/// Views whose images are made and uploaded at once while pictures are requested: with more, a picture would wait too long.
+/// Number of images prepared and uploaded together while pictures are requested. A larger number would delay pictures
+/// too much.
 const VIEWS_AT_ONCE_WATCHED: u64 = 4;
-/// Readings further than this from the rendered depth are outliers.
+/// Readings further than this from the rendered depth are treated as outliers.
 const DEPTH_CLIP_M: f64 = 0.2;
 
-/// Share of the most splats there may be that one image may take for its seeds: the others need some, too.
+/// Maximum share of the splat limit that the seeds of one image may take, so that other images get some, too.
 const SEED_SHARE: f64 = 1.0 / 8.0;
-/// Pixels of an image that a seed stands for at least: with finer ones the first steps take longer than they gain.
+/// Minimum number of pixels per seed. With more seeds, the first steps take longer than they gain.
 const PX_PER_SEED: f64 = 48.0;
-/// Place of a child within its parent, in standard deviations.
+/// Standard deviation of a child's position within its parent, in standard deviations of the parent.
 const CHILD_SPREAD: f32 = 0.5;
-/// Most that opacity and size cost against the color loss.
+/// Maximum costs of opacity and size relative to the color loss.
 const MAX_COST: f64 = 0.1;
 
-/// 3D Gaussian splats that learn from keyframes.
+/// Trains 3D Gaussian splats on keyframes.
 #[derive(Debug)]
 pub struct SplatTrainer {
     gpu: Arc<Gpu>,
@@ -76,33 +77,33 @@ pub struct SplatTrainer {
     supervision: Buffer,
     plain: Buffer,
     cameras: CameraParams,
-    /// Of the saved model this one came from.
+    /// Corrections of the saved model that this one was loaded from.
     saved_corrections: BTreeMap<String, CameraCorrection>,
     alignment_task: AlignmentTask,
     trials: SplatTrials,
     passes: Passes,
     seeder: Seeder,
-    /// Keyframes whose depth has not been looked at.
+    /// Keyframes whose depth has not been used for seeding yet.
     pending: Vec<Arc<Keyframe>>,
-    /// Keyframes without depth since the last step.
+    /// Keyframes without dense depth that arrived since the last step.
     unseeded: Vec<Arc<Keyframe>>,
     seeds_per_image: f64,
     coarse_steps: [u64; 2],
     views: Vec<TrainView>,
-    /// Maximum bytes of their images on the GPU, unless a submit needs more.
+    /// Maximum bytes of the views' images on the GPU, unless a submit needs more.
     max_image_bytes: u64,
-    /// How often images were requested.
+    /// Number of requests for images, for evicting the least recently used ones.
     n_image_requests: u64,
     order: Order,
     scene_size_m: f64,
     has_depth: bool,
     step: u64,
-    /// Steps of trials that were taken back.
+    /// Steps of trials that were reverted.
     n_reverted_steps: u64,
-    /// Step from which the planned steps count: late keyframes set it forward.
+    /// Step at which the planned steps begin; late keyframes move it forward.
     schedule_start: u64,
     last_growth_step: u64,
-    /// Whether the GPU has no memory for more splats.
+    /// Whether the GPU has no memory left for more splats.
     is_full: bool,
     n_non_finite: u64,
     in_flight: Option<InFlight>,
@@ -110,7 +111,7 @@ pub struct SplatTrainer {
     step_millis: f64,
     /// Whether pictures are requested.
     is_watched: bool,
-    /// Buffer of the image of the last comparison, for reuse.
+    /// Image buffer of the last comparison, for reuse.
     compared: Option<Buffer>,
 }
 
@@ -135,8 +136,8 @@ enum Learn {
     Failed,
 }
 
-/// Pipelines being compiled on a thread. Dropping it waits for the thread: where a process ends while its driver
-/// compiles, NVIDIA's corrupts the heap.
+/// Pipelines being compiled on a thread. Dropping it waits for the thread, because NVIDIA's driver corrupts the heap
+/// if a process exits while the driver compiles.
 #[derive(Debug)]
 struct Compiling(Option<JoinHandle<Result<LearnPipelines, Error>>>);
 
@@ -157,7 +158,7 @@ impl Drop for Compiling {
     }
 }
 
-/// Everything that training changes, for restoring it later. When a state is taken, no keyframe waits for its splats.
+/// The state that training changes, for restoring it later. No keyframe is waiting for its splats when it is taken.
 #[derive(Debug)]
 pub(crate) struct Snapshot {
     pub(super) splats: SplatBuffers,
@@ -167,7 +168,7 @@ pub(crate) struct Snapshot {
     pub(super) seeding: Seeding,
 }
 
-/// What an arriving keyframe changes: places that have splats, and the scale and schedule of training.
+/// State that an arriving keyframe changes: seeded positions, and the scale and schedule of training.
 #[derive(Clone, Debug)]
 pub(crate) struct Seeding {
     pub(super) seeder: Seeder,
@@ -176,11 +177,11 @@ pub(crate) struct Seeding {
     pub(super) schedule_start: u64,
 }
 
-/// What a step touches of the view it learns from.
+/// The resources of one training step.
 struct LearnedView<'a> {
     view: ViewPasses<'a>,
     level: &'a Level,
-    /// Where something is learned about its camera.
+    /// Present if camera parameters are optimized.
     lens: Option<&'a Buffer>,
 }
 
@@ -192,7 +193,7 @@ struct InFlight {
 }
 
 impl SplatTrainer {
-    /// An empty model. Drawing works at once; what learning needs is compiled on another thread.
+    /// Creates an empty model. It can draw at once; the training pipelines are compiled on another thread.
     pub fn new(gpu: Arc<Gpu>, options: SplatOptions) -> Result<Self, Error> {
         let learn = Learn::Compiling(Compiling::start(&gpu));
         Self::with_learn(gpu, options, learn)
@@ -265,7 +266,8 @@ impl SplatTrainer {
         })
     }
 
-    /// A model of given splats, to be drawn or trained on; what learning needs is compiled at the first step.
+    /// Creates a model of given splats, for drawing or training. The training pipelines are compiled at the first
+    /// step.
     pub fn from_arrays(gpu: Arc<Gpu>, options: SplatOptions, arrays: &SplatArrays) -> Result<Self, Error> {
         let options = SplatOptions { sh_degree: arrays.sh_degree, ..options };
         let mut trainer = Self::with_learn(gpu, options, Learn::OnDemand)?;
@@ -273,7 +275,7 @@ impl SplatTrainer {
         Ok(trainer)
     }
 
-    /// Knows about cameras what a saved model did, see `model.json`.
+    /// Loads the camera corrections of a saved model from its `model.json`.
     pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
         let metadata = read_metadata(&folder.join("model.json"))?;
         self.saved_corrections = metadata.cameras;
@@ -281,19 +283,19 @@ impl SplatTrainer {
         Ok(self)
     }
 
-    /// The splats as they are now.
+    /// The current splats.
     pub fn arrays(&mut self) -> Result<SplatArrays, Error> {
         self.seed_from_depth()?;
         self.finish_in_flight()?;
         self.splats.read(&self.gpu)
     }
 
-    /// How it learns.
+    /// The options.
     pub fn options(&self) -> &SplatOptions {
         &self.options
     }
 
-    /// What was learned about each camera; empty where nothing is.
+    /// Estimated corrections of each camera; empty if none are estimated.
     pub fn camera_corrections(&mut self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         self.finish_in_flight()?;
         let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
@@ -304,7 +306,8 @@ impl SplatTrainer {
         self.cameras.corrections(&self.gpu, set, params, self.scene_size_m)
     }
 
-    /// What is known about each camera now, with what is being tried; of keyframes that alignment has corrected already.
+    /// Current corrections of each camera, including a running trial's, for keyframes that alignment has already
+    /// corrected.
     fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
         let (set, params) = (self.cameras.set, &self.cameras.params);
         if set.any() {
@@ -319,7 +322,7 @@ impl SplatTrainer {
         self.step_millis = millis;
     }
 
-    /// Bounds the images on the GPU, as on a software adapter.
+    /// Limits the bytes of images on the GPU, as on a software adapter.
     #[cfg(test)]
     pub(super) fn limit_image_bytes(&mut self, max_bytes: u64) {
         self.max_image_bytes = max_bytes;
@@ -335,7 +338,7 @@ impl SplatTrainer {
         self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
     }
 
-    /// Number of places that count as seeded.
+    /// Number of positions that are seeded.
     #[cfg(test)]
     pub(super) fn n_seeds(&self) -> usize {
         self.seeder.n_seeds()
@@ -346,7 +349,7 @@ impl SplatTrainer {
         self.views.iter().filter(|view| view.keyframe.stamp == keyframe.stamp).count()
     }
 
-    /// Gradients that were not finite and were dropped.
+    /// Number of gradients dropped because they were not finite.
     pub fn n_non_finite(&self) -> u64 {
         self.n_non_finite
     }
@@ -364,7 +367,7 @@ impl SplatTrainer {
         Ok(ready)
     }
 
-    /// Adds splats, up to the cap.
+    /// Adds splats, up to the limit.
     fn add(&mut self, arrays: &SplatArrays) -> Result<(), Error> {
         let n_new = arrays.n_splats().min((self.options.cap() - self.splats.n_splats.min(self.options.cap())) as usize);
         if n_new == 0 {
@@ -381,7 +384,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Makes room for this many splats; if the GPU has no memory for them, returns how many there is room for.
+    /// Ensures capacity for `n_splats`. If the GPU has no memory for them, returns the smaller number that fits.
     fn reserve_up_to(&mut self, n_splats: u32) -> Result<u32, Error> {
         if self.is_full {
             return Ok(n_splats.min(self.splats.capacity));
@@ -401,7 +404,7 @@ impl SplatTrainer {
         if n_splats > self.splats.capacity {
             let capacity =
                 n_splats.max(self.splats.capacity.saturating_mul(3) / 2).min(self.options.cap().max(n_splats));
-            // Before the model itself, because every model that fits must also be drawable.
+            // Resized before the model itself, because every model that fits must also be drawable.
             let have = self.scratch.as_ref().map(|(size, _)| *size);
             if let Some(have) = have {
                 let n_entries = have.n_entries.max(2 * capacity);
@@ -424,7 +427,7 @@ impl SplatTrainer {
         self.gpu.write(status, 4 * u64::from(status::N_SPLATS), bytemuck::bytes_of(&n_splats));
     }
 
-    /// The splats that people see: while a change is being tried, those without it.
+    /// The splats that viewers see: during a trial, those without the change.
     fn displayed(&self) -> &SplatBuffers {
         self.trials.baseline().map_or(&self.splats, |snapshot| &snapshot.splats)
     }
@@ -433,7 +436,7 @@ impl SplatTrainer {
         Density { max_discs: self.seeds_per_image, px_per_disc: PX_PER_SEED }
     }
 
-    /// Gives the keyframes since the last call discs where their depth shows something new.
+    /// Adds discs at new depth readings of the keyframes that arrived since the last call.
     fn seed_from_depth(&mut self) -> Result<(), Error> {
         let pending = std::mem::take(&mut self.pending);
         if pending.is_empty() {
@@ -446,7 +449,8 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Keyframes without depth get discs where those with depth left them bare; without any depth there is a cloud.
+    /// Adds splats for areas that depth does not cover: discs for keyframes without depth, or a random cloud if there
+    /// is no depth at all.
     fn prepare_training(&mut self) -> Result<(), Error> {
         self.seed_from_depth()?;
         for keyframe in std::mem::take(&mut self.unseeded) {
@@ -468,7 +472,8 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// How large the scene is for the learning rate of the means: the spread of the cameras, or how far they look.
+    /// Measures the scale of the scene for the learning rate of the means, from the spread of the cameras or their
+    /// median depth.
     fn measure_scene(&mut self) {
         let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
         let centers: Vec<_> = keyframes.iter().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
@@ -482,7 +487,8 @@ impl SplatTrainer {
 
     fn write_rule(&self) {
         if self.cameras.set.any() {
-            // Where a submit begins depends on the clock, so what is told to it once must not depend on its first step.
+            // The first step of a submit depends on timing. Values that are set once per submit must not depend on
+            // it.
             let step = self.step - self.step % GROWTH_PERIOD;
             let completed =
                 step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
@@ -514,19 +520,20 @@ impl SplatTrainer {
         self.gpu.write(&self.rule, 0, bytemuck::bytes_of(&rule));
     }
 
-    /// Uploads the images that the next `n` steps need and that are not on the GPU.
+    /// Uploads the missing images of the next `n` steps.
     fn prepare_levels(&mut self, n: u64) -> Result<(), Error> {
         let mut requested = self.upcoming_levels(n);
         let all_there = requested.iter().all(|(view_ix, level)| self.views[*view_ix].has_level(*level));
         if !all_there && !self.gpu.is_software() {
-            // Enough at once for all processors, and for the time of a step not to be that of its images.
+            // Enough images to use all processors, and so that the time of a step does not include that of its
+            // images.
             requested =
                 self.upcoming_levels(n.max(if self.is_watched { VIEWS_AT_ONCE_WATCHED } else { MAX_STEPS_PER_SUBMIT }));
         }
         self.make_levels(&requested)
     }
 
-    /// The views and levels of the next `n` steps.
+    /// Views and levels of the next `n` steps.
     fn upcoming_levels(&mut self, n: u64) -> BTreeSet<(usize, usize)> {
         let mut upcoming_levels = BTreeSet::new();
         for step in self.step..self.step + n {
@@ -536,7 +543,7 @@ impl SplatTrainer {
         upcoming_levels
     }
 
-    /// Uploads these levels of views unless they are on the GPU, using all processors; other images may be removed for them.
+    /// Uploads the missing ones of these levels of views, using all processors. Other images may be evicted.
     fn make_levels(&mut self, requested: &BTreeSet<(usize, usize)>) -> Result<(), Error> {
         let missing: Vec<(usize, usize)> =
             requested.iter().copied().filter(|(view_ix, level)| !self.views[*view_ix].has_level(*level)).collect();
@@ -553,7 +560,7 @@ impl SplatTrainer {
             };
             let mut dropped = views::drop_levels(&mut self.views, keep);
             if !dropped.is_empty() && !self.passes.is_empty() {
-                self.passes.submit(&self.gpu); // The listed passes need the images that are replaced.
+                self.passes.submit(&self.gpu); // The recorded passes use the images that are replaced.
             }
             for ((view_ix, level), images) in missing.into_iter().zip(&made) {
                 let same_size = dropped.iter().position(|level| level.size_px == images.size_px());
@@ -571,7 +578,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Lists the passes of one step.
+    /// Records the passes of one step.
     fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
         let view_ix = self.order.pick(step, self.views.len());
         let level_ix = self.make_ready(view_ix, level_at(step, self.coarse_steps))?;
@@ -603,7 +610,8 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Makes all that a view needs to be learned from, `2^level` times smaller or as small as it gets; says how small.
+    /// Prepares images and buffers for training on a view, `2^level` times smaller or at its smallest level. Returns
+    /// the level used.
     fn make_ready(&mut self, view_ix: usize, level: u32) -> Result<usize, Error> {
         let level_ix = self.views[view_ix].clamped(level);
         if !self.views[view_ix].has_level(level_ix) {
@@ -613,14 +621,14 @@ impl SplatTrainer {
         Ok(level_ix)
     }
 
-    /// Makes the buffers for training on a view at a level, without its images.
+    /// Allocates the buffers for training on a view at a level, without its images.
     fn make_space(&mut self, view_ix: usize, level_ix: usize) -> Result<(), Error> {
         let size_px = self.views[view_ix].size_at(level_ix);
         self.make_scratch(size_px, true)?;
         ensure_image_buffers(&self.gpu, &mut self.training_buffers, &mut self.passes, size_px, true)
     }
 
-    /// A view and level that are ready, with its camera as it is learned now; lists what that takes.
+    /// A prepared view and level with its current camera parameters; records the pass that computes the view.
     fn learned_view(
         &self,
         list: &mut Passes,
@@ -647,7 +655,7 @@ impl SplatTrainer {
         Ok(LearnedView { view, level, lens })
     }
 
-    /// Makes sure that a view of this size can be drawn, or learned from.
+    /// Ensures that a view of this size can be drawn, or trained on.
     fn make_scratch(&mut self, size_px: [u32; 2], learn: bool) -> Result<(), Error> {
         let n_splats = self.splats.capacity.max(self.displayed().capacity);
         let n_entries = (2 * n_splats).max(1 << 14);
@@ -673,7 +681,7 @@ impl SplatTrainer {
             n_slots: need.n_slots.max(have.n_slots),
             n_bins: need.n_bins.max(have.n_bins),
         };
-        self.passes.submit(&self.gpu); // What is listed holds the old buffers.
+        self.passes.submit(&self.gpu); // The recorded passes use the old buffers.
         self.passes.clear_bindings();
         let had = self.scratch.take().map(|(size, _)| size);
         let made = Scratch::new(&self.gpu, &self.draw, size);
@@ -686,7 +694,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Gives a failed submit larger buffers; true when there was a failure.
+    /// Grows the buffers after a failed submit. Returns whether it had failed.
     fn grow_scratch(&mut self, counters: &[u32]) -> Result<bool, Error> {
         if counters[status::FAILED] == 0 {
             return Ok(false);
@@ -703,12 +711,12 @@ impl SplatTrainer {
         Ok(true)
     }
 
-    /// Waits for the submit in flight and takes note of what it did; says whether a buffer was too small for it.
+    /// Waits for the submit in flight and records its results. Returns whether a buffer was too small for it.
     fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
         let completed = Instant::now();
-        let began = in_flight.since.max(self.idle_since); // The submit before was still running when this one was sent.
+        let began = in_flight.since.max(self.idle_since); // The previous submit was still running then.
         self.idle_since = completed;
         let millis = (completed - began).as_secs_f64() * 1e3 / in_flight.n_steps.max(1) as f64;
         self.step_millis = if self.step_millis == 0.0 { millis } else { 0.8 * self.step_millis + 0.2 * millis };
@@ -721,21 +729,21 @@ impl SplatTrainer {
         Ok(failed)
     }
 
-    /// Takes note of gradients that were not finite; says so at first, and whenever there are twice as many.
+    /// Records the number of non-finite gradients; logs a warning at the first ones and at each doubling.
     fn log_non_finite(&mut self, n_non_finite: u64) {
         if n_non_finite.checked_ilog2() > self.n_non_finite.checked_ilog2() {
-            log::warn!("{n_non_finite} gradients of splats were not finite so far and were dropped");
+            log::warn!("dropped {n_non_finite} non-finite gradients of splats so far");
         }
         self.n_non_finite = n_non_finite;
     }
 
-    /// Step from which there are no more splats.
+    /// Step at which growth ends.
     fn growth_end(&self) -> u64 {
         let end = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
-        end.next_multiple_of(GROWTH_PERIOD) // Where a submit ends.
+        end.next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
     }
 
-    /// Changes the splat count when it is due: dead splats get new places, and there are more of them up to the cap.
+    /// Changes the splat count when due: replaces dead splats, and adds splats up to the limit.
     fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
         let due = self.step >= GROWTH_START
             && self.step < self.growth_end()
@@ -746,7 +754,7 @@ impl SplatTrainer {
         }
         self.finish_in_flight()?;
         if !self.step.is_multiple_of(GROWTH_PERIOD) {
-            return Ok(()); // The submit had failed; the change is due again when its steps are done.
+            return Ok(()); // The submit failed; the change is due again once its steps are repeated.
         }
         self.last_growth_step = self.step;
         let n_before = self.splats.n_splats;
@@ -834,11 +842,11 @@ impl SplatTrainer {
         }
     }
 
-    /// Begins, turns and ends trials. What follows from the end of one is done at the same step: when the next submit
-    /// ends is a matter of time.
+    /// Starts, advances and ends trials. All consequences of the end of a trial are applied at the same step, because
+    /// the end of the next submit depends on timing.
     fn try_when_due(&mut self) -> Result<(), Error> {
         while self.trials.due(self.trial_context()) != Due::Nothing {
-            self.finish_in_flight()?; // Steps may turn out to be lost.
+            self.finish_in_flight()?; // A failed submit may reduce the step count.
             match self.trials.due(self.trial_context()) {
                 Due::Nothing => {}
                 Due::Begin(candidate) => match self.snapshot() {
@@ -873,16 +881,16 @@ impl SplatTrainer {
         self.prepare_training()
     }
 
-    /// Trials need copies of the model. If there is no memory for them, training continues without trials.
+    /// Ends all trials, which need copies of the model, if there is no memory for them. Training continues.
     fn end_trials_without_memory(&mut self, error: Error) -> Result<(), Error> {
         if !error.is_out_of_memory() {
             return Err(error);
         }
-        log::warn!("no further trials of model changes: {error}");
+        log::warn!("model changes are no longer tested: {error}");
         self.release_validation()
     }
 
-    /// Goes back to where a trial began, with the change.
+    /// Restores the state at the beginning of a trial and applies the change.
     fn start_second_half(&mut self) -> Result<(), Error> {
         let baseline_db = self.score_validation()?;
         let snapshot = match self.snapshot() {
@@ -902,7 +910,8 @@ impl SplatTrainer {
         self.prepare_training()
     }
 
-    /// Restores the state without the change if the change is rejected, then adds the keyframes that arrived meanwhile.
+    /// Ends a trial: restores the state without the change if it was rejected, then adds the keyframes that arrived
+    /// meanwhile.
     fn end_trial(&mut self, TrialEnd { restored, seeded, deferred }: TrialEnd) -> Result<(), Error> {
         if let Some(snapshot) = restored {
             self.restore_snapshot(snapshot)?;
@@ -911,9 +920,10 @@ impl SplatTrainer {
         deferred.into_iter().try_for_each(|keyframe| self.add_keyframe(keyframe))
     }
 
-    /// Starts training on a keyframe that arrives now.
+    /// Adds a training keyframe at the current step.
     fn add_keyframe(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        // At least half of the schedule is ahead of a late keyframe: learning rates are still large enough, and growth continues.
+        // At least half of the schedule remains for a late keyframe, so that learning rates are large enough and
+        // growth continues.
         self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
         self.add_view(keyframe)
     }
@@ -926,7 +936,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// How the trials of what the model needs ended so far.
+    /// Results of the finished trials.
     pub fn trials(&self) -> &[Trial] {
         &self.trials.finished
     }
@@ -937,13 +947,13 @@ impl SplatTrainer {
         self.draw_reading(camera, background_srgb, true, requested, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
-    /// Draws one pinhole view into the frame for pictures, of the splats that people see or of those that learn.
+    /// Draws one pinhole view into the drawing buffers, either of the displayed splats or of those in training.
     fn draw_into_buffers(&mut self, camera: &Camera, background_srgb: [f32; 3], displayed: bool) -> Result<(), Error> {
         self.draw_reading(camera, background_srgb, displayed, RequestedParts::Nothing, |_| ())
     }
 
-    /// Draws one pinhole view into the frame for pictures and passes the bytes of the wanted parts to `take`. The same read
-    /// returns counters that report whether all intersections had room; if not, the view is drawn again.
+    /// Draws one pinhole view into the drawing buffers and passes the bytes of the requested parts to `take`. The
+    /// same read returns counters that show whether all intersections fitted; if not, the view is drawn again.
     fn draw_reading<R>(
         &mut self,
         camera: &Camera,
@@ -1002,13 +1012,13 @@ impl SplatTrainer {
 
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        self.finish_in_flight()?; // The step at which it comes must be true.
+        self.finish_in_flight()?; // Makes the step of its arrival exact.
         if keyframe.split == Split::Test {
             return Ok(());
         }
         if !keyframe.is_finite() {
             log::warn!(
-                "the image of {} at {} ns is left out: its pose, lens or velocity is not finite",
+                "skipping the image of camera {:?} at {} ns: its pose, intrinsics or velocity is not finite",
                 keyframe.camera,
                 keyframe.stamp.0
             );
@@ -1027,7 +1037,7 @@ impl Method for SplatTrainer {
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.finish_in_flight()?; // The step at which it goes must be true.
+        self.finish_in_flight()?; // Makes the step of its removal exact.
         self.views.retain(|view| view.keyframe.camera.as_ref() != camera || view.keyframe.stamp != stamp);
         let is_removed = |keyframe: &Keyframe| keyframe.camera.as_ref() == camera && keyframe.stamp == stamp;
         self.trials.remove(is_removed);
@@ -1051,7 +1061,7 @@ impl Method for SplatTrainer {
         self.grow_when_due(&learn)?;
         let max_millis = submit_millis(self.is_watched);
         let by_time = if self.step_millis > 0.0 { (max_millis / self.step_millis) as u64 } else { 1 };
-        let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at multiples of it.
+        let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at these steps.
         let n_requested = n;
         let n = n
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
@@ -1067,18 +1077,18 @@ impl Method for SplatTrainer {
         }
         let status = self.passes.submit_reading(&self.gpu, &[(&self.learn_status, 4 * status::LEN)]);
         self.step += n;
-        let failed = self.finish_in_flight()?; // The submit before; this one runs meanwhile.
+        let failed = self.finish_in_flight()?; // The previous submit; this one runs meanwhile.
         if !failed {
             self.in_flight = Some(InFlight { status, n_steps: n, since });
-        } // Else this one found the failure too and did nothing: its steps are to be done, not to be waited for.
+        } // Otherwise this submit failed, too: its steps are repeated, so do not wait for it.
         if n == n_requested {
-            self.finish_in_flight()?; // The caller stops here: the count must be true.
+            self.finish_in_flight()?; // The caller stops here, so the step count must be exact.
         }
         Ok(n)
     }
 
     fn is_idle(&self) -> bool {
-        false // There is always something to learn, or it is not known yet that there is not.
+        false // There are always steps to take, or it is not known yet that there are none.
     }
 
     fn primitive(&self) -> &'static str {
@@ -1149,7 +1159,7 @@ impl Method for SplatTrainer {
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.finish_in_flight()?;
         if let Some(finished) = self.trials.cancel() {
-            log::info!("training ends before what is being tried could be judged: saved without it");
+            log::info!("training stopped during a trial: saved the model without the change");
             self.end_trial(finished)?;
         }
         let arrays = self.arrays()?;
@@ -1174,17 +1184,17 @@ impl Method for SplatTrainer {
     }
 }
 
-/// What was learned about cameras, by name.
+/// Camera corrections by name.
 type CameraCorrections = BTreeMap<String, CameraCorrection>;
 
-/// The camera of a keyframe as it is, where the input has it as [`CalibratedCamera::of`].
+/// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
 fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> CalibratedCamera {
     corrections
         .get(keyframe.camera.as_ref())
         .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
 }
 
-/// What a saved model knows about cameras.
+/// Camera corrections and alignment of a saved model.
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
 pub(crate) struct ModelMetadata {
@@ -1192,7 +1202,11 @@ pub(crate) struct ModelMetadata {
     pub(crate) alignment: Option<Alignment>,
 }
 
-/// What a saved model knows about cameras; a model without such a file, or of an earlier version, knows nothing.
+/// Reads the camera corrections of a saved model; empty if the file does not exist or lacks them.
+///
+/// # Errors
+///
+/// Fails if the file cannot be read or parsed.
 pub(crate) fn read_metadata(path: &Path) -> Result<ModelMetadata, Error> {
     let invalid_file = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
     match std::fs::read(path) {
@@ -1224,7 +1238,7 @@ fn ensure_image_buffers(
     Ok(())
 }
 
-/// How many times smaller than full size, as a power of two, images are at a step.
+/// Resolution level at a step: images are smaller than full size by this power of two.
 fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
     match step {
         step if step < coarse_steps[0] => 2,
@@ -1233,7 +1247,7 @@ fn level_at(step: u64, coarse_steps: [u64; 2]) -> u32 {
     }
 }
 
-/// `n` of the splats, evenly over their list.
+/// Picks `n` of the splats, evenly over their list.
 fn spread_out(arrays: &SplatArrays, n: usize) -> SplatArrays {
     let picks: Vec<usize> = (0..n).map(|ix| ix * arrays.n_splats() / n).collect();
     let n_coeffs = arrays.n_coefficients();

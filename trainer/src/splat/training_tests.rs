@@ -1,4 +1,4 @@
-//! The trainer as a whole: it learns a scene, twice to the same bits, and keeps its caps.
+//! Tests of the whole trainer: quality on test views, reproducibility, and limits of memory and splats.
 
 use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
@@ -13,30 +13,29 @@ use std::sync::Arc;
 const SIZE_PX: [u32; 2] = [96, 80];
 const FOCAL_PX: f64 = 90.0;
 
-/// The inside of a colorful sphere: a closed surface, that depth images make sense of.
+/// The inside of a colorful sphere: a closed surface with well-defined depth.
 fn scene() -> SplatArrays {
     const N_DISCS: usize = 400;
     let mut arrays = synthetic_cloud(N_DISCS, 3);
     for ix in 0..N_DISCS {
-        // Evenly spread (Vogel 1979), facing the middle.
+        // Evenly distributed (Vogel 1979), facing the center.
         let height = 1.0 - (2 * ix + 1) as f64 / N_DISCS as f64;
         let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
         let out = Vector3::new(radius * angle.cos(), height, radius * angle.sin());
-        let facing =
-            nalgebra::UnitQuaternion::rotation_between(&Vector3::z(), &out).expect("no disc lies opposite to z");
+        let facing = nalgebra::UnitQuaternion::rotation_between(&Vector3::z(), &out).expect("no disc is opposite to z");
         arrays.means[ix] = f32s_of((6.0 * out).into());
         arrays.rotations_wxyz[ix] = f32s_of([facing.w, facing.i, facing.j, facing.k]);
     }
     arrays.log_scales.fill([-0.6, -0.6, -4.0]);
     arrays.opacity_logits.fill(4.0);
-    arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // The same from every side.
+    arrays.sh.chunks_exact_mut(16).for_each(|coeffs| coeffs[1..].fill([0.0; 3])); // No dependence on the direction.
     arrays
 }
 
 fn pose(ix: usize) -> Transform {
     let angle = ix as f64 * 0.12;
     let eye = Point3::new(3.2 * angle.sin(), -0.4 + 0.05 * ix as f64, -3.2 * angle.cos());
-    // `face_towards` has z forward; y is turned down.
+    // `face_towards` has z forward; this rotates y to point down.
     Transform::face_towards(&eye, &Point3::origin(), &Vector3::new(0.0, -1.0, 0.0))
         * nalgebra::UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI)
 }
@@ -113,7 +112,7 @@ pub(super) fn train(trainer: &mut SplatTrainer, n_steps: u64) {
     }
 }
 
-/// Trains step by step, each in a submit of its own.
+/// Trains step by step, with one submit per step.
 fn train_one_by_one(trainer: &mut SplatTrainer, n_steps: u64) {
     let end = trainer.progress().step + n_steps;
     while trainer.progress().step < end {
@@ -121,7 +120,7 @@ fn train_one_by_one(trainer: &mut SplatTrainer, n_steps: u64) {
     }
 }
 
-/// Trains in submits of up to 40 steps, and one is always on its way.
+/// Trains in submits of up to 40 steps, one of which is always in flight.
 fn train_in_long_submits(trainer: &mut SplatTrainer, n_steps: u64) {
     let end = trainer.progress().step + n_steps;
     while trainer.progress().step < end {
@@ -158,11 +157,11 @@ fn training_predicts_test_views_and_is_reproducible() {
     let (before, after, arrays) = run(1);
     assert!(after > before + 3.0 && after > 17.0, "{before} -> {after} dB");
     assert!(arrays.clone().checked().is_ok(), "a parameter is not finite");
-    assert!(run(1).2 == arrays, "the same seed gave other bits");
+    assert!(run(1).2 == arrays, "the same seed gave a different result");
     assert!(run(2).2 != arrays, "the seed has no effect: the comparison cannot fail");
 }
 
-/// On a software adapter, images are removed from the GPU: memory stays bounded however many keyframes there are.
+/// On a software adapter, images are evicted from the GPU, so memory is bounded for any number of keyframes.
 #[test]
 fn image_memory_limit_holds_and_changes_no_bit() {
     const LEVEL_0_BYTES: u64 = 8 * SIZE_PX[0] as u64 * SIZE_PX[1] as u64;
@@ -182,23 +181,23 @@ fn image_memory_limit_holds_and_changes_no_bit() {
     assert!(image_bytes >= n_train * LEVEL_0_BYTES && image_bytes < keyframes.len() as u64 * LEVEL_0_BYTES);
     assert!(
         image_bytes.is_multiple_of(LEVEL_0_BYTES),
-        "coarse images are gone once training has passed their resolution"
+        "coarse images are removed once training has passed their resolution"
     );
 
     let max_bytes = 3 * LEVEL_0_BYTES;
     let (bounded_bytes, bounded_live, bounded) = run(max_bytes, train_one_by_one);
-    // A real GPU takes the images of many steps in one submit, which may need more.
+    // A real GPU uploads the images of many steps for one submit, which may need more.
     if gpu.is_software() {
         assert!((1..=max_bytes).contains(&bounded_bytes), "{bounded_bytes} bytes of images");
     }
     // Buffers of longer submits are slightly larger; the difference is less than any image.
     let unexplained = (live_bytes - bounded_live).abs_diff(image_bytes - bounded_bytes);
-    assert!(unexplained < LEVEL_0_BYTES / 4, "removed images were not freed: {unexplained} bytes");
-    assert!(bounded == arrays, "the bound changed what is learned");
+    assert!(unexplained < LEVEL_0_BYTES / 4, "evicted images were not freed: {unexplained} bytes");
+    assert!(bounded == arrays, "the memory limit changed the result");
 
-    // A submit of many steps needs more images than fit within the bound.
+    // A submit of many steps needs more images than the limit allows.
     let (_, _, bounded) = run(max_bytes, train_in_long_submits);
-    assert!(bounded == arrays, "the bound changed what is learned in long submits");
+    assert!(bounded == arrays, "the memory limit changed the result of long submits");
 }
 
 #[test]
@@ -216,8 +215,7 @@ fn trains_without_depth_from_random_points() {
     assert!(after > before + 2.0, "{before} -> {after} dB");
 }
 
-/// A live scan may be longer than the plan: what comes late is still given splats.
-/// Depth as a scanner has it: a band of coarse cells.
+/// Depth from a range scanner: a band of coarse cells.
 #[test]
 fn area_outside_a_depth_band_is_seeded_from_it() {
     const SHARE: u32 = 4;
@@ -244,11 +242,11 @@ fn area_outside_a_depth_band_is_seeded_from_it() {
     trainer.push(keyframes[1].clone()).unwrap();
     trainer.step(1).unwrap();
     let camera_from_world = keyframes[1].world_from_camera.inverse();
-    let mut n_in_rows = [0; 5]; // Of 16 pixels; the band is the third.
+    let mut n_in_rows = [0; 5]; // Rows of 16 pixels; the band is the third.
     for mean in trainer.arrays().unwrap().means {
         let point = camera_from_world * Point3::from(mean).cast::<f64>();
         let row = FOCAL_PX * point.y / point.z + 40.0;
-        assert!((0.5..12.0).contains(&point.z), "the band is 2 to 9 m away, a seed {} m", point.z);
+        assert!((0.5..12.0).contains(&point.z), "the band is 2 to 9 m away, a seed is at {} m", point.z);
         n_in_rows[[16.0, 32.0, 48.0, 64.0].iter().filter(|edge| row >= **edge).count()] += 1;
     }
     assert!(n_in_rows.iter().all(|n| *n > 30), "{n_in_rows:?}");
@@ -259,6 +257,7 @@ fn area_outside_a_depth_band_is_seeded_from_it() {
     assert!(test_psnr(&mut trainer, &keyframes) > 20.0, "{}", test_psnr(&mut trainer, &keyframes));
 }
 
+/// A live scan may last longer than planned: areas that arrive late still get splats.
 #[test]
 fn late_keyframe_resumes_growth() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -272,13 +271,13 @@ fn late_keyframe_resumes_growth() {
         trainer.progress().primitives
     };
     let planned = n_splats_after(&mut trainer, 300);
-    assert_eq!(n_splats_after(&mut trainer, 200), planned, "growth is over");
-    // The same image again: there is nothing bare for seeds.
+    assert_eq!(n_splats_after(&mut trainer, 200), planned, "growth has ended");
+    // The same image again: it has no uncovered area for seeds.
     trainer.push(Arc::new(Keyframe { stamp: Stamp(99), ..keyframes[1].as_ref().clone() })).unwrap();
-    assert!(n_splats_after(&mut trainer, 120) > planned, "growth goes on");
+    assert!(n_splats_after(&mut trainer, 120) > planned, "growth continues");
 }
 
-/// Learns from many images, with the lens to be tried.
+/// A trainer on many images with a trial of lens parameters.
 fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
     let cameras = CameraRefinement::Try(vec![ParamSet { lens: true, ..ParamSet::default() }]);
     let options = SplatOptions { cameras, max_splats, n_planned_steps: 1500, ..options() };
@@ -289,7 +288,7 @@ fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splat
     trainer
 }
 
-/// A focal length off by 10 % is found out on the held-back images.
+/// A focal length that is off by 10 % is detected on the validation images.
 #[test]
 fn wrong_lens_is_corrected_by_trial() {
     const FOCAL_ERROR: f64 = 1.1;
@@ -304,10 +303,11 @@ fn wrong_lens_is_corrected_by_trial() {
     train(&mut trainer, 900);
     let found_focal_px = trainer.calibrated_camera(&miscalibrated[0]).unwrap().focal_px;
     assert!(trainer.trials()[0].kept, "{:?}, focal length {found_focal_px:?}", trainer.trials());
-    // The cameras turn about the vertical axis only, which tells the horizontal focal length; 400 steps go half the way.
+    // The cameras rotate about the vertical axis only, which determines the horizontal focal length. 400 steps
+    // correct about half of the error.
     assert!(
         (found_focal_px[0] / FOCAL_PX - 1.0).abs() < 0.6 * (FOCAL_ERROR - 1.0),
-        "{found_focal_px:?} instead of {FOCAL_PX}"
+        "{found_focal_px:?}, expected {FOCAL_PX}"
     );
 }
 
@@ -318,17 +318,17 @@ fn running_trial_is_not_saved_and_is_repeated() {
     let mut trainer = trainer_with_lens_trial(&keyframes, gpu, 300);
     train(&mut trainer, 750);
     trainer.step(40).unwrap();
-    assert!(trainer.progress().step < 750, "a lens is being tried");
-    assert!(trainer.camera_corrections().unwrap().is_empty(), "what is being tried is not told");
+    assert!(trainer.progress().step < 750, "a lens trial is running");
+    assert!(trainer.camera_corrections().unwrap().is_empty(), "corrections of a running trial are not reported");
     let folder = tempfile::tempdir().unwrap();
     trainer.save(folder.path()).unwrap();
-    assert!(trainer.camera_corrections().unwrap().is_empty(), "nothing is decided yet, so nothing is saved");
+    assert!(trainer.camera_corrections().unwrap().is_empty(), "corrections of a running trial are not saved");
     assert_eq!((trainer.progress().step, trainer.trials().len()), (750, 0));
     train(&mut trainer, 260);
     assert_eq!(trainer.trials().len(), 1);
 }
 
-/// Black splats look like no splats before a black background, but they hide what is behind them and have a depth.
+/// Black splats are invisible in front of a black background, but they occlude and have a depth.
 #[test]
 fn black_objects_stay_opaque() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -345,8 +345,8 @@ fn black_objects_stay_opaque() {
         expected_depth_m.iter().zip(picture.rgba_srgb.chunks_exact(4)).filter(|(expected_m, _)| **expected_m > 0.0);
     let coverage: Vec<f64> = solid.map(|(_, pixel)| f64::from(pixel[3]) / 255.0).collect();
     let mean = coverage.iter().sum::<f64>() / coverage.len() as f64;
-    // Measured 0.89; with a background that stays black 0.003.
-    assert!(mean > 0.8, "{mean} of what depth shows is covered");
+    // Measured: 0.89, and 0.003 with a constant black background.
+    assert!(mean > 0.8, "coverage of pixels with depth: {mean}");
 }
 
 #[test]
@@ -361,7 +361,7 @@ fn byte_limit_holds() {
     }
     train(&mut trainer, 210);
     let progress = trainer.progress();
-    assert!(progress.primitives > 0 && progress.bytes <= cap_bytes, "{progress:?} against {cap_bytes}");
+    assert!(progress.primitives > 0 && progress.bytes <= cap_bytes, "{progress:?}, limit {cap_bytes} bytes");
 }
 
 #[test]
@@ -376,7 +376,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
     for keyframe in &keyframes[1..4] {
         trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
     }
-    // The buffers are too small at first: the data read back must be that of the attempt that had enough room.
+    // The buffers are too small at first. The data read back must come from the attempt with sufficient capacity.
     let large = RenderRequest { size_px: [640, 480], ..request(pose(0)) };
     let [first, second] = [0, 1].map(|_| trainer.render(&large).unwrap());
     assert!(first.rgba_srgb == second.rgba_srgb && first.depth_m == second.depth_m);
@@ -415,7 +415,8 @@ fn equirectangular_agrees_with_pinhole() {
     );
 }
 
-/// How many steps fit into a submit is measured, so it must not matter; also where cameras are learned.
+/// The number of steps per submit depends on timing, so it must not affect the result, with or without camera
+/// parameters.
 #[test]
 fn submit_length_changes_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -433,7 +434,7 @@ fn submit_length_changes_no_bit() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
-/// Viewers change no bit either: submits are shorter then, and images are uploaded in smaller batches.
+/// Viewers do not change the result: submits are shorter, and images are uploaded in smaller batches.
 #[test]
 fn viewers_shorten_submits_and_change_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -460,7 +461,7 @@ fn viewers_shorten_submits_and_change_no_bit() {
     assert!(learned(true) == learned(false));
 }
 
-/// Nor where a trial ends, and held-back images join in.
+/// Submit lengths do not affect the result when a trial ends and validation images become training images, either.
 #[test]
 fn submit_length_changes_no_bit_of_a_trial() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -474,21 +475,22 @@ fn submit_length_changes_no_bit_of_a_trial() {
     assert!(learned(train_in_long_submits) == learned(train_one_by_one));
 }
 
-/// A submit whose intersections found no room is done again, and the one sent behind it is not counted twice.
+/// A submit with too many intersections for the buffers is repeated, and the submit sent after it is not counted
+/// twice.
 #[test]
 fn buffer_overflow_changes_no_bit() {
     const N_STEPS: u64 = 90;
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, false);
     let mut cloud = synthetic_cloud(4000, 5);
-    cloud.log_scales.fill([1.5; 3]); // Each covers every image: more intersections at full size than there is room for.
+    cloud.log_scales.fill([1.5; 3]); // Each covers every image: more intersections at full size than fit.
     let learned = |train: fn(&mut SplatTrainer, u64)| {
         let mut trainer = SplatTrainer::from_arrays(gpu.clone(), options(), &cloud).unwrap();
         for keyframe in &keyframes {
             trainer.push(keyframe.clone()).unwrap();
         }
         train(&mut trainer, N_STEPS);
-        // Rates and noise go by the GPU's own count.
+        // Learning rates and noise depend on the GPU's step counter.
         (trainer.n_total_steps().unwrap(), trainer.n_steps_on_gpu(), trainer.arrays().unwrap())
     };
     let (one_by_one, together) = (learned(train_one_by_one), learned(train_in_long_submits));

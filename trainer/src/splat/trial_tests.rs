@@ -1,4 +1,5 @@
-//! Trials while keyframes arrive and leave: both halves see the same data, no seed is lost, and a checkpoint holds the whole trial.
+//! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no seed is lost, and a
+//! checkpoint contains the whole trial.
 
 use super::training_tests::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
@@ -43,13 +44,13 @@ fn lens() -> ParamSet {
 
 const N_EARLY: usize = 30;
 
-/// Keyframes all around the scene; every fourth one is a selection keyframe.
+/// Keyframes all around the scene; every fourth one is a validation keyframe.
 fn around(gpu: &Arc<Gpu>) -> Vec<Arc<Keyframe>> {
     let split = |ix: usize| if ix.is_multiple_of(4) { Split::Validation } else { Split::Train };
     n_keyframes(gpu, 46, true).iter().enumerate().map(|(ix, keyframe)| with_split(keyframe, split(ix))).collect()
 }
 
-/// Keyframes arrive before the trial, in its first half and in its second half; returns after the end of the trial.
+/// Adds keyframes before the trial, in its first half and in its second half; returns after the end of the trial.
 fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let (early, late) = keyframes.split_at(N_EARLY);
     let (first_half, second_half) = late.split_at(8);
@@ -66,7 +67,7 @@ fn trial_with_arrivals(gpu: &Arc<Gpu>, candidate: ParamSet, keyframes: &[Arc<Key
 }
 
 fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
-    assert_eq!(trainer.progress().primitives, trainer.n_seeds() as u64, "splats against places that count as seeded");
+    assert_eq!(trainer.progress().primitives, trainer.n_seeds() as u64, "splats against seeded positions");
     for keyframe in keyframes.iter().filter(|keyframe| keyframe.split == Split::Train) {
         assert_eq!(trainer.n_views_of(keyframe), 1, "{:?}", keyframe.stamp);
     }
@@ -82,7 +83,7 @@ fn no_op_trial_scores_equal_while_keyframes_arrive() {
         panic!("{:?}", trainer.trials())
     };
     assert_eq!((*gain_db, *standard_error_db, *kept), (0.0, 0.0, false));
-    assert_eq!(*n_images, N_EARLY.div_ceil(4), "those held when the trial began");
+    assert_eq!(*n_images, N_EARLY.div_ceil(4), "validation keyframes at the start of the trial");
     assert_all_seeds_kept(&trainer, &keyframes);
 }
 

@@ -1,10 +1,12 @@
-//! Whether a part of the model pays: tried on a copy of the model, judged by images not learned from.
+//! A/B trials that decide whether a change of the model is kept. Each change is tested on a copy of the model and
+//! evaluated on validation images, which are not trained on.
 //!
-//! At the start the selection keyframes are held back. Each candidate gets as many steps as the model without it, from
-//! the same state. Keyframes that arrive meanwhile reach both at the same step, or wait for the end of the trial.
-//! What is added stays when the paired gain on the selection keyframes exceeds both a least gain and two
-//! standard errors; what is left out stays out when that costs less than a least gain, half a standard error counted in,
-//! and all of it together no more than [`MAX_TOTAL_LOSS_DB`]. When all is settled the selection keyframes are learned from, too.
+//! The baseline and the variant with the change are trained from the same state for the same number of steps.
+//! Keyframes that arrive during a trial are added to both at the same step, or wait for the end of the trial. An
+//! addition is accepted if the paired gain on the validation keyframes exceeds a minimum gain and two standard
+//! errors. A reduction is accepted if its loss plus half a standard error is at most a minimum gain, and the total
+//! loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
+//! training keyframes.
 
 use super::camera_params::ParamSet;
 use super::trainer::Snapshot;
@@ -16,33 +18,33 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// Step of the first trial: earlier the scene is too rough to tell.
+/// Step of the first trial; before it, the scene is too coarse for a decision.
 pub(crate) const TRIAL_START: u64 = 500;
-/// Steps of a trial of what all images share, and least of any.
+/// Steps of a trial of parameters shared by all images, and minimum for all trials.
 const SHARED_STEPS: u64 = 250;
-/// How often each image is looked at in a trial of terms of its own, and the most steps for it.
+/// Steps per image in a trial of per-image parameters. The next constant limits the total.
 const STEPS_PER_IMAGE: u64 = 4;
 const MAX_STEPS: u64 = 1200;
-/// A gain of twice the splats below this is none, dB.
+/// Gains from twice as many splats that are below this value are not significant, dB.
 const MIN_GAIN_OF_DOUBLING_DB: f64 = 0.1;
-/// All that is left out may cost this much together, dB.
+/// Maximum total loss of all accepted reductions, dB.
 const MAX_TOTAL_LOSS_DB: f64 = 0.15;
-/// Fewer selection keyframes tell nothing.
+/// Minimum number of validation keyframes for a trial.
 const MIN_VALIDATION_IMAGES: usize = 4;
-/// Maximum number of selection keyframes in a mean score.
+/// Maximum number of validation keyframes in a mean score.
 pub(crate) const MAX_SCORED: usize = 24;
-/// Fewer splats are not divided further.
+/// The number of splats is not halved further below this value.
 const MIN_SPLATS: u32 = 1000;
 
-/// Gains of images: what they bring is told by a sum over pixels, without learning them first.
+/// Per-image gains. Their effect follows from sums over pixels, so they are evaluated without training.
 const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
 
-/// What is learned about cameras.
+/// Selection of the camera parameters to optimize.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum CameraRefinement {
-    /// These terms, from the first step on.
+    /// Optimizes these parameters from the first step on.
     Always(ParamSet),
-    /// Each of these in turn, where it pays.
+    /// Tries each of these sets in turn and keeps it if the gain is significant.
     Try(Vec<ParamSet>),
 }
 
@@ -52,30 +54,30 @@ impl Default for CameraRefinement {
     }
 }
 
-/// How the number of splats is found.
+/// How the number of splats is chosen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub enum CountPolicy {
-    /// Grown up to the cap.
+    /// Grows up to the limit.
     #[default]
     ToCap,
-    /// Grown up to the cap, then halved as long as that costs less than 0.1 dB on held-back images.
+    /// Grows up to the limit, then halves the number as long as the loss on validation images is less than 0.1 dB.
     Tested,
 }
 
-/// A change of the model that is tried.
+/// A change of the model that a trial tests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Candidate {
-    /// These terms of cameras are learned, too.
+    /// Optimizes these camera parameters in addition.
     Cameras(ParamSet),
-    /// The half of the splats that shows least goes.
+    /// Removes the half of the splats that contributes least.
     Halved {
         /// Splats before.
         from: u32,
         /// Splats after.
         to: u32,
     },
-    /// Colors change less with the direction.
+    /// Lowers the degree of the colors.
     ShDegree {
         /// Degree of spherical harmonics before.
         from: u32,
@@ -85,7 +87,7 @@ pub enum Candidate {
 }
 
 impl Candidate {
-    /// What a change of the model must bring, or may cost where it makes the model smaller, dB.
+    /// Minimum gain of an addition, or maximum loss of a reduction, dB.
     fn min_gain_db(self) -> f64 {
         match self {
             Self::Halved { .. } => MIN_GAIN_OF_DOUBLING_DB,
@@ -103,35 +105,35 @@ impl std::fmt::Display for Candidate {
         match self {
             Self::Cameras(params) => params.fmt(f),
             Self::Halved { from, to } => write!(f, "{to} of {from} splats"),
-            Self::ShDegree { from, to } => write!(f, "colors of degree {to} in place of {from}"),
+            Self::ShDegree { from, to } => write!(f, "colors of degree {to} instead of {from}"),
         }
     }
 }
 
-/// How a trial ended.
+/// Result of a trial.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trial {
-    /// What was tried.
+    /// The change that was tested.
     pub candidate: Candidate,
-    /// Mean gain over the selection keyframes, dB.
+    /// Mean gain over the validation keyframes, dB.
     pub gain_db: f64,
-    /// Its standard error, dB.
+    /// Standard error of the gain, dB.
     pub standard_error_db: f64,
-    /// Selection keyframes.
+    /// Number of validation keyframes.
     pub n_images: usize,
-    /// Whether the change stays.
+    /// Whether the change is kept.
     pub kept: bool,
 }
 
 impl Trial {
-    /// Judges paired scores, dB.
+    /// Evaluates paired scores, dB.
     pub(crate) fn of(candidate: Candidate, baseline_db: &[f64], variant_db: &[f64]) -> Self {
         let gains: Vec<f64> =
             baseline_db.iter().zip(variant_db).map(|(baseline, variant)| variant - baseline).collect();
         let gain = Gain::of(&gains);
         let min_db = candidate.min_gain_db();
         let Gain { mean_db: gain_db, standard_error_db, n_images } = gain;
-        // In doubt nothing is added, and nothing is left out.
+        // In case of doubt, neither additions nor reductions are accepted.
         let is_significant = match candidate.reduces_model() {
             true => -gain_db + 0.5 * standard_error_db <= min_db,
             false => gain.is_significant(min_db),
@@ -139,12 +141,12 @@ impl Trial {
         Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && is_significant }
     }
 
-    /// The part of the model that was tried: what is added, or what would be left out.
+    /// Report on the part of the model that was tested: the addition, or what the reduction would remove.
     pub(crate) fn part(&self) -> TrialReport {
         let (part, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
-            Candidate::Halved { from, to } => (format!("{from} splats over {to}"), true),
-            Candidate::ShDegree { from, to } => (format!("colors of degree {from} over {to}"), true),
+            Candidate::Halved { from, to } => (format!("{from} instead of {to} splats"), true),
+            Candidate::ShDegree { from, to } => (format!("colors of degree {from} instead of {to}"), true),
         };
         TrialReport {
             part,
@@ -157,13 +159,13 @@ impl Trial {
 
     fn log_result(&self) {
         let verdict = match (self.candidate, self.kept) {
-            (Candidate::Cameras(_), true) => "learned from here on",
-            (Candidate::Cameras(_), false) => "does not pay",
-            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, true) => "enough",
-            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, false) => "not enough",
+            (Candidate::Cameras(_), true) => "accepted",
+            (Candidate::Cameras(_), false) => "not significant",
+            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, true) => "sufficient",
+            (Candidate::Halved { .. } | Candidate::ShDegree { .. }, false) => "not sufficient",
         };
         log::info!(
-            "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {verdict}",
+            "{}: {:+.2} dB on {} validation images (standard error {:.2}): {verdict}",
             self.candidate,
             self.gain_db,
             self.n_images,
@@ -172,7 +174,7 @@ impl Trial {
     }
 }
 
-/// A selection keyframe, and its image on the GPU once it was compared with.
+/// A validation keyframe, and its image on the GPU after the first comparison.
 #[derive(Debug)]
 pub(crate) struct ValidationImage {
     pub(crate) keyframe: Arc<Keyframe>,
@@ -182,14 +184,14 @@ pub(crate) struct ValidationImage {
 /// Camera and stamp of a keyframe.
 pub(crate) type ImageId = (Arc<str>, Stamp);
 
-/// PSNR of each selection keyframe, dB.
+/// PSNR of each validation keyframe, dB.
 pub(crate) type Scores = BTreeMap<ImageId, f64>;
 
 fn id_of(keyframe: &Keyframe) -> ImageId {
     (keyframe.camera.clone(), keyframe.stamp)
 }
 
-/// Scores of the images that are in both.
+/// Scores of the images that both maps contain.
 fn pair_scores(baseline_db: &Scores, variant_db: &Scores) -> (Vec<f64>, Vec<f64>) {
     baseline_db.iter().filter_map(|(id, baseline)| Some((*baseline, *variant_db.get(id)?))).unzip()
 }
@@ -201,25 +203,25 @@ pub(crate) struct Arrival {
     pub(crate) keyframe: Arc<Keyframe>,
 }
 
-/// Whether the number of splats is settled.
+/// State of the choice of the number of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum CountState {
-    /// Grows up to the cap.
+    /// Grows up to the limit without trials.
     ToCap,
-    /// Grows, to be tried once it is mature.
+    /// Grows; trials start once growth has ended.
     Growing,
-    /// Found to be too many: halved until half is not enough.
+    /// Halved repeatedly until half is not sufficient.
     Halving,
-    /// Stays.
+    /// Constant.
     Finished,
 }
 
-/// Where the trials stand.
+/// State of the trials.
 #[derive(Debug)]
 pub(crate) struct SplatTrials {
     candidates: VecDeque<ParamSet>,
     count: CountState,
-    /// Degree of the colors that is tried next, once the number of splats is settled.
+    /// Color degree that is tried next, once the number of splats is final.
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
     pub(crate) finished: Vec<Trial>,
@@ -245,15 +247,16 @@ pub(crate) struct RunningTrial {
     pub(crate) candidate: Candidate,
     /// Last step of this half.
     pub(crate) until: u64,
-    /// The state not in training: during the first half the start of the trial, during the second half the end of the first.
+    /// The state that is not in training: the start of the trial during the first half, the end of the first half
+    /// during the second.
     pub(crate) other: Box<Snapshot>,
-    /// The selection keyframes that both halves are scored on.
+    /// The validation keyframes on which both halves are scored.
     pub(crate) scored: Vec<ImageId>,
-    /// In the first half, the keyframes that arrived; in the second half, those that have yet to arrive again.
+    /// In the first half, the keyframes that arrived; in the second half, those that have not arrived again yet.
     pub(crate) arrivals: VecDeque<Arrival>,
 }
 
-/// What to do at the start of the second half of a trial.
+/// Work to do at the start of the second half of a trial.
 pub(crate) struct SecondHalf {
     /// The state to restore.
     pub(crate) from: Snapshot,
@@ -263,7 +266,7 @@ pub(crate) struct SecondHalf {
     pub(crate) arrived: Vec<Arc<Keyframe>>,
 }
 
-/// What to do at the end of a trial.
+/// Work to do at the end of a trial.
 pub(crate) struct TrialEnd {
     /// The state to restore if the change is rejected.
     pub(crate) restored: Option<Snapshot>,
@@ -273,10 +276,10 @@ pub(crate) struct TrialEnd {
     pub(crate) deferred: Vec<Arc<Keyframe>>,
 }
 
-/// A trial in progress, for a checkpoint; it is in its second half if it has scores of the first.
+/// A trial in progress, for a checkpoint; in the second half, with the scores of the first.
 pub(crate) type RunningTrialRef<'a> = (&'a RunningTrial, Option<&'a Scores>);
 
-/// What is still to be tried.
+/// The remaining candidates.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RemainingTrials {
@@ -286,33 +289,33 @@ pub(crate) struct RemainingTrials {
     degree: u32,
 }
 
-/// What the trainer has to do at this step.
+/// Work that is due at a step.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Due {
     /// Nothing.
     Nothing,
-    /// Copy the state and go on.
+    /// Copy the state and start the trial.
     Begin(Candidate),
-    /// Score; go back to the copy; change what is tried.
+    /// Score the baseline, restore the copy and apply the change.
     BeginSecondHalf,
     /// Add a keyframe that arrived at this step of the first half.
     Arrival,
-    /// Score; decide.
+    /// Score the variant and decide.
     End,
-    /// Score with and without gains of images; decide.
+    /// Score with and without per-image gains and decide.
     Gains,
-    /// Learn from what was held back.
+    /// Start training on the validation keyframes.
     ReleaseValidation,
 }
 
-/// The splats as they are when the trainer asks what is due.
+/// State of the splats that determines what is due.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct TrialContext {
     pub(crate) step: u64,
     pub(crate) n_splats: u32,
-    /// Whether growth is over: earlier few splats do as well as many, which learn more slowly.
+    /// Whether growth has ended. Before that, few splats score as well as many, which converge more slowly.
     pub(crate) is_mature: bool,
-    /// Of their colors.
+    /// Degree of the colors.
     pub(crate) sh_degree: u32,
 }
 
@@ -331,12 +334,12 @@ impl SplatTrials {
         Self { candidates, count, degree: 0, validation: Vec::new(), finished: Vec::new(), trial_phase }
     }
 
-    /// Whether selection keyframes are still held back.
+    /// Whether validation keyframes are still excluded from training.
     pub(crate) fn holds_validation(&self) -> bool {
         !matches!(self.trial_phase, SplatTrialPhase::Finished)
     }
 
-    /// Whether there may be more splats.
+    /// Whether splats may be added.
     pub(crate) fn may_grow(&self) -> bool {
         let is_halving =
             matches!(self.running_trial(), Some((RunningTrial { candidate: Candidate::Halved { .. }, .. }, _)));
@@ -371,7 +374,7 @@ impl SplatTrials {
             return Due::Nothing;
         }
         if self.validation.len() < MIN_VALIDATION_IMAGES {
-            // More of them may come, but not for ever.
+            // More may arrive; the wait is limited.
             return if context.step < 2 * TRIAL_START { Due::Nothing } else { Due::ReleaseValidation };
         }
         if let Some(params) = self.candidates.front() {
@@ -389,7 +392,7 @@ impl SplatTrials {
         }
     }
 
-    /// Steps that may be taken before something is due again.
+    /// Number of steps until something may be due again.
     pub(crate) fn steps_left(&self, step: u64) -> u64 {
         match &self.trial_phase {
             SplatTrialPhase::Waiting if step < TRIAL_START => TRIAL_START - step,
@@ -402,7 +405,7 @@ impl SplatTrials {
         }
     }
 
-    /// Records a training keyframe that arrives at this step; returns whether it has to wait for the end of a trial.
+    /// Records a training keyframe that arrives at this step. Returns whether it must wait for the end of a trial.
     pub(crate) fn defer_arrival(&mut self, keyframe: &Arc<Keyframe>, step: u64) -> bool {
         match &mut self.trial_phase {
             SplatTrialPhase::Baseline(trial) => {
@@ -417,7 +420,7 @@ impl SplatTrials {
         }
     }
 
-    /// The keyframe that is due to arrive now in the second half of a trial.
+    /// Next keyframe to add in the second half of a trial.
     pub(crate) fn next_arrival(&mut self) -> Option<Arc<Keyframe>> {
         match &mut self.trial_phase {
             SplatTrialPhase::Variant { trial, .. } => trial.arrivals.pop_front().map(|arrival| arrival.keyframe),
@@ -425,14 +428,14 @@ impl SplatTrials {
         }
     }
 
-    /// The selection keyframes to score: those of the trial in progress, otherwise some that are spread over all.
+    /// The validation keyframes to score: those of the trial in progress, or else a subset spread evenly over all.
     pub(crate) fn scored(&self) -> Vec<ImageId> {
         let stride = self.validation.len().div_ceil(MAX_SCORED).max(1);
         let spread = || self.validation.iter().step_by(stride).map(|validation| id_of(&validation.keyframe)).collect();
         self.running_trial().map_or_else(spread, |(trial, _)| trial.scored.clone())
     }
 
-    /// A selection keyframe, unless it was evicted.
+    /// A validation keyframe, unless it was removed.
     pub(crate) fn validation(&mut self, (camera, stamp): &ImageId) -> Option<&mut ValidationImage> {
         let matches_id = |validation: &&mut ValidationImage| {
             validation.keyframe.camera == *camera && validation.keyframe.stamp == *stamp
@@ -458,7 +461,7 @@ impl SplatTrials {
         });
     }
 
-    /// Begins the second half.
+    /// Starts the second half.
     pub(crate) fn begin_second_half(&mut self, baseline: Snapshot, baseline_db: Scores) -> Option<SecondHalf> {
         match std::mem::replace(&mut self.trial_phase, SplatTrialPhase::Finished) {
             SplatTrialPhase::Baseline(mut trial) => {
@@ -494,7 +497,7 @@ impl SplatTrials {
         Some(TrialEnd { restored: (!kept).then_some(*trial.other), seeded: Vec::new(), deferred })
     }
 
-    /// Decides on gains of images: what is learned from now on, if they pay.
+    /// Decides on per-image gains. Returns them if they are significant.
     pub(crate) fn decide_gains(&mut self, baseline_db: &[f64], variant_db: &[f64]) -> Option<ParamSet> {
         self.candidates.retain(|params| *params != GAINS);
         self.evaluate(Candidate::Cameras(GAINS), baseline_db, variant_db).then_some(GAINS)
@@ -527,13 +530,13 @@ impl SplatTrials {
         }
     }
 
-    /// What was held back, to be learned from.
+    /// Ends all trials and returns the validation keyframes, to be trained on.
     pub(crate) fn finish(&mut self) -> Vec<Arc<Keyframe>> {
         self.trial_phase = SplatTrialPhase::Finished;
         std::mem::take(&mut self.validation).into_iter().map(|validation| validation.keyframe).collect()
     }
 
-    /// The state without the change, while one is being tried.
+    /// The state without the change, during the second half of a trial.
     pub(crate) fn baseline(&self) -> Option<&Snapshot> {
         match &self.trial_phase {
             SplatTrialPhase::Variant { trial, .. } => Some(&trial.other),
@@ -541,7 +544,7 @@ impl SplatTrials {
         }
     }
 
-    /// What a checkpoint has to hold besides a trial in progress.
+    /// State for a checkpoint, except for a trial in progress.
     pub(crate) fn remaining_trials(&self) -> RemainingTrials {
         RemainingTrials {
             is_finished: !self.holds_validation(),
@@ -551,7 +554,7 @@ impl SplatTrials {
         }
     }
 
-    /// Takes over what a checkpoint holds.
+    /// Restores the state from a checkpoint.
     pub(crate) fn restore(&mut self, remaining_trials: RemainingTrials, finished: Vec<Trial>) {
         self.trial_phase =
             if remaining_trials.is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
@@ -559,7 +562,7 @@ impl SplatTrials {
         (self.count, self.degree, self.finished) = (remaining_trials.count, remaining_trials.degree, finished);
     }
 
-    /// Continues a trial from a checkpoint; it is in its second half if there are scores of the first.
+    /// Restores a trial from a checkpoint; it is in its second half if there are scores of the first.
     pub(crate) fn restore_trial(&mut self, trial: RunningTrial, baseline_db: Option<Scores>) {
         self.trial_phase = match baseline_db {
             Some(baseline_db) => SplatTrialPhase::Variant { trial, baseline_db, deferred: Vec::new() },
@@ -567,14 +570,14 @@ impl SplatTrials {
         };
     }
 
-    /// Says whether these were to be tried; they were found to be needed in another way.
+    /// Removes a candidate that was accepted without a trial. Returns whether it was a candidate.
     pub(crate) fn remove_candidate(&mut self, found: ParamSet) -> bool {
         let n = self.candidates.len();
         self.candidates.retain(|candidate| *candidate != found);
         self.candidates.len() < n
     }
 
-    /// Forgets a keyframe.
+    /// Removes a keyframe.
     pub(crate) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
         self.validation.retain(|validation| !is_removed(&validation.keyframe));
         match &mut self.trial_phase {
@@ -602,10 +605,10 @@ mod tests {
     fn gain_must_exceed_its_standard_error() {
         let trial = |variant: &[f64]| Trial::of(Candidate::Cameras(poses()), &[20.0, 22.0, 24.0, 21.0], variant);
         assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept);
-        assert!(!trial(&[20.03, 22.04, 24.02, 21.03]).kept, "too small, if sure");
-        assert!(!trial(&[23.0, 20.5, 25.5, 19.5]).kept, "large, but not sure");
+        assert!(!trial(&[20.03, 22.04, 24.02, 21.03]).kept, "significant, but too small");
+        assert!(!trial(&[23.0, 20.5, 25.5, 19.5]).kept, "large, but not significant");
         assert!(!trial(&[19.0, 21.0, 23.0, 20.0]).kept);
-        assert!(!Trial::of(Candidate::Cameras(poses()), &[20.0], &[25.0]).kept, "one image shows no scatter");
+        assert!(!Trial::of(Candidate::Cameras(poses()), &[20.0], &[25.0]).kept, "one image has no standard error");
         let gain = trial(&[20.5, 22.5, 24.5, 21.5]);
         assert!((gain.gain_db - 0.5).abs() < 1e-12 && gain.standard_error_db < 1e-12);
     }
@@ -614,10 +617,10 @@ mod tests {
     fn reductions_with_small_loss_are_kept() {
         let trial = |variant: &[f64]| Trial::of(HALVED, &[20.0, 22.0, 24.0, 21.0], variant);
         assert!(trial(&[19.94, 21.95, 23.93, 20.94]).kept);
-        assert!(!trial(&[19.6, 22.1, 23.9, 21.1]).kept, "a mean of -0.075 dB, but it may be twice that");
-        assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept, "fewer may even be better");
+        assert!(!trial(&[19.6, 22.1, 23.9, 21.1]).kept, "the mean is -0.075 dB, but the loss may be twice as large");
+        assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept, "a reduction may even improve the score");
         assert!(!trial(&[19.8, 21.7, 23.8, 20.7]).kept);
-        assert!(!Trial::of(HALVED, &[20.0], &[20.0]).kept, "one image tells nothing");
+        assert!(!Trial::of(HALVED, &[20.0], &[20.0]).kept, "one image is not sufficient");
         let part = trial(&[19.8, 21.7, 23.8, 20.7]).part();
         assert!((part.gain_db - 0.25).abs() < 1e-12 && part.kept, "{part:?}");
         assert!(!trial(&[19.94, 21.95, 23.93, 20.94]).part().kept);

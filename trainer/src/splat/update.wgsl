@@ -1,16 +1,17 @@
-// update: sum each splat's gradients over its intersections, carry them to its parameters, and take one Adam step.
+// update: sum each splat's gradients over its intersections, propagate them to its parameters, and take one Adam
+// step.
 //
 // threads   256 per block of 256 splats
-// reads     view, model, rule, drawn, tile_counts, slot_begins, gradients, status
-// writes    means, rotations, shapes, sh_dc, sh_rest, their moments, error_sums; or, with GRADIENTS_ONLY, the gradients
-//           themselves in place of the values, for tests
+// reads     view, model, rule, projected_splats, tile_counts, slot_begins, gradients, status
+// writes    means, rotations, shapes, sh_dc, sh_rest, their moments, error_sums; with GRADIENTS_ONLY, the gradients in
+//           place of the values, for tests
 // twin      splat/reference/project.rs, backward; optim/reference.rs
 // source    Kerbl et al. 2023, appendix A; Kingma and Ba 2015; noise of Kheradmand et al. 2024 (3DGS-MCMC), section 4.1;
 //           one second moment for many values as in Adam-mini (Zhang et al. 2024)
 //
-// The functions past the constant one share one second moment a splat and have no first: the squares of a degree's basis
-// functions sum to the same in every direction, so the mean square of their slopes is |v_color|^2 / (12 pi), and their rate
-// is so small that the mean over steps is taken by the parameters themselves.
+// The coefficients past the constant one share one second moment per splat and have no first moment. The squares of a
+// degree's basis functions sum to the same value in every direction, so the mean square of their gradients is
+// |v_color|^2 / (12 pi). Their learning rate is so small that the parameters themselves average over steps.
 
 #import view
 #import model
@@ -22,23 +23,23 @@
 #import random
 
 struct Rule {
-    mean_rate_m: f32,             // at the start
+    mean_rate_m: f32,             // initial rate
     log_scale_rate: f32,
     rotation_rate: f32,
     opacity_rate: f32,
     sh_dc_rate: f32,
     sh_rest_rate: f32,
-    noise: f32,                   // on the means of splats that hardly show, against their rate
-    final_mean_rate_frac: f32,    // what is left of the means' rate at the end
+    noise: f32,                   // scale of the noise on means of nearly transparent splats, relative to their rate
+    final_mean_rate_frac: f32,    // fraction of the means' rate that remains at the end
     betas: vec2f,                 // of Adam
     epsilon: f32,                 // of Adam
     n_planned_steps: f32,
     opacity_cost: f32,            // per splat
-    scale_cost: f32,              // per splat and metre
+    scale_cost: f32,              // per splat and meter
     log_scale_range: vec2f,
     seed: u32,
-    update_all: u32,              // 1: also splats that this view does not show
-    schedule_start: f32,          // step from which the planned ones count
+    update_all: u32,              // 1: also update splats that are not visible in this view
+    schedule_start: f32,          // step at which the planned steps begin
     unused: u32,
 }
 
@@ -83,7 +84,7 @@ fn is_finite(x: vec4f) -> bool {
 struct ShSums {
     splat_ix: u32,
     v_color: vec3f,
-    rest_step: vec3f,       // per value of the basis function
+    rest_step: vec3f,       // per unit of the basis function
     v_direction: vec3f,
 }
 
@@ -98,7 +99,7 @@ fn add_sh_term(sums: ptr<function, ShSums>, k: u32, basis: f32, basis_gradient: 
     sh_rest[at + 2u * model.capacity] = updated.z;
 }
 
-// The slope towards a small motion of the camera, of what one splat tells.
+// Gradient with respect to a small motion of the camera, from one splat.
 struct CameraGradient {
     rotation: vec3f,
     translation: vec3f,
@@ -179,17 +180,17 @@ fn learn(splat_ix: u32) -> CameraGradient {
         let point_mid_exposure = camera_from_world(view, mean);
         camera.translation = v_mid_exposure;
         camera.rotation = cross(point_mid_exposure, v_mid_exposure);
-        let unturned = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
+        let splat_axes = transpose(mat3x3f(view.camera_row_0.xyz, view.camera_row_1.xyz, view.camera_row_2.xyz)) * p.rotation;
         let spin = p.tau * view.shutter_angular.xyz;
-        camera.rotation += p.scale.x * cross(unturned[0], v_axis_0 + cross(spin, v_axis_0));
-        camera.rotation += p.scale.y * cross(unturned[1], v_axis_1 + cross(spin, v_axis_1));
-        camera.rotation += p.scale.z * cross(unturned[2], v_axis_2 + cross(spin, v_axis_2));
+        camera.rotation += p.scale.x * cross(splat_axes[0], v_axis_0 + cross(spin, v_axis_0));
+        camera.rotation += p.scale.y * cross(splat_axes[1], v_axis_1 + cross(spin, v_axis_1));
+        camera.rotation += p.scale.z * cross(splat_axes[2], v_axis_2 + cross(spin, v_axis_2));
         camera.principal = sum.position.xy;
         camera.focal = sum.position.xy * p.point.xy / z + vec2f(dot(v_jacobian_x, p.jacobian_x), dot(v_jacobian_y, p.jacobian_y)) / f;
         v_mean = view.camera_row_0.xyz * v_mid_exposure.x + view.camera_row_1.xyz * v_mid_exposure.y + view.camera_row_2.xyz * v_mid_exposure.z;
     }
 
-    let v_color = select(vec3f(0.0), sum.color.rgb, projected_splats[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors end at 0.
+    let v_color = select(vec3f(0.0), sum.color.rgb, projected_splats[splat_ix].color.rgb > vec3f(0.0)); // Drawn colors are clamped at 0.
     if !GRADIENTS_ONLY && (!is_finite(vec4f(v_mean, v_opacity_logit)) || !is_finite(v_rotation) || !is_finite(vec4f(v_log_scale, sum.conic.w)) || !is_finite(vec4f(v_color, 0.0))) {
         atomicAdd(&status[N_NON_FINITE], 1u);
         return CameraGradient();
@@ -220,13 +221,13 @@ fn learn(splat_ix: u32) -> CameraGradient {
     sh_rest_moments[splat_ix] = mean_square;
     let progress = clamp((step - rule.schedule_start) / max(rule.n_planned_steps, 1.0), 0.0, 1.0);
     let mean_rate = rule.mean_rate_m * pow(rule.final_mean_rate_frac, progress);
-    // The costs double as the model gets able to fit what a single image shows.
+    // The costs double over the plan, as the model becomes able to fit details of single images.
     let cost_gradient = (1.0 + progress) * vec4f(rule.scale_cost * p.scale, rule.opacity_cost * opacity * (1.0 - opacity));
     let mean_step = adam4(0u, splat_ix, vec4f(v_mean, 0.0));
     let rotation_step = adam4(2u, splat_ix, v_rotation);
     let shape_step = adam4(4u, splat_ix, vec4f(v_log_scale, v_opacity_logit) + cost_gradient);
 
-    // Noise moves splats that hardly show, so that they find a place where they are of use.
+    // Noise moves nearly transparent splats, so that they can reach positions where they are useful.
     let noise_weight = 1.0 / (1.0 + exp(100.0 * (opacity - 0.005)));
     let normal = normal3(vec3u(splat_ix, atomicLoad(&status[STEP]), rule.seed));
     let stretched = p.rotation * (p.scale * p.scale * (transpose(p.rotation) * normal));

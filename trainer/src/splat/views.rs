@@ -1,4 +1,4 @@
-//! Keyframes on the GPU, at the resolutions they are learned from.
+//! Training keyframes on the GPU at several resolutions.
 #![expect(
     clippy::cast_possible_truncation,
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
@@ -12,27 +12,27 @@ use nalgebra::Point3;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Nearest and furthest a splat may be from a keyframe's camera along z to be learned from it, metres.
+/// Nearest and furthest distance of drawn splats from a training camera along z, meters.
 const NEAR_M: f64 = 0.01;
 pub(crate) const FAR_M: f64 = 1e4;
 
-/// One keyframe that is learned from.
+/// One training keyframe.
 #[derive(Debug)]
 pub(crate) struct TrainView {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Of what its depth camera sees.
+    /// Median of its depth readings, if it has depth.
     pub(crate) median_depth_m: Option<f64>,
     levels: [Option<Level>; 3],
-    /// Where something is learned about cameras.
+    /// Present once camera parameters are optimized.
     lens: Option<Buffer>,
 }
 
-/// Which view a step learns from: every view once in a shuffled order, then again in another.
+/// Order in which views are trained on: all views once in a shuffled order, then again in another order.
 #[derive(Debug)]
 pub(crate) struct Order {
     seed: u64,
     round: u64,
-    /// Of `round`.
+    /// Order in `round`.
     order: Vec<usize>,
 }
 
@@ -68,9 +68,9 @@ pub(crate) struct Level {
     pub(crate) view: Buffer,
     /// rgba8; a = 0 where masked.
     pub(crate) image: Buffer,
-    /// Metres along z in the color camera, 0 where unknown.
+    /// Meters along z in the color camera, 0 if unknown.
     pub(crate) depth: Buffer,
-    /// When it was last needed, see [`drop_levels`].
+    /// Counter value at the last use, see [`drop_levels`].
     used_at: u64,
 }
 
@@ -81,21 +81,22 @@ impl Level {
     }
 }
 
-/// Which images to keep on the GPU.
+/// Rules for keeping images on the GPU.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Keep<'a> {
-    /// Views and levels that the next steps need; they are kept whatever their size.
+    /// Views and levels that the next steps need; they are always kept.
     pub(crate) needed: &'a BTreeSet<(usize, usize)>,
-    /// Coarser levels are no longer used for training.
+    /// Coarsest level that is still used for training.
     pub(crate) coarsest: u32,
-    /// Maximum total bytes of the images that are kept.
+    /// Maximum total bytes of the kept images.
     pub(crate) max_bytes: u64,
 }
 
 /// Removes images from the GPU and returns their buffers for reuse.
 ///
-/// Images at a resolution that training has passed are removed first. If the rest is still larger than `max_bytes`, the most
-/// recently used images are removed next: every view is used once per round, so the others are needed sooner.
+/// Images at resolutions that training has passed are removed first. If the rest is still larger than `max_bytes`,
+/// the most recently used images are removed next: every view is used once per round, so the others are needed
+/// sooner.
 pub(crate) fn drop_levels(views: &mut [TrainView], keep: Keep<'_>) -> Vec<Level> {
     let mut dropped = Vec::new();
     let mut candidates = Vec::new();
@@ -131,7 +132,7 @@ impl TrainView {
         Self { median_depth_m: median_depth_m(&keyframe), keyframe, levels: [const { None }; 3], lens: None }
     }
 
-    /// Takes part in what is learned about cameras.
+    /// Allocates slots for the camera parameters of this view.
     pub(crate) fn assign_lens(&mut self, gpu: &Gpu, cameras: &mut CameraParams) -> Result<(), Error> {
         if self.lens.is_none() {
             self.lens = Some(cameras.lens(gpu, &self.keyframe)?);
@@ -139,12 +140,12 @@ impl TrainView {
         Ok(())
     }
 
-    /// The lens, where it has one, and a level that was made.
+    /// The lens, if there is one, and a level whose images are uploaded.
     pub(crate) fn ready_level(&self, level: usize) -> Result<(Option<&Buffer>, &Level), Error> {
         Ok((self.lens.as_ref(), self.levels[level].as_ref().ok_or(Error::DeviceLost)?))
     }
 
-    /// No side of an image gets smaller than a tile's.
+    /// The level, limited so that no side of an image is smaller than a tile.
     pub(crate) fn clamped(&self, level: u32) -> usize {
         let [width, height] = self.keyframe.size_px;
         level.min((width.min(height) / TILE_PX).max(1).ilog2()) as usize
@@ -155,7 +156,7 @@ impl TrainView {
         self.keyframe.size_px.map(|px| (px >> level).max(1))
     }
 
-    /// GPU memory of its images, bytes.
+    /// GPU memory of the images, bytes.
     #[cfg(test)]
     pub(crate) fn image_bytes(&self) -> u64 {
         self.levels.iter().flatten().map(Level::bytes).sum()
@@ -165,7 +166,7 @@ impl TrainView {
         self.levels[level].is_some()
     }
 
-    /// Records that a level is needed at time `now`, a counter.
+    /// Records that a level is used at time `now`, a counter.
     pub(crate) fn mark_used(&mut self, level: usize, now: u64) {
         if let Some(level) = &mut self.levels[level] {
             level.used_at = now;
@@ -208,7 +209,7 @@ impl TrainView {
     }
 }
 
-/// A keyframe at a lower resolution, in host memory; at full size it shares the keyframe's pixels.
+/// A keyframe at a lower resolution, in host memory; at full size, it shares the keyframe's pixels.
 #[derive(Debug)]
 pub(crate) struct LevelImages {
     camera: Camera,
@@ -239,14 +240,14 @@ impl LevelImages {
 
 pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
-    // Some of each column and row, and enough of small images.
+    // Samples all columns and rows, with a sufficient number of pixels from small images.
     let step = 997.min(depth.depth_m.len() / 64).max(1);
     let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0).collect();
     sample.sort_by(f32::total_cmp);
     sample.get(sample.len() / 2).map(|z| f64::from(*z))
 }
 
-/// The camera that took the keyframe.
+/// The uncorrected camera of a keyframe.
 pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
     Camera {
         world_from_camera: keyframe.world_from_camera,
@@ -261,7 +262,7 @@ pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
     }
 }
 
-/// Means over squares of pixels; masked where any of them is.
+/// Means over squares of pixels; masked if any of their pixels is.
 fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[u8]> {
     if level == 0 {
         return keyframe.rgba_srgb.clone();
@@ -290,8 +291,8 @@ fn downscaled_image(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
     downscaled.into()
 }
 
-/// Takes the value in the middle of each square, because averages would invent surfaces between near and far. Empty for a
-/// keyframe without depth.
+/// Takes the value at the center of each square, because averages would create surfaces between near and far ones.
+/// Empty for a keyframe without depth.
 fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[f32]> {
     let full = depth_in_color_view(keyframe);
     if full.is_empty() || level == 0 {
@@ -305,9 +306,9 @@ fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
         .collect()
 }
 
-/// Depth along the color camera's z for each of its pixels; empty where the keyframe has none.
+/// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no depth.
 ///
-/// A depth camera with its own lens, pose or moment is carried over point by point; the nearest wins.
+/// Depth from a camera with another lens, pose or time is reprojected point by point; the nearest point is used.
 pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
     let Some(depth) = &keyframe.depth else { return [].into() };
     let same_lens = depth.size_px == keyframe.size_px

@@ -1,7 +1,7 @@
-//! The plain CPU version of what changes splats: the optimiser's step (update.wgsl) and growth (grow_*.wgsl).
+//! Plain CPU version of the kernels that change splats: the optimizer step (update.wgsl) and growth (grow_*.wgsl).
 //!
-//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2; error in place of opacity as the
-//! measure of growth after Bulo et al. 2024.
+//! Source: Kingma and Ba 2015; Kheradmand et al. 2024 (3DGS-MCMC), sections 4.1 and 4.2; error instead of opacity as
+//! the measure for growth after Bulo et al. 2024.
 
 use super::random::{normal3, uniform3};
 use super::{Splat, SplatGrad};
@@ -9,10 +9,11 @@ use crate::optim::reference::{Adam, Moments};
 use crate::splat::params::{Growth, Rule};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Running means of every value of one splat, in the order of [`values`]; colors past the constant share the first one's.
+/// Adam's moments of every value of one splat, in the order of [`values`]. Colors past the constant one share one
+/// second moment.
 pub(crate) type SplatMoments = Vec<Moments>;
 
-/// Mean, log scale, rotation, opacity logit, then the coefficients of color.
+/// Mean, log scale, rotation, opacity logit, then the color coefficients.
 fn values(splat: &Splat) -> Vec<f64> {
     let rest = splat.sh.as_flattened().iter().copied();
     let shape = splat.mean.into_iter().chain(splat.log_scale).chain(splat.rotation_wxyz).chain([splat.opacity_logit]);
@@ -23,7 +24,7 @@ fn sigmoid(x: f64) -> f64 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// Moves one splat against its gradient; `step` counts from 0.
+/// Takes one optimizer step for one splat; `step` counts from 0.
 pub(crate) fn update(
     splat: &Splat,
     gradient: &SplatGrad,
@@ -87,15 +88,15 @@ pub(crate) fn update(
 /// Larger families are treated as this large.
 const MAX_FAMILY: u32 = 16;
 
-/// Splats after a change of their number, and who came of whom.
+/// Splats after a change of their number, and the parent of each new one.
 pub(crate) struct Grown {
     pub(crate) splats: Vec<Splat>,
     pub(crate) parents: Vec<Option<usize>>,
-    /// How near a choice of a parent came to another one, as a share of all error.
+    /// Smallest distance of a choice from selecting another parent, as a fraction of the total error.
     pub(crate) margin: f64,
 }
 
-/// Gives dead and new splats a parent, chosen by error, a place within it and their share of its light.
+/// Gives each dead or new splat a parent, chosen by error, a position within it, and a share of its opacity.
 pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     let is_dead = |splat: &Splat| sigmoid(splat.opacity_logit) < f64::from(growth.min_opacity);
     let mut cumulative = Vec::with_capacity(splats.len());
@@ -140,7 +141,7 @@ pub(crate) fn grow(splats: &[Splat], errors: &[f64], growth: &Growth) -> Grown {
     Grown { splats: grown, parents, margin }
 }
 
-/// Opacity and size of one of `n` splats that together look as the one did.
+/// Sets the opacity and size of one of `n` splats that together look like the original one.
 fn share_opacity(splat: &mut Splat, n: u32) {
     let opacity = sigmoid(splat.opacity_logit).clamp(1e-4, 0.9999);
     let shared = (1.0 - (1.0 - opacity).powf(1.0 / f64::from(n))).clamp(0.005, 0.9999);

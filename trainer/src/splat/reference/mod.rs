@@ -1,8 +1,8 @@
-//! The plain CPU version of splatting in f64: what every kernel of `splat` is compared with.
+//! Plain CPU version of splatting in f64, with which every kernel of `splat` is compared.
 //!
-//! `project` places each splat on the image plane, `rasterize` composites the splats pixel by pixel, and each has a
-//! backward function. Whatever is decided by comparing numbers (who is seen, in which order, who adds to which pixel)
-//! is decided once, in [`decide`], and held while gradients are taken.
+//! `project` projects each splat onto the image plane, and `rasterize` composites the splats pixel by pixel; each has
+//! a backward function. All decisions by comparison (visibility, depth order, contributors of each pixel) are made
+//! once, in [`decide`], and kept fixed while gradients are computed.
 //!
 //! Source: Kerbl et al. 2023 (3D Gaussian splatting) and Ye et al. 2024 (gsplat, appendix on gradients). We differ in
 //! the rolling shutter, and in a depth output that is composited like a color.
@@ -26,14 +26,14 @@ use kinematics::Transform;
 pub use project::{project, project_backward};
 pub use rasterize::{Decisions, decide};
 
-/// Raw, optimised values of one splat.
+/// Raw, optimized values of one splat.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Splat {
-    /// Center in world, metres.
+    /// Center in the world, meters.
     pub mean: [f64; 3],
-    /// Natural logarithm of the standard deviations along the splat's own axes, in metres before the logarithm.
+    /// Natural logarithms of the standard deviations along the splat's own axes, which are in meters.
     pub log_scale: [f64; 3],
-    /// `world_from_splat` rotation; any length but zero, normalised where it is used.
+    /// `world_from_splat` rotation; any nonzero length, normalized on use.
     pub rotation_wxyz: [f64; 4],
     /// Opacity before the sigmoid.
     pub opacity_logit: f64,
@@ -41,10 +41,10 @@ pub struct Splat {
     pub sh: Vec<[f64; 3]>,
 }
 
-/// Gradient of a loss by the raw values of one splat, in the shape of the splat.
+/// Gradient of a loss with respect to the raw values of one splat, in the shape of the splat.
 pub type SplatGrad = Splat;
 
-/// One camera at one moment, with its motion while the image is read out.
+/// One camera at one time, with its motion during readout.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// Pose at the middle row's exposure.
@@ -55,16 +55,16 @@ pub struct View {
     pub principal_px: [f64; 2],
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// Splats nearer than this along z are not seen, metres.
+    /// Splats nearer than this along z are not drawn, meters.
     pub near_m: f64,
-    /// Motion of the camera over the whole readout in its own axes, metres: linear velocity times readout time.
+    /// Translation of the camera over the whole readout in its own axes, meters: linear velocity times readout time.
     pub linear_m: [f64; 3],
     /// Rotation of the camera over the whole readout in its own axes, radians: angular velocity times readout time.
     pub angular_rad: [f64; 3],
 }
 
 impl View {
-    /// How many pixels the image has.
+    /// Number of pixels of the image.
     pub fn n_pixels(&self) -> usize {
         self.size_px.iter().map(|&side| side as usize).product()
     }
@@ -76,14 +76,15 @@ impl View {
     }
 }
 
-/// Gradient of a loss by a view.
+/// Gradient of a loss with respect to a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ViewGrad {
-    /// By a small motion `exp(pose) * camera_from_world`: translation in metres, then rotation in radians.
+    /// With respect to a small motion `exp(pose) * camera_from_world`: translation in meters, then rotation in
+    /// radians.
     pub pose: [f64; 6],
-    /// By [`View::linear_m`].
+    /// With respect to [`View::linear_m`].
     pub linear_m: [f64; 3],
-    /// By [`View::angular_rad`].
+    /// With respect to [`View::angular_rad`].
     pub angular_rad: [f64; 3],
 }
 
@@ -96,75 +97,75 @@ pub struct Projected {
     pub conic: [f64; 3],
     /// Opacity at the center, 0 to 1.
     pub opacity: f64,
-    /// Color as seen from the camera, not below 0.
+    /// Color in the direction of the camera, at least 0.
     pub color: [f64; 3],
-    /// Depth of the center along the camera's z axis, metres.
+    /// Depth of the center along the camera's z axis, meters.
     pub depth: f64,
-    /// Half sides of the box round `mean_px` outside which the splat adds nothing, pixels.
+    /// Half sides of the bounding box around `mean_px`, outside which the splat contributes nothing, pixels.
     pub extent_px: [f64; 2],
 }
 
-/// Gradient of a loss by a [`Projected`]; the extent decides nothing and has none.
+/// Gradient of a loss with respect to a [`Projected`]. The extent has no gradient.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ProjectedGrad {
-    /// By the center.
+    /// With respect to the center.
     pub mean_px: [f64; 2],
-    /// By the three numbers of the conic; `b` stands for both off-diagonal entries.
+    /// With respect to the three numbers of the conic; `b` represents both off-diagonal entries.
     pub conic: [f64; 3],
-    /// By the opacity.
+    /// With respect to the opacity.
     pub opacity: f64,
-    /// By the color.
+    /// With respect to the color.
     pub color: [f64; 3],
-    /// By the depth.
+    /// With respect to the depth.
     pub depth: f64,
 }
 
-/// What a render gives, row by row.
+/// Output of a render, row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedImage {
-    /// Color of the splats alone, premultiplied; no background.
+    /// Color of the splats without background, premultiplied.
     pub rgb: Vec<[f64; 3]>,
-    /// Share of the background that shows, 0 to 1.
+    /// Fraction of the background that is visible, 0 to 1.
     pub transmittance: Vec<f64>,
-    /// Depths along z weighted as the colors are, metres; divide by `1 - transmittance` for a mean depth.
+    /// Depths along z with the weights of the colors, meters; divide by `1 - transmittance` for a mean depth.
     pub depth: Vec<f64>,
-    /// The last splat, by index, that was added to the pixel.
+    /// Index of the last splat that contributed to the pixel.
     pub last_contributor: Vec<Option<usize>>,
 }
 
-/// Gradient of a loss by a [`RenderedImage`], row by row.
+/// Gradient of a loss with respect to a [`RenderedImage`], row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Upstream {
-    /// By the color.
+    /// With respect to the color.
     pub rgb: Vec<[f64; 3]>,
-    /// By the transmittance.
+    /// With respect to the transmittance.
     pub transmittance: Vec<f64>,
-    /// By the depth.
+    /// With respect to the depth.
     pub depth: Vec<f64>,
 }
 
-/// Gradient of a loss by everything a render is made of.
+/// Gradient of a loss with respect to all inputs of a render.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderGrad {
-    /// By the raw values of each splat; zero for splats that are not seen.
+    /// With respect to the raw values of each splat; zero for invisible splats.
     pub splats: Vec<SplatGrad>,
-    /// By each splat on the image plane; zero for splats that are not seen.
+    /// With respect to each projected splat; zero for invisible splats.
     pub projected: Vec<ProjectedGrad>,
-    /// By the view.
+    /// With respect to the view.
     pub view: ViewGrad,
 }
 
-/// Draws the splats.
+/// Renders the splats.
 pub fn render(view: &View, splats: &[Splat]) -> RenderedImage {
     render_decided(view, splats, &decide(view, splats))
 }
 
-/// Draws the splats with decisions taken before, so that a nudged splat can be compared with itself.
+/// Renders the splats with given decisions, so that finite differences do not change them.
 pub fn render_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> RenderedImage {
     rasterize::composite(view, &project_decided(view, splats, decisions), decisions)
 }
 
-/// Gradient of a loss by every splat and by the view, from its gradient by the image.
+/// Gradient of a loss with respect to every splat and the view, from its gradient with respect to the image.
 pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> RenderGrad {
     let decisions = decide(view, splats);
     let projected = project_decided(view, splats, &decisions);

@@ -1,31 +1,31 @@
-//! Placing one splat on the image plane, and the gradient of that.
+//! Projection of one splat onto the image plane, and its gradient.
 //!
-//! Source: Zwicker et al. 2001 (EWA splatting); the Jacobian's clamp is that of gsplat (Ye et al. 2024). A rolling
-//! shutter moves the splat by its row's share of the readout; the share is held constant in the gradient.
+//! Source: Zwicker et al. 2001 (EWA splatting); the clamp of the Jacobian is that of gsplat (Ye et al. 2024). A
+//! rolling shutter moves the splat by its row's share of the readout; the gradient treats this share as constant.
 
 use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad, sh};
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
-/// Least share of a pixel that is still drawn.
+/// Minimum alpha that is drawn.
 pub const MIN_ALPHA: f64 = 1.0 / 255.0;
 /// Added to both variances on the image plane so that no splat falls between pixels, square pixels.
 pub const BLUR_PX2: f64 = 0.3;
-/// The Jacobian is held constant beyond this share of half the image outside its border.
+/// The ratios in the Jacobian are clamped beyond this fraction of half the image outside its border.
 const MARGIN_FRAC: f64 = 0.3;
 
-/// Places a splat on the image plane; `None` where it is nearer than `near_m` or too faint to draw.
+/// Projects a splat; `None` if it is nearer than `near_m` or too transparent to draw.
 ///
-/// A splat beside the image is placed too: whoever asks for its pixels finds none.
+/// Splats outside the image are projected, too; they do not contribute to any pixel.
 pub fn project(view: &View, splat: &Splat) -> Option<Projected> {
     let projected = project_at(view, splat, row_share(view, splat));
-    // Written so that a NaN is not seen.
+    // Written so that a splat with a NaN is invisible.
     (projected.depth >= view.near_m && projected.opacity >= MIN_ALPHA).then_some(projected)
 }
 
-/// When the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5 for the last.
+/// Time at which the splat's row is read, as a share of the readout: -0.5 for the first row, 0.5 for the last.
 ///
-/// The row is that of the camera's pose at the middle row, without motion; a splat not in front of that camera has none
-/// and is taken to be read with the middle row.
+/// The row is determined with the camera's pose at the middle row, without motion. The share is 0 for a splat that is
+/// not in front of that camera.
 pub fn row_share(view: &View, splat: &Splat) -> f64 {
     let point_in_camera = view.camera_from_world * nalgebra::Point3::from(splat.mean);
     if point_in_camera.z < view.near_m {
@@ -35,7 +35,7 @@ pub fn row_share(view: &View, splat: &Splat) -> f64 {
     (row_px / f64::from(view.size_px[1])).clamp(0.0, 1.0) - 0.5
 }
 
-/// Places a splat whose row is read at `row_share`, seen or not.
+/// Projects a splat whose row is read at `row_share`, whether or not it is visible.
 pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     let parts = Parts::new(view, splat, row_share);
     let [fx, fy] = view.focal_px;
@@ -53,7 +53,8 @@ pub fn project_at(view: &View, splat: &Splat, row_share: f64) -> Projected {
     }
 }
 
-/// Gradient by the splat's raw values and by the view, from the gradient by the placed splat.
+/// Gradient with respect to the splat's raw values and the view, from the gradient with respect to the projected
+/// splat.
 pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &ProjectedGrad) -> (SplatGrad, ViewGrad) {
     let parts = Parts::new(view, splat, row_share);
     let camera_from_world = view.camera_from_world.rotation.to_rotation_matrix().into_inner();
@@ -61,7 +62,7 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
     let (v_sh, v_offset) = sh::color_backward(&splat.sh, &offset_in_world(view, splat), &v.color);
     let opacity = sigmoid(splat.opacity_logit);
 
-    // From the conic down to the map of the splat's axes onto the image.
+    // From the conic to the map from the splat's axes to the image.
     let v_conic = Matrix2::new(v.conic[0], 0.5 * v.conic[1], 0.5 * v.conic[1], v.conic[2]);
     let v_cov = -parts.conic * v_conic * parts.conic;
     let v_image_from_world = 2.0 * v_cov * parts.image_from_world * parts.cov_in_world;
@@ -70,7 +71,7 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
     let v_cov_in_world = parts.image_from_world.transpose() * v_cov * parts.image_from_world;
     let (v_log_scale, v_rotation_wxyz) = shape_backward(splat, &v_cov_in_world);
 
-    // From the image down to the point in the camera as its row sees it, then as the middle row would.
+    // From the image to the point in the camera frame at the splat's row, then at the middle row.
     let mut v_point =
         pinhole_backward(view, &parts.point_in_camera, &v.mean_px) + jacobian_backward(view, &parts, &v_jacobian);
     v_point.z += v.depth;
@@ -86,7 +87,8 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
         opacity_logit: v.opacity * opacity * (1.0 - opacity),
         sh: v_sh,
     };
-    // A step of the camera moves the point in the camera, and the place from which the color is seen.
+    // A motion of the camera changes the point in the camera frame and the direction from which the color is
+    // evaluated.
     let v_translation = v_still_point + camera_from_world * v_offset;
     let v_rotation =
         parts.still_point.cross(&v_still_point) + by_rotation(&(v_camera_from_world * camera_from_world.transpose()));
@@ -98,20 +100,20 @@ pub fn project_backward(view: &View, splat: &Splat, row_share: f64, v: &Projecte
     (by_splat, by_view)
 }
 
-/// What lies between a splat and its place on the image.
+/// Intermediate results of the projection of a splat.
 struct Parts {
-    /// Center in the camera at the middle row.
+    /// Center in the camera frame at the middle row.
     still_point: Vector3<f64>,
-    /// Center in the camera when the splat's row is read.
+    /// Center in the camera frame when the splat's row is read.
     point_in_camera: Vector3<f64>,
     /// Linear part of the camera's motion between the two.
     moved_from_still: Matrix3<f64>,
-    /// Linear part from world to the moved camera.
+    /// Linear part of the transform from the world to the moved camera.
     moved_from_world: Matrix3<f64>,
     cov_in_world: Matrix3<f64>,
-    /// Slope ratios x/z and y/z as the Jacobian uses them, and whether each was clamped.
+    /// Ratios x/z and y/z as used by the Jacobian, and whether each was clamped.
     ratio: [(f64, bool); 2],
-    /// Of pixels by the point in the camera.
+    /// Jacobian of pixels with respect to the point in the camera frame.
     jacobian: Matrix2x3<f64>,
     image_from_world: Matrix2x3<f64>,
     cov_px2: Matrix2<f64>,
@@ -157,7 +159,7 @@ impl Parts {
     }
 }
 
-/// Slope x/z (axis 0) or y/z (axis 1) kept within the image and a margin, and whether that changed it.
+/// Clamps the ratio x/z (axis 0) or y/z (axis 1) to the image plus a margin; returns whether that changed it.
 fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
     let (focal_px, principal_px, size_px) =
         (view.focal_px[axis], view.principal_px[axis], f64::from(view.size_px[axis]));
@@ -167,13 +169,13 @@ fn clamped_ratio(view: &View, axis: usize, ratio: f64) -> (f64, bool) {
     (ratio.clamp(lowest, highest), ratio < lowest || ratio > highest)
 }
 
-/// From the gradient by the center in pixels to that by the point in the camera.
+/// From the gradient with respect to the center in pixels to that with respect to the point in the camera frame.
 fn pinhole_backward(view: &View, point: &Vector3<f64>, v_mean_px: &[f64; 2]) -> Vector3<f64> {
     let per_z = Vector2::new(view.focal_px[0] * v_mean_px[0], view.focal_px[1] * v_mean_px[1]) / point.z;
     Vector3::new(per_z.x, per_z.y, -(per_z.x * point.x + per_z.y * point.y) / point.z)
 }
 
-/// From the gradient by the pinhole's Jacobian to that by the point in the camera.
+/// From the gradient with respect to the pinhole's Jacobian to that with respect to the point in the camera frame.
 ///
 /// Row `axis` of the Jacobian is `f / z` on the diagonal and `-f * ratio / z` in the last column, where `ratio` is
 /// `point / z` inside the clamp and constant outside.
@@ -193,7 +195,8 @@ fn jacobian_backward(view: &View, parts: &Parts, v_jacobian: &Matrix2x3<f64>) ->
     v_point
 }
 
-/// From the gradient by the covariance in world to that by log scale and raw quaternion.
+/// From the gradient with respect to the covariance in the world to that with respect to log scale and raw
+/// quaternion.
 fn shape_backward(splat: &Splat, v_cov: &Matrix3<f64>) -> ([f64; 3], [f64; 4]) {
     let unit_wxyz = unit(&splat.rotation_wxyz);
     let rotation = rotation_matrix(&unit_wxyz);
@@ -206,7 +209,7 @@ fn shape_backward(splat: &Splat, v_cov: &Matrix3<f64>) -> ([f64; 3], [f64; 4]) {
     (v_log_scale, std::array::from_fn(|ix| (v_unit[ix] - unit_wxyz[ix] * along) / length))
 }
 
-/// Rotation of a unit quaternion.
+/// Rotation matrix of a unit quaternion.
 fn rotation_matrix(&[w, x, y, z]: &[f64; 4]) -> Matrix3<f64> {
     Matrix3::new(
         1.0 - 2.0 * (y * y + z * z),
@@ -221,7 +224,7 @@ fn rotation_matrix(&[w, x, y, z]: &[f64; 4]) -> Matrix3<f64> {
     )
 }
 
-/// Gradient of [`rotation_matrix`] by its four numbers as free variables.
+/// Gradient of [`rotation_matrix`] with respect to its four numbers as free variables.
 fn rotation_matrix_backward(&[w, x, y, z]: &[f64; 4], v: &Matrix3<f64>) -> [f64; 4] {
     let even = |row, column| v[(row, column)] + v[(column, row)];
     let odd = |row, column| v[(row, column)] - v[(column, row)];
@@ -233,12 +236,12 @@ fn rotation_matrix_backward(&[w, x, y, z]: &[f64; 4], v: &Matrix3<f64>) -> [f64;
     ]
 }
 
-/// Gradient by the vector `a` of a matrix that holds `a`'s cross-product matrix, from the gradient by the matrix.
+/// Gradient with respect to a vector `a` from the gradient with respect to its cross-product matrix.
 fn by_rotation(v: &Matrix3<f64>) -> Vector3<f64> {
     Vector3::new(v[(2, 1)] - v[(1, 2)], v[(0, 2)] - v[(2, 0)], v[(1, 0)] - v[(0, 1)])
 }
 
-/// From the camera to the splat, in world.
+/// Vector from the camera to the splat, in the world frame.
 fn offset_in_world(view: &View, splat: &Splat) -> Vector3<f64> {
     let world_from_camera = view.camera_from_world.inverse();
     Vector3::from(splat.mean) - world_from_camera.translation.vector

@@ -1,4 +1,4 @@
-//! The plain CPU version of shared/random.wgsl: numbers from a hash of where and when they are needed.
+//! Plain CPU version of shared/random.wgsl: random numbers from a hash of a key.
 //!
 //! Source: Jarzynski and Olano 2020 (PCG3D); Box and Muller 1958.
 
@@ -16,7 +16,7 @@ pub(crate) fn hash3(key: [u32; 3]) -> [u32; 3] {
     v
 }
 
-/// Three numbers of 0 <= x < 1.
+/// Three uniform numbers in 0 <= x < 1.
 pub(crate) fn uniform3(key: [u32; 3]) -> [f64; 3] {
     hash3(key).map(|hash| f64::from(hash >> 8) / 16_777_216.0)
 }

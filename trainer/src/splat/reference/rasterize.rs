@@ -1,25 +1,26 @@
-//! Compositing placed splats pixel by pixel, front to back, and the gradient of that.
+//! Front-to-back compositing of projected splats, pixel by pixel, and its gradient.
 //!
 //! Source: Kerbl et al. 2023, section 6 and appendix C.
 
 use super::project::{MIN_ALPHA, project, row_share};
 use super::{Projected, ProjectedGrad, RenderedImage, Splat, Upstream, View};
 
-/// No splat hides more than this share of what lies behind it.
+/// Maximum alpha of a splat at a pixel.
 pub const MAX_ALPHA: f64 = 0.999;
-/// A pixel is full before the splat that would let less than this through.
+/// Compositing of a pixel stops before the splat that would lower the transmittance to this value or less.
 pub const MIN_TRANSMITTANCE: f64 = 1e-4;
 
-/// What was decided by comparing numbers, kept as integers so that forward and backward agree.
+/// Results of all comparisons, stored so that forward and backward passes agree.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Decisions {
-    /// Share of the readout at which each splat is seen (see [`row_share`]); `None` for splats that are not drawn.
+    /// Share of the readout at which each splat is read out (see [`row_share`]); `None` for splats that are not
+    /// drawn.
     pub row_shares: Vec<Option<f64>>,
-    /// Splats by index that are added to each pixel, front to back; pixels row by row.
+    /// Indices of the splats that contribute to each pixel, front to back; pixels row by row.
     pub contributors: Vec<Vec<usize>>,
 }
 
-/// Decides who is seen, in which order, and who adds to which pixel.
+/// Decides which splats are visible, their order, and the contributors of each pixel.
 pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
@@ -33,7 +34,7 @@ pub fn decide(view: &View, splats: &[Splat]) -> Decisions {
     }
 }
 
-/// Composites the splats that were decided on.
+/// Composites the splats according to `decisions`.
 pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) -> RenderedImage {
     let mut image = RenderedImage::default();
     for (center_px, contributors) in view.pixel_centers().zip(&decisions.contributors) {
@@ -53,7 +54,7 @@ pub fn composite(view: &View, projected: &[Projected], decisions: &Decisions) ->
     image
 }
 
-/// Gradient of a loss by each placed splat, from its gradient by the image.
+/// Gradient of a loss with respect to each projected splat, from its gradient with respect to the image.
 pub fn composite_backward(
     view: &View,
     projected: &[Projected],
@@ -69,7 +70,7 @@ pub fn composite_backward(
             in_front.push(transmittance);
             transmittance *= 1.0 - Coverage::new(&projected[splat_ix], &center_px).alpha();
         }
-        // What the loss gains from everything behind the splat at hand.
+        // Part of the loss that depends on everything behind the current splat.
         let mut behind = upstream.transmittance[pixel_ix] * transmittance;
         for (&splat_ix, transmittance) in decisions.contributors[pixel_ix].iter().zip(in_front).rev() {
             let (splat, grad) = (&projected[splat_ix], &mut grads[splat_ix]);
@@ -87,11 +88,11 @@ pub fn composite_backward(
     grads
 }
 
-/// How far each pixel's decisions are from falling the other way, relative to what is compared.
+/// Relative distance of each pixel's decisions from their thresholds.
 ///
-/// The smallest relative distance of any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`], of any transmittance to
-/// [`MIN_TRANSMITTANCE`], and between the depths of neighbours in the order unless they are equal. Arithmetic that rounds
-/// more coarsely than this may decide otherwise.
+/// The distance is the smallest of: any alpha to [`MIN_ALPHA`] or [`MAX_ALPHA`], any transmittance to
+/// [`MIN_TRANSMITTANCE`], and the depths of consecutive splats to each other unless they are equal. Arithmetic with
+/// rounding errors larger than this may decide differently.
 pub fn threshold_margins(view: &View, splats: &[Splat]) -> Vec<f64> {
     let projected: Vec<_> = splats.iter().map(|splat| project(view, splat)).collect();
     let front_to_back = front_to_back(&projected);
@@ -120,7 +121,7 @@ fn threshold_margin(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) 
     margin
 }
 
-/// Visible splats with their indices, by depth rounded to f32; of equals the lower index first.
+/// Visible splats with their indices, ordered by depth rounded to f32, then by index.
 fn front_to_back(projected: &[Option<Projected>]) -> Vec<(usize, Projected)> {
     let mut visible: Vec<_> =
         projected.iter().enumerate().filter_map(|(ix, visible_splat)| visible_splat.map(|splat| (ix, splat))).collect();
@@ -128,14 +129,14 @@ fn front_to_back(projected: &[Option<Projected>]) -> Vec<(usize, Projected)> {
     visible
 }
 
-/// Positive floats order as their bits do.
+/// Positive floats sort like their bit patterns.
 fn depth_bits(depth: f64) -> u32 {
     #[expect(clippy::cast_possible_truncation, reason = "the kernels sort by the depth in f32")]
     let depth = depth as f32;
     depth.to_bits()
 }
 
-/// The splats, by index, that are added to the pixel at `center_px`.
+/// Indices of the splats that contribute to the pixel at `center_px`.
 fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> Vec<usize> {
     let mut added = Vec::new();
     let mut transmittance = 1.0;
@@ -153,9 +154,9 @@ fn contributors(front_to_back: &[(usize, Projected)], center_px: &[f64; 2]) -> V
     added
 }
 
-/// How one splat covers one pixel.
+/// Coverage of one pixel by one splat.
 struct Coverage {
-    /// From the pixel's center to the splat's, pixels.
+    /// Vector from the pixel's center to the splat's, pixels.
     offset_px: [f64; 2],
     /// Half the squared distance in standard deviations.
     sigma: f64,
@@ -178,12 +179,12 @@ impl Coverage {
         self.unclamped.min(MAX_ALPHA)
     }
 
-    /// A conic that is not positive, from rounding, draws nothing.
+    /// Whether the splat contributes. A conic that is not positive definite, due to rounding, is not drawn.
     fn is_drawn(&self) -> bool {
         self.sigma >= 0.0 && self.alpha() >= MIN_ALPHA
     }
 
-    /// Adds the gradient by center, conic and opacity; a clamped alpha passes nothing on.
+    /// Adds the gradient with respect to center, conic and opacity, which is zero if alpha is clamped.
     fn backward(&self, splat: &Projected, v_alpha: f64, grad: &mut ProjectedGrad) {
         if self.unclamped > MAX_ALPHA {
             return;

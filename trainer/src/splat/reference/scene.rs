@@ -4,7 +4,7 @@ use super::{RenderedImage, Splat, Upstream, View};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Coefficients of the spherical harmonics of degree 0 to 3.
+/// Number of spherical-harmonic coefficients for degrees 0 to 3.
 pub(crate) const N_COEFFS: [usize; 4] = [1, 4, 9, 16];
 
 /// Fixed pseudo-random numbers, the same on every machine (Steele et al. 2014, `SplitMix64`).
@@ -15,16 +15,16 @@ impl Random {
         Self(seed)
     }
 
-    /// Uniform in `low..high`, and a number that f32 holds exactly, so that a kernel and its twin start from the same.
+    /// Uniform in `low..high`, rounded to f32 so that a kernel and its twin start from the same values.
     pub(crate) fn uniform(&mut self, low: f64, high: f64) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut bits = self.0;
         bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         bits ^= bits >> 31;
-        // The upper 32 bits are enough, and exact in f64.
-        let share = f64::from(u32::try_from(bits >> 32).expect("32 bits are left")) / f64::from(u32::MAX);
-        #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what is wanted")]
+        // The upper 32 bits suffice and are exact in f64.
+        let share = f64::from(u32::try_from(bits >> 32).expect("a shift by 32 leaves 32 bits")) / f64::from(u32::MAX);
+        #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is intended")]
         let rounded = (low + (high - low) * share) as f32;
         f64::from(rounded)
     }
@@ -34,8 +34,8 @@ impl Random {
     }
 }
 
-/// A camera that is off-axis, rotated about all axes, with unequal focal lengths and an off-center principal point,
-/// so that no term of a gradient is zero; no motion. It looks at the world's origin from 2 m away.
+/// A static camera that is off-axis, rotated about all axes, with unequal focal lengths and an off-center principal
+/// point, so that no term of a gradient is zero. It looks at the world's origin from 2 m away.
 pub(crate) fn tilted_view() -> View {
     let world_from_camera = Transform::face_towards(
         &Point3::new(1.1, -1.5, 0.8),
@@ -53,14 +53,14 @@ pub(crate) fn tilted_view() -> View {
     }
 }
 
-/// [`tilted_view`] moving and turning while its image is read out, by a few pixels in all.
+/// [`tilted_view`] with a camera that translates and rotates by a few pixels during readout.
 pub(crate) fn rolling_view() -> View {
     View { linear_m: [0.12, -0.09, 0.15], angular_rad: [0.05, -0.08, 0.11], ..tilted_view() }
 }
 
-/// `n` overlapping splats of every degree in turn in front of [`tilted_view`].
+/// `n` overlapping splats, cycling through all degrees, in front of [`tilted_view`].
 ///
-/// Colors stay above 0, opacities between 0.15 and 0.95, and rotations away from unit length.
+/// Colors stay above 0, opacities are between 0.15 and 0.95, and rotations do not have unit length.
 pub(crate) fn small_scene(seed: u64, n: usize) -> Vec<Splat> {
     let mut random = Random::new(seed);
     let splat = |splat_ix: usize| Splat {
@@ -79,7 +79,7 @@ fn colorful(random: &mut Random, n_coeffs: usize) -> Vec<[f64; 3]> {
     sh
 }
 
-/// Some gradient by every number of an image, between -1 and 1.
+/// A random gradient with respect to every number of an image, between -1 and 1.
 pub(crate) fn some_upstream(seed: u64, view: &View) -> Upstream {
     let mut random = Random::new(seed);
     let n_pixels = view.n_pixels();
@@ -91,7 +91,7 @@ pub(crate) fn some_upstream(seed: u64, view: &View) -> Upstream {
 }
 
 impl Upstream {
-    /// The loss with this gradient that is linear in the image.
+    /// The loss that is linear in the image and has this gradient.
     pub(crate) fn dot(&self, image: &RenderedImage) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         dot(self.rgb.as_flattened(), image.rgb.as_flattened())
@@ -100,7 +100,7 @@ impl Upstream {
     }
 }
 
-/// Names one raw value of a splat.
+/// Identifies one raw value of a splat.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum SplatParam {
     Mean(usize),
@@ -134,7 +134,7 @@ impl Splat {
         }
     }
 
-    /// This splat with one raw value raised by `nudge`.
+    /// This splat with `nudge` added to one raw value.
     pub(crate) fn nudged(&self, param: SplatParam, nudge: f64) -> Self {
         let mut splat = self.clone();
         *match param {

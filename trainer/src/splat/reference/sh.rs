@@ -1,10 +1,10 @@
-//! Color of a splat from the direction it is seen in: real spherical harmonics up to degree 3.
+//! Color of a splat as a function of the viewing direction: real spherical harmonics up to degree 3.
 //!
 //! Source: Kerbl et al. 2023 for constants, order and signs; the polynomials agree with Sloan 2013 on the unit sphere.
 
 use nalgebra::Vector3;
 
-/// Coefficients of the highest degree.
+/// Number of coefficients of the highest degree.
 pub const MAX_N_COEFFS: usize = 16;
 
 const C0: f64 = 0.282_094_791_773_878_14;
@@ -26,14 +26,15 @@ const C3: [f64; 7] = [
     -0.590_043_589_926_643_5,
 ];
 
-/// Color seen along `offset`, the vector from the camera to the splat in world; clamped at 0 from below.
+/// Color in the direction `offset`, the vector from the camera to the splat in the world frame; clamped below at 0.
 ///
 /// `sh` holds 1, 4, 9 or 16 coefficients.
 pub fn color(sh: &[[f64; 3]], offset: &Vector3<f64>) -> [f64; 3] {
     unclamped_color(sh, offset).map(|channel| channel.max(0.0))
 }
 
-/// Gradient by `sh` and by `offset`, from the gradient by the color; a clamped channel passes nothing on.
+/// Gradient with respect to `sh` and `offset`, from the gradient with respect to the color; zero for clamped
+/// channels.
 pub fn color_backward(sh: &[[f64; 3]], offset: &Vector3<f64>, v_color: &[f64; 3]) -> (Vec<[f64; 3]>, Vector3<f64>) {
     let direction = offset.normalize();
     let (basis, by_direction) = (basis(&direction), basis_gradient(&direction));
@@ -47,7 +48,7 @@ pub fn color_backward(sh: &[[f64; 3]], offset: &Vector3<f64>, v_color: &[f64; 3]
         let v_basis: f64 = (0..3).map(|channel| v_color[channel] * coeff[channel]).sum();
         v_direction += by_direction[coeff_ix] * v_basis;
     }
-    // The length of the offset does not matter, so the part along the direction goes.
+    // The color does not depend on the length of the offset, so the component along the direction is removed.
     let v_offset = (v_direction - direction * direction.dot(&v_direction)) / offset.norm();
     (v_sh, v_offset)
 }
@@ -76,7 +77,7 @@ pub fn basis(direction: &Vector3<f64>) -> [f64; MAX_N_COEFFS] {
     ]
 }
 
-/// Gradients of the basis polynomials by x, y and z as free variables.
+/// Gradients of the basis polynomials with respect to x, y and z as free variables.
 fn basis_gradient(direction: &Vector3<f64>) -> [Vector3<f64>; MAX_N_COEFFS] {
     let (x, y, z) = (direction.x, direction.y, direction.z);
     let (xx, yy, zz) = (x * x, y * y, z * z);
@@ -112,7 +113,7 @@ mod tests {
 
     #[test]
     fn basis_is_orthonormal_on_the_sphere() {
-        const N_AZIMUTHS: u32 = 16; // Enough for products of degree 6: the sum over azimuths is then exact.
+        const N_AZIMUTHS: u32 = 16; // Sufficient for products of degree 6: the sum over azimuths is then exact.
         // Gauss-Legendre with 4 points is exact to degree 7 in z (Abramowitz and Stegun 1964, table 25.4).
         const HEIGHTS: [(f64, f64); 4] = [
             (-0.861_136_311_594_052_6, 0.347_854_845_137_453_9),
@@ -143,7 +144,8 @@ mod tests {
 
     #[test]
     fn basis_has_the_signs_of_published_splat_files() {
-        // Here every polynomial is positive before its constant (x > sqrt(3) y > 0, z large), so the constants' signs show.
+        // Here every polynomial is positive before its constant (x > sqrt(3) y > 0, z large), so the signs are those
+        // of the constants.
         let signs = basis(&Vector3::new(0.36, 0.2, 0.9).normalize()).map(f64::signum);
         let published = [1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1].map(f64::from);
         assert_eq!(signs, published);

@@ -1,4 +1,4 @@
-//! Gradients through a whole render, and what a render must keep to whatever the scene.
+//! Tests of the gradients of a whole render, and of invariants of rendering.
 
 use super::project::{MIN_ALPHA, project_at, row_share};
 use super::rasterize::{MAX_ALPHA, MIN_TRANSMITTANCE, threshold_margins};
@@ -7,12 +7,12 @@ use super::*;
 use crate::mismatches::Mismatches;
 
 const NUDGE: f64 = 1e-5;
-/// Rounding of a loss of a few tens, divided by the nudge.
+/// Rounding error of a loss of a few tens, divided by the nudge.
 const ABS: f64 = 2e-8;
-/// Truncation: the nudge squared times third derivatives, which small sharp splats make large.
+/// Truncation error: the nudge squared times third derivatives, which are large for small sharp splats.
 const REL: f64 = 1e-6;
 
-/// Compares every gradient of a render with central differences; decisions are held.
+/// Compares every gradient of a render with central differences; decisions are kept fixed.
 fn check_gradients(view: &View, splats: &[Splat], mismatches: &mut Mismatches) {
     let upstream = some_upstream(7, view);
     let decisions = decide(view, splats);
@@ -52,13 +52,13 @@ fn check_gradients(view: &View, splats: &[Splat], mismatches: &mut Mismatches) {
             view.linear_m[axis] += nudge;
             loss(&view, splats)
         };
-        let turned = |nudge: f64| {
+        let rotated = |nudge: f64| {
             let mut view = view.clone();
             view.angular_rad[axis] += nudge;
             loss(&view, splats)
         };
         let by_linear = (moved(NUDGE) - moved(-NUDGE)) / (2.0 * NUDGE);
-        let by_angular = (turned(NUDGE) - turned(-NUDGE)) / (2.0 * NUDGE);
+        let by_angular = (rotated(NUDGE) - rotated(-NUDGE)) / (2.0 * NUDGE);
         mismatches.check(format!("linear {axis}"), grad.view.linear_m[axis], by_linear, ABS, REL);
         mismatches.check(format!("angular {axis}"), grad.view.angular_rad[axis], by_angular, ABS, REL);
     }
@@ -93,20 +93,20 @@ fn gradients_match_central_differences_at_clamps() {
     let grad = render_backward(&view, &splats, &some_upstream(7, &view));
     assert!(
         grad.splats[1].sh.iter().all(|coeff| coeff[1] == 0.0 && coeff[0] != 0.0),
-        "a color below 0 passes nothing on"
+        "a color below 0 has no gradient"
     );
-    let center_of_3 = project(&view, &splats[3]).expect("it is seen");
+    let center_of_3 = project(&view, &splats[3]).expect("the splat is visible");
     let clamped = view.pixel_centers().zip(decide(&view, &splats).contributors).filter(|(center_px, contributors)| {
         contributors.contains(&3) && center_of_3.opacity * (-sigma(&center_of_3, center_px)).exp() > MAX_ALPHA
     });
     assert!(clamped.count() > 0, "no pixel reaches the bound of alpha");
-    for beside in [0, 2] {
-        assert!(grad.splats[beside].mean.iter().all(|v| v.abs() > 1e-6), "the splat beside the image matters to it");
+    for outside in [0, 2] {
+        assert!(grad.splats[outside].mean.iter().all(|v| v.abs() > 1e-6), "a splat outside the image has a gradient");
     }
 }
 
-/// A large splat beside the image (its Jacobian is clamped along x and, for another, y), one with a channel far below 0,
-/// one almost opaque (its alpha is clamped at some pixels), two at exactly the same place, and some more.
+/// A large splat outside the image whose Jacobian is clamped along x, another one for y, one with a channel far below
+/// 0, one almost opaque whose alpha is clamped at some pixels, two at the same position, and some more.
 fn clamped_scene(view: &View) -> Vec<Splat> {
     let world_from_camera = view.camera_from_world.inverse();
     let in_world = |x, y, z| (world_from_camera * nalgebra::Point3::new(x, y, z)).coords.into();
@@ -118,13 +118,13 @@ fn clamped_scene(view: &View) -> Vec<Splat> {
     splats[2].mean = in_world(-0.02 * z, -0.75 * z, z); // The image ends at y/z = -0.37, the clamp at -0.48.
     splats[2].log_scale = [-0.5, -0.7, -0.6];
     splats[3].opacity_logit = 20.0;
-    splats[3].log_scale = [0.0; 3]; // So wide that a pixel lies where alpha is above its bound.
+    splats[3].log_scale = [0.0; 3]; // Wide enough that alpha exceeds its bound at a pixel.
     splats[3].mean = in_world(0.02, 0.03, 2.4); // Behind the others.
     splats[5].mean = splats[4].mean;
     splats
 }
 
-/// Half the squared distance of a pixel from a placed splat, in standard deviations.
+/// Half the squared distance of a pixel from a projected splat, in standard deviations.
 fn sigma(projected: &Projected, center_px: &[f64; 2]) -> f64 {
     let [dx, dy] = [center_px[0] - projected.mean_px[0], center_px[1] - projected.mean_px[1]];
     0.5 * (projected.conic[0] * dx * dx + projected.conic[2] * dy * dy) + projected.conic[1] * dx * dy
@@ -152,11 +152,11 @@ fn wrong_gradient_is_detected() {
 
 #[test]
 fn each_parameter_has_a_gradient() {
-    // Else the comparison above would be one of zeros.
+    // Otherwise the comparison above would compare zeros.
     let view = rolling_view();
     let grad = render_backward(&view, &small_scene(4, 12), &some_upstream(7, &view));
     let visible: Vec<_> = grad.splats.iter().filter(|splat| splat.opacity_logit != 0.0).collect();
-    assert!(visible.len() >= 8, "only {} splats are seen", visible.len());
+    assert!(visible.len() >= 8, "only {} splats are visible", visible.len());
     for splat in visible {
         assert!(splat.params().iter().all(|&param| splat.get(param).abs() > 1e-9), "{splat:?}");
     }
@@ -170,7 +170,7 @@ fn static_camera_ignores_readout_time() {
     let still = render(&tilted_view(), &splats);
     let moving = render(&rolling_view(), &splats);
     assert_ne!(still.rgb, moving.rgb);
-    // In the middle row a moving camera sees what a camera at rest does.
+    // At the middle row, a moving camera has the same view as a static one.
     let view = View { angular_rad: [0.0; 3], ..rolling_view() };
     for splat in &splats {
         assert_eq!(project_at(&view, splat, 0.0).mean_px, project_at(&tilted_view(), splat, 0.0).mean_px);
@@ -179,9 +179,9 @@ fn static_camera_ignores_readout_time() {
 
 #[test]
 fn rolling_shutter_follows_the_camera_of_each_row() {
-    // The first-order motion of the reference against the exact pose at the splat's own row.
+    // Compares the reference's first-order motion with the exact pose at the splat's own row.
     let view = View { linear_m: [2e-3, -1e-3, 3e-3], angular_rad: [1e-3, -2e-3, 2e-3], ..tilted_view() };
-    const ABS_PX: f64 = 1e-3; // The second order of the motion: (2e-3)^2 times 31 px, and the row's own shift of 0.1 px.
+    const ABS_PX: f64 = 1e-3; // Second order of the motion: (2e-3)^2 times 31 px, and 0.1 px for the row's own shift.
     let mut mismatches = Mismatches::default();
     for (ix, splat) in small_scene(2, 8).iter().enumerate() {
         let share = row_share(&view, splat);
@@ -203,7 +203,8 @@ fn rolling_shutter_follows_the_camera_of_each_row() {
 
 #[test]
 fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
-    // A round splat 2 m away in a camera at the world's origin: its covariance follows from the slopes by hand.
+    // A round splat 2 m away from a camera at the world's origin: its covariance follows analytically from the
+    // ratios.
     let view = View { camera_from_world: Transform::identity(), ..tilted_view() };
     let scale_px: [f64; 2] = [0.1 * 31.0 / 2.0, 0.1 * 28.0 / 2.0];
     let splat = |mean| Splat {
@@ -216,19 +217,19 @@ fn ratios_beyond_the_margin_are_clamped_only_in_covariance() {
     // The margin is 0.15 of the image's side: to the right (28 - 13.3 + 4.2) / 31, upwards (10.4 + 3) / 28.
     let (right, up) = (18.9 / 31.0, -13.4 / 28.0);
     let mut mismatches = Mismatches::default();
-    for (slope_x, slope_y) in [(right - 0.01, up + 0.01), (right + 0.2, up + 0.01), (right - 0.01, up - 0.2)] {
+    for (ratio_x, ratio_y) in [(right - 0.01, up + 0.01), (right + 0.2, up + 0.01), (right - 0.01, up - 0.2)] {
         let projected =
-            project(&view, &splat([2.0 * slope_x, 2.0 * slope_y, 2.0])).expect("it is in front of the camera");
-        let (clamped_x, clamped_y) = (slope_x.min(right), slope_y.max(up));
+            project(&view, &splat([2.0 * ratio_x, 2.0 * ratio_y, 2.0])).expect("it is in front of the camera");
+        let (clamped_x, clamped_y) = (ratio_x.min(right), ratio_y.max(up));
         let cov_xx = scale_px[0].powi(2) * (1.0 + clamped_x * clamped_x) + 0.3;
         let cov_yy = scale_px[1].powi(2) * (1.0 + clamped_y * clamped_y) + 0.3;
         let cov_xy = scale_px[0] * scale_px[1] * clamped_x * clamped_y;
         let determinant = cov_xx * cov_yy - cov_xy * cov_xy;
         for (got, expected) in projected.conic.into_iter().zip([cov_yy, -cov_xy, cov_xx]) {
-            mismatches.check(format!("conic at {slope_x} {slope_y}"), got, expected / determinant, 1e-12, 1e-12);
+            mismatches.check(format!("conic at {ratio_x} {ratio_y}"), got, expected / determinant, 1e-12, 1e-12);
         }
-        mismatches.check("x", projected.mean_px[0], 31.0 * slope_x + 13.3, 1e-12, 1e-12);
-        mismatches.check("y", projected.mean_px[1], 28.0 * slope_y + 10.4, 1e-12, 1e-12);
+        mismatches.check("x", projected.mean_px[0], 31.0 * ratio_x + 13.3, 1e-12, 1e-12);
+        mismatches.check("y", projected.mean_px[1], 28.0 * ratio_y + 10.4, 1e-12, 1e-12);
     }
     mismatches.assert_none();
 }
@@ -253,7 +254,7 @@ fn extent_bounds_drawn_pixels_tightly() {
     for splat in small_scene(3, 20) {
         let projected = project(&view, &splat).expect("all are in front of the camera");
         let [a, b, c] = projected.conic;
-        // The smallest sigma along each side of the box is that at which alpha is just not drawn.
+        // At the smallest sigma along each side of the box, alpha equals the drawing threshold.
         let [half_x, half_y] = projected.extent_px;
         for (dx, dy) in [(half_x, -b / c * half_x), (-b / a * half_y, half_y)] {
             let alpha =
@@ -271,12 +272,12 @@ fn faint_and_near_splats_are_not_drawn() {
     splat.opacity_logit = logit(MIN_ALPHA * 0.999);
     assert_eq!(project(&view, &splat), None);
     splat.opacity_logit = logit(MIN_ALPHA * 1.001);
-    let depth = project(&view, &splat).expect("just bright enough").depth;
+    let depth = project(&view, &splat).expect("just opaque enough").depth;
     assert!(project(&View { near_m: depth * 1.001, ..view.clone() }, &splat).is_none());
     assert!(project(&View { near_m: depth * 0.999, ..view.clone() }, &splat).is_some());
     for broken in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
         splat.mean[0] = broken;
-        assert_eq!(project(&view, &splat), None, "a center at {broken}");
+        assert_eq!(project(&view, &splat), None, "center at {broken}");
     }
 }
 
@@ -284,7 +285,7 @@ fn faint_and_near_splats_are_not_drawn() {
 fn saturated_pixels_stop_compositing() {
     let view = tilted_view();
     let mut random = Random::new(3);
-    // Ten wide, almost opaque splats one behind the other, given back to front.
+    // Ten wide, almost opaque splats one behind another, listed back to front.
     let splats: Vec<_> = (0..10)
         .map(|ix| {
             let point_in_camera = nalgebra::Point3::new(0.0, 0.0, 2.0 - 0.1 * f64::from(ix));
@@ -312,7 +313,7 @@ fn equal_depths_are_drawn_in_index_order() {
     let view = tilted_view();
     let mut splats = small_scene(4, 2);
     splats[1].mean = splats[0].mean;
-    let center = decide(&view, &splats).contributors.into_iter().max_by_key(Vec::len).expect("there are pixels");
+    let center = decide(&view, &splats).contributors.into_iter().max_by_key(Vec::len).expect("the image has pixels");
     assert_eq!(center, [0, 1]);
 
     let empty = render(&view, &[]);
@@ -326,12 +327,13 @@ fn margins_identify_ambiguous_pixels() {
     let (view, splats) = (tilted_view(), small_scene(1, 12));
     let margins = threshold_margins(&view, &splats);
     let before = decide(&view, &splats);
-    // Raising every logit by a tenth changes alphas by up to a tenth: it may change a pixel's contributors only where the margin is as small.
+    // Adding 0.1 to every logit changes alphas by up to a tenth. This may change a pixel's contributors only if its
+    // margin is as small.
     let brighter: Vec<_> = splats.iter().map(|splat| splat.nudged(scene::SplatParam::OpacityLogit, 0.1)).collect();
     let after = decide(&view, &brighter);
     let changed: Vec<_> =
         (0..view.n_pixels()).filter(|&ix| before.contributors[ix] != after.contributors[ix]).collect();
-    assert!(!changed.is_empty(), "the nudge is too small to show anything");
+    assert!(!changed.is_empty(), "the nudge changes no decision");
     assert!(
         changed.iter().all(|&ix| margins[ix] < 0.11),
         "{:?}",
@@ -340,7 +342,7 @@ fn margins_identify_ambiguous_pixels() {
     let n_safe_in_f32 = margins.iter().filter(|&&margin| margin > 1e-4).count();
     assert!(n_safe_in_f32 > view.n_pixels() * 9 / 10, "{n_safe_in_f32} of {} pixels", view.n_pixels());
 
-    // Two splats at almost the same depth: where both are drawn, their order is not safe.
+    // Two splats at almost the same depth: their order is ambiguous wherever both are drawn.
     let mut pair = splats[..2].to_vec();
     pair[1].mean = pair[0].mean.map(|along| along + 1e-6);
     let margins = threshold_margins(&view, &pair);

@@ -1,5 +1,5 @@
-//! Where alignment keeps something the keyframes are corrected and training begins anew: splats learned from wrong poses would
-//! have to be unlearned.
+//! Alignment of keyframes during training. If alignment finds corrections, training restarts from corrected
+//! keyframes, because splats trained on wrong poses would have to be corrected, too.
 
 use super::SplatTrainer;
 use crate::Error;
@@ -11,7 +11,7 @@ use crate::splat::seed::Seeder;
 use crate::splat::views::TrainView;
 
 impl SplatTrainer {
-    /// Steps that may be taken before alignment is due.
+    /// Number of steps until alignment is due.
     pub(super) fn steps_to_alignment(&self) -> u64 {
         if self.alignment_task.is_done() { u64::MAX } else { self.alignment_step().saturating_sub(self.step).max(1) }
     }
@@ -20,7 +20,7 @@ impl SplatTrainer {
         align::alignment_step(self.gpu.is_software(), self.options.n_planned_steps)
     }
 
-    /// Begins alignment, or takes its result.
+    /// Starts alignment, or applies its result when due.
     pub(super) fn align_when_due(&mut self) -> Result<(), Error> {
         if self.alignment_task.is_requested() {
             let views = self.views.iter().map(|view| view.keyframe.clone());
@@ -36,13 +36,13 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Throws the splats away and starts from corrected keyframes.
+    /// Discards the splats and restarts training from corrected keyframes.
     fn restart(&mut self) -> Result<(), Error> {
         self.finish_in_flight()?;
-        log::info!("training begins anew with corrected cameras");
+        log::info!("restarting training with corrected cameras");
         let poses = ParamSet { image_poses: true, ..ParamSet::default() };
         if self.alignment_task.result().is_some_and(Alignment::has_image_poses) && self.trials.remove_candidate(poses) {
-            self.cameras.enable(poses); // Depth tells them to a few millimetres; the scene tells them better.
+            self.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
         }
         self.step_millis = 0.0;
         self.passes.clear_bindings();

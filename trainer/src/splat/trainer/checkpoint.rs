@@ -1,4 +1,4 @@
-//! The state of a splat model in training: all that decides how it goes on, bit for bit.
+//! Checkpoints of a splat model in training. They contain all state that affects further training, bit for bit.
 
 use super::{Seeding, Snapshot, SplatTrainer};
 use crate::align::{Alignment, AlignmentTask};
@@ -24,14 +24,14 @@ const ARRAYS: [&str; N_PLANAR_BUFFERS] =
 const SEED_POSITIONS: &str = "seed_positions";
 const SEED_CELLS: &str = "seed_cells";
 const CAMERA_PARAMS: &str = "camera_params";
-/// Prefix of the array names of the other half of a trial in progress.
+/// Prefix of the array names of the other state of a trial in progress.
 const OTHER: &str = "other_";
 
-/// All but the arrays.
+/// The state except for the arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SavedState {
-    /// As they were settled for the adapter.
+    /// Options with the values chosen for the adapter.
     options: SplatOptions,
     step: u64,
     schedule_start: u64,
@@ -44,17 +44,17 @@ struct SavedState {
     scene_size_m: f64,
     has_depth: bool,
     n_seeds: u64,
-    /// What is learned from, in order: the order decides which view comes when.
+    /// Training views in order, which determines the order of training.
     views: Vec<KeyframeSignature>,
-    /// Which of them wait to be given splats.
+    /// Indices of the views that wait for their splats.
     unseeded: Vec<usize>,
-    /// Where the terms of cameras and images lie.
+    /// Slots of the parameters of cameras and images.
     slots: CameraSlots,
-    /// What is learned about cameras, and what is still to be tried.
+    /// Camera parameters being optimized, and the trials that remain.
     params: ParamSet,
     remaining_trials: RemainingTrials,
     finished_trials: Vec<Trial>,
-    /// Whether alignment is settled, and what it found; views are told as it corrected them.
+    /// Whether alignment is finished, and its result. The signatures of the views are those of corrected keyframes.
     is_aligned: bool,
     alignment: Option<Alignment>,
     /// A trial in progress.
@@ -62,20 +62,20 @@ struct SavedState {
     trial: Option<TrialState>,
 }
 
-/// A trial in progress: the half in training is the state above, and the arrays of the other half have a prefix.
+/// A trial in progress. The half in training is the state above; the arrays of the other state have a prefix.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct TrialState {
     candidate: Candidate,
     until: u64,
     scored: Vec<ImageKey>,
-    /// Scores of the first half, once it is over.
+    /// Scores of the first half, once it is finished.
     baseline_scores: Option<Vec<(ImageKey, f64)>>,
     arrivals: Vec<ArrivalState>,
     other: OtherHalf,
 }
 
-/// Camera and stamp, nanoseconds.
+/// Camera name and stamp in nanoseconds.
 type ImageKey = (String, i64);
 
 /// A keyframe that arrived in the first half of a trial. In the second half it is not a view until it arrives again.
@@ -141,7 +141,7 @@ impl TrialState {
         }
     }
 
-    /// The trial, with the state of its other half and the keyframes that arrived.
+    /// Restores the trial with its other state and the keyframes that arrived.
     fn restored(
         self,
         gpu: &Gpu,
@@ -181,7 +181,7 @@ impl TrialState {
     }
 }
 
-/// Splats of size `[n_splats, capacity, sh_degree, active_degree]`, from the arrays with this prefix.
+/// Reads splats of size `[n_splats, capacity, sh_degree, active_degree]` from the arrays with this prefix.
 fn read_splats(
     gpu: &Gpu,
     checkpoint: &Checkpoint,
@@ -189,7 +189,9 @@ fn read_splats(
     [n_splats, capacity, sh_degree, active_degree]: [u32; 4],
 ) -> Result<SplatBuffers, Error> {
     if n_splats > capacity || active_degree > sh_degree || sh_degree > 3 {
-        return Err(invalid_state(format!("{n_splats} splats of degree {active_degree} do not fit")));
+        return Err(invalid_state(format!(
+            "{n_splats} splats of degree {active_degree} do not fit a capacity of {capacity} and degree {sh_degree}"
+        )));
     }
     let mut splats = SplatBuffers::new(gpu, capacity, sh_degree)?;
     for (name, (buffer, n_planes, bytes)) in ARRAYS.into_iter().zip(splats.planes()) {
@@ -208,7 +210,8 @@ fn read_splats(
 
 fn read_seeds(checkpoint: &Checkpoint, prefix: &str, n_seeds: u64) -> Result<Seeder, Error> {
     let array = |name: &str, bytes: u64| {
-        let n_bytes = n_seeds.checked_mul(bytes).ok_or_else(|| invalid_state(format!("{n_seeds} seeds")))?;
+        let n_bytes =
+            n_seeds.checked_mul(bytes).ok_or_else(|| invalid_state(format!("{n_seeds} seeds are too many")))?;
         checkpoint.array(&format!("{prefix}{name}"), n_bytes)
     };
     Ok(Seeder::from_bytes(array(SEED_POSITIONS, Seeder::POSITION_BYTES)?, array(SEED_CELLS, Seeder::CELL_BYTES)?))
@@ -253,8 +256,8 @@ impl PendingArrays {
 }
 
 impl SplatTrainer {
-    /// Takes the state as it is after every step queued so far. The model is only copied within the GPU here;
-    /// [`PendingCheckpoint::finish`], on any thread, brings it to the host.
+    /// Captures the state after all steps queued so far. The model is only copied within the GPU here;
+    /// [`PendingCheckpoint::finish`] copies it to the host, on any thread.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.seed_from_depth()?;
         self.finish_in_flight()?;
@@ -304,15 +307,22 @@ impl SplatTrainer {
         }))
     }
 
-    /// Goes on from a checkpoint as if training had not stopped. What it had learned from must be among `keyframes`; the
-    /// others come back, to be pushed or kept for testing.
+    /// Resumes from a checkpoint as if training had not been interrupted. All keyframes that were trained on must be
+    /// among `keyframes`. Returns the other keyframes, to be pushed or kept for testing.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the checkpoint is invalid, if keyframes are missing or differ, or if the GPU has too little memory.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
         if checkpoint.method != METHOD {
-            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!(
+                "it was written by the method {:?}, expected {METHOD:?}",
+                checkpoint.method
+            )));
         }
         let state: SavedState =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
@@ -338,7 +348,8 @@ impl SplatTrainer {
         let unseeded = state.unseeded.iter().map(|ix| views.get(*ix).cloned());
         let unseeded =
             unseeded.collect::<Option<Vec<_>>>().ok_or_else(|| invalid_state("a view is missing".to_owned()))?;
-        let step = u32::try_from(state.step).map_err(|_| invalid_state(format!("step {}", state.step)))?;
+        let step = u32::try_from(state.step)
+            .map_err(|_| invalid_state(format!("step {} does not fit into 32 bits", state.step)))?;
 
         let mut trainer = Self::new(gpu, state.options)?;
         let size = [state.n_splats, state.capacity, state.sh_degree, state.active_degree];
@@ -367,7 +378,7 @@ impl SplatTrainer {
     }
 }
 
-/// One buffer on its way to the host.
+/// One buffer while it is copied to the host.
 struct Planes {
     read: Option<PendingRead>,
     n_planes: usize,
@@ -376,7 +387,7 @@ struct Planes {
 }
 
 impl Planes {
-    /// The used part of every plane, one after the other.
+    /// The used parts of all planes, concatenated.
     fn finish(self, gpu: &Gpu) -> Result<Vec<u8>, Error> {
         let Some(read) = self.read else { return Ok(Vec::new()) };
         let all: Vec<u8> = read.finish(gpu)?;

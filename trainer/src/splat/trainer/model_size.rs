@@ -1,4 +1,5 @@
-//! How large the model has to be: what each splat contributes, what remains without the least of them, what colors need.
+//! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
+//! degrees.
 
 use super::{LearnedView, SplatTrainer, VIEWS_AT_ONCE};
 use crate::Error;
@@ -6,11 +7,11 @@ use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::LearnPipelines;
 use crate::splat::params::{Gathering, status};
 
-/// Most views that tell what a splat contributes.
+/// Maximum number of views over which contributions are summed.
 const MAX_VIEWS: usize = 64;
 
 impl SplatTrainer {
-    /// What each splat contributes to the views: the sum of its blending weights, in pixels.
+    /// Contribution of each splat to the views: the sum of its blending weights, in pixels.
     pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
         let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
@@ -19,7 +20,7 @@ impl SplatTrainer {
             self.make_space(*view_ix, 0)?;
         }
         if let Some(image_buffers) = &self.training_buffers {
-            // An error of one in every pixel, and no slope.
+            // An error of one at every pixel, and a gradient of zero.
             self.gpu.write(
                 &image_buffers.pixel_totals,
                 0,
@@ -37,7 +38,7 @@ impl SplatTrainer {
                 let LearnedView { view, .. } = self.learned_view(&mut list, learn, (view_ix, 0))?;
                 view.draw(&mut list, &self.draw);
                 view.backward(&mut list, learn);
-                view.contribute(&mut list, learn, &contributions); // Nothing, where a buffer was too small.
+                view.contribute(&mut list, learn, &contributions); // Adds nothing if a buffer was too small.
                 list.submit(&self.gpu);
                 self.passes = list;
                 let counters: Vec<u32> = self.gpu.read(&self.learn_status, status::LEN)?;
@@ -51,7 +52,7 @@ impl SplatTrainer {
         self.gpu.read(&contributions, self.splats.n_splats as usize)
     }
 
-    /// Keeps the `n_kept` splats that contribute most, in their order.
+    /// Keeps the `n_kept` splats that contribute most, without changing their order.
     pub(super) fn keep_most_contributing(&mut self, n_kept: u32) -> Result<(), Error> {
         let learn = self.learn()?;
         let contributions = self.contributions(&learn)?;
@@ -66,7 +67,7 @@ impl SplatTrainer {
         Ok(())
     }
 
-    /// Goes on with colors of a lower degree.
+    /// Lowers the degree of the colors.
     pub(super) fn lower_degree(&mut self, sh_degree: u32) -> Result<(), Error> {
         self.splats = self.splats.resized(&self.gpu, self.splats.capacity, sh_degree)?;
         self.passes.clear_bindings();
@@ -74,10 +75,10 @@ impl SplatTrainer {
     }
 }
 
-/// The splats of the given indices with their moments.
+/// Copies the splats with the given indices, and their moments.
 fn gather_splats(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
     let (gpu, splats) = (&trainer.gpu, &trainer.splats);
-    let n_kept = u32::try_from(kept.len()).expect("no more than there are splats");
+    let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
     let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
     let indices = gpu.storage_with("splat.kept", bytemuck::cast_slice(kept))?;
     for ((from, n_planes, bytes), (to, _, _)) in splats.planes().iter().zip(fewer.planes()) {
@@ -131,7 +132,7 @@ mod tests {
         (trained(CountPolicy::Tested, &keyframes, gpu, n_steps), keyframes)
     }
 
-    /// What blends into a pixel and what it lets through sum to one.
+    /// At each pixel, the blending weights and the transmittance sum to one.
     #[test]
     fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
@@ -160,14 +161,14 @@ mod tests {
         sorted.sort_by(|a, b| b.total_cmp(a));
         let min_kept = sorted[n_kept as usize - 1];
         let kept: Vec<usize> = (0..contributions.len()).filter(|ix| contributions[*ix] >= min_kept).collect();
-        assert_eq!(kept.len(), n_kept as usize, "no two contribute the same here");
+        assert_eq!(kept.len(), n_kept as usize, "contributions are distinct");
         for (before, after) in before.iter().zip(&after) {
             let expected: Vec<u32> = kept.iter().flat_map(|ix| before[*ix].iter().copied()).collect();
             assert_eq!(expected, after.concat());
         }
     }
 
-    /// Of every plane of every buffer, the words of each splat.
+    /// The words of each splat, for every plane of every buffer.
     fn words(trainer: &SplatTrainer) -> Vec<Vec<Vec<u32>>> {
         let splats = &trainer.splats;
         let mut all = Vec::new();
@@ -187,7 +188,7 @@ mod tests {
         all
     }
 
-    /// The same images with noise of up to a quarter of the range: no model can score much more than 21 dB on them.
+    /// Adds noise of up to a quarter of the range to the images: no model can score much more than 21 dB on them.
     fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let noisy = |keyframe: &Arc<Keyframe>| {
             let mut state = keyframe.stamp.0.cast_unsigned();
@@ -204,11 +205,11 @@ mod tests {
         keyframes.iter().map(noisy).collect()
     }
 
-    /// Where noise hides the details, few splats are enough, and colors that do not change with the direction.
+    /// Noise hides the details, so few splats suffice, with colors that do not depend on the direction.
     #[test]
     fn model_size_fits_the_scene_and_is_reproducible() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-        let clean = n_keyframes(&gpu, 36, false); // Begins with a cloud as large as the cap.
+        let clean = n_keyframes(&gpu, 36, false); // Starts with a cloud as large as the limit.
         let keyframes = noisy(&clean);
         let mut tested = trained(CountPolicy::Tested, &keyframes, gpu.clone(), 1750);
         let mut again = trained(CountPolicy::Tested, &keyframes, gpu, 1750);
@@ -233,7 +234,7 @@ mod tests {
         assert!(reached > ceiling - 1.5, "{reached} of {ceiling} dB, {reported:?}");
     }
 
-    /// While half of the splats are being tried, people see all of them.
+    /// While a trial halves the splats, viewers still see all of them.
     #[test]
     fn running_trial_is_not_displayed() {
         let (mut trainer, keyframes) = some_trained(400);

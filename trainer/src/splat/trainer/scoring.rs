@@ -1,4 +1,4 @@
-//! How the model as it learns does on images that it has not learned from.
+//! Scores of the model in training on images that it was not trained on.
 
 use super::{CameraCorrections, Learn, RequestedParts, SplatTrainer, VIEWS_AT_ONCE, corrected_camera};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
@@ -11,7 +11,7 @@ use crate::{Error, Keyframe};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// Sums over the pixels of a picture and an image, of each color.
+/// Sums over the pixels of a picture and an image, for one color.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Products {
     picture_picture: u64,
@@ -20,24 +20,24 @@ struct Products {
     n_visible: u64,
 }
 
-/// A keyframe and how the picture of it compares.
+/// A keyframe and the sums of its comparison with a picture.
 type ScoredKeyframe = (Arc<Keyframe>, [Products; 3]);
 
-/// PSNR, dB, of a picture whose colors are multiplied; `None` where nothing was seen. What would be brighter than white counts
-/// as it is.
+/// PSNR in dB of a picture whose colors are multiplied by gains; `None` if all pixels are masked. Values above white
+/// are not clamped.
 fn psnr_with(products: &[Products; 3], gains: [f64; 3]) -> Option<f64> {
     let n: u64 = products.iter().map(|color| color.n_visible).sum();
     let square = |(color, gain): (&Products, f64)| {
         gain * gain * color.picture_picture as f64 - 2.0 * gain * color.picture_image as f64 + color.image_image as f64
     };
     let squares: f64 = products.iter().zip(gains).map(square).sum();
-    // One level of one color: nothing is better.
+    // A squared error of at least one bounds the score: one level of one color at one pixel.
     (n > 0).then(|| 10.0 * (255.0f64.powi(2) * n as f64 / squares.max(1.0)).log10())
 }
 
-/// Logarithms of the gains that bring a picture nearest to an image.
+/// Logarithms of the gains that best match a picture to an image.
 fn log_gains(products: &[Products; 3]) -> [f64; 3] {
-    const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: what asks for more is no exposure.
+    const MAX_LOG_GAIN: f64 = 1.5; // Two photographic stops: larger gains are not caused by exposure.
     products.map(|color| match (color.picture_image, color.picture_picture) {
         (0, _) | (_, 0) => 0.0,
         (with_image, picture_only) => (with_image as f64 / picture_only as f64).ln().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN),
@@ -47,7 +47,7 @@ fn log_gains(products: &[Products; 3]) -> [f64; 3] {
 /// Size of a workgroup's sums in `score.wgsl`, bytes.
 pub(super) const PRODUCTS_BYTES: usize = 48;
 
-/// Adds the comparison of a picture with an image to the list; returns how many workgroups write sums.
+/// Records the comparison of a picture with an image; returns the number of workgroups that write sums.
 pub(super) fn compare(
     gpu: &Gpu,
     passes: &mut Passes,
@@ -78,7 +78,7 @@ fn sum_up(sums: &[[u32; 4]]) -> [Products; 3] {
     })
 }
 
-/// PSNR in dB with the same bits as [`crate::eval::psnr`]: integer sums have no rounding.
+/// PSNR in dB, bit-identical to [`crate::eval::psnr`] because integer sums are exact.
 fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
     let n: u64 = products.iter().map(|color| color.n_visible).sum();
     if n == 0 {
@@ -91,8 +91,8 @@ fn psnr_as_evaluated(products: &[Products; 3]) -> Result<f64, Error> {
 }
 
 impl SplatTrainer {
-    /// PSNR of the picture that viewers see of a view against a keyframe's image of the same size; `None` before training has
-    /// begun.
+    /// PSNR of the displayed picture of a view against a keyframe's image of the same size; `None` before training
+    /// has started.
     pub(super) fn psnr_of_view(
         &mut self,
         camera: &Camera,
@@ -122,7 +122,7 @@ impl SplatTrainer {
         psnr_as_evaluated(&products).map(Some)
     }
 
-    /// PSNR of keyframes that were not learned from, dB; of many, some spread over them.
+    /// PSNR of the validation keyframes, dB; of at most a limited number, spread evenly over them.
     pub(super) fn score_validation(&mut self) -> Result<Scores, Error> {
         let score = |(keyframe, products): &ScoredKeyframe| {
             Some(((keyframe.camera.clone(), keyframe.stamp), psnr_with(products, [1.0; 3])?))
@@ -130,15 +130,15 @@ impl SplatTrainer {
         Ok(self.compare_validation()?.iter().filter_map(score).collect())
     }
 
-    /// Scores the held-back keyframes as they are, and with the gains of the images before and after them in time; decides
-    /// whether gains are learned.
+    /// Scores the validation keyframes with and without gains, which are interpolated between the images before and
+    /// after them in time. Enables gains if they are significant.
     pub(super) fn try_gains(&mut self) -> Result<(), Error> {
         let validation = self.compare_validation()?;
         let corrections = self.learned_corrections()?;
         let neighbors: Vec<Vec<usize>> = validation.iter().map(|(keyframe, _)| self.neighbors(keyframe)).collect();
         let mut known: BTreeMap<usize, [f64; 3]> = BTreeMap::new();
         self.add_gains(&mut known, neighbors.iter().flatten().copied().collect(), &corrections)?;
-        // What all images ask for is the brightness of the model, not of an image.
+        // The mean over all images is an error of the model's brightness, not of an image.
         let mean = |color: usize| known.values().map(|gains| gains[color]).sum::<f64>() / known.len().max(1) as f64;
         let mean = [0, 1, 2].map(mean);
         let (mut baseline_db, mut variant_db) = (Vec::new(), Vec::new());
@@ -175,7 +175,7 @@ impl SplatTrainer {
         before.into_iter().chain(after).map(|(ix, _)| ix).collect()
     }
 
-    /// Adds the missing gains of these views.
+    /// Computes the missing gains of these views.
     fn add_gains(
         &mut self,
         known: &mut BTreeMap<usize, [f64; 3]>,
@@ -205,7 +205,7 @@ impl SplatTrainer {
         let corrections = self.learned_corrections()?;
         let mut compared = Vec::new();
         for id in self.trials.scored() {
-            let Some(validation) = self.trials.validation(&id) else { continue }; // Evicted since.
+            let Some(validation) = self.trials.validation(&id) else { continue }; // Removed in the meantime.
             let (keyframe, image) = (validation.keyframe.clone(), validation.image.take());
             self.draw_keyframe(&keyframe, &corrections)?;
             let image = match image {
@@ -222,7 +222,7 @@ impl SplatTrainer {
         Ok(compared)
     }
 
-    /// Draws the model as it learns where a keyframe was taken.
+    /// Draws the model in training from the camera of a keyframe.
     fn draw_keyframe(&mut self, keyframe: &Keyframe, corrections: &CameraCorrections) -> Result<(), Error> {
         let lens = corrected_camera(corrections, keyframe);
         let camera = Camera {
@@ -256,7 +256,7 @@ impl<'a> RenderedView<'a> {
         }
     }
 
-    /// Sums over the pixels of it and of the image that it shows.
+    /// Sums of the comparison with a keyframe's image.
     fn compare(&self, passes: &mut Passes, keyframe: &Keyframe, image: &Buffer) -> Result<[Products; 3], Error> {
         let n_groups = compare(self.gpu, passes, self.score, (self.view, self.image_buffers), keyframe.size_px, image);
         let read =
@@ -310,7 +310,8 @@ mod tests {
         let mut trainer = SplatTrainer::new(gpu, options()).unwrap();
         trainer.push(keyframes[1].clone()).unwrap();
         train(&mut trainer, 20);
-        // A masked image at the edge of a workgroup, followed by complete images in the same buffer.
+        // A masked image whose mask starts and ends within workgroups, followed by complete images in the same
+        // buffer.
         let mut rgba = keyframes[0].rgba_srgb.to_vec();
         rgba.as_chunks_mut::<4>().0[250..900].iter_mut().for_each(|pixel| pixel[3] = 0);
         let masked = Keyframe { rgba_srgb: rgba.into(), ..keyframes[0].as_ref().clone() };
@@ -333,7 +334,7 @@ mod tests {
         assert_eq!(loaded.psnr(&request_for(&same), &same).unwrap(), None, "the training pipelines are not compiled");
     }
 
-    /// From the middle of the capture on the images are darker by a stop.
+    /// Darkens the images by one stop from the middle of the capture on.
     fn with_exposure_step(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let darken = |(ix, keyframe): (usize, &Arc<Keyframe>)| {
             let mut rgba = keyframe.rgba_srgb.to_vec();
@@ -358,7 +359,7 @@ mod tests {
         let mut trainer = trained(&stepped, gpu, 700);
         assert!(trainer.trials()[0].kept && trainer.trials()[0].gain_db > 1.0, "{:?}", trainer.trials());
         let gains = |trainer: &mut SplatTrainer, ix: usize| trainer.calibrated_camera(&stepped[ix]).unwrap().gains[1];
-        // Further from the step no image sees what was seen with the other exposure.
+        // Away from the step, no image shows a part of the scene that was captured with the other exposure.
         let ratio = gains(&mut trainer, 17) / gains(&mut trainer, 18);
         assert!((1.6..2.4).contains(&ratio), "{ratio}");
     }
