@@ -227,7 +227,7 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        list.clear_bindings(); // These terms are used once.
+        list.clear_bindings(); // This buffer of image parameters is used once.
         let ray_colors: Vec<[f32; 4]> = gpu.read(&kept.ray_colors, rays.len())?;
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
         let background = background(options, 0);
