@@ -118,5 +118,8 @@ fn samples_lie_in_occupied_cells_within_limit() {
         }
     }
     mismatches.assert_none();
-    assert!(n_compared > 100 && n_thinned > 20, "only {n_compared} rays could be compared, {n_thinned} of them thinned");
+    assert!(
+        n_compared > 100 && n_thinned > 20,
+        "only {n_compared} rays could be compared, {n_thinned} of them thinned"
+    );
 }

@@ -44,7 +44,8 @@ impl Canvas {
             backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("nerf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("nerf.depths", 4 * n_pixels)?,
-            image_params: gpu.storage("nerf.picture_image_params", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
+            image_params: gpu
+                .storage("nerf.picture_image_params", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
             n_pixels,
         })

@@ -152,7 +152,10 @@ impl NerfModel {
         let Some(candidate) = self.trials.remaining.front().copied() else { return Ok(()) };
         match std::mem::take(&mut self.trials.trial_phase) {
             TrialPhase::Waiting if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
-                log::info!("{candidate}: no trial: {} validation images found, at least {MIN_VALIDATION_IMAGES} needed", self.validation_images.len());
+                log::info!(
+                    "{candidate}: no trial: {} validation images found, at least {MIN_VALIDATION_IMAGES} needed",
+                    self.validation_images.len()
+                );
                 self.end_trials();
             }
             TrialPhase::Waiting => match self.rule_out(candidate)? {
@@ -443,10 +446,7 @@ mod tests {
         let baseline = [1e-3; 6];
         assert!(measure_gain(POSES, &baseline.map(|error| 0.8 * error), &baseline).kept);
         assert!(!measure_gain(POSES, &baseline, &baseline).kept);
-        assert!(
-            !measure_gain(POSES, &baseline.map(|error| 0.999 * error), &baseline).kept,
-            "below the minimum gain"
-        );
+        assert!(!measure_gain(POSES, &baseline.map(|error| 0.999 * error), &baseline).kept, "below the minimum gain");
         let mixed = [0.5e-3, 2e-3, 0.5e-3, 2e-3, 0.5e-3, 1.2e-3];
         assert!(!measure_gain(POSES, &mixed, &baseline).kept, "not significant");
         assert!(!measure_gain(POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few images");

@@ -50,7 +50,13 @@ fn ray_gradients_match_central_differences() {
             };
             let along = |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
             let translated = |step: f64| moved(ImagePose { translation: along(step), ..ImagePose::default() });
-            mismatches.check(format!("{seed}: translation {axis}"), pose.translation[axis], central(translated), ABS, REL);
+            mismatches.check(
+                format!("{seed}: translation {axis}"),
+                pose.translation[axis],
+                central(translated),
+                ABS,
+                REL,
+            );
             let rotated = |step: f64| moved(ImagePose { rotation_rad: along(step), ..ImagePose::default() });
             mismatches.check(format!("{seed}: rotation {axis}"), pose.rotation_rad[axis], central(rotated), ABS, REL);
         }
