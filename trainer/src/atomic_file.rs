@@ -29,7 +29,7 @@ pub fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()
         }
     });
     if written.is_err() {
-        let _ = std::fs::remove_file(&partial); // Incomplete, and it takes space.
+        let _ = std::fs::remove_file(&partial); // An incomplete file only takes up space.
     }
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }

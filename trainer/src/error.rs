@@ -151,7 +151,7 @@ pub enum Error {
     LpipsWeights {
         /// The file.
         path: PathBuf,
-        /// What is missing or wrong.
+        /// Cause.
         source: candle_core::Error,
     },
     /// The network of LPIPS failed.

@@ -63,7 +63,7 @@ pub trait Method {
     fn step(&mut self, n: u64) -> Result<u64, Error>;
     /// Whether more steps would do nothing until a keyframe arrives.
     fn is_idle(&self) -> bool;
-    /// What [`Progress::primitives`] counts, in the singular.
+    /// Name of the items that [`Progress::primitives`] counts, in the singular.
     fn primitive(&self) -> &'static str;
     /// Waits for queued updates and returns the total number of updates, including those of rejected trials. Unlike
     /// [`Progress::step`], it never decreases.

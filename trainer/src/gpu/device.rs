@@ -18,7 +18,7 @@ const CHECK_PERIOD: Duration = Duration::from_millis(100);
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.
     pub optional_features: bool,
-    /// Whether cooperative matrices are among them.
+    /// Whether cooperative matrices may be used.
     pub matrices: bool,
     /// Whether float atomics may be used. Their order of additions varies between runs, so training does not use them.
     pub float_atomics: bool,
@@ -153,10 +153,10 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 
 /// How the allocator divides the driver's memory among buffers.
 ///
-/// By default it cuts buffers out of blocks of 128 MiB and more. Buffers that grow with the scene leave holes in these blocks, and a
-/// block returns to the system only when it is empty: in a long run, the blocks took more than twice the bytes in use. On a software
-/// adapter that is host memory, so there each large buffer gets a block of its own, which costs no more than a `malloc`. A driver of
-/// a real GPU takes far longer for that and limits the number of blocks.
+/// By default, it places buffers in shared blocks of 128 MiB or more. Buffers that grow with the scene leave holes in these
+/// blocks, and a block returns to the system only when it is empty: in a long run, the blocks took more than twice the bytes in
+/// use. On a software adapter, blocks are host memory. There, each large buffer gets its own block, which costs no more than a
+/// `malloc`. The driver of a real GPU is far slower at allocating blocks and limits their number.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {

@@ -1,6 +1,6 @@
 // network_tile: memory layout of a field's networks while a workgroup processes 32 samples at once.
 //
-// A row holds one number of all 32 samples, four samples a vec4. All widths are multiples of 16.
+// A row holds one number of all 32 samples, four samples per vec4. All widths are multiples of 16.
 //
 // twin      nerf/reference/network.rs
 

@@ -21,13 +21,13 @@ const ONE_IMAGE_FRAC: f64 = 0.1;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VoxelGrid {
-    /// Edge of a voxel, metres.
+    /// Edge of a voxel, meters.
     pub voxel_m: f64,
     /// Minimum truncation, meters.
     pub truncation_m: f64,
     /// Maximum truncation, and the distance that the largest stored number represents, meters.
     pub scale_m: f64,
-    /// Standard deviation of depth at 1 m, metres.
+    /// Standard deviation of depth at 1 m, meters.
     pub noise_per_m2: f64,
     /// Readings beyond this depth are ignored, meters.
     pub max_depth_m: f64,

@@ -100,7 +100,7 @@ fn removed_object_is_carved() {
 /// Observes a ball `n_with` times, then observes the scene without it until its mesh is gone. Returns the number of
 /// those later observations: for its upper part, and for the part within five voxels of the floor.
 fn n_views_until_removed(n_with: usize) -> [usize; 2] {
-    const MAX_LOOKS: usize = 200;
+    const MAX_VIEWS: usize = 200;
     let [with_ball, without_ball] = [&[scenes::ball(BALL_CENTER), scenes::floor()][..], &[scenes::floor()]]
         .map(|shapes| scenes::ring(shapes, BALL_CENTER, 4));
     let mut n_pushed = 0;
@@ -125,8 +125,8 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
         add_view(&mut model, &with_ball);
     }
     let before = n_left(&mut model);
-    let mut n_views = [MAX_LOOKS; 2];
-    for n in 1..=MAX_LOOKS {
+    let mut n_views = [MAX_VIEWS; 2];
+    for n in 1..=MAX_VIEWS {
         add_view(&mut model, &without_ball);
         let now = n_left(&mut model);
         for part in 0..2 {
@@ -134,7 +134,7 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
                 n_views[part] = n_views[part].min(n);
             }
         }
-        if n_views.iter().all(|n| *n < MAX_LOOKS) {
+        if n_views.iter().all(|n| *n < MAX_VIEWS) {
             break;
         }
     }

@@ -5,7 +5,7 @@
 pub struct Network {
     /// Number of inputs, width of each hidden layer, and number of outputs.
     pub sizes: Vec<usize>,
-    /// Layer after layer, `[outputs, inputs]` each.
+    /// Layer by layer, `[outputs, inputs]` each.
     pub weights: Vec<f64>,
 }
 

@@ -138,7 +138,7 @@ pub struct Weights {
     pub near: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// So close to a distance, per itself and at least, light may be held back.
+    /// Opacity this close to the measured distance is allowed: a fraction of the distance, and an offset added to it.
     pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],

@@ -24,7 +24,7 @@ fn vertex_positions(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
     mesh.positions_m.iter().map(move |vertex| (Vector3::from(vertex.map(f64::from)) + origin).into())
 }
 
-/// Mean and largest distance of the vertices from a shape, metres.
+/// Mean and largest distance of the vertices from a shape, meters.
 fn errors_m(mesh: &Mesh, shape: &TestShape) -> (f64, f64) {
     let errors: Vec<f64> = vertex_positions(mesh).map(|vertex| shape.distance_m(&vertex).abs()).collect();
     (errors.iter().sum::<f64>() / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
