@@ -31,7 +31,7 @@ const OCCUPANCY_DECAY: f32 = 0.7;
 const UPDATED_FRAC: f64 = 0.25;
 /// Maximum number of samples of a training ray, as a multiple of the mean.
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
-/// Samples per round for a ray of a picture; `ROUND` of `find_samples.wgsl`.
+/// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
 /// Rounds before checking whether any ray is unfinished, and the maximum number of checks, which limits the length of
 /// rays.

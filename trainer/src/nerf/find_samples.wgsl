@@ -1,8 +1,8 @@
-// find_samples: the next samples of a picture's rays, at most ROUND each.
+// find_samples: the next samples of a picture's rays, at most MAX_SAMPLES_PER_ROUND each.
 //
 // threads   one per ray
 // reads     march, occupied (one bit per cell)
-// writes    rays (next_segment, first_sample, n_samples), found (n_samples, zero before), spans, points [n_samples]
+// writes    rays (next_segment, first_sample, n_samples), batch (n_samples, zero before), spans, points [n_samples]
 //           (center of the sample, in the unit cube)
 // twin      nerf/reference/march.rs
 //

@@ -273,8 +273,8 @@ impl TsdfModel {
         let (n_blocks_needed, n_blocks_allowed) =
             (counters[status::N_BLOCKS], self.max_blocks_with_table(capacity.n_chunks));
         if n_blocks_needed > capacity.n_blocks {
-            let n_blocks_wanted = n_blocks_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
-            capacity.n_blocks = n_blocks_wanted.min(n_blocks_allowed).max(capacity.n_blocks);
+            let n_blocks_target = n_blocks_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
+            capacity.n_blocks = n_blocks_target.min(n_blocks_allowed).max(capacity.n_blocks);
         }
         if capacity != field.capacity {
             log::debug!("tsdf: grown to {capacity:?}");

@@ -162,8 +162,8 @@ impl TsdfModel {
         self.swap_blocks(frustum, n, 0.0, added).map(drop)
     }
 
-    /// Evicts at least `n` blocks outside the frustum to host memory, farthest first, and up to `n_spare` more; then
-    /// adds `added`. Returns how many were evicted.
+    /// Evicts up to `n + n_spare` blocks outside the frustum to host memory, farthest first; then adds `added`. Returns
+    /// how many were evicted.
     fn swap_blocks(&mut self, frustum: &ViewFrustum, n: usize, n_spare: f64, added: Blocks) -> Result<usize, Error> {
         let Some(field) = &mut self.field else { return Ok(0) };
         self.stale.extend(field.take_changed(&self.gpu)?);
