@@ -2,7 +2,7 @@
 //
 // groups    any number: each processes visible blocks in turn; 64 threads, one per column along z
 // reads     field, depth_view, readings [depth pixels], image [color pixels] (rgba8; a = 0 where masked), coords,
-//           visible [N_VISIBLE], status (N_VISIBLE, FAILED)
+//           visible [N_VISIBLE], status (N_VISIBLE)
 // writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 if a voxel changed)
 // twin      tsdf/reference/integrate.rs
 // source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of its cosine, as
