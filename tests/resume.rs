@@ -89,7 +89,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
     let other_data = |args: &[&str]| {
         let output = train(folder, &[&["--resume", "half", "--out", "x"], args].concat()).output().unwrap();
         let printed = assert_fails(&output, 1);
-        assert!(printed.contains("error: the checkpoint is of other data: image"), "{printed}");
+        assert!(printed.contains("error: the checkpoint belongs to different data: image"), "{printed}");
         printed
     };
     assert!(other_data(&["--scale", "0.5"]).contains("has 32x24 pixels, had 64x48"));

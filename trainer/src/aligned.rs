@@ -1,6 +1,7 @@
-//! A scene model whose cameras are aligned before they are believed.
+//! A scene model that restarts with aligned cameras.
 //!
-//! Alignment runs beside learning, and where that keeps something, the model begins anew with corrected keyframes. Splats, which try out more about cameras, have alignment of their own.
+//! Alignment runs in parallel with training. If it keeps corrections, the model restarts with corrected keyframes.
+//! Splats, which support more trials of camera parameters, implement alignment separately.
 
 use crate::align::{Alignment, AlignmentTask, alignment_step};
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
@@ -12,37 +13,38 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Key of what is known about cameras in the state of a checkpoint, and in `model.json`.
+/// Key of the alignment in the state of a checkpoint, and in `model.json`.
 const STATE_KEY: &str = "aligned";
 const METADATA_KEY: &str = "alignment";
 
-/// A model that can begin anew.
+/// A model that can restart.
 pub trait Restartable: Method {
-    /// Forgets all keyframes and all that was learned; what is compiled may stay.
+    /// Forgets all keyframes and all training; compiled kernels may be kept.
     fn restart(&mut self) -> Result<(), Error>;
-    /// What was learned about a camera along with the scene, from keyframes as they are pushed; none where nothing is.
+    /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
+    /// none.
     fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
         Ok(None)
     }
 }
 
-/// A model that goes on from a checkpoint, and the keyframes that it had not learned from.
+/// A resumed model, and the keyframes that it was not trained on.
 pub type ResumedModel = (Box<dyn Method>, Vec<Arc<Keyframe>>);
 
-/// A model, and what is known about the cameras of its keyframes.
+/// A model, and the alignment of its keyframes' cameras.
 #[derive(Debug)]
 pub struct Aligned<M> {
     model: M,
     choice: CameraRefinement,
     alignment_task: AlignmentTask,
-    /// As they came, until alignment is settled.
+    /// The uncorrected keyframes, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
     alignment_step: u64,
-    /// Updates of the model before it began anew.
+    /// Steps of the model before its restart.
     n_steps_before_restart: u64,
 }
 
-/// What a checkpoint says about cameras.
+/// The alignment state in a checkpoint.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct AlignedState {
@@ -54,7 +56,7 @@ struct AlignedState {
 }
 
 impl<M: Restartable + 'static> Aligned<M> {
-    /// A model whose keyframes are aligned as `choice` says; the result is taken early in `n_planned_steps`.
+    /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
     pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
         let (alignment_task, alignment_step) =
             (AlignmentTask::new(&choice), alignment_step(is_software, n_planned_steps));
@@ -68,7 +70,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         }
     }
 
-    /// A saved model, with what its folder knows about cameras.
+    /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
         let alignment_task = AlignmentTask::Done(read_metadata(&folder.join("model.json"))?.alignment);
         Ok(Self {
@@ -81,8 +83,8 @@ impl<M: Restartable + 'static> Aligned<M> {
         })
     }
 
-    /// Goes on from a checkpoint with `resume`, which finds the keyframes among those it is given, each as it was learned
-    /// from.
+    /// Resumes from a checkpoint. `resume` receives the corrected keyframes and finds those that the model was trained
+    /// on.
     pub fn resume(
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
@@ -99,7 +101,7 @@ impl<M: Restartable + 'static> Aligned<M> {
         let alignment_task = if is_aligned { AlignmentTask::Done(alignment) } else { AlignmentTask::new(&choice) };
         let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
-        // What is pushed again is corrected again.
+        // These are corrected when they are pushed again.
         let is_untrained = |keyframe: &Arc<Keyframe>| {
             untrained.iter().any(|other| (&other.camera, other.stamp) == (&keyframe.camera, keyframe.stamp))
         };
@@ -118,14 +120,14 @@ impl<M: Restartable + 'static> Aligned<M> {
         ))
     }
 
-    /// Takes what alignment found, and begins anew where that is anything.
+    /// Applies the result of alignment; if there are corrections, restarts the model.
     fn finish_alignment(&mut self) -> Result<(), Error> {
         let has_corrections = self.alignment_task.finish()?;
         let original_keyframes = std::mem::take(&mut self.original_keyframes);
         if !has_corrections {
             return Ok(());
         }
-        log::info!("training begins anew with corrected cameras");
+        log::info!("training restarts with corrected cameras");
         self.n_steps_before_restart += self.model.n_total_steps()?;
         self.model.restart()?;
         original_keyframes.iter().try_for_each(|keyframe| self.model.push(self.alignment_task.corrected(keyframe)))
@@ -149,7 +151,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     fn step(&mut self, n: u64) -> Result<u64, Error> {
         let step = self.model.progress().step;
         if !self.alignment_task.is_done() && (step >= self.alignment_step || (self.model.is_idle() && step > 0)) {
-            // A model that was resumed at this step has not begun it.
+            // A model that was resumed at this step has not started the task.
             if self.alignment_task.is_requested() {
                 self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
             }
@@ -161,7 +163,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             self.alignment_step.saturating_sub(self.model.progress().step)
         };
         let n_steps = self.model.step(n.min(remaining))?;
-        // After the first step, which has much to do on the processor itself.
+        // After the first step, which itself needs much CPU time.
         if self.alignment_task.is_requested() && n_steps > 0 {
             self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
         }
@@ -270,7 +272,7 @@ mod tests {
     use crate::tsdf::{TsdfModel, TsdfOptions};
     use crate::{Split, test_scenes as scenes};
 
-    /// The step at which the result is taken.
+    /// The step at which the result is applied.
     const ALIGNMENT_STEP: u64 = 6;
     const EXTRINSICS: ParamSet = ParamSet { extrinsics: true, ..ParamSet::NONE };
 
@@ -324,7 +326,7 @@ mod tests {
         assert_eq!(
             (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
             (1, ALIGNMENT_STEP + 1),
-            "it began anew"
+            "the model must have restarted"
         );
         let correction = uninterrupted.alignment().unwrap().corrections["wrist"].clone();
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
@@ -369,7 +371,7 @@ mod tests {
         assert_eq!(
             loaded().calibrated_camera(test).unwrap(),
             CalibratedCamera::of(test),
-            "nothing is known without the file"
+            "there must be no corrections without the file"
         );
     }
 

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// The name of a file while it is written: its own with the suffix `.part`.
+/// Temporary path of a file that is being written: the path with `.part` appended.
 pub fn partial_path(path: &Path) -> PathBuf {
     let mut partial = path.as_os_str().to_owned();
     partial.push(".part");
@@ -29,7 +29,7 @@ pub fn write(path: &Path, contents: impl FnOnce(&mut File) -> std::io::Result<()
         }
     });
     if written.is_err() {
-        let _ = std::fs::remove_file(&partial); // Incomplete, and it takes space.
+        let _ = std::fs::remove_file(&partial); // An incomplete file only takes up space.
     }
     written.map_err(|source| Error::Write { path: path.to_owned(), source })
 }

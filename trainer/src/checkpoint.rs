@@ -1,4 +1,4 @@
-//! The state of training on disk: a file that is whole or not there, and says what it is.
+//! Training state on disk: a file that is either complete or absent, and describes its contents.
 //!
 //! `docs/reference/files.md` describes the layout.
 
@@ -11,28 +11,28 @@ use std::io::Write;
 use std::path::Path;
 
 const MAGIC: [u8; 8] = *b"FRIGCKPT";
-/// Of the layout and of what the states of all methods mean.
+/// Version of the layout and of the states of all methods.
 const VERSION: u32 = 3;
-/// Magic, version, and the length of the description.
+/// Magic, version, and length of the header.
 const PREAMBLE_BYTES: usize = 16;
 const CHECKSUM_BYTES: usize = 32;
 
-/// Everything that a model in training needs to go on.
+/// Everything needed to continue training a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Checkpoint {
     /// Name of the method.
     pub method: String,
-    /// Seconds it had been trained for.
+    /// Training time so far, seconds.
     pub seconds: f64,
-    /// SHA-256 of the model that keyframes without depth had theirs drawn from, where there was one.
+    /// SHA-256 of the model that rendered the depth of keyframes without depth, if there was one.
     pub depth_from: Option<String>,
-    /// Flags of the run by name, for its caller to continue with them. They include the limit of training.
+    /// Flags of the run by name, for continuing it. They include the limit of training.
     pub flags: BTreeMap<String, String>,
     /// Whether training had reached its limit.
     pub is_finished: bool,
-    /// The method's state but for its arrays.
+    /// The method's state without its arrays.
     pub state: serde_json::Value,
-    /// What is too large for a description, little endian.
+    /// Large arrays, little endian.
     pub arrays: Vec<Array>,
 }
 
@@ -45,10 +45,10 @@ pub struct Array {
     pub bytes: Vec<u8>,
 }
 
-/// A state that was taken and is on its way from the GPU; training may go on meanwhile.
+/// A state that is being read back from the GPU; training may continue meanwhile.
 pub struct PendingCheckpoint(Box<dyn FnOnce() -> Result<Checkpoint, Error> + Send>);
 
-/// What stands between the front and the arrays, as JSON.
+/// The JSON header between preamble and arrays.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Header {
@@ -71,7 +71,7 @@ struct ArrayHeader {
 }
 
 impl PendingCheckpoint {
-    /// A state that `finish` waits for.
+    /// Wraps a function that waits for the state.
     pub fn new(finish: impl FnOnce() -> Result<Checkpoint, Error> + Send + 'static) -> Self {
         Self(Box::new(finish))
     }
@@ -89,7 +89,7 @@ impl Debug for PendingCheckpoint {
 }
 
 impl Checkpoint {
-    /// What a method tells of itself; how long it had been trained for, and on what, is for its caller to say.
+    /// A checkpoint of a method's state. The caller fills in the remaining fields.
     pub(crate) fn new(method: &str, state: serde_json::Value, arrays: Vec<Array>) -> Self {
         Self {
             method: method.to_owned(),
@@ -102,19 +102,19 @@ impl Checkpoint {
         }
     }
 
-    /// Writes the file beside its place, waits until the disk has it, and moves it there: whatever happens, either the
-    /// previous file or this one is under the name, whole.
+    /// Writes the file under a temporary name, syncs it, and renames it: whatever happens, the name refers to the
+    /// complete previous file or the complete new one.
     pub fn write(&self, path: &Path) -> Result<(), Error> {
         atomic_file::write(path, |file| self.write_to(file))
     }
 
-    /// Reads a whole file and checks every byte of it.
+    /// Reads a file and verifies its checksum.
     pub fn read(path: &Path) -> Result<Self, Error> {
         let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
         Self::from_bytes(&bytes).map_err(|reason| Error::Checkpoint { path: path.to_owned(), reason })
     }
 
-    /// Takes out the array of this name, which has to have so many bytes.
+    /// Returns the array with this name, which must have `n_bytes` bytes.
     pub(crate) fn array(&self, name: &str, n_bytes: u64) -> Result<&[u8], Error> {
         let array = self.arrays.iter().find(|array| array.name == name);
         let bytes = array
@@ -151,30 +151,30 @@ impl Checkpoint {
     }
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
-        let preamble = bytes.get(..PREAMBLE_BYTES).ok_or("cut off")?;
+        let preamble = bytes.get(..PREAMBLE_BYTES).ok_or("truncated")?;
         if preamble[..8] != MAGIC {
-            return Err("it does not begin as a checkpoint".to_owned());
+            return Err("not a checkpoint file".to_owned());
         }
         let word = |at: usize| u32::from_le_bytes([preamble[at], preamble[at + 1], preamble[at + 2], preamble[at + 3]]);
         if word(8) != VERSION {
             return Err(format!("version {} of the format, this program reads {VERSION}", word(8)));
         }
-        let whole = bytes.len().checked_sub(CHECKSUM_BYTES).filter(|n| *n >= PREAMBLE_BYTES).ok_or("cut off")?;
+        let whole = bytes.len().checked_sub(CHECKSUM_BYTES).filter(|n| *n >= PREAMBLE_BYTES).ok_or("truncated")?;
         let (body, checksum) = bytes.split_at(whole);
         let checksum_matches = Sha256::digest(body)[..] == *checksum;
         let rest = &body[PREAMBLE_BYTES..];
-        let header = rest.get(..word(12) as usize).ok_or("cut off")?;
+        let header = rest.get(..word(12) as usize).ok_or("truncated")?;
         let mut rest = &rest[header.len()..];
         let header: Header = match serde_json::from_slice(header) {
             Ok(header) => header,
-            Err(error) if checksum_matches => return Err(format!("its description is not understood: {error}")),
-            Err(_) => return Err("damaged: its checksum does not match".to_owned()),
+            Err(error) if checksum_matches => return Err(format!("invalid header: {error}")),
+            Err(_) => return Err("damaged: the checksum does not match".to_owned()),
         };
         let expected = header.arrays.iter().try_fold(0_u64, |total, array| total.checked_add(array.bytes));
         match expected.unwrap_or(u64::MAX) {
-            expected if expected > rest.len() as u64 => return Err("cut off".to_owned()),
-            expected if expected < rest.len() as u64 => return Err("bytes follow its end".to_owned()),
-            _ if !checksum_matches => return Err("damaged: its checksum does not match".to_owned()),
+            expected if expected > rest.len() as u64 => return Err("truncated".to_owned()),
+            expected if expected < rest.len() as u64 => return Err("unexpected bytes after the end".to_owned()),
+            _ if !checksum_matches => return Err("damaged: the checksum does not match".to_owned()),
             _ => {}
         }
         let mut arrays = Vec::new();
@@ -222,7 +222,7 @@ mod tests {
             written.write(&path).unwrap();
             assert_eq!(Checkpoint::read(&path).unwrap(), written);
         }
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file stays");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file remains");
         assert!(matches!(checkpoint().write(&folder.path().join("none/x")), Err(Error::Write { .. })));
     }
 
@@ -241,19 +241,19 @@ mod tests {
         let whole = bytes_of(&checkpoint());
         let error_of = |bytes: &[u8]| Checkpoint::from_bytes(bytes).unwrap_err();
         for length in 0..whole.len() {
-            assert_eq!(error_of(&whole[..length]), "cut off", "{length} of {} bytes", whole.len());
+            assert_eq!(error_of(&whole[..length]), "truncated", "{length} of {} bytes", whole.len());
         }
-        assert_eq!(error_of(b"ply\nformat binary"), "it does not begin as a checkpoint");
-        assert_eq!(error_of(&[&whole[..], &[0; 5]].concat()), "bytes follow its end");
+        assert_eq!(error_of(b"ply\nformat binary"), "not a checkpoint file");
+        assert_eq!(error_of(&[&whole[..], &[0; 5]].concat()), "unexpected bytes after the end");
         let error_with_byte = |at: usize, to: u8| {
             let mut bytes = whole.clone();
             bytes[at] = to;
             error_of(&bytes)
         };
         assert_eq!(error_with_byte(8, 1), "version 1 of the format, this program reads 3");
-        assert_eq!(error_with_byte(15, 255), "cut off");
+        assert_eq!(error_with_byte(15, 255), "truncated");
         for at in [20, whole.len() - 40, whole.len() - 1] {
-            assert_eq!(error_with_byte(at, 0xff), "damaged: its checksum does not match", "byte {at}");
+            assert_eq!(error_with_byte(at, 0xff), "damaged: the checksum does not match", "byte {at}");
         }
         let mut other = whole[..16].to_vec();
         other[12..16].copy_from_slice(&2_u32.to_le_bytes());

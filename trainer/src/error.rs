@@ -1,37 +1,37 @@
-//! What can go wrong in training.
+//! Errors of the trainer.
 
 use std::path::PathBuf;
 
-/// Errors of the trainer.
+/// An error of the trainer.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Our own bug: the thread that aligned keyframes ended early.
-    #[error("the alignment of keyframes did not end")]
+    /// A bug: the alignment thread panicked.
+    #[error("internal error: the alignment thread ended without a result")]
     AlignmentPanicked,
-    /// No GPU, real or software, answers.
+    /// No GPU adapter, real or software, was found.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,
-    /// The adapter that was asked for is not there.
-    #[error("there is no GPU {ix}: {n_adapters} are there, counted from 0")]
+    /// The requested adapter does not exist.
+    #[error("no GPU with index {ix}: found {n_adapters} adapters, numbered from 0")]
     NoSuchAdapter {
-        /// Counted from 0.
+        /// Requested index, from 0.
         ix: usize,
-        /// How many there are.
+        /// Number of adapters found.
         n_adapters: usize,
     },
-    /// The adapter is there but refuses a device.
-    #[error("GPU {adapter:?} refuses a device")]
+    /// The adapter could not open a device.
+    #[error("cannot open a device on GPU {adapter:?}")]
     NoDevice {
         /// Name of the adapter.
         adapter: String,
-        /// Why.
+        /// Cause.
         source: wgpu::RequestDeviceError,
     },
     /// The GPU stopped answering.
     #[error("the GPU stopped answering: its driver reset or lost the device")]
     DeviceLost,
-    /// The GPU has no memory left for a buffer, or for commands or a transfer; these have no name and no size.
+    /// The GPU has no memory left for a buffer, or for commands or a transfer, which have no name and size.
     #[error(
         "the GPU ran out of memory{}; close other programs that use it, or lower --max-splats, --max-bytes or the image size",
         buffer_suffix(label, *bytes)
@@ -45,39 +45,39 @@ pub enum Error {
     /// The GPU rejected a command, because of a bug in this program or in the driver.
     #[error("the GPU rejected a command: {0}")]
     Rejected(String),
-    /// A buffer past the adapter's limit.
+    /// A buffer exceeds the adapter's limit.
     #[error(
         "buffer {label}: {bytes} bytes are more than this GPU can bind ({limit_bytes} bytes); lower --max-splats, --max-bytes or the image size"
     )]
     BufferTooLarge {
         /// Name of the buffer.
         label: String,
-        /// Bytes wanted.
+        /// Requested size, bytes.
         bytes: u64,
-        /// Bytes allowed.
+        /// Maximum size, bytes.
         limit_bytes: u64,
     },
-    /// A kernel needs more memory of a workgroup than the adapter has.
+    /// A kernel needs more workgroup memory than the adapter has.
     #[error("kernel {kernel}: {bytes} bytes of workgroup memory are more than this GPU has ({limit_bytes} bytes)")]
     WorkgroupTooLarge {
         /// Name of the kernel.
         kernel: &'static str,
-        /// Bytes wanted.
+        /// Required size, bytes.
         bytes: u32,
-        /// Bytes there are.
+        /// Available size, bytes.
         limit_bytes: u32,
     },
-    /// Less memory than the smallest model of the method takes.
+    /// The memory budget is below the minimum of the method.
     #[error("max_bytes = {max_bytes}: the smallest {model} takes {min_bytes} bytes")]
     BudgetTooSmall {
-        /// The method's model, in words.
+        /// Name of the method's model.
         model: &'static str,
-        /// Bytes allowed.
+        /// Budget, bytes.
         max_bytes: u64,
-        /// Bytes needed.
+        /// Minimum, bytes.
         min_bytes: u64,
     },
-    /// A kernel imports what is not there.
+    /// A kernel imports an unknown source.
     #[error("kernel {kernel}: unknown import {import:?}")]
     UnknownImport {
         /// Name of the kernel.
@@ -90,21 +90,21 @@ pub enum Error {
     Wgsl {
         /// Name of the kernel.
         kernel: &'static str,
-        /// What naga says.
+        /// Message of naga.
         message: String,
     },
-    /// A picture does not hold four bytes a pixel.
+    /// A picture does not have four bytes per pixel.
     #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
     PictureBytes {
-        /// Which of the two.
+        /// Which picture: `rendered`, `true` or `keyframe`.
         what: &'static str,
         /// Width, pixels.
         width: u32,
         /// Height, pixels.
         height: u32,
-        /// Bytes it holds.
+        /// Actual size, bytes.
         got: usize,
-        /// Bytes it should hold.
+        /// Expected size, bytes.
         expected: usize,
     },
     /// A metric needs larger pictures.
@@ -112,7 +112,7 @@ pub enum Error {
     PictureTooSmall {
         /// The metric.
         metric: &'static str,
-        /// Shortest side it takes, pixels.
+        /// Minimum side length, pixels.
         min_px: u32,
         /// Width, pixels.
         width: u32,
@@ -120,14 +120,14 @@ pub enum Error {
         height: u32,
     },
     /// Every pixel, or every window, is masked.
-    #[error("nothing to compare: the mask leaves no pixel")]
+    #[error("nothing to compare: all pixels are masked")]
     AllPixelsMasked,
     /// Two depth images differ in size.
     #[error("rendered depth has {rendered} pixels, true depth {truth}")]
     DepthSizeMismatch {
-        /// Pixels of the rendered one.
+        /// Number of pixels of the rendered one.
         rendered: usize,
-        /// Pixels of the true one.
+        /// Number of pixels of the true one.
         truth: usize,
     },
     /// A file cannot be read.
@@ -135,7 +135,7 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: std::io::Error,
     },
     /// A file cannot be written.
@@ -143,46 +143,46 @@ pub enum Error {
     Write {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: std::io::Error,
     },
-    /// A file does not hold the weights of LPIPS.
+    /// A file is not a valid file of LPIPS weights.
     #[error("{path:?} does not hold LPIPS weights for SqueezeNet: {source}")]
     LpipsWeights {
         /// The file.
         path: PathBuf,
-        /// What is missing or wrong.
+        /// Cause.
         source: candle_core::Error,
     },
     /// The network of LPIPS failed.
     #[error("LPIPS network failed")]
     LpipsNetwork(#[source] candle_core::Error),
-    /// A file of splats is not what it should be.
-    #[error("{path:?} is not a splat file we read: {reason}")]
+    /// A file of splats, or a model's metadata, is invalid.
+    #[error("cannot parse {path:?}: {reason}")]
     SplatFile {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
-    /// A file is no checkpoint, not a whole one, or of another version.
-    #[error("{path:?} is no checkpoint to go on from: {reason}")]
+    /// A file is not a checkpoint, incomplete, damaged, or of another version.
+    #[error("cannot read checkpoint {path:?}: {reason}")]
     Checkpoint {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
-    /// A whole checkpoint holds a state that this program does not know.
-    #[error("the checkpoint holds no state to go on from: {reason}")]
+    /// A complete checkpoint has an invalid or unknown state.
+    #[error("invalid state in the checkpoint: {reason}")]
     CheckpointState {
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
-    /// A checkpoint belongs to other keyframes.
-    #[error("the checkpoint is of other data: {0}")]
+    /// A checkpoint belongs to different keyframes.
+    #[error("the checkpoint belongs to different data: {0}")]
     CheckpointData(String),
-    /// Arrays of splats do not fit together.
+    /// Arrays of splats are inconsistent.
     #[error("splats: {0}")]
     SplatArrays(String),
 }

@@ -1,11 +1,11 @@
-//! What a part of a model brings on images held back, and whether that is more than chance.
+//! Gain of a part of a model on validation images, and its statistical significance.
 
-/// Less is not worth having, dB.
+/// Minimum gain for keeping a part, dB.
 pub(crate) const MIN_GAIN_DB: f64 = 0.05;
-/// Standard errors that a gain must exceed.
+/// Minimum gain in standard errors.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
-/// The gain on the same images with something and without.
+/// Mean gain over the same images with a variant and without it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Gain {
     pub(crate) mean_db: f64,
@@ -14,7 +14,7 @@ pub(crate) struct Gain {
 }
 
 impl Gain {
-    /// Of what each image gains, dB.
+    /// Computes the gain from those of single images, dB.
     pub(crate) fn of(gains_db: &[f64]) -> Self {
         let n = gains_db.len().max(1) as f64;
         let mean_db = gains_db.iter().sum::<f64>() / n;
@@ -22,7 +22,7 @@ impl Gain {
         Self { mean_db, standard_error_db: (variance / n).sqrt(), n_images: gains_db.len() }
     }
 
-    /// Whether it is at least this large, and not by chance.
+    /// Whether the gain is above both `min_db` and its own uncertainty.
     pub(crate) fn is_significant(&self, min_db: f64) -> bool {
         self.mean_db > f64::max(min_db, MIN_STANDARD_ERRORS * self.standard_error_db)
     }

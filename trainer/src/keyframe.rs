@@ -5,19 +5,20 @@ use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// What a keyframe may be used for.
+/// How a keyframe may be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Split {
-    /// Trained on.
+    /// For training.
     Train,
-    /// Decides what the model needs; trained on once that is settled.
+    /// For deciding hyperparameters and trials; then for training.
     Validation,
-    /// Only reported, decides nothing.
+    /// For reporting only.
     Test,
 }
 
 impl Split {
-    /// The split of the `ix`-th keyframe of a camera in order: every 8th from 0 is test, every 8th from 4 selection.
+    /// The split of the `ix`-th keyframe of a camera in order: every 8th from 0 is for testing, every 8th from 4 for
+    /// validation.
     pub fn of(ix: usize) -> Self {
         match ix % 8 {
             0 => Self::Test,
@@ -27,7 +28,7 @@ impl Split {
     }
 }
 
-/// One posed image, undistorted, at its own size.
+/// One posed, undistorted image at its own size.
 #[derive(Clone, Debug)]
 pub struct Keyframe {
     /// Name of the camera.
@@ -40,28 +41,28 @@ pub struct Keyframe {
     pub focal_px: [f64; 2],
     /// Principal point of the undistorted image, pixels.
     pub principal_px: [f64; 2],
-    /// `[height, width, 4]`, sRGB; alpha 255 where the pixel was seen, 0 where undistortion or a mask left nothing.
+    /// `[height, width, 4]`, sRGB; alpha is 255 for valid pixels, 0 where undistortion or a mask left nothing.
     pub rgba_srgb: Arc<[u8]>,
-    /// Depth, where the camera has it.
+    /// Depth, if the camera provides it.
     pub depth: Option<DepthMap>,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// Velocity of the camera at `stamp`, where known; used with `readout_secs`.
+    /// Velocity of the camera at `stamp`, if known; used with `readout_secs`.
     pub twist: Option<Twist>,
     /// Time from the first row's exposure to the last row's, seconds; 0 for a global shutter.
     pub readout_secs: f64,
-    /// How the camera moves, in its own axes, when one of the joints that carry it moves by a radian or metre; empty where unknown.
+    /// Twist of the camera, in its own axes, per radian or meter of each joint that carries it; empty if unknown.
     pub joint_twists: Arc<[Twist]>,
-    /// Where the base was that carries the camera; `None` where no base moves it.
+    /// State of the base that carries the camera; `None` if the base is fixed.
     pub base: Option<BaseState>,
-    /// What it may be used for.
+    /// How the keyframe may be used.
     pub split: Split,
-    /// What a simulator knows.
+    /// Ground truth from a simulator.
     pub truth: Option<Truth>,
 }
 
 impl Keyframe {
-    /// Whether depth tells nothing about most of the image: it has none, or that of a scanner, which sees a band.
+    /// Whether most of the image has no depth: there is none, or it comes from a scanner, which covers only a band.
     pub fn lacks_dense_depth(&self) -> bool {
         self.depth.as_ref().is_none_or(|depth| {
             let n_known = depth.depth_m.iter().filter(|z| **z > 0.0).count();
@@ -69,14 +70,14 @@ impl Keyframe {
         })
     }
 
-    /// Host memory of the arrays.
+    /// Host memory of the arrays, bytes.
     pub fn bytes(&self) -> u64 {
         let depth = self.depth.as_ref().map_or(0, |depth| size_of_val(&*depth.depth_m));
         let truth = self.truth.as_ref().map_or(0, |truth| truth.rgba_srgb.len());
         (self.rgba_srgb.len() + depth + truth) as u64
     }
 
-    /// Refuses arrays that do not have their pixels.
+    /// Fails if the length of an array does not match its size in pixels.
     pub(crate) fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;
         let expected = 4 * width as usize * height as usize;
@@ -91,7 +92,7 @@ impl Keyframe {
         Ok(())
     }
 
-    /// The keyframe as the base carries it when that stands elsewhere: all poses are multiplied from the left.
+    /// The keyframe after correcting the base pose: all poses are multiplied by `map_from_odom` from the left.
     pub fn with_base_correction(&self, map_from_odom: &Transform) -> Self {
         Self {
             world_from_camera: map_from_odom * self.world_from_camera,
@@ -104,7 +105,7 @@ impl Keyframe {
         }
     }
 
-    /// Whether all numbers about the camera are finite; readings of depth may be what they like.
+    /// Whether all camera parameters are finite; depth readings are not checked.
     pub fn is_finite(&self) -> bool {
         let is_valid_lens = |focal_px: [f64; 2], principal_px: [f64; 2]| {
             focal_px.iter().all(|focal| focal.is_finite() && *focal > 0.0) && principal_px.iter().all(|x| x.is_finite())
@@ -120,20 +121,20 @@ impl Keyframe {
     }
 }
 
-/// Where a base that walks was when it carried a camera.
+/// State of a mobile base at the time of a keyframe.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BaseState {
-    /// Which of the places where the base stood, counted from 0; `None` while it walks.
+    /// Station at which the base stood, counted from 0; `None` while it moves.
     pub station: Option<usize>,
-    /// Pose of the base at the keyframe's stamp, as its source told it.
+    /// Pose of the base at the keyframe's stamp, as reported by its source.
     pub world_from_base: Transform,
-    /// What the poses of the keyframe have been multiplied by from the left since: what its source got wrong.
+    /// Correction by which the poses of the keyframe have been multiplied from the left: the drift of the source.
     pub map_from_odom: Transform,
     /// The true pose of the base, from a simulator.
     pub truth: Option<Transform>,
 }
 
-/// Depth along a camera's z axis with its own size, lens and pose.
+/// Depth along a camera's z axis, with its own size, intrinsics and pose.
 #[derive(Clone, Debug)]
 pub struct DepthMap {
     /// Width and height, pixels.
@@ -142,21 +143,21 @@ pub struct DepthMap {
     pub focal_px: [f64; 2],
     /// Principal point, pixels.
     pub principal_px: [f64; 2],
-    /// `[height, width]`, metres along z; 0 where the sensor saw nothing.
+    /// `[height, width]`, meters along z; 0 for pixels without a reading.
     pub depth_m: Arc<[f32]>,
     /// Pose at the stamp of the depth image.
     pub world_from_camera: Transform,
 }
 
 impl DepthMap {
-    /// What lies at a depth of `z_m` behind the middle of a pixel, in the depth camera's axes, metres.
+    /// Point at depth `z_m` on the ray through the center of a pixel, in the depth camera's axes, meters.
     pub fn point(&self, x: u32, y: u32, z_m: f64) -> Vector3<f64> {
         let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m
     }
 
-    /// The middle pixels of squares of `stride` by `stride`, an odd number, as an image of their own: the same readings along the same
-    /// rays. What is left over at the far edges is left out.
+    /// An image of the center pixels of squares of `stride` by `stride` pixels (`stride` is odd): the same readings
+    /// along the same rays. Incomplete squares at the far edges are dropped.
     #[must_use]
     pub fn subsampled(&self, stride: u32) -> Self {
         let [width, height] = self.size_px.map(|size| size / stride);
@@ -180,7 +181,7 @@ pub struct Truth {
     pub rgba_srgb: Arc<[u8]>,
     /// True pose at the keyframe's stamp.
     pub world_from_camera: Transform,
-    /// PSNR, dB, of the keyframe's image against itself before the noise: no model can score more. `None` without noise.
+    /// PSNR of the keyframe's image against its noise-free version, dB: no model can score more. `None` without noise.
     pub psnr_ceiling: Option<f64>,
 }
 

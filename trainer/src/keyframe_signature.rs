@@ -1,11 +1,11 @@
-//! Keyframes that a model has learned from: told apart without their pixels, and found again.
+//! Signatures of keyframes that a model was trained on: identify and verify them without their pixels.
 
 use crate::{Error, Keyframe, Split};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
 
-/// What tells one keyframe from another without its pixels.
+/// Identifies a keyframe without its pixels.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct KeyframeSignature {
@@ -42,18 +42,18 @@ impl KeyframeSignature {
         }
     }
 
-    /// Why the keyframe is not the one that was seen; `None` where it is.
+    /// Description of a difference from the recorded keyframe; `None` if they match.
     fn difference(&self, keyframe: &Keyframe) -> Option<String> {
         let other = Self::of(keyframe);
         let [[width, height], [other_width, other_height]] = [self.size_px, other.size_px];
         let problem = if self.size_px != other.size_px {
             format!("has {other_width}x{other_height} pixels, had {width}x{height}")
         } else if self.depth_size_px != other.depth_size_px {
-            "has another depth image".to_owned()
+            "has a different depth image".to_owned()
         } else if (self.focal_px, self.principal_px) != (other.focal_px, other.principal_px) {
-            "has another lens".to_owned()
+            "has different intrinsics".to_owned()
         } else if self.world_from_camera != other.world_from_camera {
-            "has another pose".to_owned()
+            "has a different pose".to_owned()
         } else {
             return None;
         };
@@ -61,10 +61,10 @@ impl KeyframeSignature {
     }
 }
 
-/// Keyframes of a list, in its order, and the others.
+/// The matched keyframes in the order of a list, and all others.
 pub(crate) type MatchedAndOthers = (Vec<Arc<Keyframe>>, Vec<Arc<Keyframe>>);
 
-/// Finds what was seen among keyframes, each as `corrected` gives it back; it must be as it was then.
+/// Finds the expected keyframes, each after applying `corrected`. Fails if one is missing or differs.
 pub(crate) fn match_keyframes(
     expected: &[KeyframeSignature],
     keyframes: &[Arc<Keyframe>],
@@ -79,9 +79,9 @@ pub(crate) fn match_keyframes(
     let mut matched_keyframes: Vec<&Arc<Keyframe>> = Vec::new();
     for expected in expected {
         let (camera, stamp) = (expected.camera.as_str(), expected.stamp_nanos);
-        let keyframe = by_name.get(&(camera, stamp)).ok_or_else(|| {
-            Error::CheckpointData(format!("image {stamp} of camera {camera:?} is not there to be learned from"))
-        })?;
+        let keyframe = by_name
+            .get(&(camera, stamp))
+            .ok_or_else(|| Error::CheckpointData(format!("image {stamp} of camera {camera:?} is missing")))?;
         let corrected = corrected(keyframe);
         if let Some(difference) = expected.difference(&corrected) {
             return Err(Error::CheckpointData(difference));

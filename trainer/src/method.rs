@@ -1,4 +1,4 @@
-//! What every scene model can do.
+//! The interface of all scene models.
 
 use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
@@ -9,37 +9,37 @@ use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Where training stands.
+/// Progress of training.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Progress {
-    /// Optimiser updates so far.
+    /// Optimizer updates so far.
     pub step: u64,
     /// Splats, voxel blocks or table entries.
     pub primitives: u64,
-    /// Bytes of GPU memory the model holds.
+    /// GPU memory of the model, bytes.
     pub bytes: u64,
     /// GPU time of a step, milliseconds, smoothed.
     pub step_millis: f64,
 }
 
-/// What a part of the model was found to be worth, on images held back for it.
+/// Result of a trial of one part of a model, on validation images.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct TrialReport {
-    /// What it is, in words.
+    /// Description of the part.
     pub part: String,
-    /// Mean PSNR with it less that without it, dB.
+    /// Mean PSNR with the part minus that without it, dB.
     pub gain_db: f64,
     /// Standard error of the mean, dB.
     pub standard_error_db: f64,
-    /// Images it was measured on.
+    /// Number of validation images.
     pub n_images: usize,
-    /// Whether the model has it.
+    /// Whether the part was kept.
     pub kept: bool,
 }
 
-/// Maximum GPU time of a training submit, short enough for checkpoints, keyframes and Ctrl-C to get their turn.
+/// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are handled soon.
 const SUBMIT_MILLIS: f64 = 20.0;
-/// The same while pictures are requested: a picture waits for one running submit and one queued submit.
+/// Maximum while pictures are requested: a picture waits for one running submit and one queued submit.
 const SUBMIT_MILLIS_WATCHED: f64 = 4.0;
 
 /// Maximum GPU time of a training submit, milliseconds.
@@ -47,58 +47,60 @@ pub(crate) fn submit_millis(watched: bool) -> f64 {
     if watched { SUBMIT_MILLIS_WATCHED } else { SUBMIT_MILLIS }
 }
 
-/// One scene model that learns from keyframes.
+/// A scene model that trains on keyframes.
 ///
 /// Several models can share one device; each is owned by one thread.
 pub trait Method {
     /// Adds a keyframe. Test keyframes are evaluated, never trained on.
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error>;
-    /// Forgets the keyframe of this camera and stamp, if it is held.
+    /// Forgets the keyframe with this camera and stamp, if there is one.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error>;
-    /// Queues at most `n` optimizer updates, few enough to hold the GPU for no more than 20 ms ([`Method::set_watched`]: 4 ms),
-    /// and returns how many. At most one submit runs and one is queued.
+    /// Queues at most `n` optimizer updates, few enough to occupy the GPU for at most 20 ms ([`Method::set_watched`]: 4
+    /// ms), and returns their number. At most one submit runs and one is queued.
     ///
-    /// A queued update is lost, and done again later, when it turns out that a buffer was too small. When all `n` were
-    /// queued the call waits for them, so that [`Method::progress`] is exact; loop until it has reached the step you want.
+    /// If a buffer turns out to be too small, a queued update is discarded and repeated later. If all `n` were queued,
+    /// the call waits for them, so that [`Method::progress`] is exact; loop until it reaches the desired step.
     fn step(&mut self, n: u64) -> Result<u64, Error>;
-    /// Whether more steps would do nothing until a keyframe comes.
+    /// Whether more steps would do nothing until a keyframe arrives.
     fn is_idle(&self) -> bool;
-    /// What [`Progress::primitives`] counts, in the singular.
+    /// Name of the items that [`Progress::primitives`] counts, in the singular.
     fn primitive(&self) -> &'static str;
-    /// Waits for what is queued, and says how many updates were made in all, those included that a trial took back: unlike
-    /// [`Progress::step`] it never goes back.
+    /// Waits for queued updates and returns the total number of updates, including those of rejected trials. Unlike
+    /// [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
-    /// Makes of the keyframes so far what can be drawn without learning, as [`Method::render`] does.
+    /// Initializes the model from the keyframes so far, so that it can be rendered without training, as
+    /// [`Method::render`] does.
     fn seed(&mut self) -> Result<(), Error>;
-    /// Waits until everything that learning needs is compiled; [`Method::step`] would wait for it otherwise.
+    /// Waits until all kernels needed for training are compiled; otherwise [`Method::step`] waits for them.
     fn prepare(&mut self) -> Result<(), Error>;
-    /// Sets whether pictures are requested during training: submits are shorter then, but the learned parameters are bit-identical.
+    /// Sets whether pictures are requested during training. Submits are then shorter, but the trained parameters are
+    /// bit-identical.
     fn set_watched(&mut self, watched: bool);
-    /// Draws a picture; works from the first keyframe on.
+    /// Renders a picture; works from the first keyframe on.
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error>;
-    /// PSNR of the requested picture against a keyframe's image of the same size, dB, without reading the picture back. The same
-    /// bits as [`crate::eval::psnr`] of the picture, which also has 8 bits. `None` if the model cannot compare on the GPU, or not
-    /// yet.
+    /// PSNR of the requested picture against a keyframe's image of the same size, dB, without reading the picture back.
+    /// Bit-identical to [`crate::eval::psnr`] of the picture, which also has 8 bits. `None` if the model cannot compare
+    /// on the GPU, or not yet.
     fn psnr(&mut self, _request: &RenderRequest, _keyframe: &Keyframe) -> Result<Option<f64>, Error> {
         Ok(None)
     }
-    /// Pixels from one to the next, along both axes, of a depth image that is drawn to be compared with a measured one: an odd number,
-    /// more than 1 where a ray is dear.
+    /// Stride along both axes for rendering a depth image that is compared with a measured one: an odd number, above 1
+    /// if rays are expensive.
     fn depth_stride(&self) -> u32 {
         1
     }
-    /// The camera of a keyframe as the model has it: with what was learned about all its images, not about this one.
+    /// The camera of a keyframe with the model's corrections for the camera, but not those for this single image.
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;
-    /// Takes one step with a timestamp around every pass; empty where the adapter has none.
+    /// Takes one step with timestamps around every pass; returns an empty list if the adapter has none.
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error>;
-    /// What alignment of the keyframes found, once that is settled; none where it was not asked for or could not be done.
+    /// Result of keyframe alignment once it is done; `None` if it was not requested or not possible.
     fn alignment(&self) -> Option<&Alignment>;
-    /// Where training stands.
+    /// Progress of training.
     fn progress(&self) -> Progress;
-    /// What the parts of the model that were tried bought, in the order of the trials.
+    /// Results of the trials, in their order.
     fn report(&self) -> Vec<TrialReport>;
     /// Writes the model into a folder.
     fn save(&mut self, folder: &Path) -> Result<(), Error>;
-    /// Takes all that training needs to go on from here; what is learned afterwards does not change it.
+    /// Takes a checkpoint of everything needed to continue training; later training does not change it.
     fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error>;
 }

@@ -1,4 +1,4 @@
-//! Comparing many numbers in a test and reporting every one that is off.
+//! Compares many numbers in a test and reports all mismatches.
 
 use std::fmt::Display;
 
@@ -12,7 +12,7 @@ pub(crate) struct Mismatches {
 }
 
 impl Mismatches {
-    /// Notes the pair unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN never passes.
+    /// Records a mismatch unless `|got - expected| <= abs + rel * max(|got|, |expected|)`; a NaN never passes.
     pub(crate) fn check(&mut self, name: impl Display, got: f64, expected: f64, abs: f64, rel: f64) {
         let ratio = (got - expected).abs() / (abs + rel * got.abs().max(expected.abs()));
         self.n_checked += 1;
@@ -23,19 +23,19 @@ impl Mismatches {
         }
     }
 
-    /// How many numbers were off.
+    /// Number of mismatches.
     pub(crate) fn n_mismatches(&self) -> usize {
         self.mismatches.len()
     }
 
-    /// Panics with every mismatch, or where nothing was compared at all.
+    /// Panics with all mismatches, or if nothing was compared.
     #[track_caller]
     pub(crate) fn assert_none(&self) {
         assert!(self.n_checked > 0, "nothing was compared");
         let Self { n_checked, mismatches, max_ratio } = self;
         assert!(
             mismatches.is_empty(),
-            "{} of {n_checked} are off, worst {max_ratio:.1} x tolerance:\n{}",
+            "{} of {n_checked} values differ, worst {max_ratio:.1} x tolerance:\n{}",
             mismatches.len(),
             mismatches.join("\n")
         );
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    #[should_panic(expected = "1 of 1 are off")]
+    #[should_panic(expected = "1 of 1 values differ")]
     fn mismatch_panics() {
         let mut mismatches = Mismatches::default();
         mismatches.check("x", 2.0, 1.0, 1e-9, 1e-9);

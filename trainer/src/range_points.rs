@@ -1,17 +1,17 @@
-//! One turn of a range scanner as a trainer takes it: points in the world.
+//! One revolution of a range scanner as training input: points in world.
 
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// Echoes of one turn, each put into the world with the scanner's pose at its own instant.
+/// Echoes of one revolution, each transformed to world with the scanner's pose at its own stamp.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RangePoints {
     /// Name of the scanner.
     pub scanner: Arc<str>,
-    /// When the turn began.
+    /// Begin of the revolution.
     pub stamp: Stamp,
-    /// Where the scanner was then; it saw each point from near there.
+    /// Pose of the scanner at `stamp`; it is close to where each point was observed from.
     pub world_from_scanner: Transform,
-    /// The points, metres.
+    /// The points in world, meters.
     pub points_in_world_m: Arc<[[f32; 3]]>,
 }

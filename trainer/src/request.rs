@@ -4,7 +4,7 @@ use crate::gpu::Buffer;
 use kinematics::{Stamp, Transform, Twist};
 use std::sync::Arc;
 
-/// A box with sides along the axes of the frame it is given in, metres.
+/// A box with sides along the axes of its frame, meters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aabb {
     /// Pose of the box's frame.
@@ -25,11 +25,12 @@ pub enum Projection {
         /// Principal point, pixels.
         principal_px: [f64; 2],
     },
-    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to down, centre forward.
+    /// All directions: longitude along x from -180 to 180 degrees, latitude along y from up to down, forward in the
+    /// center.
     Equirectangular,
 }
 
-/// Motion of a camera whose rows are exposed one after the other.
+/// Motion of a camera with a rolling shutter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shutter {
     /// Velocity of the camera in its own axes.
@@ -38,7 +39,7 @@ pub struct Shutter {
     pub readout_secs: f64,
 }
 
-/// What to draw.
+/// A request for a picture.
 #[derive(Clone, Debug)]
 pub struct RenderRequest {
     /// Pose of the virtual camera.
@@ -47,37 +48,36 @@ pub struct RenderRequest {
     pub size_px: [u32; 2],
     /// How directions map to pixels.
     pub projection: Projection,
-    /// Rolling shutter to imitate, as when a render is compared with a real image; `None` for people.
+    /// Rolling shutter to simulate, for comparison with a real image; `None` for viewers.
     pub shutter: Option<Shutter>,
-    /// Nothing nearer than this along z is drawn, metres.
+    /// Nothing nearer than this along z is rendered, meters.
     pub near_m: f64,
-    /// Nothing further than this is drawn, metres.
+    /// Nothing farther than this along z is rendered, meters.
     pub far_m: f64,
-    /// Only what lies inside is drawn.
+    /// Only space inside this box is rendered.
     pub crop: Option<Aabb>,
-    /// Colour behind everything, sRGB 0 to 1.
+    /// Background color, sRGB 0 to 1.
     pub background_srgb: [f32; 3],
-    /// In the light and with the exposure that this camera had at this time, where the model knows them; `None`: in those of the
-    /// mean image.
+    /// Camera and time whose light and exposure to use, if the model has them; `None`: those of the mean image.
     pub appearance_of: Option<(Arc<str>, Stamp)>,
     /// Whether depth is requested. Without it [`Picture::depth_m`] is empty, and half as many bytes are read back from the GPU.
     pub depth: bool,
 }
 
-/// A drawn picture.
+/// A rendered picture.
 #[derive(Clone, Debug)]
 pub struct Picture {
     /// Width and height, pixels.
     pub size_px: [u32; 2],
     /// `[height, width, 4]`, sRGB over the background; alpha is coverage.
     pub rgba_srgb: Vec<u8>,
-    /// `[height, width]`, meters along z (distance for equirectangular); 0 where nothing is. Empty without
+    /// `[height, width]`, meters along z (distance for equirectangular); 0 for pixels without a surface. Empty without
     /// [`RenderRequest::depth`].
     pub depth_m: Vec<f32>,
 }
 
 impl Picture {
-    /// The buffers to read back for a picture drawn into them; the depths only if requested.
+    /// The buffers to read back for a rendered picture; the depths only if requested.
     pub(crate) fn buffers<'a>(
         size_px: [u32; 2],
         pixels: &'a Buffer,
@@ -87,13 +87,13 @@ impl Picture {
         std::iter::once(pixels).chain(depths).map(|buffer| (buffer, n_bytes)).collect()
     }
 
-    /// The picture made from the data read back from [`Self::buffers`].
+    /// The picture from the data read back from [`Self::buffers`].
     pub(crate) fn from_parts(size_px: [u32; 2], parts: &[&[u8]]) -> Self {
         let depth_m = parts.get(1).map_or(Vec::new(), |bytes| bytemuck::pod_collect_to_vec(bytes));
         Self { size_px, rgba_srgb: parts[0].to_vec(), depth_m }
     }
 
-    /// Nothing but background.
+    /// A picture of only background.
     pub(crate) fn empty(size_px: [u32; 2], background_srgb: [f32; 3], depth: bool) -> Self {
         let n = size_px[0] as usize * size_px[1] as usize;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0 to 255")]

@@ -1,4 +1,4 @@
-//! Scenes of known shape, and exact keyframes of them.
+//! Scenes of known shapes, and exact keyframes of them.
 
 use crate::gpu::f32_of;
 use crate::tsdf::TsdfOptions;
@@ -12,7 +12,7 @@ pub(crate) const SIZE_PX: [u32; 2] = [96, 80];
 pub(crate) const FOCAL_PX: [f64; 2] = [90.0, 88.0];
 pub(crate) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
 
-/// A thing with a surface.
+/// A shape with a surface.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum TestShape {
     Sphere {
@@ -27,7 +27,7 @@ pub(crate) enum TestShape {
 }
 
 impl TestShape {
-    /// Depth along z of the first surface on the ray, in a frame moved to `camera`.
+    /// Depth of the first surface along a ray: a multiple of `direction`, whose z is 1 in the camera.
     fn depth_m(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<f64> {
         let depth_m = match self {
             Self::Sphere { center_m, radius_m } => {
@@ -41,7 +41,7 @@ impl TestShape {
         (depth_m > 0.0).then_some(depth_m)
     }
 
-    /// Distance to the surface, outside positive for spheres; without sign for planes.
+    /// Distance to the surface: signed and positive outside for spheres, unsigned for planes.
     pub(crate) fn distance_m(&self, point: &Point3<f64>) -> f64 {
         match self {
             Self::Sphere { center_m, radius_m } => (point - center_m).norm() - radius_m,
@@ -50,20 +50,20 @@ impl TestShape {
     }
 }
 
-/// Color that the world has at a point.
+/// Color of the world at a point.
 pub(crate) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
     [0, 1, 2].map(|axis| 0.5 + 0.4 * (3.0 * point[axis] + axis as f64).sin())
 }
 
-/// A camera at `eye` that looks at `target`, z up.
+/// Pose of a camera at `eye` that faces `target`, z up.
 pub(crate) fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
     let up = if (target - eye).xy().norm() < 1e-9 { Vector3::y() } else { Vector3::z() };
     Transform::face_towards(&eye, &target, &up) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
-/// What a camera sees of the shapes: exact depth and color.
+/// A keyframe of the shapes with exact depth and color.
 pub(crate) fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
-    // The color camera sits 4 cm beside the depth camera and has another size.
+    // The color camera is 4 cm to the side of the depth camera and has a different size.
     let color_pose = world_from_camera * Transform::translation(0.04, 0.0, 0.0);
     let depth_m: Vec<f32> = cast_pixels(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
         .map(|hit| hit.map_or(0.0, |(depth, _)| f32_of(depth)))
@@ -100,7 +100,7 @@ pub(crate) fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transfo
     }
 }
 
-/// The same in the size of a depth camera's images.
+/// Like [`keyframe`], in the size of a depth camera's images.
 pub(crate) fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
     let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
     let mut keyframe = keyframe(ix, shapes, world_from_camera);
@@ -117,12 +117,12 @@ pub(crate) fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: T
     keyframe
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "colors lie between 0 and 1")]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "colors are between 0 and 1")]
 fn bytes(color: [f64; 3]) -> [u8; 3] {
     color.map(|part| (255.0 * part).round() as u8)
 }
 
-/// Depth and place of what each pixel sees.
+/// Depth and position of the first surface along each pixel's ray.
 fn cast_pixels(
     shapes: &[TestShape],
     world_from_camera: &Transform,
@@ -140,17 +140,17 @@ fn cast_pixels(
     })
 }
 
-/// A ball of 30 cm whose middle is `at`.
+/// A ball with a radius of 30 cm, centered at `at`.
 pub(crate) fn ball(at: Point3<f64>) -> TestShape {
     TestShape::Sphere { center_m: at, radius_m: 0.3 }
 }
 
-/// The floor under it.
+/// The floor below a ball at the origin.
 pub(crate) fn floor() -> TestShape {
     TestShape::Plane { normal: Vector3::z(), offset_m: -0.3 }
 }
 
-/// Views of a point from all around, `n` of them, evenly over the sphere (Vogel 1979).
+/// `n` views of a point from all sides, evenly distributed over the sphere (Vogel 1979).
 pub(crate) fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {

@@ -2,9 +2,9 @@
 
 use crate::{DepthMap, Error};
 
-/// Root of the mean squared difference of two depth images in metres, over pixels where both know the depth (above 0).
+/// Root mean squared difference of two depth images in meters, over pixels where both have a depth above 0.
 ///
-/// `None` when there is no such pixel; fails when the images differ in size.
+/// Returns `None` if there is no such pixel; fails if the images differ in size.
 pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, Error> {
     if rendered_m.len() != truth_m.len() {
         return Err(Error::DepthSizeMismatch { rendered: rendered_m.len(), truth: truth_m.len() });
@@ -19,24 +19,26 @@ pub fn depth_rmse_m(rendered_m: &[f32], truth_m: &[f32]) -> Result<Option<f64>, 
     Ok((n_known > 0).then(|| (squares / f64::from(n_known)).sqrt()))
 }
 
-/// How near a drawn surface comes to a measured one.
+/// Distance of a rendered surface from a measured one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceError {
-    /// Mean distance along the measured surface's normal, over measured pixels that are drawn, metres; `None` when none is.
+    /// Mean distance along the measured surface's normal, over measured pixels that are rendered, meters; `None` if
+    /// none is.
     pub mean_m: Option<f64>,
-    /// Share of the measured pixels where the drawn surface is no further off than [`SurfaceError::NEAR_M`].
+    /// Fraction of the measured pixels where the rendered surface is within [`SurfaceError::NEAR_M`].
     pub near_frac: f64,
 }
 
 impl SurfaceError {
-    /// What counts as near, metres.
+    /// Distance that counts as near, meters.
     pub const NEAR_M: f64 = 0.005;
 }
 
-/// Distance of a surface, drawn as depth in metres of the same camera, from a measured one.
+/// Distance of a surface, rendered as depth in meters of the same camera, from a measured one.
 ///
-/// Measured pixels count where they tell how their surface is turned: with a reading on each side along both axes, none of
-/// which differs by more than 4 % (an edge). `None` when there is no such pixel; fails when the images differ in size.
+/// Only measured pixels with a known surface normal count: those with a reading on each side along both axes, none of
+/// which differs by more than 4 % (an edge). Returns `None` if there is no such pixel; fails if the images differ in
+/// size.
 pub fn surface_error(rendered_m: &[f32], measured: &DepthMap) -> Result<Option<SurfaceError>, Error> {
     const EDGE_FRAC: f64 = 0.04;
     let [width, height] = measured.size_px;
@@ -110,7 +112,7 @@ mod tests {
         assert!((mean_m - 0.004).abs() < 1e-5 && near_frac == 1.0, "{mean_m} {near_frac}");
         let (mean_m, near_frac) = score(&plane(normal, 0.994));
         assert!((mean_m - 0.006).abs() < 1e-5 && near_frac == 0.0, "{mean_m} {near_frac}");
-        // What is not drawn is not complete, and has no error.
+        // Pixels that are not rendered reduce completeness but have no error.
         let mut half = plane(normal, 1.004);
         half[..600].fill(0.0);
         let (mean_m, near_frac) = score(&half);
@@ -126,7 +128,7 @@ mod tests {
         depth_m[20 * 40 + 7] = 0.0;
         let truth = measured(depth_m.clone());
         let near_frac = |rendered: &[f32]| surface_error(rendered, &truth).unwrap().unwrap().near_frac;
-        // 28 rows less two at the edge, of 38 pixels; five lie on or beside the hole.
+        // 28 rows minus two at the edge, of 38 pixels; five are on or next to the hole.
         let n = 26.0 * 38.0 - 5.0;
         let mut rendered = depth_m.clone();
         rendered[10 * 40 + 10] = 3.0;

@@ -6,21 +6,22 @@ use candle_core::{Device, Tensor};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Shortest side, pixels: the weights were fitted to patches of this size.
+/// Minimum side length, pixels: the weights were fitted to patches of this size.
 const MIN_SIDE_PX: u32 = 64;
-/// Channel means and deviations of the inputs, which lie in -1 to 1.
+/// Channel means and standard deviations of the inputs, which are between -1 and 1.
 const CHANNEL_MEAN: [f32; 3] = [-0.030, -0.088, -0.188];
 const CHANNEL_DEVIATION: [f32; 3] = [0.458, 0.448, 0.450];
-/// Keeps the normalisation of an all-zero feature finite.
+/// Keeps the normalization of an all-zero feature finite.
 const EPSILON: f64 = 1e-10;
-/// The parts of the network, each ending where features are compared. `true`: halve the size before the fire module.
+/// Stages of the network; features are compared at the end of each. `true`: halve the size before the fire module.
 const STAGES: [&[(usize, bool)]; 6] =
     [&[(3, true), (4, false)], &[(6, true), (7, false)], &[(9, true)], &[(10, false)], &[(11, false)], &[(12, false)]];
 
 /// The learned perceptual distance of two pictures; 0 for equal ones.
 ///
-/// Features of seven depths of `SqueezeNet` 1.1, normalised per pixel, squared differences weighted per channel, mean
-/// over pixels, sum over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola et al. 2016.
+/// Features of seven depths of `SqueezeNet` 1.1 are normalized per pixel; squared differences are weighted per channel,
+/// averaged over pixels and summed over depths. Source: Zhang, Isola, Efros, Shechtman, Wang 2018, section 3; Iandola
+/// et al. 2016.
 #[derive(Debug)]
 pub struct Lpips {
     first: Convolution,
@@ -48,9 +49,9 @@ impl Lpips {
         Ok(Self { first: Convolution::of(&tensors, "features.0")?, stages, channel_weights })
     }
 
-    /// The distance of the two pictures; masked pixels are mid grey in both.
+    /// The distance of the two pictures; masked pixels are mid-gray in both.
     ///
-    /// Fails for pictures with a side below 64 pixels, and when no pixel was seen.
+    /// Fails for pictures with a side below 64 pixels, and if all pixels are masked.
     pub fn distance(&self, pair: &PixelPair<'_>) -> Result<f64, Error> {
         pair.require_side("LPIPS", MIN_SIDE_PX)?;
         if !(0..pair.truth_rgba.len() / 4).any(|ix| pair.is_visible(ix)) {
@@ -74,7 +75,7 @@ impl Lpips {
     }
 }
 
-/// `[1, 3, height, width]`: -1 to 1, then shifted and scaled as the network expects.
+/// `[1, 3, height, width]`: -1 to 1, then normalized with the channel means and deviations.
 fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tensor> {
     let n_pixels = rgba.len() / 4;
     let mut planes = Vec::with_capacity(3 * n_pixels);
@@ -88,7 +89,7 @@ fn network_input(pair: &PixelPair<'_>, rgba: &[u8]) -> candle_core::Result<Tenso
     Tensor::from_vec(planes, (1, 3, height, width), &Device::Cpu)
 }
 
-/// Squared difference of features normalised per pixel, weighted per channel, mean over pixels.
+/// Squared difference of features normalized per pixel, weighted per channel, averaged over pixels.
 fn feature_distance(rendered: &Tensor, truth: &Tensor, channel_weights: &Tensor) -> candle_core::Result<f64> {
     let difference = (normalized(rendered)? - normalized(truth)?)?;
     let per_pixel =
@@ -100,7 +101,7 @@ fn normalized(feature: &Tensor) -> candle_core::Result<Tensor> {
     feature.broadcast_div(&(feature.sqr()?.sum_keepdim(1)?.sqrt()? + EPSILON)?)
 }
 
-/// A convolution with bias and rectification.
+/// A convolution with bias and ReLU.
 #[derive(Debug)]
 struct Convolution {
     weight: Tensor,
@@ -120,7 +121,7 @@ impl Convolution {
     }
 }
 
-/// The module of `SqueezeNet`: few channels in the middle, then small and large windows side by side.
+/// The fire module of `SqueezeNet`: a convolution to few channels, then small and large windows in parallel.
 #[derive(Debug)]
 struct Fire {
     halve: bool,
@@ -142,9 +143,9 @@ impl Fire {
     }
 }
 
-/// The largest of each 3 x 3 window, every second pixel, the last window reaching past the edge where sizes are even.
+/// Max pooling over 3 x 3 windows with a stride of two; for even sizes, the last window reaches past the edge.
 ///
-/// Features are rectified, so the zeros that fill such a window change no maximum.
+/// Features are not negative, so the zeros that pad such a window do not change a maximum.
 fn halved(feature: &Tensor) -> candle_core::Result<Tensor> {
     let (_, _, height, width) = feature.dims4()?;
     let past_edge = |side: usize| 1 - side % 2;
@@ -154,7 +155,7 @@ fn halved(feature: &Tensor) -> candle_core::Result<Tensor> {
 
 fn tensor_by_name(tensors: &HashMap<String, Tensor>, name: &str) -> candle_core::Result<Tensor> {
     let found = tensors.get(name).cloned();
-    found.ok_or_else(|| candle_core::Error::Msg(format!("no tensor {name:?}")))
+    found.ok_or_else(|| candle_core::Error::Msg(format!("tensor {name:?} is missing")))
 }
 
 #[cfg(test)]

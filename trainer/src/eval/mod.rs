@@ -1,4 +1,4 @@
-//! How near a rendered picture comes to the truth: PSNR, SSIM, LPIPS and depth error.
+//! Comparison of a rendered picture with the truth: PSNR, SSIM, LPIPS and depth error.
 
 mod depth;
 mod lpips;
@@ -12,9 +12,9 @@ pub use ssim::ssim;
 
 use crate::Error;
 
-/// Two pictures of one size to be compared, `[height, width, 4]`, 8-bit sRGB.
+/// Two pictures of equal size to be compared, `[height, width, 4]`, 8-bit sRGB.
 ///
-/// Only pixels that were seen count: those where the truth's alpha is not 0. The rendered picture's alpha means nothing.
+/// Only pixels where the truth's alpha is not 0 count. The alpha of the rendered picture is ignored.
 #[derive(Clone, Copy, Debug)]
 pub struct PixelPair<'a> {
     size_px: [u32; 2],
@@ -23,7 +23,7 @@ pub struct PixelPair<'a> {
 }
 
 impl<'a> PixelPair<'a> {
-    /// Pairs two pictures; fails when either does not hold width x height x 4 bytes.
+    /// Pairs two pictures. Fails if either does not have width x height x 4 bytes.
     pub fn new(size_px: [u32; 2], rendered_rgba: &'a [u8], truth_rgba: &'a [u8]) -> Result<Self, Error> {
         let expected = size_px[0] as usize * size_px[1] as usize * 4;
         for (what, bytes) in [("rendered", rendered_rgba), ("true", truth_rgba)] {
@@ -35,7 +35,7 @@ impl<'a> PixelPair<'a> {
         Ok(Self { size_px, rendered_rgba, truth_rgba })
     }
 
-    /// Fails when a side is shorter than `min_px`, which `metric` needs.
+    /// Fails if a side is shorter than `min_px`, the minimum of `metric`.
     fn require_side(&self, metric: &'static str, min_px: u32) -> Result<(), Error> {
         let [width, height] = self.size_px;
         if width < min_px || height < min_px {
@@ -44,7 +44,7 @@ impl<'a> PixelPair<'a> {
         Ok(())
     }
 
-    /// Whether the truth was seen at this pixel.
+    /// Whether the truth is not masked at this pixel.
     fn is_visible(&self, pixel_ix: usize) -> bool {
         self.truth_rgba[4 * pixel_ix + 3] != 0
     }

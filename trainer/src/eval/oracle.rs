@@ -1,14 +1,14 @@
-//! Our metrics against independent libraries on the shared picture pairs.
+//! Compares our metrics with independent libraries on the shared picture pairs.
 
 use super::{Lpips, PixelPair, psnr, ssim};
 use serde_json::Value;
 use std::path::Path;
 
-/// Both sides compute the same integers.
+/// Both implementations compute the same integers.
 const PSNR_TOLERANCE_DB: f64 = 1e-6;
 /// Ours blurs in f32; the reference in f64 agrees to a few 1e-6.
 const SSIM_TOLERANCE: f64 = 1e-4;
-/// Different summation order through 26 convolutions in f32.
+/// The order of summation through 26 convolutions in f32 differs.
 const LPIPS_TOLERANCE: f64 = 1e-4;
 
 struct Picture {
@@ -16,7 +16,7 @@ struct Picture {
     rgba: Vec<u8>,
 }
 
-/// The picture of this base name.
+/// Loads the picture with this base name.
 fn picture(folder: &Path, name: &str) -> Picture {
     let base = Path::new(name).file_name().unwrap();
     let image = image::open(folder.join(base)).unwrap().into_rgba8();
@@ -27,7 +27,7 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
 }
 
-/// Whether the figure agrees; prints it where it does not.
+/// Whether the value agrees; prints it if not.
 fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
     let all_agree = (got - expected).abs() <= tolerance;
     if !all_agree {
@@ -51,7 +51,7 @@ fn metrics_agree_with_the_oracle() {
         all_agree &= agrees(b, ssim(&pair).unwrap(), expected("ssim_3dgs_valid_crop5"), SSIM_TOLERANCE);
         all_agree &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
     }
-    assert!(all_agree, "see the figures above");
+    assert!(all_agree, "see the values above");
     assert_eq!(rows.as_array().unwrap().len(), 3);
 }
 
@@ -73,7 +73,7 @@ fn slightly_brighter_picture_does_not_agree() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
-    // One level brighter everywhere: hardly visible, yet every metric must notice.
+    // One level brighter everywhere: hardly visible, but every metric must detect it.
     let brighter: Vec<u8> = b.rgba.iter().map(|&value| value.saturating_add(1)).collect();
     let right = PixelPair::new(a.size_px, &a.rgba, &b.rgba).unwrap();
     let wrong = PixelPair::new(a.size_px, &a.rgba, &brighter).unwrap();

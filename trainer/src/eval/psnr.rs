@@ -3,10 +3,9 @@
 use super::PixelPair;
 use crate::Error;
 
-/// Peak signal-to-noise ratio in decibels over the three colours of the seen pixels; infinite for equal pictures.
+/// Peak signal-to-noise ratio in decibels over the three colors of the unmasked pixels; infinite for equal pictures.
 ///
-/// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits.
-/// Fails when no pixel was seen.
+/// `10 log10(255^2 / mean squared difference)`, on values already rounded to 8 bits. Fails if all pixels are masked.
 pub fn psnr(pair: &PixelPair<'_>) -> Result<f64, Error> {
     let (mut squares, mut n_visible) = (0_u64, 0_u64);
     for (rendered, truth) in pair.rendered_rgba.chunks_exact(4).zip(pair.truth_rgba.chunks_exact(4)) {

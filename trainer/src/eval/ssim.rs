@@ -1,4 +1,4 @@
-//! Structural similarity, gaussian window of 11 pixels, sigma 1.5, valid crop.
+//! Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, over windows inside the picture.
 
 use super::PixelPair;
 use crate::Error;
@@ -11,17 +11,17 @@ const SIGMA_PX: f64 = 1.5;
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
 
-/// Structural similarity, the mean over the three colours and over all windows that lie inside the picture.
+/// Structural similarity: the mean over the three colors and over all windows inside the picture.
 ///
-/// Windows that touch a masked pixel are left out. Source: Wang, Bovik, Sheikh, Simoncelli 2004, section III.
-/// Fails for pictures smaller than a window, and when no window is left.
+/// Windows that touch a masked pixel are left out. Source: Wang, Bovik, Sheikh, Simoncelli 2004, section III. Fails for
+/// pictures smaller than a window, and if no window remains.
 pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     pair.require_side("SSIM", WINDOW_PX)?;
     let width = pair.size_px[0] as usize;
     let n_rows = pair.size_px[1] as usize - WINDOW + 1;
     let signal = SumAndDifference::of(pair);
     let masked = masked_counts(pair);
-    // Each row's sum is kept apart and added in order, so the result does not depend on the threads.
+    // Sums are computed per row and added in order, so that the result does not depend on the threads.
     let rows: Vec<(f64, usize)> = (0..n_rows)
         .into_par_iter()
         .map_init(|| RowScratch::new(width), |scratch, y| scratch.ssim_of_row(&signal, masked.as_deref(), y))
@@ -33,10 +33,10 @@ pub fn ssim(pair: &PixelPair<'_>) -> Result<f64, Error> {
     Ok(rows.iter().map(|row| row.0).sum::<f64>() / (3 * n_windows) as f64)
 }
 
-/// `rendered + truth` and `rendered - truth`, colours interleaved, each picture in 0 to 1.
+/// `rendered + truth` and `rendered - truth`, colors interleaved, each picture in 0 to 1.
 ///
-/// The local variances of these two hold all that SSIM needs: their sum is twice the sum of the pictures' variances,
-/// their difference four times the covariance. That is four blurs instead of five.
+/// SSIM follows from the local variances of these two: their sum is twice the sum of the pictures' variances, their
+/// difference four times the covariance. That takes four blurs instead of five.
 struct SumAndDifference {
     row_len: usize,
     sum: Vec<f32>,
@@ -58,7 +58,7 @@ impl SumAndDifference {
     }
 }
 
-/// For every column of every window row, how many of its 11 pixels are masked; none when no pixel is.
+/// For each column of each row of windows, how many of its 11 pixels are masked; `None` if no pixel is.
 fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     let [width, height] = pair.size_px.map(|side| side as usize);
     if (0..width * height).all(|ix| pair.is_visible(ix)) {
@@ -77,7 +77,7 @@ fn masked_counts(pair: &PixelPair<'_>) -> Option<Vec<u8>> {
     Some(counts)
 }
 
-/// Memory for one row of windows: the four signals blurred along y, then along x.
+/// Scratch memory for one row of windows: the four signals blurred along y, then along x.
 struct RowScratch {
     weights: [f32; WINDOW],
     width: usize,
@@ -96,7 +96,7 @@ impl RowScratch {
         }
     }
 
-    /// The sum of SSIM over the windows whose first row is `y` and the three colours, and the number of windows.
+    /// The sum of SSIM over the windows whose first row is `y` and over the three colors, and the number of windows.
     fn ssim_of_row(&mut self, signal: &SumAndDifference, masked: Option<&[u8]>, y: usize) -> (f64, usize) {
         self.blur_along_y(signal, y);
         self.blur_along_x();
@@ -136,7 +136,7 @@ impl RowScratch {
         }
     }
 
-    /// SSIM of one colour of one window.
+    /// SSIM of one color of one window.
     fn ssim_at(&self, ix: usize) -> f32 {
         let [sum, difference, sum_square, difference_square] = self.blurred.each_ref().map(|blurred| blurred[ix]);
         let (sum_variance, difference_variance) = (sum_square - sum * sum, difference_square - difference * difference);
@@ -148,7 +148,7 @@ impl RowScratch {
     }
 }
 
-/// Adds a row and its squares, weighted.
+/// Adds a weighted row and its weighted squares.
 fn add_weighted(blurred: &mut [f32], blurred_square: &mut [f32], row: &[f32], weight: f32) {
     for ((blurred, square), &value) in blurred.iter_mut().zip(blurred_square).zip(row) {
         *blurred += weight * value;
@@ -168,7 +168,7 @@ fn gaussian() -> [f32; WINDOW] {
 mod tests {
     use super::*;
 
-    /// A picture of repeatable noise.
+    /// A picture of reproducible noise.
     fn noise(n_pixels: usize, seed: u32) -> Vec<u8> {
         let mut state = seed;
         let mut next = || {
@@ -192,7 +192,7 @@ mod tests {
         let a = noise(40 * 30, 1);
         let mut rendered = a.clone();
         let mut truth = a.clone();
-        // Wrong only where masked: what is left is perfect.
+        // Wrong only at the masked pixel: all remaining windows are perfect.
         let pixel = 4 * (15 * 40 + 20);
         rendered[pixel] ^= 0x80;
         truth[pixel + 3] = 0;
@@ -200,7 +200,7 @@ mod tests {
         assert!((masked - 1.0).abs() < 1e-6, "{masked}");
         let counted = ssim(&PixelPair::new([40, 30], &rendered, &a).unwrap()).unwrap();
         assert!(counted < 0.999_9, "{counted}");
-        // A wrong pixel eight columns on still counts in the windows that do not reach back to the mask.
+        // A wrong pixel eight columns to the right still counts in the windows that do not reach the mask.
         rendered[pixel + 4 * 8] ^= 0x80;
         let with_wrong_pixel = ssim(&PixelPair::new([40, 30], &rendered, &truth).unwrap()).unwrap();
         assert!(with_wrong_pixel < 0.999_9, "{with_wrong_pixel}");

@@ -1,4 +1,4 @@
-//! The device all kernels and viewers share, and its buffers.
+//! The device that all kernels and viewers share, and its buffers.
 
 use super::Optional;
 use crate::Error;
@@ -18,15 +18,15 @@ const CHECK_PERIOD: Duration = Duration::from_millis(100);
 pub struct GpuOptions {
     /// Whether optional features of the adapter may be used.
     pub optional_features: bool,
-    /// Whether cooperative matrices are among them.
+    /// Whether cooperative matrices may be used.
     pub matrices: bool,
-    /// Whether floats may be added atomically: in an order of their own, so nothing that learns wants it.
+    /// Whether float atomics may be used. Their order of additions varies between runs, so training does not use them.
     pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
     /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
     pub memory_limit_bytes: Option<u64>,
-    /// Which of [`Gpu::adapters`]; else the fastest.
+    /// Index into [`Gpu::adapters`]; `None`: the fastest adapter.
     pub adapter: Option<usize>,
 }
 
@@ -134,7 +134,7 @@ impl Health {
     }
 }
 
-/// Where compute kernels run.
+/// Backends that support compute kernels.
 const BACKENDS: wgpu::Backends = wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
 
 fn instance() -> wgpu::Instance {
@@ -153,10 +153,10 @@ fn all_adapters(instance: &wgpu::Instance) -> Vec<wgpu::Adapter> {
 
 /// How the allocator divides the driver's memory among buffers.
 ///
-/// By default it cuts buffers out of blocks of 128 MiB and more. Buffers that grow with the scene leave holes in these blocks, and a
-/// block returns to the system only when it is empty: in a long run, the blocks took more than twice the bytes in use. On a software
-/// adapter that is host memory, so there each large buffer gets a block of its own, which costs no more than a `malloc`. A driver of
-/// a real GPU takes far longer for that and limits the number of blocks.
+/// By default, it places buffers in shared blocks of 128 MiB or more. Buffers that grow with the scene leave holes in these
+/// blocks, and a block returns to the system only when it is empty: in a long run, the blocks took more than twice the bytes in
+/// use. On a software adapter, blocks are host memory. There, each large buffer gets its own block, which costs no more than a
+/// `malloc`. The driver of a real GPU is far slower at allocating blocks and limits their number.
 fn memory_hints(device_type: wgpu::DeviceType) -> wgpu::MemoryHints {
     match device_type {
         wgpu::DeviceType::Cpu => wgpu::MemoryHints::Manual {
@@ -172,7 +172,7 @@ impl Gpu {
         all_adapters(&instance()).iter().map(|adapter| adapter.get_info().name).collect()
     }
 
-    /// Opens the adapter that is asked for, or the fastest there is; a software one serves when there is no other.
+    /// Opens the requested adapter, or the fastest one; uses a software adapter if there is no other.
     pub fn open(options: &GpuOptions) -> Result<Arc<Self>, Error> {
         let instance = instance();
         let adapter = match options.adapter {
@@ -229,13 +229,13 @@ impl Gpu {
         }))
     }
 
-    /// Name, kind, driver and optional features of the adapter, for people.
+    /// Name, type, driver and optional features of the adapter as text.
     pub fn describe(&self) -> String {
         let info = &self.info;
         let subgroups =
             self.optional.subgroup_lanes.map_or("no subgroups".to_owned(), |lanes| format!("subgroups of {lanes}"));
         let timestamps = if self.optional.timestamps { "timestamps" } else { "no timestamps" };
-        let matrices = if self.optional.half_matrices { "matrices of f16" } else { "no matrices of f16" };
+        let matrices = if self.optional.half_matrices { "f16 matrices" } else { "no f16 matrices" };
         format!(
             "{} ({:?}, {:?}, {} {}), {subgroups}, {timestamps}, {matrices}",
             info.name, info.device_type, info.backend, info.driver, info.driver_info
@@ -252,12 +252,12 @@ impl Gpu {
         self.optional
     }
 
-    /// Largest buffer a kernel can see, bytes.
+    /// Largest buffer that a kernel can bind, bytes.
     pub fn max_binding_bytes(&self) -> u64 {
         self.limits.max_storage_buffer_binding_size.min(self.limits.max_buffer_size)
     }
 
-    /// Memory that a workgroup can share, bytes.
+    /// Maximum workgroup memory, bytes.
     pub(super) fn max_workgroup_bytes(&self) -> u32 {
         self.limits.max_compute_workgroup_storage_size
     }
@@ -284,7 +284,7 @@ impl Gpu {
         Some(self.device.generate_allocator_report()?.total_reserved_bytes)
     }
 
-    /// Whether the device was lost. Nothing that was created on it can be used any more.
+    /// Whether the device was lost. Nothing that was created on it can be used anymore.
     pub fn is_lost(&self) -> bool {
         self.health.lost.get().is_some()
     }
@@ -348,7 +348,7 @@ impl Gpu {
         self.buffer(label, bytes, usage)
     }
 
-    /// Writes before the next submit; a length that is no multiple of 4 is filled up with zeros.
+    /// Writes before the next submit; a length that is not a multiple of 4 is padded with zeros.
     pub fn write(&self, buffer: &Buffer, offset_bytes: u64, contents: &[u8]) {
         let whole = contents.len() / 4 * 4;
         self.queue.write_buffer(&buffer.raw, offset_bytes, &contents[..whole]);
@@ -359,14 +359,14 @@ impl Gpu {
         }
     }
 
-    /// Fills part of a buffer with zeros at once.
+    /// Fills part of a buffer with zeros, without waiting for the next submit.
     pub fn clear(&self, buffer: &Buffer, offset_bytes: u64, bytes: u64) {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.clear_buffer(&buffer.raw, offset_bytes, Some(bytes));
         self.queue.submit([encoder.finish()]);
     }
 
-    /// Copies `bytes` bytes from one buffer to another at once.
+    /// Copies `bytes` bytes from one buffer to another, without waiting for the next submit.
     pub fn copy(&self, from: (&Buffer, u64), to: (&Buffer, u64), bytes: u64) {
         let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         encoder.copy_buffer_to_buffer(&from.0.raw, from.1, &to.0.raw, to.1, bytes);
@@ -381,7 +381,7 @@ impl Gpu {
         self.submit_reading(self.encoder(), &[(buffer, n * size_of::<T>())]).finish(self)
     }
 
-    /// Begins to read the first `n` words of `buffer` as they are after everything submitted so far.
+    /// Begins to read the first `n` words of `buffer`, with the contents after everything submitted so far.
     pub fn begin_read(&self, buffer: &Buffer, n: usize) -> PendingRead {
         self.submit_reading(self.encoder(), &[(buffer, 4 * n)])
     }
@@ -409,7 +409,7 @@ impl Gpu {
         let submission = self.queue.submit([encoder.finish()]);
         let (sender, mapped) = std::sync::mpsc::sync_channel(1);
         staging.map_async(wgpu::MapMode::Read, .., move |result| {
-            // Nobody listens any more when the read was given up.
+            // Sending fails if the read was dropped.
             let _ = sender.send(result);
         });
         PendingRead(Ok(Reading { staging, submission, mapped, parts }))
@@ -440,7 +440,8 @@ impl Gpu {
         self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner).len()
     }
 
-    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; those unused longest are dropped first.
+    /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; the least recently used ones are dropped
+    /// first.
     fn keep_staging(&self, buffer: wgpu::Buffer) {
         let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
         idle.push_back(buffer);
@@ -581,7 +582,7 @@ mod tests {
     fn growing_buffers_do_not_fragment_host_memory() {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         if !gpu.is_software() {
-            eprintln!("skipped: only on a software adapter are buffers in host memory");
+            eprintln!("skipped: buffers are in host memory only on a software adapter");
             return;
         }
         let mut buffers: Vec<Buffer> = (0..8).map(|_| gpu.storage("growing", 16).unwrap()).collect();
@@ -592,6 +593,9 @@ mod tests {
         }
         gpu.wait().unwrap();
         let (live, reserved) = (gpu.live_bytes(), gpu.reserved_bytes().expect("Vulkan"));
-        assert!(live == 8 * (24 << 20) && reserved <= live + 8 * SOFTWARE_BLOCK_BYTES, "{reserved} of {live} bytes");
+        assert!(
+            live == 8 * (24 << 20) && reserved <= live + 8 * SOFTWARE_BLOCK_BYTES,
+            "{reserved} bytes reserved for {live} bytes"
+        );
     }
 }

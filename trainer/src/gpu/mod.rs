@@ -1,4 +1,4 @@
-//! The GPU as this crate sees it: one device, pipelines found by reflection, lists of passes. No word about splats.
+//! GPU access: one device, pipelines with bindings by reflection, and lists of passes. Independent of splats.
 
 mod device;
 mod passes;

@@ -5,7 +5,7 @@ use crate::Error;
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Most workgroups WebGPU allows along one axis.
+/// Maximum number of workgroups that WebGPU allows along one axis.
 const MAX_GROUPS_PER_AXIS: u64 = 65_535;
 
 /// GPU time of one pass.
@@ -23,9 +23,9 @@ enum Pass {
     Copy { from: (wgpu::Buffer, u64), to: (wgpu::Buffer, u64), bytes: u64 },
 }
 
-/// A list of GPU passes; listing them does not touch the GPU.
+/// A list of GPU passes; adding to it does not touch the GPU.
 ///
-/// Bind groups are kept between lists, keyed by kernel and buffers; [`Passes::clear_bindings`] lets go of them.
+/// Bind groups are cached across submits, keyed by kernel and buffers; [`Passes::clear_bindings`] drops them.
 #[derive(Default)]
 pub struct Passes {
     list: Vec<Pass>,
@@ -45,17 +45,17 @@ impl std::fmt::Debug for Passes {
 }
 
 impl Passes {
-    /// Adds a kernel over `n_groups` workgroups, folded to two axes; buffers are bound by the names in the WGSL.
+    /// Adds a kernel over `n_groups` workgroups, folded to two axes; buffers are bound by their names in the WGSL.
     ///
     /// # Panics
-    /// When the names differ from those of the kernel: a mistake in this crate, shown with both lists.
+    /// If the names differ from those of the kernel, which is a bug in this crate. The message lists both.
     pub fn dispatch(&mut self, gpu: &Gpu, pipeline: &Pipeline, n_groups: u64, buffers: &[(&str, &Buffer)]) {
         if n_groups == 0 {
             return;
         }
         let rows = n_groups.div_ceil(MAX_GROUPS_PER_AXIS);
         let columns = n_groups.div_ceil(rows);
-        assert!(rows <= MAX_GROUPS_PER_AXIS, "{}: {n_groups} workgroups are more than a dispatch holds", pipeline.name);
+        assert!(rows <= MAX_GROUPS_PER_AXIS, "{}: {n_groups} workgroups exceed the limit of a dispatch", pipeline.name);
         let find = |name: &str| buffers.iter().find(|(given, _)| *given == name).map(|(_, buffer)| *buffer);
         let found: Option<Vec<&Buffer>> = pipeline.bindings.iter().map(|binding| find(&binding.name)).collect();
         let Some(found) = found.filter(|found| found.len() == buffers.len()) else {
@@ -88,12 +88,12 @@ impl Passes {
         });
     }
 
-    /// Adds the zeroing of a buffer.
+    /// Adds a pass that fills a buffer with zeros.
     pub fn clear(&mut self, buffer: &Buffer) {
         self.clear_range(buffer, 0..buffer.bytes());
     }
 
-    /// Adds the zeroing of a part of a buffer; begin and end are multiples of 4.
+    /// Adds a pass that fills part of a buffer with zeros; begin and end are multiples of 4.
     pub fn clear_range(&mut self, buffer: &Buffer, bytes: Range<u64>) {
         self.list.push(Pass::Clear { buffer: buffer.raw.clone(), bytes });
     }
@@ -105,39 +105,40 @@ impl Passes {
         }
     }
 
-    /// Number of passes listed.
+    /// Number of passes in the list.
     pub fn len(&self) -> usize {
         self.list.len()
     }
 
-    /// Whether nothing is listed.
+    /// Whether the list is empty.
     pub fn is_empty(&self) -> bool {
         self.list.is_empty()
     }
 
-    /// Lets go of kept bind groups, and so of buffers that nobody else holds.
+    /// Drops the cached bind groups, and with them buffers that have no other owner.
     pub fn clear_bindings(&mut self) {
         self.bind_groups.clear();
     }
 
-    /// Sends the list to the GPU and empties it.
+    /// Submits the list and empties it.
     pub fn submit(&mut self, gpu: &Gpu) {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
         gpu.queue.submit([encoder.finish()]);
     }
 
-    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers as they are after the list:
-    /// one submit and one read-back for all.
+    /// Submits the list, empties it, and begins to read the first bytes of each of these buffers, with their contents
+    /// after the list: one submit and one read-back for all.
     pub fn submit_reading(&mut self, gpu: &Gpu, reads: &[(&Buffer, usize)]) -> PendingRead {
         let mut encoder = gpu.encoder();
         encode_all(&mut encoder, self.list.drain(..));
         gpu.submit_reading(encoder, reads)
     }
 
-    /// Sends the list, waits, and tells the GPU time from the first pass's beginning to the last one's end, milliseconds.
+    /// Submits the list, waits, and returns the GPU time from the beginning of the first pass to the end of the last,
+    /// milliseconds.
     ///
-    /// `None` when the adapter has no timestamps.
+    /// Returns `None` if the adapter has no timestamps.
     pub fn submit_timed_total(&mut self, gpu: &Gpu) -> Result<Option<f64>, Error> {
         let timed = gpu.optional.timestamps;
         let queries = timed.then(|| {
@@ -168,9 +169,9 @@ impl Passes {
         Ok(timed.then(|| ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(gpu.queue.get_timestamp_period()) / 1e6))
     }
 
-    /// Sends the list, one timestamped pass a kernel, waits, and tells the GPU time of each.
+    /// Submits the list with one timestamped pass per kernel, waits, and returns the GPU time of each.
     ///
-    /// Empty when the adapter has no timestamps.
+    /// Returns an empty list if the adapter has no timestamps.
     pub fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
         if !gpu.optional.timestamps {
             self.submit(gpu);
@@ -225,7 +226,7 @@ impl Passes {
     }
 }
 
-/// An empty pass that writes one timestamp at its beginning or end.
+/// Encodes an empty pass that writes one timestamp at its beginning or end.
 fn write_timestamp(encoder: &mut wgpu::CommandEncoder, queries: Option<&wgpu::QuerySet>, first: bool) {
     let Some(query_set) = queries else { return };
     let timestamp_writes = Some(wgpu::ComputePassTimestampWrites {
@@ -269,7 +270,7 @@ fn encode(compute: &mut wgpu::ComputePass<'_>, pass: &Pass) {
 }
 
 fn u32_of(value: u64) -> u32 {
-    u32::try_from(value).expect("workgroup counts are folded below 2^16 an axis")
+    u32::try_from(value).expect("workgroup counts are folded below 2^16 per axis")
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
-//! Compute pipelines whose bindings are found by the names in the WGSL.
+//! Compute pipelines whose bindings are found by their names in the WGSL.
 
 use super::wgsl::{Access, Binding};
 use super::{Gpu, Source, reflect, resolve, wgsl};
 use crate::Error;
 
-/// A kernel: its WGSL file and what it may import.
+/// A kernel: its WGSL file and the files it may import.
 #[derive(Clone, Copy, Debug)]
 pub struct Kernel {
     /// The file with the entry point `main`.
@@ -39,7 +39,7 @@ impl Pipeline {
             wgpu::ShaderModuleDescriptor { label: Some(name), source: wgpu::ShaderSource::Wgsl(text.into()) };
         let checks = wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
         // SAFETY: every loop of our kernels counts to a bound that is fixed before it starts.
-        #[expect(unsafe_code, reason = "bounding loops once more costs every round of the innermost ones")]
+        #[expect(unsafe_code, reason = "a second bound would cost time in every iteration of the innermost loops")]
         let shader = unsafe { device.create_shader_module_trusted(described, checks) };
         let entries: Vec<wgpu::BindGroupLayoutEntry> = bindings
             .iter()

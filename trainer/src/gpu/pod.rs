@@ -1,4 +1,4 @@
-//! The one place where f64 becomes f32 on its way to the GPU.
+//! The only place where f64 is converted to f32 for the GPU.
 #![expect(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose of this file")]
 
 /// Rounds to the nearest f32.

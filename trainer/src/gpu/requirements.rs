@@ -1,26 +1,26 @@
-//! What a kernel may use beyond the WebGPU defaults, and what happens without it.
+//! Optional features beyond the WebGPU defaults, and their fallbacks.
 
 use super::GpuOptions;
 
-/// Optional abilities of the adapter; every one has a fallback.
+/// Optional features of the adapter; each has a fallback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Optional {
-    /// Smallest number of lanes that run together, when subgroup operations may be used: 4 to 128.
+    /// Smallest number of lanes per subgroup, if subgroup operations may be used: 4 to 128.
     ///
-    /// Without it sorting ranks sequentially and backward sums over its lanes through workgroup memory.
+    /// Without it, sorting ranks sequentially, and the backward pass sums over lanes through workgroup memory.
     pub subgroup_lanes: Option<u32>,
-    /// GPU timestamps for per-pass times; without them only wall time is known.
+    /// GPU timestamps for the time of each pass; without them, only wall time is available.
     pub timestamps: bool,
-    /// Atomic additions of floats; only a measurement wants them, and says where there are none.
+    /// Atomic additions of floats; used only for benchmarks, which report if they are unavailable.
     pub float_atomics: bool,
-    /// Products of 16x16 matrices of f16, summed in f32, each worked out by a subgroup; without them neural fields work in f32.
+    /// Products of 16x16 f16 matrices, summed in f32, each computed by a subgroup; without them, neural fields use f32.
     pub half_matrices: bool,
 }
 
-/// What kernels with matrices of f16 need.
+/// Features needed by kernels with f16 matrices.
 const HALF_MATRICES: wgpu::Features = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX.union(wgpu::Features::SHADER_F16);
 
-/// Whether matrices of the size and types that our kernels have are among those that the adapter multiplies.
+/// Whether the adapter multiplies matrices of the size and types that our kernels use.
 fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
     adapter.cooperative_matrix_properties().iter().any(|properties| {
         [properties.m_size, properties.n_size, properties.k_size] == [16; 3]
@@ -30,7 +30,7 @@ fn has_half_matrices(adapter: &wgpu::Adapter) -> bool {
 }
 
 impl Optional {
-    /// What `adapter` offers of what may be used; nothing of it when `FIELDRIG_GPU_FEATURES=none` was asked for.
+    /// Features of `adapter` that `options` allows. With `FIELDRIG_GPU_FEATURES=none`, the caller allows none.
     pub(super) fn of(adapter: &wgpu::Adapter, options: &GpuOptions) -> Self {
         let allowed = options.optional_features;
         let features = adapter.features();
@@ -49,7 +49,7 @@ impl Optional {
         }
     }
 
-    /// The wgpu features to ask for.
+    /// The wgpu features to request.
     pub(super) fn features(self) -> wgpu::Features {
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::SUBGROUP, self.subgroup_lanes.is_some());

@@ -3,10 +3,10 @@
 use crate::Error;
 use wgpu::naga;
 
-/// A WGSL file; the name is the file's, without `.wgsl`.
+/// A WGSL file.
 #[derive(Clone, Copy, Debug)]
 pub struct Source {
-    /// File name without the ending.
+    /// File name without `.wgsl`.
     pub name: &'static str,
     /// Contents.
     pub text: &'static str,
@@ -20,7 +20,7 @@ pub(super) enum Access {
     ReadWrite,
 }
 
-/// One buffer of a kernel, as naga sees it.
+/// One buffer of a kernel, from naga's reflection.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Binding {
     pub(super) name: String,
@@ -28,7 +28,7 @@ pub(super) struct Binding {
     pub(super) access: Access,
 }
 
-/// Replaces each line `#import name` by the shared source of that name, once, recursively.
+/// Replaces each line `#import name` with the shared source of that name, recursively; repeated imports are skipped.
 pub fn resolve(kernel: Source, shared: &[Source]) -> Result<String, Error> {
     let mut text = String::new();
     let mut seen = Vec::new();
@@ -55,7 +55,7 @@ fn append(source: Source, shared: &[Source], seen: &mut Vec<&'static str>, text:
     Ok(())
 }
 
-/// Parses and validates WGSL and lists the buffers of group 0 in order of their numbers.
+/// Parses and validates WGSL.
 pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     let rejected = |message: String| Error::Wgsl { kernel: name, message };
     let module = naga::front::wgsl::parse_str(text).map_err(|error| rejected(error.emit_to_string(text)))?;
@@ -65,7 +65,7 @@ pub fn reflect(name: &'static str, text: &str) -> Result<naga::Module, Error> {
     Ok(module)
 }
 
-/// Memory that a workgroup shares, bytes.
+/// Workgroup memory that a kernel uses, bytes.
 pub(super) fn workgroup_bytes(module: &naga::Module) -> u32 {
     let shared = module.global_variables.iter().filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup);
     shared.map(|(_, variable)| module.types[variable.ty].inner.size(module.to_ctx())).sum()

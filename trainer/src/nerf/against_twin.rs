@@ -1,4 +1,4 @@
-//! The kernels against their twins in f64.
+//! Tests of the kernels against their f64 twins.
 
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, RaySlot, SampleBuffers, StepBuffers,
@@ -16,10 +16,10 @@ use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, reso
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 
-/// More samples than one partial sum goes over.
+/// More samples than one partial sum covers.
 const N_RAYS: u32 = 90;
 
-/// Rows of a matrix with zeros around it.
+/// Rows of a matrix, padded with zeros.
 fn padded(weights: &[f64], [n_in, n_out]: [usize; 2], [n_in_padded, n_out_padded]: [u32; 2]) -> Vec<f32> {
     let mut padded = vec![0.0; (n_in_padded * n_out_padded) as usize];
     for row in 0..n_out {
@@ -30,13 +30,13 @@ fn padded(weights: &[f64], [n_in, n_out]: [usize; 2], [n_in_padded, n_out_padded
     padded
 }
 
-/// Sizes of the layers of both networks, and those of the kernels.
+/// Layer sizes of both networks: the twin's and the kernels'.
 fn layers<'a>(twin: &'a Field, widths: &Widths) -> impl Iterator<Item = ([usize; 2], [u32; 2])> + use<'a> {
     let of = |network: &'a Network| network.sizes.windows(2).map(|pair| [pair[0], pair[1]]);
     of(&twin.density).chain(of(&twin.color)).zip(widths.layers())
 }
 
-/// Weights of both networks as the kernels have them.
+/// Weights of both networks in the layout of the kernels.
 fn weights(twin: &Field, widths: &Widths) -> Vec<f32> {
     let mut rest = &[&twin.density.weights[..], &twin.color.weights].concat()[..];
     let mut all = Vec::new();
@@ -48,7 +48,7 @@ fn weights(twin: &Field, widths: &Widths) -> Vec<f32> {
     all
 }
 
-/// Compares weights, or slopes towards them, those of both networks one after the other; those of the padding are zero.
+/// Compares weights, or gradients with respect to them, of both networks in sequence. The padding must be zero.
 fn check_weights(
     mismatches: &mut Mismatches,
     got: &[f32],
@@ -76,7 +76,7 @@ fn check_weights(
     }
 }
 
-/// Slopes towards weights, summed over the chunks of samples.
+/// Gradients with respect to weights, summed over the chunks of samples.
 fn summed(gpu: &Gpu, step: &StepBuffers, widths: &Widths, n_samples: u32) -> Vec<f32> {
     let n_sums = widths.n_padded_weights() as usize;
     let n_chunks = n_samples.div_ceil(N_CHUNK) as usize;
@@ -97,7 +97,7 @@ struct Bench {
     step: StepBuffers,
     gradients: FieldGradients,
     slot: RaySlot,
-    /// A code a ray.
+    /// One appearance embedding per ray.
     image_params: Buffer,
 }
 
@@ -111,7 +111,7 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     let entries: Vec<[f32; 2]> = twin.table.iter().map(|entry| f32s_of(*entry)).collect();
     gpu.write(&field.grid, 0, bytemuck::cast_slice(&entries));
     gpu.write(&field.weights, 0, bytemuck::cast_slice(&weights(twin, &widths)));
-    // Room for more than there are.
+    // Capacity for more samples than there are.
     let samples = SampleBuffers::new(&gpu, n_samples + 600).unwrap();
     let step = StepBuffers::new(&gpu, &widths, n_rays + 3, n_samples + 600).unwrap();
     gpu.write(&samples.batch, 0, bytemuck::bytes_of(&Batch { n_samples, ..Batch::of(n_rays) }));
@@ -173,13 +173,14 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     }
 }
 
-/// With what the adapter has, without matrices, and with nothing but what all have.
+/// All features of the adapter; without cooperative matrices; without any optional feature.
 fn gpu_variants() -> [GpuOptions; 3] {
     let all = GpuOptions::default();
     [all, GpuOptions { matrices: false, ..all }, GpuOptions { optional_features: false, ..all }]
 }
 
-/// How much farther off slopes may be where layers are matrices: they are of f16 then, with 11 bits, those that sums in f32 lose aside.
+/// Factor on gradient tolerances if layers are cooperative matrices: gradients are then f16, with 11 bits, although
+/// summed in f32.
 fn tolerance_scale_of(widths: &Widths) -> f64 {
     if widths.is_half_precision { 200.0 } else { 1.0 }
 }
@@ -218,7 +219,7 @@ fn colors_and_gradients_match_twin() {
         list.submit(gpu);
 
         let tolerance_scale = tolerance_scale_of(widths);
-        // What is seen has twice as many bits.
+        // Forward values have twice as many bits.
         let (abs, rel) = if widths.is_half_precision { (5e-5, 5e-5) } else { (1e-5, 1e-5) };
         let mut mismatches = Mismatches::default();
         let ray_colors: Vec<[f32; 4]> = gpu.read(&step.ray_colors, rays.len()).unwrap();
@@ -251,7 +252,8 @@ fn colors_and_gradients_match_twin() {
     }
 }
 
-/// Slopes towards poses and codes of images, and the first step of each: images of seven rays, the last of fewer.
+/// Gradients with respect to poses and appearance embeddings of images, and the first step of each. Images have seven
+/// rays, the last one fewer.
 #[test]
 fn image_param_gradients_match_twin() {
     const RAYS_PER_IMAGE: usize = 7;
@@ -259,7 +261,7 @@ fn image_param_gradients_match_twin() {
     const ALL: u32 = (1 << params::IMAGE_PARAM_STRIDE) - 1;
     const RATES: [f64; 3] = [0.25, 0.125, 0.0625];
     let (twin, rays) = (field(7), rays());
-    // Turn, shift and code of each ray.
+    // Rotation, translation and appearance embedding gradients of each ray.
     let expected: Vec<[[f64; 3]; 3]> = rays
         .iter()
         .map(|ray| {
@@ -338,22 +340,22 @@ fn image_param_gradients_match_twin() {
         for (image, of_image) in expected.chunks(RAYS_PER_IMAGE).enumerate() {
             for (image_param, got) in image_params[image].iter().enumerate() {
                 if learned & (1 << image_param) == 0 {
-                    assert_eq!(*got, [0.0; 4], "image {image}: term {image_param} is not learned");
+                    assert_eq!(*got, [0.0; 4], "image {image}: parameter {image_param} is not optimized");
                     continue;
                 }
                 let (part, axis) = (image_param / 3, image_param % 3);
                 let sum: f64 = of_image.iter().map(|ray| ray[part][axis]).sum();
                 let [value, first, second, n_steps] = got.map(f64::from);
-                let label = |name: &str| format!("image {image}, term {image_param}, {name}");
+                let label = |name: &str| format!("image {image}, parameter {image_param}, {name}");
                 mismatches.check(
-                    label("slope"),
+                    label("gradient"),
                     first / 0.1,
                     sum,
                     5e-5 * tolerance_scale * largest[part],
                     2e-4 * tolerance_scale,
                 );
                 mismatches.check(label("square"), second / 0.01, (first / 0.1).powi(2), 1e-12, 1e-4);
-                // A first step goes as far as the rate says, and half of it is pulled back.
+                // The first step has the length of the rate; weight decay then takes back half of it.
                 mismatches.check(label("value"), value, -0.5 * RATES[part] * first.signum(), 1e-6, 1e-5);
                 mismatches.check(label("steps"), n_steps, 1.0, 1e-9, 0.0);
             }
@@ -362,7 +364,7 @@ fn image_param_gradients_match_twin() {
         assert_eq!(
             image_params[N_IMAGES],
             [[0.0; 4]; params::IMAGE_PARAM_STRIDE],
-            "an image without rays stays where it is"
+            "an image without rays must not change"
         );
 
         gpu.write(&slot.rays, 0, bytemuck::cast_slice(&of_images));
@@ -388,7 +390,7 @@ fn image_param_gradients_match_twin() {
     }
 }
 
-/// Steps of both, each from its own gradients.
+/// Optimizer steps of the kernels and the twin, each with its own gradients.
 #[test]
 fn optimizer_steps_match_twin() {
     const N_STEPS: u32 = 4;
@@ -398,14 +400,15 @@ fn optimizer_steps_match_twin() {
         rate: 0.02,
         final_rate_frac: 0.25,
         betas: [0.75, 0.875],
-        epsilon: 1e-4, // Small slopes, which f32 knows less well, move less.
+        epsilon: 1e-4, // Small gradients, which f32 represents less precisely, move less.
         weight_decay: 0.0,
         n_planned_steps: 4.0,
         unused: 0.0,
     };
     let of_weights = AdamRule { rate: 0.01, weight_decay: 0.5, ..grid_rule };
-    let first_scale = 2f32.powi(28); // Fine enough for the first step; the others find their own.
-    let options = GpuOptions { matrices: false, ..GpuOptions::default() }; // A step is as long for a slope of f16's noise.
+    let first_scale = 2f32.powi(28); // Fine enough for the first step; later steps choose their own.
+    // A step along f16 noise would be as long as a real one.
+    let options = GpuOptions { matrices: false, ..GpuOptions::default() };
     let bench = bench(&options, &twin, &rays, &vec![first_scale; twin.shape.n_cells.len()]);
     let Bench { gpu, pipelines, widths, field: buffers, samples, step: kept_step, gradients, slot, image_params } =
         &bench;
@@ -459,14 +462,14 @@ fn optimizer_steps_match_twin() {
     mismatches.assert_none();
     assert_eq!(gpu.read::<u32>(&moments.steps, 1).unwrap(), [N_STEPS]);
     assert!(gpu.read::<i32>(&gradients.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
-    // A tenth of a level's largest slope still has 19 bits.
+    // A tenth of a level's largest gradient still has 19 bits.
     let scales: Vec<f32> = gpu.read(&gradients.scales, twin.shape.n_cells.len()).unwrap();
     assert!(scales.iter().all(|scale| scale.log2().fract() == 0.0), "{scales:?}");
     assert!(scales.iter().any(|scale| *scale != first_scale), "{scales:?}");
 }
 
-/// The first step of the weights, along the slopes that were summed: without a twin's, which are too far off those of f16 to decide where
-/// a small slope points.
+/// The first step of the weights, along the summed gradients. The twin's gradients are not used: they differ too much
+/// from f16 ones to predict the sign of a small gradient.
 #[test]
 fn first_step_follows_summed_gradients() {
     let (twin, rays) = (field(7), rays());
@@ -503,7 +506,7 @@ fn first_step_follows_summed_gradients() {
             n_moved += usize::from(derivative.abs() > 1e-5);
         }
         mismatches.assert_none();
-        assert!(n_moved > 100, "only {n_moved} weights have slopes to speak of");
+        assert!(n_moved > 100, "only {n_moved} weights have significant gradients");
     }
 }
 

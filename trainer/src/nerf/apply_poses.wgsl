@@ -1,7 +1,7 @@
-// aim_rays: rays as the poses of their images were found to be.
+// apply_poses: corrects rays by the optimized poses of their images.
 //
 // threads   one per ray
-// reads     batch, terms [n_images, TERM_STRIDE]
+// reads     batch, image_params [n_images, IMAGE_PARAM_STRIDE]
 // writes    rays (origin, direction)
 // twin      nerf/reference/pose.rs
 

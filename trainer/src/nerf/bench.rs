@@ -1,7 +1,7 @@
-//! Times a step of learning on synthetic rays, pass by pass.
+//! Times a training step on synthetic rays, pass by pass.
 //!
-//! Rays begin anywhere in a cube that is occupied throughout and are all equally long, so that a step has a known number of
-//! samples; their colors are noise. The occupancy is not visited.
+//! Rays begin anywhere in a fully occupied cube and have equal lengths, so that a step has a known number of samples;
+//! their colors are noise. The occupancy is not updated.
 
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::{NerfBudget, NerfOptions};
@@ -16,31 +16,33 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Levels, coarsest and finest cells along an axis, and the logarithm of the entries of a level: as Mueller et al. 2022 have it.
+/// Number of levels, coarsest and finest cells along an axis, and log2 of the entries per level, as in Mueller et al.
+/// 2022.
 const GRID_SHAPE: (u32, u32, u32, u32) = (16, 16, 2048, 19);
-/// No multiple of the steps between two visits of the occupancy.
+/// Not a multiple of the steps between two occupancy updates.
 const STEP: u64 = 1;
 
-/// Figures of one number of samples.
+/// Timings for one number of samples.
 #[derive(Clone, Debug)]
 pub struct StepFigures {
-    /// Rays of a step.
+    /// Rays per step.
     pub n_rays: u32,
-    /// Samples of a step.
+    /// Samples per step.
     pub n_samples: u32,
-    /// GPU time of a step, milliseconds: the sum over its passes, median; wall time where there are no timestamps.
+    /// GPU time of a step, milliseconds: median of the sum over its passes, or wall time without timestamps.
     pub step_millis: f64,
-    /// Wall time of a step, mean of a row of them back to back, milliseconds.
+    /// Wall time of a step, milliseconds: mean of consecutive steps.
     pub step_wall_millis: f64,
-    /// GPU time of the colors of as many samples of a picture, milliseconds, median; wall time where there are no timestamps.
+    /// GPU time to render the colors of as many samples of a picture, milliseconds: median, or wall time without
+    /// timestamps.
     pub colors_millis: f64,
     /// GPU time of each pass of one step; empty without timestamps.
     pub passes: Vec<PassTiming>,
-    /// Most bytes of GPU buffers alive at once.
+    /// Peak size of live GPU buffers, bytes.
     pub peak_bytes: u64,
 }
 
-/// Times steps of `n_rays` rays with `n_samples` samples in all, a multiple of them.
+/// Times steps of `n_rays` rays with `n_samples` samples in total, which is a multiple of `n_rays`.
 pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> Result<StepFigures, Error> {
     let options = NerfOptions::default();
     let nerf_budget = NerfBudget { n_rays, n_samples, ..NerfBudget::FULL };
@@ -61,7 +63,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let since = Instant::now();
     let mut before = None;
     for _ in 0..n_submits {
-        // As in learning, the next submit is made while one runs.
+        // As in training, encode the next submit while one runs.
         if let Some(before) = before.replace(submit(&mut field_trainer, STEPS_PER_SUBMIT)?) {
             before.finish::<u32>(gpu)?;
         }
@@ -102,16 +104,16 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     })
 }
 
-/// Rays with equally many samples, filling the batch.
+/// Rays with equal numbers of samples that fill the batch.
 fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
     let NerfBudget { n_rays, n_samples, n_steps, .. } = nerf_budget;
-    // Half a step to spare, so that rounding decides nothing.
+    // Half a step shorter, so that rounding does not change the count.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
     let ray = |ix: u32| {
         let number = |stream: u64| 2.0 * unit(mix_hash(u64::from(ix) << 8 | stream)) - 1.0;
         let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
         let direction = triple(0).normalize();
-        // Its middle in the cube, and all of it where steps are even.
+        // Clamped so that the ray's center is in the cube and all of it is where steps have constant length.
         let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
         let target = mix_hash(u64::from(ix) << 8 | 6).to_le_bytes();
         Ray {

@@ -1,4 +1,4 @@
-//! What the field and its samples take on the GPU.
+//! GPU buffers of the field, its samples and its training.
 
 use super::kernels::{N_CHUNK, N_TILE, Widths};
 use super::params::{
@@ -9,55 +9,55 @@ use super::reference::grid::GridShape;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu};
 
-/// All that is learned.
+/// All trained parameters of a field.
 #[derive(Debug)]
 pub(crate) struct FieldBuffers {
     pub(crate) levels: Buffer,
-    /// Two f32 an entry.
+    /// Two f32 per entry.
     pub(crate) grid: Buffer,
-    /// Of all layers of both networks, `[outputs, inputs]` each.
+    /// Weights of all layers of both networks, `[outputs, inputs]` each.
     pub(crate) weights: Buffer,
-    /// The same as two numbers of f16 each, as they were before the step, where layers are matrices.
+    /// The weights before the step as two f16 numbers each; only if layers use cooperative matrices.
     pub(crate) half_weights: Option<Buffer>,
-    /// What kernels bind and do not use.
+    /// Placeholder for bindings that a kernel does not use.
     pub(crate) unused_buffer: Buffer,
-    /// Terms of no image.
+    /// Placeholder for image parameters, with no images.
     pub(crate) no_image_params: Buffer,
     pub(crate) n_entries: u32,
 }
 
-/// Slopes towards the grid.
+/// Gradients with respect to the grid.
 #[derive(Debug)]
 pub(crate) struct FieldGradients {
-    /// Two i32 an entry, times the scale of its level.
+    /// Two i32 per entry, multiplied by the scale of the level.
     pub(crate) grid: Buffer,
-    /// A power of two a level.
+    /// One power of two per level.
     pub(crate) scales: Buffer,
-    /// How many contributions were too large for their scale: in this step, and in those before.
+    /// Number of contributions that overflowed their scale: in this step and in all earlier steps.
     pub(crate) counts: Buffer,
 }
 
-/// What the optimiser keeps.
+/// State of the optimizer.
 #[derive(Debug)]
 pub(crate) struct FieldMoments {
-    /// Four f32 an entry: first and second of both numbers.
+    /// Four f32 per entry: first and second moments of both numbers.
     pub(crate) grid: Buffer,
-    /// Eight f32 for four weights: first of all, second of all.
+    /// Eight f32 per four weights: four first moments, then four second moments.
     pub(crate) weights: Buffer,
-    /// Largest sum of slopes of each level.
+    /// Largest gradient sum of each level.
     pub(crate) largest: Buffer,
-    /// Steps so far, and visits of cells so far.
+    /// Number of steps and number of occupancy updates so far.
     pub(crate) steps: Buffer,
-    /// How far the next step goes.
+    /// Scale of the next step.
     pub(crate) step_scale: Buffer,
 }
 
-/// Where something is: the cells that rays are walked through.
+/// Occupancy grid: the cells in which rays are sampled.
 #[derive(Debug)]
 pub(crate) struct Occupancy {
-    /// A bit a cell, then a bit a block of cells.
+    /// One bit per cell, then one bit per block of cells.
     pub(crate) occupied: Buffer,
-    /// An f32 a cell: the share of light that it lately held back over a step; negative: never visited; 0: never looked at.
+    /// One f32 per cell: its recent opacity over one step; negative: never updated; 0: outside all views.
     pub(crate) cell_occupancy: Buffer,
     pub(crate) occupancy_sum: Buffer,
     pub(crate) occupancy_update: Buffer,
@@ -72,7 +72,7 @@ pub(crate) fn n_blocks(n_cells: u32) -> u32 {
 }
 
 impl Occupancy {
-    /// All cells hold something as far as anyone knows; where there is depth it is left to the depth to say so.
+    /// An occupancy grid with all cells marked. With depth, the cells start as outside all views until hints arrive.
     pub(crate) fn new(gpu: &Gpu, occupancy_update: &OccupancyUpdate, has_depth: bool) -> Result<Self, Error> {
         let n = occupancy_update.n_cells.pow(3) as usize;
         let n_words = n / 32 + n_blocks(occupancy_update.n_cells).pow(3).div_ceil(32) as usize;
@@ -90,15 +90,15 @@ impl Occupancy {
     }
 }
 
-/// Threads that walk one ray, `SHARES` of `march_shares.wgsl`.
+/// Threads that walk one ray; `THREADS_PER_RAY` of `march_threads.wgsl`.
 pub(crate) const THREADS_PER_RAY: u32 = 8;
 
-/// The rays of one step or of part of a picture, and how they are looked along.
+/// The rays of one step or of part of a picture, and the parameters for walking them.
 #[derive(Debug)]
 pub(crate) struct RaySlot {
     pub(crate) n_rays: u32,
     pub(crate) rays: Buffer,
-    /// Pieces found along each ray; and, for each thread that looks for them, by those before it.
+    /// Number of segments found per ray; and, per thread of a ray, the number found by the threads before it.
     pub(crate) n_found: Buffer,
     pub(crate) n_before: Buffer,
     pub(crate) march: Buffer,
@@ -118,52 +118,52 @@ impl RaySlot {
     }
 }
 
-/// The samples of rays, and what they look like.
+/// The samples of rays and the networks' outputs for them.
 #[derive(Debug)]
 pub(crate) struct SampleBuffers {
-    /// Most samples.
+    /// Maximum number of samples.
     pub(crate) n_samples: u32,
     pub(crate) batch: Buffer,
     pub(crate) spans: Buffer,
-    /// Middles of the samples in the unit cube, four f32 each.
+    /// Centers of the samples in the unit cube, four f32 each.
     pub(crate) points: Buffer,
     /// Logarithms of the densities.
     pub(crate) log_density: Buffer,
-    /// Before the sigmoid, four f32 each.
+    /// Colors before the sigmoid, four f32 each.
     pub(crate) colors: Buffer,
 }
 
-/// What a step keeps of its samples and rays.
+/// Intermediate values of a training step for its samples and rays.
 #[derive(Debug)]
 pub(crate) struct StepBuffers {
-    /// What goes into each layer, in numbers of [`Widths::bytes_per_number`], as the next.
+    /// Inputs of each layer, as numbers of [`Widths::bytes_per_number`] bytes; so is the next field.
     pub(crate) activations: Buffer,
-    /// Slopes towards what comes out of each layer.
+    /// Gradients with respect to the outputs of each layer.
     pub(crate) v_activations: Buffer,
     pub(crate) v_log_density: Buffer,
     pub(crate) v_colors: Buffer,
     pub(crate) ray_colors: Buffer,
     pub(crate) ray_errors: Buffer,
-    /// Slopes towards the weights, of each chunk of samples.
+    /// Gradients with respect to the weights, per chunk of samples.
     pub(crate) partial_sums: Buffer,
 }
 
-/// What is learned about images, and the slopes towards that.
+/// Parameters of images and their gradients.
 #[derive(Debug)]
 pub(crate) struct ImageParamBuffers {
     /// `[n_images, IMAGE_PARAM_STRIDE]`.
     pub(crate) image_params: Buffer,
     pub(crate) rule: Buffer,
     pub(crate) n_images: u32,
-    /// Of the places of each sample, and of each ray.
+    /// Gradients with respect to the position of each sample, and to each ray.
     pub(crate) v_points: Buffer,
     pub(crate) v_rays: Buffer,
-    /// Of each sample.
+    /// Gradients with respect to the appearance embedding, per sample.
     pub(crate) v_embeddings: Buffer,
 }
 
 impl ImageParamBuffers {
-    /// Of images that have right poses and the same light as far as anyone knows.
+    /// All parameters start at zero: no pose correction and equal lighting.
     pub(crate) fn new(gpu: &Gpu, rule: &ImageParamRule, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
         let n_images = rule.n_images;
         Ok(Self {
@@ -171,7 +171,7 @@ impl ImageParamBuffers {
                 "nerf.image_params",
                 u64::from(n_images) * (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64,
             )?,
-            rule: gpu.uniform_with("nerf.term_rule", rule),
+            rule: gpu.uniform_with("nerf.image_param_rule", rule),
             n_images,
             v_points: gpu.storage("nerf.v_points", 16 * u64::from(n_samples))?,
             v_rays: gpu.storage("nerf.v_rays", 32 * u64::from(n_rays))?,
@@ -181,7 +181,7 @@ impl ImageParamBuffers {
 }
 
 impl FieldBuffers {
-    /// A field of zeros.
+    /// A field with all parameters zero.
     pub(crate) fn new(gpu: &Gpu, shape: &GridShape, widths: &Widths) -> Result<Self, Error> {
         let levels: Vec<Level> = levels(shape);
         Ok(Self {
@@ -193,13 +193,13 @@ impl FieldBuffers {
             } else {
                 None
             },
-            unused_buffer: gpu.storage("nerf.nothing", 16)?,
-            no_image_params: gpu.storage("nerf.no_terms", 16)?,
+            unused_buffer: gpu.storage("nerf.unused", 16)?,
+            no_image_params: gpu.storage("nerf.no_image_params", 16)?,
             n_entries: shape.n_entries_total(),
         })
     }
 
-    /// Weights as layers take them.
+    /// Weights in the number type that the layers use.
     pub(crate) fn working_weights(&self) -> &Buffer {
         self.half_weights.as_ref().unwrap_or(&self.weights)
     }
@@ -228,7 +228,7 @@ impl FieldMoments {
 }
 
 impl SampleBuffers {
-    /// Room for so many samples.
+    /// Buffers for up to `n_samples` samples.
     pub(crate) fn new(gpu: &Gpu, n_samples: u32) -> Result<Self, Error> {
         let floats = |name: &str, width: u64| gpu.storage(name, 4 * width * u64::from(n_samples));
         Ok(Self {
@@ -243,7 +243,7 @@ impl SampleBuffers {
 }
 
 impl StepBuffers {
-    /// For so many rays and samples.
+    /// Buffers for up to `n_rays` rays and `n_samples` samples.
     pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_rays: u32, n_samples: u32) -> Result<Self, Error> {
         let floats = |name: &str, n_rows: u32, width: u32| gpu.storage(name, 4 * u64::from(n_rows) * u64::from(width));
         let in_tiles = u64::from(n_samples.next_multiple_of(N_TILE)) * u64::from(widths.bytes_per_number());

@@ -1,4 +1,4 @@
-//! What images and their depth tell about where something may be, before anything is learned.
+//! Derives initial occupancy hints from images and their depth, before training.
 
 use super::extent::Extent;
 use super::reference::march::March;
@@ -8,21 +8,22 @@ use kinematics::Transform;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-/// What is told of a cell, as in `hint_cells.wgsl`.
+/// Kinds of hints, as in `hint_cells.wgsl`.
 const UNBOUNDED: u32 = 0;
 const FREE: u32 = 1 << 30;
 const SURFACE: u32 = 2 << 30;
-/// Where rays that meet nothing end, in units of the scene's radius.
+/// Distance up to which rays without a reading are followed, in units of the scene radius.
 const UNBOUNDED_DISTANCE: f64 = 50.0;
-/// Readings from one ray that is followed to the next: readings are told of every half cell, and so is where nothing was read, but what is
-/// empty before readings need be told once.
+/// Depth readings per ray that is marked as free space. Readings, and pixels without one, are processed every half
+/// cell; free space in front of readings needs fewer rays.
 const READINGS_PER_FREE_RAY: u32 = 4;
-/// Pixels to each side that tell a hole in what a depth camera read from what it cannot read.
+/// Radius in pixels within which a hole in the depth image is distinguished from a region that the depth camera cannot
+/// measure.
 const HOLE_RADIUS_PX: u32 = 2;
-/// Share of the distance that a reading may be off by: so far in front of it nothing is taken for free.
+/// Relative error of a reading. Cells within this distance in front of it are not marked as free.
 const DEPTH_ERROR_FRAC: f64 = 0.03;
 
-/// Cells that images look at or through.
+/// Cells that images observe: without a limit, as free space, or as a surface.
 #[derive(Debug)]
 struct Cells {
     unbounded: CellSet,
@@ -30,7 +31,7 @@ struct Cells {
     surfaces: CellSet,
 }
 
-/// A set of cells: a bit each.
+/// A set of cells, one bit each.
 #[derive(Debug)]
 struct CellSet(Vec<u64>);
 
@@ -47,7 +48,7 @@ impl CellSet {
         self.0.iter_mut().zip(&other.0).for_each(|(own_word, other_words)| *own_word |= other_words);
     }
 
-    /// The cells that `other` has not got, in their order.
+    /// The cells of this set that are not in `other`, in order.
     fn difference<'a>(&'a self, other: &'a Self) -> impl Iterator<Item = u32> + 'a {
         let other_words = other.0.iter().copied().chain(std::iter::repeat(0));
         let words = (0u32..)
@@ -59,16 +60,16 @@ impl CellSet {
     }
 }
 
-/// Origin and direction of a ray, in units of the radius.
+/// Origin and direction of a ray, in units of the scene radius.
 type UnitRay = ([f64; 3], [f64; 3]);
 
-/// Pixels from one ray that is followed to the next: half a cell apart a radius away.
+/// Pixels between the rays that are followed: half a cell at a distance of one radius.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
 fn stride_of(focal_px: [f64; 2], march: &March) -> u32 {
     (2.0 / march.n_cells as f64 * focal_px[0]).clamp(1.0, 16.0) as u32
 }
 
-/// Whether a depth image shows what lies far away in a direction, given in the axes of another camera.
+/// Whether a direction, given in the axes of another camera, is in the field of view of a depth image.
 fn is_in_depth_image(depth: &DepthMap, depth_from_camera: &Transform, along: Vector3<f64>) -> bool {
     let along = depth_from_camera.rotation * along;
     let is_inside = |axis: usize| {
@@ -82,7 +83,8 @@ fn is_reading(z_m: f64) -> bool {
     z_m.is_finite() && z_m > 0.0
 }
 
-/// Whether most pixels around one without reading have one: it says nothing then, and what lies behind the others is not seen through it.
+/// Whether most pixels around one without a reading have one. Such a hole is not evidence of a far or unmeasurable
+/// region.
 fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     let [width, height] = depth.size_px;
     let around = |coordinate: u32, size: u32| {
@@ -94,12 +96,12 @@ fn is_small_hole(depth: &DepthMap, [x, y]: [u32; 2]) -> bool {
     2 * n_read > n
 }
 
-/// Of the cell around a point, drawn in as it is.
+/// Width of the cell around a point, in world, where contracted cells are larger.
 fn cell_width(march: &March, point: [f64; 3]) -> f64 {
     4.0 / march.n_cells as f64 * largest(point).1.max(1.0).powi(2)
 }
 
-/// What images tell about cells, each told once; of cells that none of them looks at nothing is told.
+/// Hints from images about cells, one per cell. Cells that no image observes get none.
 pub(crate) fn hints(keyframes: &[&Keyframe], extent: &Extent, march: &March) -> Vec<u32> {
     let empty = || Cells::new(march.n_cells.pow(3));
     let Cells { unbounded, free, surfaces } = keyframes
@@ -131,7 +133,7 @@ impl Cells {
         self
     }
 
-    /// Takes note of a depth image.
+    /// Adds the hints of a depth image.
     fn add_depth_image(&mut self, depth: &DepthMap, extent: &Extent, march: &March) {
         let stride = stride_of(depth.focal_px, march);
         let origin = extent.in_scene_units(&depth.world_from_camera).translation.vector.into();
@@ -158,7 +160,7 @@ impl Cells {
         }
     }
 
-    /// Takes note of what a color image sees where its depth image does not look, as far away as nowhere is.
+    /// Adds rays of a color image outside the field of view of its depth image, followed without a limit.
     fn add_color_only_rays(&mut self, keyframe: &Keyframe, extent: &Extent, march: &March) {
         let Keyframe { size_px: [width, height], focal_px, principal_px, world_from_camera, depth, .. } = keyframe;
         let depth = depth.as_ref().map(|depth| (depth, depth.world_from_camera.inverse() * world_from_camera));
@@ -178,7 +180,7 @@ impl Cells {
         }
     }
 
-    /// Follows a ray to its reading; to nowhere where that is 0.
+    /// Marks the cells along a ray up to its reading, or up to [`UNBOUNDED_DISTANCE`] if `distance` is 0.
     fn mark_along_ray(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let cell = |t: f64| march.cell(point(t)).0;
@@ -193,7 +195,7 @@ impl Cells {
         }
     }
 
-    /// Takes note of what a reading lies in, and of a cell before and behind it.
+    /// Marks the cells at a reading, up to one cell width in front of it and behind it.
     fn mark_surface(&mut self, march: &March, (origin, direction): UnitRay, distance: f64) {
         let point = |t: f64| std::array::from_fn(|axis| origin[axis] + t * direction[axis]);
         let width = cell_width(march, point(distance));

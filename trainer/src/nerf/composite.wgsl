@@ -1,13 +1,14 @@
-// composite: what every ray sees, how far that is from its target, and the slopes back to its samples.
+// composite: color of every ray, its error, and the gradients with respect to its samples.
 //
 // threads   one per ray
-// reads     batch, loss, rays, spans, told [n_samples], colors [n_samples] (before the sigmoid)
-// writes    seen [n_rays] (rgb before its background, transmittance), ray_errors [n_rays] (squared error of color, distance seen),
-//           v_log_density [n_samples], v_colors [n_samples]
+// reads     batch, loss, rays, spans, log_density [n_samples], colors [n_samples] (before the sigmoid)
+// writes    ray_colors [n_rays] (rgb without background, transmittance), ray_errors [n_rays] (squared color error,
+//           rendered distance), v_log_density [n_samples], v_colors [n_samples]
 // twin      nerf/reference/ray.rs
-// source    Max 1995; line of sight of Rematas et al. 2022, equations 9 to 12, with a band in place of a bell; distortion of Barron et al. 2022, equation 15, in one pass as in Sun et al. 2022
+// source    Max 1995; line of sight of Rematas et al. 2022, equations 9 to 12, with a band in place of a bell;
+//           distortion of Barron et al. 2022, equation 15, in one pass as in Sun et al. 2022
 //
-// Slopes are of the mean over the rays.
+// Gradients are of the mean over the rays.
 
 #import folded
 #import ray_batch
@@ -26,7 +27,7 @@
 @group(0) @binding(8) var<storage, read_write> v_log_density: array<f32>;
 @group(0) @binding(9) var<storage, read_write> v_colors: array<vec4f>;
 
-// Where a distance lies between near and infinity, 0 to 1.
+// Maps distances from near to infinity to 0 to 1.
 fn normalized_distance(t: f32) -> f32 {
     return 1.0 - loss.near / max(t, loss.near);
 }
@@ -39,12 +40,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let end = ray.first_sample + ray.n_samples;
     let band = vec2f(ray.target_distance, loss.band + loss.band_frac * ray.target_distance);
     let line_of_sight = select(0.0, 2.0 * loss.line_of_sight / f32(batch.n_rays), ray.target_distance > 0.0);
-    var weight_near_reading = 0.0;     // sum of the weights close to what the depth camera saw
-    var weight_sq_elsewhere = 0.0;    // sum of the squares of the others
+    var weight_near_reading = 0.0;     // sum of the weights close to the depth reading
+    var weight_sq_elsewhere = 0.0;    // sum of the squared weights of the other samples
     var rgb = vec3f(0.0);
     var distance = 0.0;
     var transmittance = 1.0;
-    var total = vec2f(0.0); // sums of weights, and of weights times places
+    var total = vec2f(0.0); // sums of weights, and of weights times normalized distance
     for (var ix = ray.first_sample; ix < end; ix++) {
         let sample = sample_at(ix);
         let weight = transmittance * (1.0 - sample.transmitted);
@@ -69,11 +70,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         v_distance = loss.distance_weight * per_ray * sign(distance_residual);
         v_transmittance += v_distance * ray.target_distance;
     }
-    // What lies behind a sample is what all are worth less what lies in front of it and what it is worth itself.
+    // The part behind a sample is the total minus the sample's own part and the part in front of it.
     var behind = dot(v_rgb, rgb) + v_distance * distance + line_of_sight * (weight_sq_elsewhere - (1.0 - weight_near_reading) * weight_near_reading);
     let distortion_weight = loss.distortion * per_ray;
     var before = vec2f(0.0);
-    // What the weights' own slopes add to it takes a pass of its own.
+    // The distortion gradients of the weights are added to it in a separate pass.
     var transmittance_before = 1.0;
     for (var ix = ray.first_sample; ix < end && distortion_weight > 0.0; ix++) {
         let sample = sample_at(ix);
@@ -100,7 +101,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     }
 }
 
-// Whether a sample lies where the depth camera saw something: band is its distance and what it may be off by.
+// Whether a sample is near the depth reading; band: distance of the reading and its tolerance.
 fn is_near_reading(sample: Sample, band: vec2f) -> bool {
     return abs(0.5 * (sample.begin + sample.end) - band.x) <= band.y;
 }

@@ -1,8 +1,9 @@
-// code_slopes: slopes of every sample towards the code of its image, from those towards the hidden layer that takes it.
+// embedding_gradients: gradients of every sample with respect to the appearance embedding of its image, computed from
+// the gradients of the hidden layer it enters.
 //
 // threads   one per sample
-// reads     batch, weights, v_held [n_tiles, n_slope_rows, 8]
-// writes    v_codes [n_samples]
+// reads     batch, weights, v_activations [n_tiles, n_gradient_rows, 8]
+// writes    v_embeddings [n_samples]
 // twin      nerf/reference/field.rs
 
 #import number

@@ -1,10 +1,10 @@
-// end_step: counts the step, and scales the next slopes of each level so that sums keep 8 bits of room.
+// end_step: counts the step, and chooses the gradient scale of each level so that sums keep 8 bits of headroom.
 //
 // threads   one per level
-// reads     rule, largest [n_levels] of this step's sums, counts ([0]: contributions that were too large)
-// writes    scales [n_levels], largest (zero again), counts ([0] zero again, [1]: too large so far), steps, pace
+// reads     rule, largest [n_levels] of this step's sums, counts ([0]: overflowed contributions of this step)
+// writes    scales [n_levels], largest (reset to zero), counts ([0]: reset to zero, [1]: total), steps, step_scale
 //
-// Every level's slopes are scaled by a power of two of its own, from what its largest sum was.
+// The scale of each level is a power of two, chosen from the level's largest sum.
 
 #import adam_rule
 
@@ -23,13 +23,13 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     let n_saturated = counts[0];
     if lane < arrayLength(&scales) {
         let n_bits = 32u - countLeadingZeros(largest[lane]);
-        // A level without slopes keeps its scale; what was lost was too large by an unknown factor.
+        // A level without gradients keeps its scale. Overflowed contributions were too large by an unknown factor.
         var change = select(exp2(f32(TARGET_BITS) - f32(n_bits)), 1.0, n_bits == 0u);
         if n_saturated > 0u { change = min(change, 1.0) / 16.0; }
         scales[lane] = clamp(scales[lane] * change, 1.0 / MAX_SCALE, MAX_SCALE);
         largest[lane] = 0u;
     }
-    storageBarrier(); // All have read how many were lost.
+    storageBarrier(); // All lanes have read the overflow count.
     if lane == 0u {
         counts[1] += n_saturated;
         counts[0] = 0u;

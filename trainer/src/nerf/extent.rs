@@ -1,4 +1,4 @@
-//! Where the scene lies, as far as the keyframes tell.
+//! Extent of the scene, estimated from the keyframes.
 
 use crate::splat::Camera;
 use crate::{Aabb, Keyframe, Shutter};
@@ -6,32 +6,32 @@ use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Readings of depth that are asked about the scene's size, of each keyframe.
+/// Depth readings per keyframe that are used to estimate the extent.
 const SAMPLES_PER_KEYFRAME: usize = 64;
-/// Share of the readings on each side that may lie outside.
+/// Fraction of the readings on each side that may be outside.
 const OUTSIDE_FRAC: f64 = 0.02;
-/// What is further away than this many times the median is far: it is drawn in.
+/// Readings farther away than this multiple of the median are ignored: contraction covers them.
 const FAR_OVER_MEDIAN: f64 = 2.0;
-/// Where nothing is known, metres.
+/// Radius without any information, meters.
 const DEFAULT_RADIUS_M: f64 = 1.0;
 const MIN_RADIUS_M: f64 = 0.01;
-/// Who reaches this many radii far calls for a new field: further out too little of the grid is left.
+/// A scene that extends beyond this many radii needs a new field: contraction leaves too little resolution there.
 const MAX_REACH: f64 = 2.0;
 
-/// The cube that is learned at full resolution; what lies outside is drawn in.
+/// The cube modeled at full resolution. The space outside is contracted.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Extent {
-    /// Middle of the cube in world, metres.
+    /// Center of the cube in world, meters.
     pub center_m: [f64; 3],
-    /// Half an edge, metres.
+    /// Half the edge length, meters.
     pub radius_m: f64,
 }
 
 impl Extent {
-    /// Around the cameras and nearly all that they see.
+    /// Extent around the cameras and nearly all of their depth readings.
     ///
-    /// Without depth the middle is where the cameras look together, and the cameras are at its border.
+    /// Without depth, the center is the point closest to all optical axes, and the cameras are at the border.
     pub fn of<'a>(keyframes: impl Iterator<Item = &'a Keyframe> + Clone) -> Self {
         let cameras: Vec<Vector3<f64>> =
             keyframes.clone().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
@@ -45,7 +45,7 @@ impl Extent {
         let range = |axis: usize| {
             let mut along: Vec<f64> = visible_points.iter().map(|(_, point)| point[axis]).collect();
             along.sort_by(f64::total_cmp);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
             let n_outliers = (along.len() as f64 * OUTSIDE_FRAC) as usize;
             let trimmed_range = [along[n_outliers], along[along.len() - 1 - n_outliers]];
             let camera_coords = cameras.iter().map(|camera| camera[axis]);
@@ -59,7 +59,8 @@ impl Extent {
     }
 
     fn without_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, cameras: &[Vector3<f64>]) -> Self {
-        // The point with the least sum of squared distances to the optical axes, held weakly at the cameras' mean.
+        // The point with the smallest sum of squared distances to the optical axes, weakly regularized towards the
+        // cameras' mean.
         const CENTER_REGULARIZATION: f64 = 1e-3;
         let mean = cameras.iter().sum::<Vector3<f64>>() / cameras.len().max(1) as f64;
         let (mut normal, mut right) = (Matrix3::identity() * CENTER_REGULARIZATION, mean * CENTER_REGULARIZATION);
@@ -75,20 +76,21 @@ impl Extent {
         Self { center_m: center.into(), radius_m }
     }
 
-    /// Whether a field learned here says too little about a scene that lies there.
+    /// Whether the scene has outgrown this extent, so that a field trained with it has too little resolution for
+    /// `other`.
     pub fn is_outgrown_by(&self, other: &Self) -> bool {
         let offset = Vector3::from(self.center_m) - Vector3::from(other.center_m);
         offset.amax() + other.radius_m > MAX_REACH * self.radius_m
     }
 
-    /// A pose with its place in units of the radius around the middle.
+    /// A pose with its position relative to the center, in units of the radius.
     pub(crate) fn in_scene_units(&self, world_from_other: &Transform) -> Transform {
         let mut pose = *world_from_other;
         pose.translation.vector = (pose.translation.vector - Vector3::from(self.center_m)) / self.radius_m;
         pose
     }
 
-    /// A camera with all its lengths in units of the radius.
+    /// A camera with all lengths in units of the radius.
     pub(crate) fn camera_in_scene_units(&self, camera: &Camera) -> Camera {
         let shutter = camera.shutter.map(|shutter| Shutter {
             twist: Twist { linear_m_s: shutter.twist.linear_m_s / self.radius_m, ..shutter.twist },
@@ -110,11 +112,11 @@ impl Extent {
     }
 }
 
-/// Some of what a keyframe's depth shows: how deep, and where in world.
+/// A sample of a keyframe's depth readings: depth along z in meters, and position in world.
 fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
     let Some(depth) = &keyframe.depth else { return Vec::new() };
     let width = depth.size_px[0].max(1);
-    // Some of each column and row.
+    // An odd step, so that samples cover all columns and rows.
     let step = (depth.depth_m.len() / SAMPLES_PER_KEYFRAME).max(1) | 1;
     let valid = (0u32..).zip(depth.depth_m.iter()).step_by(step).filter(|(_, z)| **z > 0.0 && z.is_finite());
     let point = |(ix, z): (u32, &f32)| {
@@ -124,7 +126,7 @@ fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
     valid.map(point).collect()
 }
 
-/// The size that a pixel has in the scene, metres: median over the keyframes.
+/// Size of a pixel in the scene, meters: median over the keyframes.
 pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, extent: &Extent) -> f64 {
     let size = |keyframe: &Keyframe| {
         let typical_depth_m = crate::splat::median_depth_m(keyframe).unwrap_or(extent.radius_m);

@@ -1,10 +1,11 @@
-// field_backward: slopes towards all layers from those towards densities and colors, and on to the entries of the grid, as whole numbers, so
-// that their order does not matter.
+// field_backward: gradients with respect to all layers from those of densities and colors, and on to the entries of the
+// grid. Grid gradients are summed as integers, so their order does not matter.
 //
 // threads   LANES per 32 samples
-// reads     batch, levels [n_levels], points, weights, held [n_tiles, n_held_rows, 8], v_log_density [n_samples],
-//           v_colors [n_samples], scales [n_levels] (powers of two)
-// writes    v_held [n_tiles, n_slope_rows, 8], v_grid [n_entries, 2] (slope times scale), counts: [0] saturated contributions
+// reads     batch, levels [n_levels], points, weights, activations [n_tiles, n_activation_rows, 8], v_log_density
+//           [n_samples], v_colors [n_samples], scales [n_levels] (powers of two)
+// writes    v_activations [n_tiles, n_gradient_rows, 8], v_grid [n_entries, 2] (gradient times scale), counts: [0]
+//           saturated contributions
 // twin      nerf/reference/field.rs, nerf/reference/grid.rs
 
 #import number
@@ -27,7 +28,7 @@
 @group(0) @binding(9) var<storage, read_write> v_grid: array<atomic<i32>>;
 @group(0) @binding(10) var<storage, read_write> counts: array<atomic<u32>>;
 
-// One contribution is at most this: 2^7 of them fit into a sum.
+// Largest contribution: 2^7 of them fit into a sum.
 const MAX_ABS = 16777216.0;
 const NO_RELU = 0xffffffffu;
 const NOT_STORED = 0xffffffffu;
@@ -43,11 +44,11 @@ struct Layer {
     first_weight: u32,
     n_in: u32,
     n_out: u32,
-    relu_row: u32,          // what came in, which was cut at zero; NOT_CUT: it was not
-    stored_row: u32,         // NOT_KEPT: nobody needs them
+    relu_row: u32,          // the layer's inputs, to which a ReLU was applied; NO_RELU: none was
+    stored_row: u32,         // NOT_STORED: the gradients are not needed later
 }
 
-// From the last one on.
+// Layers in backward order.
 fn layer_of(ix: u32) -> Layer {
     switch ix {
         case 0u: { return Layer(0u, color_weights(), N_HIDDEN, N_COLORS, hidden_2_row(), v_hidden_2_row()); }
@@ -58,7 +59,7 @@ fn layer_of(ix: u32) -> Layer {
     }
 }
 
-// Slopes towards what goes into a layer, as they go on.
+// Gradients with respect to a layer's inputs, after its ReLU.
 fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
     var v = sum;
     if layer.relu_row != NO_RELU {
@@ -69,7 +70,7 @@ fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec
     return v;
 }
 
-// What the compositing tells, in the first bank.
+// Loads the gradients from compositing into the first bank.
 fn seed_color_gradients(tile: u32, lane: u32) {
     for (var item = lane; item < N_COLORS * PARTS; item += LANES) {
         let row = item / PARTS;
@@ -82,10 +83,10 @@ fn seed_color_gradients(tile: u32, lane: u32) {
         put_four(0u, row, part, v);
         store_activation(tile, v_color_row() + row, part, v);
     }
-    workgroupBarrier(); // The slopes are there before the last layer reads them.
+    workgroupBarrier(); // The gradients are written before the last layer reads them.
 }
 
-// What goes towards density and what was handed on, to the first bank.
+// Loads the gradients of density and geometry features into the first bank.
 fn seed_density_gradients(tile: u32, lane: u32) {
     for (var item = lane; item < N_DENSITY_OUT * PARTS; item += LANES) {
         let row = item / PARTS;
@@ -102,7 +103,7 @@ fn seed_density_gradients(tile: u32, lane: u32) {
         put_four(0u, row, part, v);
         store_activation(tile, v_density_out_row() + row, part, v);
     }
-    workgroupBarrier(); // The slopes are there before the layer reads them.
+    workgroupBarrier(); // The gradients are written before the layer reads them.
 }
 
 fn add(entry: u32, gradient: vec2f) {
@@ -116,7 +117,8 @@ fn add(entry: u32, gradient: vec2f) {
     }
 }
 
-// From the first bank to the grid. Four samples beside each other add up as long as they lie in the same cell.
+// Scatters gradients from the first bank to the grid. Four adjacent samples are summed first while they are in the same
+// cell.
 fn scatter(tile: u32, lane: u32) {
     for (var item = lane; item < arrayLength(&levels) * PARTS; item += LANES) {
         let level_ix = item / PARTS;
@@ -147,7 +149,7 @@ fn scatter(tile: u32, lane: u32) {
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
         seed_color_gradients(tile, lane);
-        // A loop, so that the code of a layer is there once: it is long.
+        // A loop keeps a single copy of the long code of a layer.
         for (var ix = 0u; ix < N_LAYERS; ix++) {
             if ix == N_COLOR_LAYERS { seed_density_gradients(tile, lane); }
             evaluate_layer(layer_of(ix), tile, lane);

@@ -2,9 +2,9 @@
 //
 // threads   LANES per 32 samples
 // reads     batch, levels [n_levels], points [n_samples] (in the unit cube), grid [n_entries], weights, rays, spans,
-//           terms [n_images, TERM_STRIDE] (of images past their end the code is zero)
-// writes    told [n_samples] (logarithm of the density); where COLORS: colors [n_samples];
-//           where KEEPS: held [n_tiles, n_held_rows, 8] (four samples)
+//           image_params [n_images, IMAGE_PARAM_STRIDE] (the embedding of images past the end is zero)
+// writes    log_density [n_samples]; if COLORS: colors [n_samples]; if STORE_ACTIVATIONS: activations [n_tiles,
+//           n_activation_rows, 8] (four samples)
 // twin      nerf/reference/field.rs
 // source    Mueller et al. 2022
 
@@ -50,7 +50,7 @@ fn store_activation(tile: u32, row: u32, part: u32, value: vec4f) {
     activations[(tile * n_activation_rows() + row) * PARTS + part] = narrowed(value);
 }
 
-// Keeps rows of a bank, which go into a layer.
+// Stores rows of a bank that are inputs of a layer.
 fn store_inputs(tile: u32, bank: u32, first_row: u32, n_rows: u32, lane: u32) {
     for (var item = lane; item < n_rows * PARTS; item += LANES) {
         let row = item / PARTS;
@@ -58,8 +58,8 @@ fn store_inputs(tile: u32, bank: u32, first_row: u32, n_rows: u32, lane: u32) {
     }
 }
 
-// What the grid holds around the points, in the first bank. Neighboring threads have neighboring samples of a level, which lie in the same cells
-// of coarse levels.
+// Interpolates grid features at the points into the first bank. Neighboring threads process neighboring samples of one
+// level, which are in the same cells of coarse levels.
 fn interpolate_features(tile: u32, lane: u32) {
     let n_levels = arrayLength(&levels);
     for (var item = lane; item < n_levels * TILE; item += LANES) {
@@ -80,7 +80,7 @@ fn interpolate_features(tile: u32, lane: u32) {
     for (var item = 2u * n_levels * PARTS + lane; item < N_FEATURES * PARTS; item += LANES) {
         put_four(0u, item / PARTS, item % PARTS, vec4f(0.0));
     }
-    workgroupBarrier(); // The features are there before they are read.
+    workgroupBarrier(); // The features are written before they are read.
     if STORE_ACTIVATIONS { store_inputs(tile, 0u, 0u, N_FEATURES, lane); }
 }
 
@@ -89,7 +89,7 @@ struct Layer {
     first_weight: u32,
     n_in: u32,
     n_out: u32,
-    stored_row: u32,         // NOT_KEPT: the last of its network, which is not cut at zero
+    stored_row: u32,         // NOT_STORED: the last layer of its network, without a ReLU
 }
 
 fn layer_of(ix: u32) -> Layer {
@@ -102,7 +102,7 @@ fn layer_of(ix: u32) -> Layer {
     }
 }
 
-// What comes out of a layer, as it goes on.
+// Outputs of a layer, after its ReLU.
 fn layer_output(layer: Layer, tile: u32, row: u32, part: u32, sum: vec4f) -> vec4f {
     if layer.stored_row == NOT_STORED { return sum; }
     let cut = max(sum, vec4f(0.0));
@@ -116,7 +116,7 @@ fn embedding_of(image: u32, k: u32) -> f32 {
     return 0.0;
 }
 
-// Direction, what is handed on, and the image's code, in the second bank.
+// Loads direction, geometry features and the image's embedding into the second bank.
 fn gather_color_inputs(tile: u32, lane: u32) {
     for (var sample = lane; sample < TILE; sample += LANES) {
         let ix = min(tile * TILE + sample, batch.n_samples - 1u);
@@ -131,14 +131,14 @@ fn gather_color_inputs(tile: u32, lane: u32) {
         let row = item / PARTS;
         put_four(BANK, N_HARMONICS + row, item % PARTS, out_four(0u, 1u + row, item % PARTS));
     }
-    workgroupBarrier(); // All inputs are there before they are read.
+    workgroupBarrier(); // All inputs are written before they are read.
     if STORE_ACTIVATIONS { store_inputs(tile, BANK, color_input_row(), N_COLOR_IN, lane); }
 }
 
 fn work(tile: u32, lane: u32) {
     if tile * TILE < batch.n_samples {
         interpolate_features(tile, lane);
-        // A loop, so that the code of a layer is there once: it is long.
+        // A loop keeps a single copy of the long code of a layer.
         for (var ix = 0u; ix < select(N_DENSITY_LAYERS, N_LAYERS, COLORS); ix++) {
             if ix == N_DENSITY_LAYERS { gather_color_inputs(tile, lane); }
             evaluate_layer(layer_of(ix), tile, lane);

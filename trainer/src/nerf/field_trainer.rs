@@ -1,4 +1,4 @@
-//! A field on the GPU that learns from rays and draws pictures.
+//! Trains one field on the GPU and renders it.
 
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
@@ -19,46 +19,47 @@ use crate::{Error, Picture};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Most steps of a submit: their rays lie on the GPU at once.
+/// Maximum number of steps per submit: their rays are on the GPU at once.
 pub(crate) const STEPS_PER_SUBMIT: usize = 8;
-/// Steps between two visits of the occupancy.
+/// Steps between two updates of the occupancy.
 const OCCUPANCY_UPDATE_PERIOD: u64 = 16;
-/// Depth tells where something is until the field knows better: the first visit's step.
+/// First step that updates the occupancy if there is depth: until then, depth is more reliable than the field.
 const FIRST_OCCUPANCY_UPDATE_WITH_DEPTH: u64 = 128;
-/// What stays of a cell's thickness when it is visited.
+/// Factor on a cell's previous occupancy at each update.
 const OCCUPANCY_DECAY: f32 = 0.7;
-/// Share of the cells that a visit looks at, as far as a batch holds them.
+/// Fraction of the cells that an update evaluates, limited by the batch size.
 const UPDATED_FRAC: f64 = 0.25;
-/// Most samples of a ray that is learned from, in even shares of the batch.
+/// Maximum number of samples of a training ray, as a multiple of the mean.
 const MAX_SAMPLES_OVER_MEAN: u32 = 4;
-/// Samples that a ray of a picture takes at once, `ROUND` of `find_samples.wgsl`.
+/// Samples per round for a ray of a picture; `MAX_SAMPLES_PER_ROUND` of `find_samples.wgsl`.
 const SAMPLES_PER_ROUND: u32 = 8;
-/// Rounds before it is asked whether any ray goes on, and how often it is asked: rays are no longer than that.
+/// Rounds before checking whether any ray is unfinished, and the maximum number of checks, which limits the length of
+/// rays.
 const ROUNDS_PER_SUBMIT: u32 = 4;
 const MAX_SUBMITS: u32 = 64;
-/// Range of the entries at the start (Mueller et al. 2022, section 4).
+/// Initial range of the entries (Mueller et al. 2022, section 4).
 const INITIAL_ENTRY_RANGE: f64 = 1e-4;
-/// Differences of distance beyond this pull no more, in units of the radius.
+/// Differences of distance beyond this have no gradient, in units of the scene radius.
 const DISTANCE_CLIP: f32 = 0.5;
-/// Share of a distance by which a depth camera may be off.
+/// Relative error of a depth camera.
 const DEPTH_BAND_FRAC: f32 = 0.01;
-/// Where the places of the spread begin, in units of the radius.
+/// Near end of the distances compared by the distortion loss, in units of the scene radius.
 const DISTORTION_NEAR: f32 = 0.05;
-/// How far an image turns in a step at the start, radians, and is shifted, units of the radius: what is looked at is a third of
-/// a radius away, roughly.
+/// Initial step of an image's rotation (radians) and translation (units of the scene radius): observed surfaces are
+/// roughly a third of a radius away.
 const ROTATION_RATE: f32 = 5e-4;
 const TRANSLATION_RATE: f32 = ROTATION_RATE / 3.0;
-/// How far a number of an image's code goes in a step at the start.
+/// Initial step of a component of an image's appearance embedding.
 const EMBEDDING_RATE: f32 = 2e-2;
-/// Share of an image's turn, shift and code that is lost in a step at the start.
+/// Initial decay per step of an image's rotation, translation and embedding, as a fraction.
 const IMAGE_PARAM_DECAY: f32 = 5e-4;
-/// Scale of slopes at the start, before their sizes are known.
+/// Initial scale of gradients, before their magnitudes are known.
 const INITIAL_GRADIENT_SCALE: f32 = 1_048_576.0;
 
-/// Where the terms of a picture lie, which is alone with them.
+/// Index of the parameters of a picture in its buffer, which holds no others.
 const PICTURE_EMBEDDING_IX: u32 = 0;
 
-/// All that one field takes on the GPU.
+/// GPU state of one field.
 #[derive(Debug)]
 pub(crate) struct FieldTrainer {
     pub(crate) sizes: Sizes,
@@ -66,7 +67,7 @@ pub(crate) struct FieldTrainer {
     pub(crate) moments: FieldMoments,
     pub(crate) gradients: FieldGradients,
     pub(crate) occupancy: Occupancy,
-    /// Where anything is learned about images.
+    /// Parameters of images, if any are optimized.
     pub(crate) images: Option<ImageParamBuffers>,
     compiled: Arc<Compiled>,
     samples: SampleBuffers,
@@ -77,7 +78,7 @@ pub(crate) struct FieldTrainer {
     passes: Passes,
 }
 
-/// Kernels for all fields of an effort.
+/// Kernels shared by all fields with the same budget.
 #[derive(Debug)]
 pub(crate) struct Compiled {
     pipelines: FieldPipelines,
@@ -97,7 +98,7 @@ impl Compiled {
 }
 
 impl FieldTrainer {
-    /// A field that knows nothing.
+    /// A field with random initial parameters.
     pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Arc<Compiled>) -> Result<Self, Error> {
         let NerfBudget { n_rays, n_samples, .. } = sizes.nerf_budget;
         let shape = sizes.shape();
@@ -127,8 +128,8 @@ impl FieldTrainer {
         Ok(field_trainer)
     }
 
-    /// Random numbers to start from: small ones for entries, for weights as many as keep sums as large as their parts (Glorot
-    /// and Bengio 2010).
+    /// Initializes entries with small random numbers, and weights with random numbers that preserve the variance
+    /// (Glorot and Bengio 2010).
     fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
         let uniform = |stream: u64, ix: usize, bound: f64| {
             f32_of(bound * (2.0 * unit(mix_hash(seed ^ mix_hash(stream << 40 | ix as u64))) - 1.0))
@@ -150,14 +151,15 @@ impl FieldTrainer {
         gpu.write(&self.field.weights, 0, bytemuck::cast_slice(&weights));
     }
 
-    /// Bytes of what is learned, its slopes and moments.
+    /// Bytes of the trained parameters, their gradients and moments.
     pub(crate) fn bytes(&self) -> u64 {
         let Self { field, gradients, moments, occupancy, .. } = self;
         let grids = [&field.grid, &gradients.grid, &moments.grid, &occupancy.cell_occupancy, &occupancy.occupied];
         grids.into_iter().chain([&field.weights, &moments.weights]).map(Buffer::bytes).sum()
     }
 
-    /// Lists one step that learns from some rays, as the `slot_ix`-th of a submit; `learned` of images where they are held.
+    /// Records one training step on `rays` as the `slot_ix`-th of a submit. `learned`: which image parameters it
+    /// optimizes.
     pub(crate) fn record_step(
         &mut self,
         gpu: &Gpu,
@@ -200,7 +202,8 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// What each of some rays sees, as they are given, of images with these codes: nothing is learned. What was sent must be done.
+    /// Renders rays with their given poses and these appearance embeddings per image, without training. No submit may
+    /// be in flight.
     pub(crate) fn render_rays(
         &mut self,
         gpu: &Gpu,
@@ -224,7 +227,7 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.composite(list, kept);
         list.submit(gpu);
-        list.clear_bindings(); // These terms are used once.
+        list.clear_bindings(); // This buffer of image parameters is used once.
         let ray_colors: Vec<[f32; 4]> = gpu.read(&kept.ray_colors, rays.len())?;
         let errors: Vec<[f32; 2]> = gpu.read(&kept.ray_errors, rays.len())?;
         let background = background(options, 0);
@@ -239,7 +242,8 @@ impl FieldTrainer {
             .collect())
     }
 
-    /// Makes room for what is learned about so many images, which stays as it is known, and says what of it is learned from here on.
+    /// Allocates parameters for `n_images` images, keeping existing values, and sets which of them are optimized from
+    /// now on.
     pub(crate) fn allocate_images(&mut self, gpu: &Gpu, n_images: usize, learned: ParamSet) -> Result<(), Error> {
         let n_images = u32::try_from(n_images).expect("few images");
         let n_allocated = self.images.as_ref().map_or(0, |images| images.n_images);
@@ -266,7 +270,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Lets images from the `first_ix`-th on begin with these codes, and with their poses as they are given.
+    /// Initializes images from the `first_ix`-th on with these appearance embeddings and without pose corrections.
     pub(crate) fn initialize_images(&self, gpu: &Gpu, first_ix: usize, embeddings: &[[f64; EMBEDDING_DIM]]) {
         if let Some(images) = &self.images {
             let row_bytes = IMAGE_PARAM_STRIDE * size_of::<ImageParam>();
@@ -278,8 +282,8 @@ impl FieldTrainer {
         }
     }
 
-    /// Of each of the first images its turn (rotation vector in world, radians), its shift (in world, units of the radius) and its
-    /// code; empty where nothing is learned about images.
+    /// For each of the first images: rotation (rotation vector in world, radians), translation (in world, units of the
+    /// scene radius) and appearance embedding. Empty if no image parameters are optimized.
     pub(crate) fn image_param_values(
         &self,
         gpu: &Gpu,
@@ -290,13 +294,13 @@ impl FieldTrainer {
         Ok(image_params.iter().map(|image| image.map(|[value, ..]| f64::from(value))).collect())
     }
 
-    /// Knows nothing about images.
+    /// Drops all parameters of images.
     pub(crate) fn drop_images(&mut self) {
         self.passes.clear_bindings();
         self.images = None;
     }
 
-    /// Forgets an image; those after it move up.
+    /// Removes an image; later images move up by one.
     pub(crate) fn remove_image(&mut self, gpu: &Gpu, image_ix: usize) -> Result<(), Error> {
         let Some(images) = &self.images else { return Ok(()) };
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
@@ -308,7 +312,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Forgets all terms of images but these.
+    /// Resets all image parameters except these to zero.
     pub(crate) fn reset_image_params_except(&mut self, gpu: &Gpu, kept: ParamSet) -> Result<(), Error> {
         let Some(images) = &self.images else { return Ok(()) };
         let mut image_params = read_image_params(gpu, images, images.n_images as usize)?;
@@ -321,7 +325,7 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// What a step of some rays reads, as the `slot_ix`-th of a submit.
+    /// Writes the inputs of a step on `rays`, as the `slot_ix`-th of a submit.
     fn write_slot(
         &mut self,
         gpu: &Gpu,
@@ -354,29 +358,30 @@ impl FieldTrainer {
         };
         gpu.write(&slot.loss, 0, bytemuck::bytes_of(&loss));
         let n_rays = u32::try_from(rays.len()).expect("at most the rays of a step");
-        // All steps of a submit have as many rays.
+        // All steps of a submit have the same number of rays.
         gpu.write(&self.samples.batch, 0, bytemuck::bytes_of(&Batch::of(n_rays)));
         Ok(())
     }
 
-    /// Lists the networks as pictures have them, for the samples of the last step.
+    /// Records the networks as pictures use them, on the samples of the last step.
     pub(crate) fn record_colors(&mut self, gpu: &Gpu) {
         let Self { compiled, field, samples, slots, passes: list, .. } = self;
         let image_params = &field.no_image_params;
         FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot: &slots[0], image_params }.colors(list);
     }
 
-    /// Sends what is listed; the read tells when it is done.
+    /// Submits the recorded passes; the returned read completes with them.
     pub(crate) fn submit(&mut self, gpu: &Gpu) -> PendingRead {
         self.passes.submit_reading(gpu, &[(&self.samples.batch, 8)])
     }
 
-    /// Sends what is listed with a timestamp around each pass.
+    /// Submits the recorded passes with timestamps around each.
     pub(crate) fn submit_timed(&mut self, gpu: &Gpu) -> Result<Vec<PassTiming>, Error> {
         self.passes.submit_timed(gpu)
     }
 
-    /// Halves cells and steps; each half knows what the whole did. What was sent must be done.
+    /// Halves the size of cells and steps; the new cells inherit the occupancy of the old ones. No submit may be in
+    /// flight.
     pub(crate) fn refine_cells(&mut self, gpu: &Gpu) -> Result<(), Error> {
         let n = self.sizes.nerf_budget.n_cells as usize;
         let known: Vec<f32> = gpu.read(&self.occupancy.cell_occupancy, n.pow(3))?;
@@ -384,7 +389,7 @@ impl FieldTrainer {
         self.sizes.can_refine = false;
         self.passes.clear_bindings();
         self.occupancy = Occupancy::new(gpu, &occupancy_update_of(&self.sizes.nerf_budget), self.sizes.has_depth)?;
-        // A step that is half as long holds back half as much; what is below zero says that nobody was there.
+        // A step of half the length has half the opacity; negative values mean that the cell was never updated.
         let half_step_opacity =
             |cell_occupancy: f32| if cell_occupancy > 0.0 { 0.5 * cell_occupancy } else { cell_occupancy };
         let row = |row: usize| {
@@ -403,13 +408,13 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// How its rays are walked.
+    /// Parameters for walking rays.
     pub(crate) fn march(&self) -> reference::March {
         let NerfBudget { n_cells, n_steps, .. } = self.sizes.nerf_budget;
         reference::March { step: 2.0 / f64::from(n_steps), max_samples: usize::MAX, n_cells: n_cells as usize }
     }
 
-    /// Takes note of what depth images tell about where something is.
+    /// Applies hints from depth images to the occupancy.
     pub(crate) fn hint(&mut self, gpu: &Gpu, hints: &[u32]) -> Result<(), Error> {
         if hints.is_empty() {
             return Ok(());
@@ -432,9 +437,9 @@ impl FieldTrainer {
         Ok(())
     }
 
-    /// Draws a pinhole view, given in units of the scene's radius, as an image with a code would look.
+    /// Renders a pinhole view, given in units of the scene radius, with an appearance embedding.
     ///
-    /// Rays are followed in rounds of a few samples, until none lets light through or meets anything more.
+    /// Rays are sampled in rounds of a few samples, until all are opaque or have no occupied cells left.
     pub(crate) fn draw(
         &mut self,
         gpu: &Gpu,
@@ -492,21 +497,21 @@ impl FieldTrainer {
     }
 }
 
-/// What a ray sees.
+/// Rendered color of a ray.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RayColor {
-    /// Mean squared difference of color.
+    /// Mean squared color error.
     pub(crate) error: f64,
-    /// Over the background.
+    /// Composited over the background.
     pub(crate) rgb: [f64; 3],
 }
 
-/// Whatever is behind the scene must not help to explain it.
+/// A random background: the field must not use the background to explain the images.
 fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
     [0, 1, 2].map(|ix| f32_of(unit(mix_hash(options.seed ^ mix_hash(step << 2 | ix)))))
 }
 
-/// All that is kept of the first images.
+/// Parameters and optimizer state of the first images.
 fn read_image_params(
     gpu: &Gpu,
     images: &ImageParamBuffers,
@@ -515,26 +520,26 @@ fn read_image_params(
     gpu.read(&images.image_params, n_images.min(images.n_images as usize))
 }
 
-/// Numbers of an image's code as the kernels have them.
+/// Size of an image's appearance embedding.
 fn embedding_dim() -> u32 {
     u32::try_from(EMBEDDING_DIM).expect("a few")
 }
 
-/// The terms that are learned, a bit each.
+/// Bit mask of the optimized parameters.
 fn learned_bits(learned: ParamSet) -> u32 {
     let bits = |on: bool, first: usize, n: usize| if on { ((1 << n) - 1) << first } else { 0 };
     bits(learned.image_poses, 0, EMBEDDING) | bits(learned.image_gains, EMBEDDING, EMBEDDING_DIM)
 }
 
-/// How the occupancy is visited.
+/// Parameters of an occupancy update.
 fn occupancy_update_of(nerf_budget: &NerfBudget) -> OccupancyUpdate {
     let NerfBudget { n_samples, n_cells, n_steps, .. } = *nerf_budget;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u32")]
     let n_points = (f64::from(n_cells.pow(3)) * UPDATED_FRAC) as u32;
     OccupancyUpdate { n_cells, n_points: n_points.min(n_samples), decay: OCCUPANCY_DECAY, step: 2.0 / n_steps as f32 }
 }
 
-/// Whole sixteens of bytes, as buffers are; the last hint is given more than once.
+/// Pads the hints to a multiple of 16 bytes, as buffers require, by repeating the last one.
 fn pad_hints(hints: &[u32]) -> Vec<u32> {
     let n = hints.len().next_multiple_of(4);
     hints.iter().chain(std::iter::repeat_n(&hints[hints.len() - 1], n - hints.len())).copied().collect()

@@ -1,11 +1,12 @@
-// find_samples: the next samples of the rays of a picture, at most ROUND each.
+// find_samples: the next samples of a picture's rays, at most MAX_SAMPLES_PER_ROUND each.
 //
 // threads   one per ray
-// reads     march, occupied (a bit a cell)
-// writes    rays (next_piece, first_sample, n_samples), found (n_samples, zero before), spans, points [n_samples] (middle of the sample, in the unit cube)
+// reads     march, occupied (one bit per cell)
+// writes    rays (next_segment, first_sample, n_samples), batch (n_samples, zero before), spans, points [n_samples]
+//           (center of the sample, in the unit cube)
 // twin      nerf/reference/march.rs
 //
-// Where the samples of 256 rays lie depends on who comes first; what becomes of them does not.
+// The positions of samples in the buffers depend on the order in which workgroups run; the resulting colors do not.
 
 #import folded
 #import ray_batch

@@ -1,10 +1,10 @@
-// hint_cells: what a depth image tells about cells of the occupancy that no sample was taken in yet.
+// hint_cells: applies hints from images to cells of the occupancy in which no sample was taken yet.
 //
 // threads   one per hint
-// reads     hints [n]: cells; in the highest two bits what is told of them, see below
-// writes    thickness
+// reads     hints [n]: cell index, with the kind of hint in the highest two bits, see below
+// writes    cell_occupancy
 //
-// What is told is listed in the order of its weight, each kind in a dispatch of its own: a cell may be told more than once.
+// Hints are sorted by priority, and each kind has its own dispatch: a cell may have several hints.
 
 #import folded
 
@@ -13,11 +13,11 @@
 
 override KIND: u32;
 
-const UNBOUNDED = 0u; // Something may be there, too far or too dark for the depth camera.
+const UNBOUNDED = 0u; // Possibly occupied, but too far or too dark for the depth camera.
 const FREE = 1u;
 const SURFACE = 2u;
 
-// Of a cell that no image looks at, of one that was looked through, and of one that is to be walked until it was visited.
+// Values of a cell outside all views, of one observed to be free, and of one that is sampled until its first update.
 const OUTSIDE_VIEWS = 0.0;
 const EMPTY = 1e-30;
 const NEVER_UPDATED = -1.0;

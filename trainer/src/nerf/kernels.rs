@@ -22,7 +22,7 @@ macro_rules! kernel {
     };
 }
 
-/// What the kernels import that have layers or what goes through them, with numbers of one kind.
+/// Shared sources of the kernels with network layers, for one number type.
 macro_rules! layers {
     ($numbers:literal) => {
         &[
@@ -40,7 +40,7 @@ macro_rules! layers {
         ]
     };
 }
-/// In f32, and on matrices of f16.
+/// Variants in f32, and with cooperative matrices in f16.
 const FULL: &[Source] = layers!("full");
 const HALF: &[Source] = layers!("half");
 
@@ -104,32 +104,33 @@ pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("end_step"),
 ];
 
-/// Samples of a workgroup, `TILE` of `network_tile.wgsl`.
+/// Samples per workgroup; `TILE` of `network_tile.wgsl`.
 pub(crate) const N_TILE: u32 = 32;
-/// Tiles of samples that one partial sum of slopes towards weights goes over.
+/// Tiles of samples per partial sum of weight gradients.
 pub(crate) const CHUNK_TILES: u32 = 16;
 pub(crate) const N_CHUNK: u32 = CHUNK_TILES * N_TILE;
-/// Threads that work on a tile with matrices: whole subgroups of any size.
+/// Threads per tile with cooperative matrices: whole subgroups of any size.
 const HALF_LANES: u32 = 128;
-/// Most rows of a layer.
+/// Maximum number of rows of a layer.
 const MAX_ROWS: u32 = 64;
-/// Rows of a matrix.
+/// Rows of a cooperative matrix.
 const MATRIX: u32 = 16;
-/// Numbers that the first network tells, and colors, as the kernels have them.
+/// Outputs of the first network, and colors, in the kernels.
 const N_DENSITY_OUT: u32 = 16;
 const N_COLORS: u32 = 4;
 
-/// Widths of both networks as the kernels have them: multiples of four, and of what a matrix has where layers are matrices. Those that
-/// fields have are multiples of both, so that files fit all adapters.
+/// Widths of both networks in the kernels: multiples of four, and of the matrix size with cooperative matrices. Stored
+/// fields have widths that are multiples of both, so that files fit all adapters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Widths {
     pub(crate) n_features: u32,
     pub(crate) n_hidden: u32,
     pub(crate) n_color_in: u32,
     pub(crate) embedding_dim: u32,
-    /// Whether layers are matrices of f16 ([`crate::gpu::Optional::half_matrices`]): what goes through them is f16 then.
+    /// Whether layers use f16 cooperative matrices ([`crate::gpu::Optional::half_matrices`]): their inputs are then
+    /// f16.
     pub(crate) is_half_precision: bool,
-    /// Features, hidden and inputs of the second network as they are without matrices.
+    /// Widths without matrices of features, hidden layers and inputs of the second network.
     used: [u32; 3],
 }
 
@@ -159,7 +160,7 @@ impl Widths {
         layers_of([self.n_features, self.n_hidden, self.n_color_in])
     }
 
-    /// The same as they are without matrices: what lies beyond begins at zero and stays there.
+    /// The layers without matrices: weights outside them start at zero and stay zero.
     pub(crate) fn used_layers(&self) -> [[u32; 2]; 5] {
         layers_of(self.used)
     }
@@ -169,40 +170,40 @@ impl Widths {
         self.layers().iter().map(|[n_in, n_out]| n_in * n_out).sum()
     }
 
-    /// Outputs of the last layer: three colors, and nothing.
+    /// Outputs of the last layer: three colors and padding.
     fn n_colors(&self) -> u32 {
         if self.is_half_precision { MATRIX } else { N_COLORS }
     }
 
-    /// Weights of all layers as they are worked with, and sums of slopes towards them: those of the outputs that are nothing come last.
+    /// Weights of all layers with padding, and sums of their gradients: those of padding outputs come last.
     pub(crate) fn n_padded_weights(&self) -> u32 {
         self.n_weights() + (self.n_colors() - N_COLORS) * self.n_hidden
     }
 
-    /// Bytes of a number that is kept for the way back.
+    /// Bytes per number stored for the backward pass.
     pub(crate) fn bytes_per_number(&self) -> u32 {
         if self.is_half_precision { 2 } else { 4 }
     }
 
-    /// Numbers of a sample that are kept for the way back: what goes into each layer.
+    /// Numbers stored per sample for the backward pass: the inputs of each layer.
     pub(crate) fn n_activations(&self) -> u32 {
         self.layers().iter().map(|[n_in, _]| n_in).sum()
     }
 
-    /// Slopes of a sample: towards what comes out of each layer, and towards what the grid holds.
+    /// Gradients stored per sample: with respect to the outputs of each layer, and to the grid features.
     pub(crate) fn n_gradients(&self) -> u32 {
         self.layers().iter().map(|[_, n_out]| n_out).sum::<u32>() + self.n_colors() - N_COLORS + self.n_features
     }
 }
 
-/// All that draws and learns a field.
+/// All pipelines for training and rendering a field.
 #[derive(Debug)]
 pub(crate) struct FieldPipelines {
     pub(crate) count_samples: Pipeline,
     pub(crate) place_samples: Pipeline,
     pub(crate) write_samples: Pipeline,
     pub(crate) find_samples: Pipeline,
-    /// One a kind of hint, in the order in which they are taken.
+    /// One per kind of hint, in the order they are applied.
     pub(crate) hint_cells: [Pipeline; 3],
     pub(crate) sample_cells: Pipeline,
     pub(crate) update_cells: Pipeline,
@@ -211,11 +212,11 @@ pub(crate) struct FieldPipelines {
     pub(crate) mark_blocks: Pipeline,
     pub(crate) picture_rays: Pipeline,
     pub(crate) show_rays: Pipeline,
-    /// Densities alone; colors too; and all that is kept for the way back.
+    /// Forward variants: densities only; with colors; and with everything stored for the backward pass.
     pub(crate) densities: Pipeline,
     pub(crate) colors: Pipeline,
     pub(crate) forward: Pipeline,
-    /// Where layers are matrices of f16.
+    /// Only with f16 cooperative matrices.
     pub(crate) weights_to_half: Option<Pipeline>,
     pub(crate) composite: Pipeline,
     pub(crate) field_backward: Pipeline,
@@ -231,7 +232,8 @@ pub(crate) struct FieldPipelines {
 }
 
 impl FieldPipelines {
-    /// For so many samples at most; `picture_embedding_ix` is where the terms of a picture lie among those that it is drawn with.
+    /// Pipelines for up to `n_samples` samples; `picture_embedding_ix` is the index of a picture's parameters in its
+    /// buffer.
     pub(crate) fn new(gpu: &Gpu, widths: &Widths, n_samples: u32, picture_embedding_ix: u32) -> Result<Self, Error> {
         let Widths { n_features, n_hidden, n_color_in, embedding_dim, is_half_precision, .. } = *widths;
         let sizes = [
@@ -255,14 +257,14 @@ impl FieldPipelines {
                 &with(&kind),
             )
         };
-        // A thread has 16 weights.
+        // Each thread sums 16 weights.
         let max_weights = widths.layers().iter().map(|[n_in, n_out]| n_in * n_out).max().expect("five layers");
         let chunk = ("CHUNK_TILES", f64::from(CHUNK_TILES));
         let sums =
             if is_half_precision { vec![chunk] } else { vec![chunk, ("SUM_LANES", f64::from(max_weights / 16))] };
         let hint = |kind: f64| Pipeline::new(gpu, kernel!("hint_cells"), &[("KIND", kind)]);
         let plain = |kernel: Kernel| Pipeline::new(gpu, kernel, &[]);
-        // These take long to compile.
+        // These take long to compile, so they are compiled in parallel.
         let ((densities, colors), (learned, (field_backward, weight_gradients))) = rayon::join(
             || rayon::join(|| forward(0.0, 0.0), || forward(1.0, 0.0)),
             || {

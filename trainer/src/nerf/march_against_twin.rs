@@ -1,4 +1,4 @@
-//! Samples along rays against their twin.
+//! Tests of samples along rays against their twin.
 
 use super::buffers::{FieldBuffers, FieldMoments, Occupancy, RaySlot, SampleBuffers};
 use super::kernels::{FieldPipelines, Widths};
@@ -16,10 +16,10 @@ const N_CELLS: u32 = 64;
 const N_RAYS: u32 = 300;
 const CAPACITY: u32 = 16_384;
 const MARCH: March = March { step: 0.03125, max_samples: 12, n_cells: N_CELLS as usize };
-/// A place so close to a cell's side, in cells, may be taken for the next one in f32.
+/// Margin to a cell's side, in cells, below which f32 may select the neighboring cell.
 const MIN_MARGIN: f64 = 1e-4;
 
-/// Half of the cells in half of the blocks, which are 4 cells wide.
+/// Marks half of the cells in half of the blocks, which are 4 cells wide.
 fn is_occupied(cell: usize) -> bool {
     let n = N_CELLS as usize;
     let block = cell % n / 4 + n * (cell / n % n / 4 + n * (cell / n / n / 4));
@@ -27,7 +27,7 @@ fn is_occupied(cell: usize) -> bool {
     is_taken(block + 1) && is_taken(cell)
 }
 
-/// A ray, where it begins and ends, and its shift: numbers that f32 holds exactly.
+/// A ray, its begin and end, and its jitter, in numbers that f32 holds exactly.
 type TestRay = ([f64; 3], [f64; 3], [f64; 2], f64);
 
 fn rays() -> Vec<TestRay> {
@@ -35,7 +35,7 @@ fn rays() -> Vec<TestRay> {
     let ray = |seed: u64| {
         let mut random = Random::new(seed);
         let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0)).normalize().map(rounded);
-        // Some begin outside the inner cube, some end inside of it.
+        // Some begin outside the inner cube, some end inside it.
         let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
         (random.array(-2.0, 2.0), direction.into(), [0.125, end], rounded(random.uniform(0.0, 0.99)))
     };
@@ -103,7 +103,7 @@ fn samples_lie_in_occupied_cells_within_limit() {
         n_compared += 1;
         n_thinned += usize::from(segments.len() > MARCH.max_samples);
         let expected = MARCH.spans(&segments, *jitter);
-        assert_eq!(ray.n_samples as usize, expected.len(), "ray {ix} of {} pieces", segments.len());
+        assert_eq!(ray.n_samples as usize, expected.len(), "ray {ix} of {} segments", segments.len());
         let begin = ray.first_sample as usize;
         for (sample, [low, high]) in expected.into_iter().enumerate() {
             let (span, point) = (spans[begin + sample], points[begin + sample]);
@@ -118,5 +118,8 @@ fn samples_lie_in_occupied_cells_within_limit() {
         }
     }
     mismatches.assert_none();
-    assert!(n_compared > 100 && n_thinned > 20, "only {n_compared} rays are clear, {n_thinned} of them thinned");
+    assert!(
+        n_compared > 100 && n_thinned > 20,
+        "only {n_compared} rays could be compared, {n_thinned} of them thinned"
+    );
 }

@@ -1,8 +1,8 @@
-// mark_cells: which cells are walked through: those that hold back enough, and those that nobody visited.
+// mark_cells: which cells are sampled: those that are opaque enough, and those that were never updated.
 //
 // threads   one per 32 cells
-// reads     thickness, thickness_sum
-// writes    occupied (a bit a cell, before the blocks), steps ([1]: visits so far)
+// reads     cell_occupancy, occupancy_sum
+// writes    occupied (one bit per cell, before the blocks), steps ([1]: updates so far)
 
 #import folded
 #import occupancy_sum
@@ -12,7 +12,8 @@
 @group(0) @binding(2) var<storage, read_write> occupied: array<u32>;
 @group(0) @binding(3) var<storage, read_write> steps: array<u32>;
 
-// A step through a cell that holds back less is left out, unless most hold back little: then half of their mean.
+// Cells with a lower opacity per step are skipped. If the mean opacity is low, the threshold is half of the mean
+// instead.
 const MIN_OCCUPANCY = 0.02;
 
 @compute @workgroup_size(64)

@@ -1,4 +1,4 @@
-//! The neural field as a [`Method`].
+//! The neural radiance field as a [`Method`].
 
 mod checkpoint;
 mod images;
@@ -23,38 +23,40 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Nearest place that rays look at, in units of the scene's radius.
+/// Distance at which rays begin, in units of the scene radius.
 const NEAR_DISTANCE: f32 = 0.03;
-/// Cells of the occupancy become finer after one of so many of the planned steps: before a trial, which compares fields of one size.
+/// Occupancy cells are refined after this fraction (1 / divisor) of the planned steps: before the first trial, because
+/// trials compare fields of one size.
 const REFINE_DIVISOR: u64 = 10;
-/// On a processor a picture of 640x480 takes tens of seconds before much is learned: of depth every ninth pixel tells enough.
+/// On a software adapter, a picture of 640x480 takes tens of seconds early in training. Every ninth pixel is enough for
+/// depth.
 const SOFTWARE_DEPTH_STRIDE: u32 = 3;
 
-/// A neural field that learns from keyframes: a hash grid and two small networks, drawn along rays.
+/// A neural radiance field trained on keyframes: a hash grid and two small networks, rendered along rays.
 #[derive(Debug)]
 pub struct NerfModel {
     gpu: Arc<Gpu>,
     options: NerfOptions,
     images: Vec<RayImage>,
     field: Option<(Extent, FieldTrainer)>,
-    /// For all fields that come.
+    /// Shared by all fields that this model creates.
     compiled: Option<Arc<Compiled>>,
-    /// Keyframes came or went since the extent was looked at.
+    /// Keyframes were added since the extent was last computed.
     is_extent_stale: bool,
-    /// Images whose depth was told to the field: the first so many.
+    /// Number of images, from the first, whose hints were applied to the field.
     n_hinted: usize,
     in_flight: Option<InFlight>,
-    /// What is learned of images along with the field.
+    /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     trials: Trials,
-    /// Images that are learned from when all trials are over.
+    /// Validation images, used for training after all trials are finished.
     validation_images: Vec<RayImage>,
-    /// Of the saved field this one came from.
+    /// Camera corrections of the saved field that was loaded.
     loaded_corrections: BTreeMap<String, CameraCorrection>,
-    /// What is known about cameras, since the last step.
+    /// Camera corrections since the last step; `None` if they must be computed.
     corrections: Option<BTreeMap<String, CameraCorrection>>,
     step: u64,
-    /// Steps of trials that were taken back.
+    /// Steps of rejected trials.
     n_discarded_steps: u64,
     step_millis: f64,
     /// Whether pictures are requested.
@@ -69,7 +71,7 @@ struct InFlight {
 }
 
 impl NerfModel {
-    /// A model that has seen nothing.
+    /// A model without keyframes.
     pub fn new(gpu: Arc<Gpu>, options: NerfOptions) -> Result<Self, Error> {
         Ok(Self {
             gpu,
@@ -92,17 +94,17 @@ impl NerfModel {
         })
     }
 
-    /// How it was asked to learn.
+    /// Options of this model.
     pub fn options(&self) -> &NerfOptions {
         &self.options
     }
 
-    /// Where the scene lies; `None` before the first keyframe is learned from.
+    /// Extent of the scene; `None` before training starts.
     pub fn extent(&self) -> Option<&Extent> {
         self.field.as_ref().map(|(extent, _)| extent)
     }
 
-    /// What was learned about each camera; empty where nothing is.
+    /// Correction of each camera; empty if none are optimized or loaded.
     fn camera_corrections(&mut self) -> Result<&BTreeMap<String, CameraCorrection>, Error> {
         if self.corrections.is_none() {
             self.finish_in_flight()?;
@@ -115,8 +117,8 @@ impl NerfModel {
         self.options.nerf_budget.unwrap_or(if self.gpu.is_software() { NerfBudget::SMALL } else { NerfBudget::FULL })
     }
 
-    /// Makes a field where there is none, or where the scene has outgrown it, with cells as fine as are due. False where there is nothing
-    /// to learn from.
+    /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when due. Returns
+    /// whether there are images to train on.
     fn begin(&mut self) -> Result<bool, Error> {
         if self.images.is_empty() {
             return Ok(false);
@@ -132,7 +134,7 @@ impl NerfModel {
         Ok(true)
     }
 
-    /// What the images ask for.
+    /// Extent and sizes of a field for the current images.
     fn sizes(&self) -> Result<(Extent, Sizes), Error> {
         let keyframes = || self.images.iter().map(|image| &*image.keyframe);
         let extent = Extent::of(keyframes());
@@ -141,7 +143,7 @@ impl NerfModel {
         Ok((extent, sizes))
     }
 
-    /// The kernels, compiled once.
+    /// Returns the kernels, compiling them on first use.
     fn compiled(&mut self) -> Result<Arc<Compiled>, Error> {
         if let Some(compiled) = &self.compiled {
             return Ok(compiled.clone());
@@ -159,14 +161,14 @@ impl NerfModel {
         log::debug!("nerf: {extent:?}, {sizes:?}");
         self.finish_in_flight()?;
         self.abort_trials()?;
-        self.field = None; // Its memory is free before the next one takes some.
+        self.field = None; // Free its memory before allocating the next field.
         let compiled = self.compiled()?;
         self.field = Some((extent, FieldTrainer::new(&self.gpu, &self.options, sizes, compiled)?));
         self.n_hinted = 0;
         Ok(())
     }
 
-    /// Tells the field what new images say about where something is, where any of them has depth, and in what light they begin.
+    /// Applies occupancy hints of new images, if any image has depth, and initializes their appearance embeddings.
     fn hint(&mut self) -> Result<(), Error> {
         self.initialize_embeddings()?;
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
@@ -178,7 +180,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Steps until cells become finer.
+    /// Steps until the cells are refined.
     fn steps_to_finer_cells(&self) -> u64 {
         let is_refinement_due = self.field.as_ref().is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine);
         if is_refinement_due { self.refinement_step().saturating_sub(self.step).max(1) } else { u64::MAX }
@@ -188,7 +190,8 @@ impl NerfModel {
         (self.options.n_planned_steps / REFINE_DIVISOR).max(1)
     }
 
-    /// Coarse cells are soon visited, fine ones tell better what is empty.
+    /// Refines the cells when due: coarse cells need fewer updates at first, fine ones separate empty space better
+    /// later.
     fn refine_cells_when_due(&mut self) -> Result<(), Error> {
         let is_refinement_due = self.step >= self.refinement_step();
         if !is_refinement_due || !self.field.as_ref().is_some_and(|(_, field_trainer)| field_trainer.sizes.can_refine) {
@@ -208,7 +211,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Lists the next step as the `slot_ix`-th of a submit.
+    /// Records the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
         let learned_params = self.params_learned_now();
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
@@ -224,7 +227,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// Steps of a submit that take no longer than it may.
+    /// Number of steps that fit into the time limit of a submit.
     fn steps_per_submit(&self) -> u64 {
         if self.step_millis == 0.0 || self.gpu.is_software() {
             return 1;
@@ -312,7 +315,8 @@ impl Method for NerfModel {
             return Ok(0);
         }
         self.advance_trials_when_due()?;
-        self.begin()?; // Images that were held back have joined, before the next step and not after so many as fit into a submit.
+        // Validation images may have joined: start on them before the next step rather than after the next submit.
+        self.begin()?;
         let max_steps = self.steps_to_finer_cells().min(self.steps_to_trial());
         let n_steps = n.min(self.steps_per_submit()).min(max_steps);
         let since = Instant::now();
@@ -321,10 +325,10 @@ impl Method for NerfModel {
         }
         let Some((_, field_trainer)) = &mut self.field else { return Err(Error::DeviceLost) };
         let batch = field_trainer.submit(&self.gpu);
-        self.finish_in_flight()?; // The submit before; this one runs meanwhile.
+        self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         self.in_flight = Some(InFlight { batch, n_steps, since });
         if n_steps == n {
-            self.finish_in_flight()?; // The caller stops here.
+            self.finish_in_flight()?; // The caller expects `n` completed steps.
         }
         Ok(n_steps)
     }
@@ -342,7 +346,7 @@ impl Method for NerfModel {
         Ok(self.step + self.n_discarded_steps)
     }
 
-    /// Nothing can be drawn before something was learned.
+    /// Does nothing: a field can be rendered only after training.
     fn seed(&mut self) -> Result<(), Error> {
         Ok(())
     }
@@ -352,7 +356,7 @@ impl Method for NerfModel {
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
-        // Whoever looks must not decide with which keyframes the field begins.
+        // Rendering must not create a field: views would then decide which keyframes it starts with.
         self.finish_in_flight()?;
         let embedding = self.embedding_of(request.appearance_of.as_ref())?;
         projections::render(request, |camera| self.draw(request, camera, embedding))

@@ -1,4 +1,4 @@
-//! How a neural field learns.
+//! Training options of a neural field.
 
 use crate::splat::CameraRefinement;
 use serde::{Deserialize, Serialize};
@@ -9,50 +9,50 @@ use serde::{Deserialize, Serialize};
 pub struct NerfOptions {
     /// Seeds every random choice.
     pub seed: u64,
-    /// Most bytes of GPU memory the field (its parameters, slopes and the optimiser's moments) may take.
+    /// Maximum GPU memory for the field (its parameters, gradients and the optimizer's moments), in bytes.
     pub max_bytes: Option<u64>,
-    /// Steps over which the learning rate falls.
+    /// Number of steps over which the learning rate decays.
     pub n_planned_steps: u64,
-    /// Weight of the difference of distances, per scene radius, against the squared difference of colors.
+    /// Weight of the absolute difference of distances, per scene radius, relative to the squared difference of colors.
     pub distance_weight: f64,
-    /// Weight of light that is held back elsewhere than where the depth says.
+    /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// Weight of the spread of light along a ray.
+    /// Weight of the distortion loss, which penalizes spread of the weights along a ray.
     pub distortion: f64,
-    /// Learning rate at the start.
+    /// Initial learning rate.
     pub rate: f64,
-    /// What is left of it at the end of the planned steps.
+    /// Fraction of the initial rate that remains after the planned steps.
     pub final_rate_frac: f64,
-    /// What is learned about cameras with the field: of all terms it knows the poses of images.
+    /// Which camera parameters to optimize with the field. A field supports only poses and appearance of images.
     pub cameras: CameraRefinement,
-    /// Sizes of batch and networks; `None`: as suits the adapter.
+    /// Sizes of batch and networks; `None`: chosen for the adapter.
     pub nerf_budget: Option<NerfBudget>,
 }
 
-/// What a step takes.
+/// Sizes of a training step and of the networks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NerfBudget {
-    /// Rays of a step.
+    /// Rays per step.
     pub n_rays: u32,
-    /// Most samples of a step, of all its rays.
+    /// Maximum number of samples per step, over all its rays.
     pub n_samples: u32,
     /// Width of hidden layers, a multiple of 4 up to 64.
     pub n_hidden: u32,
-    /// Cells of the occupancy along an axis, a power of two.
+    /// Cells of the occupancy grid along an axis, a power of two.
     pub n_cells: u32,
     /// Steps through the inner cube along an axis.
     pub n_steps: u32,
-    /// Most entries of a level, as a power of two.
+    /// Maximum number of entries of a level, as log2.
     pub max_log2_entries: u32,
-    /// Most levels of the grid, an even number.
+    /// Maximum number of levels of the grid, an even number.
     pub max_levels: u32,
-    /// Most rays of a picture that are followed at once.
+    /// Maximum number of rays of a picture that are processed at once.
     pub picture_rays: u32,
 }
 
 impl NerfBudget {
-    /// For a processor in place of a GPU.
+    /// For a software adapter.
     pub const SMALL: Self = Self {
         n_rays: 512,
         n_samples: 1 << 14,
@@ -77,7 +77,8 @@ impl NerfBudget {
 }
 
 impl NerfBudget {
-    /// With cells and steps half as wide, where these are those of a GPU: a processor would wait for them, and more would take too much memory.
+    /// Halves the size of cells and steps if they are those of [`Self::FULL`]. Others stay: refinement is too slow on
+    /// software adapters, and finer cells need too much memory.
     #[must_use]
     pub(crate) fn refined(self) -> Self {
         if self.n_cells != Self::FULL.n_cells {

@@ -1,4 +1,4 @@
-//! Small structs the kernels read, with the layouts of their WGSL twins.
+//! Small structs that kernels read, with the layouts of their WGSL counterparts.
 
 use super::reference::grid::GridShape;
 use crate::gpu::f32_of;
@@ -14,7 +14,7 @@ pub(crate) struct Batch {
 }
 
 impl Batch {
-    /// Rays whose samples are to be found.
+    /// A batch of rays whose samples are not placed yet.
     pub(crate) fn of(n_rays: u32) -> Self {
         Self { n_rays, n_samples: 0, max_samples: 0, unused: 0 }
     }
@@ -138,13 +138,14 @@ pub(crate) struct ImageParamRule {
     pub(crate) unused: [u32; 2],
 }
 
-/// What is kept of each image, [`IMAGE_PARAM_STRIDE`] terms: three of its turn, three of its shift, and its code from [`EMBEDDING`] on, as in
-/// `shared/image_terms.wgsl`: value, Adam's two means, and the steps it took.
+/// One of the [`IMAGE_PARAM_STRIDE`] parameters of an image: value, Adam's two moments, and the number of steps taken.
+/// The parameters are three of the rotation, three of the translation, and the appearance embedding from [`EMBEDDING`]
+/// on, as in `shared/image_params.wgsl`.
 pub(crate) type ImageParam = [f32; 4];
 pub(crate) const IMAGE_PARAM_STRIDE: usize = 9;
 pub(crate) const EMBEDDING: usize = 6;
 
-/// The terms of images that have these codes and no more.
+/// Parameters of images with these appearance embeddings and no pose correction.
 pub(crate) fn image_params_of<const N: usize>(embeddings: &[[f64; N]]) -> Vec<[ImageParam; IMAGE_PARAM_STRIDE]> {
     let params_with_embedding = |embedding: &[f64; N]| {
         let mut image_params = [[0.0; 4]; IMAGE_PARAM_STRIDE];
@@ -158,13 +159,13 @@ pub(crate) fn image_params_of<const N: usize>(embeddings: &[[f64; N]]) -> Vec<[I
 }
 
 impl AdamRule {
-    /// Of the first step.
+    /// Scale of the first step.
     pub(crate) fn first_step_scale(&self) -> StepScale {
         StepScale { rate_frac: 1.0, unused: 0.0, correction: self.betas.map(|beta| 1.0 / (1.0 - beta)) }
     }
 }
 
-/// The levels of a grid as the kernels read them.
+/// The levels of a grid in the layout of the kernels.
 pub(crate) fn levels(shape: &GridShape) -> Vec<Level> {
     let level = |ix: usize| {
         let is_dense = (u64::from(shape.n_cells[ix]) + 1).pow(3) <= 1 << shape.log2_entries;

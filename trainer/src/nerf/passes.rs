@@ -1,4 +1,4 @@
-//! The stages of drawing and learning, as lists of passes.
+//! The stages of rendering and training, as lists of passes.
 
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, Occupancy, RaySlot, SampleBuffers, StepBuffers,
@@ -11,7 +11,7 @@ use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::View;
 use std::ops::Range;
 
-/// What the passes of one batch of rays touch.
+/// Resources for the passes of one batch of rays.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FieldPasses<'a> {
     pub(crate) gpu: &'a Gpu,
@@ -19,20 +19,20 @@ pub(crate) struct FieldPasses<'a> {
     pub(crate) field: &'a FieldBuffers,
     pub(crate) samples: &'a SampleBuffers,
     pub(crate) slot: &'a RaySlot,
-    /// Of the images that the rays belong to.
+    /// Parameters of the images that the rays belong to.
     pub(crate) image_params: &'a Buffer,
 }
 
-/// A picture and where it is drawn.
+/// Buffers that a picture is rendered into.
 #[derive(Debug)]
 pub(crate) struct Canvas {
     pub(crate) view: Buffer,
     pub(crate) backdrop: Buffer,
     pub(crate) pixels: Buffer,
     pub(crate) depths: Buffer,
-    /// Of the image that it is to look like.
+    /// Parameters of the image whose appearance is used.
     pub(crate) image_params: Buffer,
-    /// What the rays of a batch have seen so far.
+    /// Color and transmittance accumulated by the rays of a batch.
     light: Buffer,
     pub(crate) n_pixels: u64,
 }
@@ -44,7 +44,8 @@ impl Canvas {
             backdrop: gpu.uniform_with("nerf.backdrop", &<Backdrop as bytemuck::Zeroable>::zeroed()),
             pixels: gpu.storage("nerf.pixels", 4 * n_pixels)?,
             depths: gpu.storage("nerf.depths", 4 * n_pixels)?,
-            image_params: gpu.storage("nerf.picture_terms", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
+            image_params: gpu
+                .storage("nerf.picture_image_params", (IMAGE_PARAM_STRIDE * size_of::<ImageParam>()) as u64)?,
             light: gpu.storage("nerf.light", 32 * u64::from(n_rays))?,
             n_pixels,
         })
@@ -53,7 +54,7 @@ impl Canvas {
 
 /// Layers of both networks.
 const N_LAYERS: u64 = 5;
-/// Where the number of samples lies in a batch.
+/// Byte range of the number of samples in a batch.
 const N_SAMPLES_BYTES: Range<u64> = 4..8;
 
 fn groups(n: u32, size: u32) -> u64 {
@@ -61,7 +62,7 @@ fn groups(n: u32, size: u32) -> u64 {
 }
 
 impl FieldPasses<'_> {
-    /// Finds the pieces of rays where something is.
+    /// Finds the segments of rays in occupied cells.
     pub(crate) fn count(&self, list: &mut Passes, occupancy: &Occupancy) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let found = [
@@ -75,7 +76,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.count_samples, groups(THREADS_PER_RAY * slot.n_rays, 64), &found);
     }
 
-    /// After [`FieldPasses::count`]: makes samples of the pieces.
+    /// Turns segments into samples. Run after [`FieldPasses::count`].
     pub(crate) fn place_samples_in_rays(&self, list: &mut Passes, occupancy: &Occupancy) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shared =
@@ -91,7 +92,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.write_samples, n_groups, &[&shared[..], &written].concat());
     }
 
-    /// Looks at some cells of the occupancy anew. What the batch held is lost.
+    /// Updates a subset of the occupancy cells. Overwrites the batch.
     pub(crate) fn occupancy_update(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
         let Self { gpu, pipelines, samples, .. } = *self;
         let Occupancy { cell_occupancy, occupancy_update, n_points, .. } = occupancy;
@@ -110,7 +111,7 @@ impl FieldPasses<'_> {
         self.mark_occupied_cells(list, occupancy, moments);
     }
 
-    /// Takes note of what depth tells, [`super::carve::hints`].
+    /// Applies hints from depth, see [`super::carve::hints`].
     pub(crate) fn hint(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments, hints: &Buffer) {
         for kernel in &self.pipelines.hint_cells {
             let n_groups = (hints.bytes() / 4).div_ceil(64);
@@ -124,7 +125,7 @@ impl FieldPasses<'_> {
         self.mark_occupied_cells(list, occupancy, moments);
     }
 
-    /// Marks the cells that rays are walked through.
+    /// Marks the cells in which rays are sampled.
     pub(crate) fn mark_occupied_cells(&self, list: &mut Passes, occupancy: &Occupancy, moments: &FieldMoments) {
         let Self { gpu, pipelines, .. } = *self;
         let Occupancy { occupied, cell_occupancy, occupancy_sum, occupancy_update, n_cells, .. } = occupancy;
@@ -142,7 +143,7 @@ impl FieldPasses<'_> {
         );
     }
 
-    /// Makes layers take the weights as they are now.
+    /// Converts the current weights to the number type of the layers.
     pub(crate) fn convert_weights(&self, list: &mut Passes) {
         let Self { gpu, pipelines, field, .. } = *self;
         if let (Some(kernel), Some(half)) = (&pipelines.weights_to_half, &field.half_weights) {
@@ -151,17 +152,18 @@ impl FieldPasses<'_> {
         }
     }
 
-    /// After [`FieldPasses::convert_weights`]: density of every point, before the exponential.
+    /// Density of every point, before the exponential. Run after [`FieldPasses::convert_weights`].
     fn densities(&self, list: &mut Passes) {
         self.networks(list, &self.pipelines.densities, &self.field.unused_buffer);
     }
 
-    /// After [`FieldPasses::convert_weights`]: density and color of every sample, before the exponential and the sigmoid.
+    /// Density and color of every sample, before the exponential and the sigmoid. Run after
+    /// [`FieldPasses::convert_weights`].
     pub(crate) fn colors(&self, list: &mut Passes) {
         self.networks(list, &self.pipelines.colors, &self.field.unused_buffer);
     }
 
-    /// As [`FieldPasses::colors`], and all that is needed on the way back.
+    /// Like [`FieldPasses::colors`], and stores everything needed for the backward pass.
     pub(crate) fn forward(&self, list: &mut Passes, step: &StepBuffers) {
         self.networks(list, &self.pipelines.forward, &step.activations);
     }
@@ -199,7 +201,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.find_samples, groups(slot.n_rays, 256), &found);
     }
 
-    /// Fills in the rays of a picture's pixels.
+    /// Generates the rays of a picture's pixels.
     pub(crate) fn picture_rays(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let posed = [
@@ -212,7 +214,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.picture_rays, groups(slot.n_rays, 64), &posed);
     }
 
-    /// After [`FieldPasses::forward`]: the pixels that the rays see.
+    /// Writes the pixels of the rays. Run after [`FieldPasses::colors`].
     pub(crate) fn show(&self, list: &mut Passes, canvas: &Canvas) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let shown = [
@@ -231,14 +233,14 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.show_rays, groups(slot.n_rays, 64), &shown);
     }
 
-    /// Moves the rays as their images' poses were found to be moved.
+    /// Corrects the rays by the optimized poses of their images.
     pub(crate) fn apply_pose(&self, list: &mut Passes) {
         let Self { gpu, pipelines, samples, slot, image_params, .. } = *self;
         let posed = [("batch", &samples.batch), ("image_params", image_params), ("rays", &slot.rays)];
         list.dispatch(gpu, &pipelines.apply_poses, groups(slot.n_rays, 64), &posed);
     }
 
-    /// After [`FieldPasses::backward`]: slopes towards the poses of rays.
+    /// Gradients with respect to the poses of rays. Run after [`FieldPasses::backward`].
     pub(crate) fn pose_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, field, samples, slot, .. } = *self;
         let (batch, rays, spans) = (("batch", &samples.batch), ("rays", &slot.rays), ("spans", &samples.spans));
@@ -258,7 +260,8 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.ray_gradients, groups(slot.n_rays, 64), &summed);
     }
 
-    /// After [`FieldPasses::backward`]: slopes of samples towards the codes of their images.
+    /// Gradients of samples with respect to the appearance embeddings of their images. Run after
+    /// [`FieldPasses::backward`].
     pub(crate) fn embedding_gradients(&self, list: &mut Passes, step: &StepBuffers, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, field, samples, .. } = *self;
         let carried = [
@@ -270,7 +273,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.embedding_gradients, groups(samples.n_samples, 64), &carried);
     }
 
-    /// After the slopes: one step of the terms of all images.
+    /// One optimizer step for the parameters of all images. Run after their gradients.
     pub(crate) fn update_images(&self, list: &mut Passes, moments: &FieldMoments, images: &ImageParamBuffers) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let learned = [
@@ -285,7 +288,7 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.update_images, images.n_images.into(), &learned);
     }
 
-    /// After [`FieldPasses::forward`]: what every ray sees, its loss, and the slopes back to its samples.
+    /// Color and loss of every ray, and the gradients with respect to its samples. Run after [`FieldPasses::forward`].
     pub(crate) fn composite(&self, list: &mut Passes, step: &StepBuffers) {
         let Self { gpu, pipelines, samples, slot, .. } = *self;
         let composited = [
@@ -303,7 +306,8 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.composite, groups(slot.n_rays, 64), &composited);
     }
 
-    /// After [`FieldPasses::forward`]: the loss of every ray, and the slopes towards all that is learned.
+    /// Loss of every ray, and the gradients with respect to all parameters of the field. Run after
+    /// [`FieldPasses::forward`].
     pub(crate) fn backward(&self, list: &mut Passes, step: &StepBuffers, gradients: &FieldGradients) {
         let Self { gpu, pipelines, field, samples, .. } = *self;
         self.composite(list, step);
@@ -329,8 +333,8 @@ impl FieldPasses<'_> {
         list.dispatch(gpu, &pipelines.weight_gradients, N_LAYERS * n_chunks, &summed);
     }
 
-    /// After [`FieldPasses::backward`]: one step of the optimiser, each with a rule of its own for the grid and for the weights. The
-    /// slopes towards the grid are zero afterwards.
+    /// One optimizer step, with separate rules for grid and weights. Resets the gradients of the grid to zero. Run
+    /// after [`FieldPasses::backward`].
     pub(crate) fn learn(
         &self,
         list: &mut Passes,

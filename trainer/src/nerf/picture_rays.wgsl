@@ -1,8 +1,8 @@
-// picture_rays: the rays of some pixels of a view.
+// picture_rays: the rays of a range of pixels of a view.
 //
 // threads   one per ray
-// reads     batch, march (first_ray: the first pixel), view (in units of the scene's radius around its middle)
-// writes    rays, light [n_rays, 2] (none yet)
+// reads     batch, march (first_ray: the first pixel), view (in units of the scene radius around its center)
+// writes    rays, light [n_rays, 2] (reset: nothing accumulated)
 
 #import view
 #import picture_ray

@@ -1,8 +1,8 @@
-// place_samples: where the samples of each ray begin, and how many rays may have at most so that there is room for all.
+// place_samples: range of samples of each ray, and a limit of samples per ray at which all rays fit.
 //
 // threads   256, in one workgroup
 // reads     march, n_found
-// writes    rays (first_sample, n_samples), batch (n_samples, most_samples)
+// writes    rays (first_sample, n_samples), batch (n_samples, max_samples)
 
 #import ray_batch
 #import march_params

@@ -1,8 +1,9 @@
-// point_slopes: slopes towards the place of every sample, from those towards what the grid holds there.
+// point_gradients: gradients with respect to the position of every sample, from those of its grid features.
 //
 // threads   one per sample
-// reads     batch, levels [n_levels], points [n_samples], grid [n_entries], rays, spans, v_held [n_tiles, n_slope_rows, 8]
-// writes    v_points [n_samples] (per unit of the scene's radius)
+// reads     batch, levels [n_levels], points [n_samples], grid [n_entries], rays, spans, v_activations [n_tiles,
+//           n_gradient_rows, 8]
+// writes    v_points [n_samples] (per unit of the scene radius)
 // twin      nerf/reference/grid.rs, nerf/reference/space.rs
 
 #import number
@@ -20,7 +21,7 @@
 @group(0) @binding(6) var<storage, read> v_activations: array<Four>;
 @group(0) @binding(7) var<storage, read_write> v_points: array<vec4f>;
 
-// Towards the point of the unit cube.
+// Gradient with respect to the point in the unit cube.
 fn gradient_in(level: Level, at: vec3f, v_features: vec2f) -> vec3f {
     let cell = cell_of(level, at);
     var gradient = vec3f(0.0);
@@ -34,13 +35,13 @@ fn gradient_in(level: Level, at: vec3f, v_features: vec2f) -> vec3f {
     return gradient * f32(level.n_cells);
 }
 
-// From the unit cube to the world.
+// Gradient with respect to the point in world, from that in the unit cube.
 fn contract_backward(at: vec3f, v: vec3f) -> vec3f {
     let size = abs(at);
     let max_abs = max(size.x, max(size.y, size.z));
     if max_abs <= 1.0 { return v / 4.0; }
     let is_max = select(vec3f(0.0), sign(at), size == vec3f(max_abs));
-    // One axis alone where two are alike.
+    // Select a single axis if two are equal.
     let axis = select(select(vec3f(0.0, 0.0, is_max.z), vec3f(0.0, is_max.y, 0.0), is_max.y != 0.0), vec3f(is_max.x, 0.0, 0.0), is_max.x != 0.0);
     let factor = (2.0 * max_abs - 1.0) / (max_abs * max_abs);
     let by_max = (2.0 - 2.0 * max_abs) / (max_abs * max_abs * max_abs);

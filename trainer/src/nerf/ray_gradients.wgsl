@@ -1,11 +1,13 @@
-// ray_slopes: slopes towards a turn and a shift of every ray, from those towards the places of its samples.
+// ray_gradients: gradients with respect to rotation and translation of every ray, from those of the positions of its
+// samples.
 //
 // threads   one per ray
 // reads     batch, rays, spans, v_points [n_samples]
-// writes    v_rays [n_rays, 2] (towards the turn about the ray's begin, towards the shift)
+// writes    v_rays [n_rays, 2] (with respect to rotation about the ray's origin; to translation)
 // twin      nerf/reference/pose.rs
 //
-// What a turn changes about the direction that colors are looked at from is left out: it is small beside where the ray goes.
+// The effect of rotation on the view direction of colors is neglected: it is small compared with the effect on
+// positions.
 
 #import folded
 #import ray_batch

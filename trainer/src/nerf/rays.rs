@@ -1,4 +1,4 @@
-//! Rays that a step learns from: pixels of all keyframes, chosen by a hash of seed, step and place in the batch.
+//! Training rays: pixels of all keyframes, chosen by a hash of seed, step and position in the batch.
 
 use super::extent::Extent;
 use super::params;
@@ -9,23 +9,23 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 
-/// Rays that one task draws.
+/// Rays per parallel task.
 const RAYS_PER_TASK: usize = 512;
-/// Tries to find a pixel that was seen.
+/// Attempts to find a pixel that is not masked.
 const MAX_ATTEMPTS: u64 = 4;
-/// Where rays end: far beyond this the field tells nothing apart.
+/// End of rays without a reading: contraction leaves no resolution far beyond this.
 const MAX_DISTANCE: f32 = 1e3;
 
-/// So far behind a reading, in units of the radius and as a share of its distance, a ray is still looked along: what lies further
-/// back it says nothing about.
+/// How far behind a reading a ray is sampled, in units of the scene radius and as a fraction of its distance. The
+/// reading gives no information about the space farther back.
 const BEHIND_SURFACE: f64 = 0.03;
 const BEHIND_SURFACE_FRAC: f64 = 0.03;
 
-/// A keyframe that rays are drawn from.
+/// A keyframe that rays are sampled from.
 #[derive(Clone, Debug)]
 pub(crate) struct RayImage {
     pub(crate) keyframe: Arc<Keyframe>,
-    /// Of each pixel, metres along z; 0 where unknown; empty where there is none. Worked out when it is first asked for.
+    /// Depth of each pixel, meters along z; 0 where unknown; empty without depth. Computed on first use.
     depth_m: OnceLock<Arc<[f32]>>,
 }
 
@@ -38,7 +38,7 @@ impl RayImage {
         self.depth_m.get_or_init(|| depth_in_color_view(&self.keyframe))
     }
 
-    /// Origin, direction of length 1, and how far the depth says that the ray goes (0: it does not), in units of the
+    /// Origin, direction of length 1, and measured distance along the ray (0 if there is no reading), in units of the
     /// extent's radius.
     pub(crate) fn reading(&self, extent: &Extent, pixel_ix: usize) -> ([f64; 3], [f64; 3], f64) {
         let Keyframe { size_px: [width, height], focal_px, principal_px, .. } = &*self.keyframe;
@@ -47,7 +47,7 @@ impl RayImage {
         let mut in_camera = Vector3::new(along(x, 0), along(y, 1), 1.0);
         let mut origin_m = Vector3::zeros();
         if let Some(twist) = &self.keyframe.twist {
-            // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
+            // The camera motion moves a point by -tau (v + w x p) in the camera; the ray undoes that.
             let tau_secs = ((y as f64 + 0.5) / f64::from(*height) - 0.5) * self.keyframe.readout_secs;
             in_camera += twist.angular_rad_s.cross(&in_camera) * tau_secs;
             origin_m = twist.linear_m_s * tau_secs;
@@ -60,7 +60,7 @@ impl RayImage {
         ((origin / extent.radius_m).into(), (pose.rotation * (in_camera / length)).into(), distance.max(0.0))
     }
 
-    /// The ray through the middle of a pixel, with what is seen there.
+    /// The ray through the center of a pixel, with the color and depth observed there.
     fn ray(&self, extent: &Extent, pixel_ix: usize, begin: f32, jitter: f32) -> params::Ray {
         let (origin, direction, distance) = self.reading(extent, pixel_ix);
         let pixel = &self.keyframe.rgba_srgb[4 * pixel_ix..4 * pixel_ix + 4];
@@ -81,17 +81,17 @@ impl RayImage {
     }
 }
 
-/// Which rays, and how they begin.
+/// How rays are sampled.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RaySampling {
     pub(crate) seed: u64,
     pub(crate) step: u64,
     pub(crate) n_rays: u32,
-    /// Nearest place that is looked at, in units of the radius.
+    /// Distance at which rays begin, in units of the radius.
     pub(crate) begin: f32,
 }
 
-/// Rays of a step, all images alike, in the order of the images.
+/// Samples the rays of a step evenly from all images, in the order of the images.
 pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> Vec<params::Ray> {
     if images.is_empty() {
         return Vec::new();
@@ -100,13 +100,13 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
     let ray = |ix: u64| {
         let ray_key = mix_hash(key ^ mix_hash(ix));
         let share = (ix as f64 + unit(ray_key)) / f64::from(draw.n_rays);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
         let pick = |attempt: u64| {
             let word = mix_hash(ray_key.wrapping_add(1 + attempt));
-            // The upper half of a product of 64 bits: even over all pixels.
+            // The upper half of a 64-bit product: uniform over all pixels.
             usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64).expect("less than a length")
         };
         let is_unmasked = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
@@ -126,7 +126,7 @@ pub(crate) fn mix_hash(word: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// 0 <= x < 1.
+/// Maps a word to 0 <= x < 1.
 pub(crate) fn unit(word: u64) -> f64 {
     (word >> 11) as f64 / (1u64 << 53) as f64
 }

@@ -1,7 +1,7 @@
-// visit_cells: a point somewhere in each of some cells of the occupancy.
+// sample_cells: a random point in each of the occupancy cells that this update evaluates.
 //
 // threads   one per point
-// reads     visit, steps ([1]: visits so far)
+// reads     occupancy_update, steps ([1]: updates so far)
 // writes    points [n_points] (in the unit cube), batch (n_samples)
 
 #import folded

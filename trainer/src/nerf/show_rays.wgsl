@@ -1,9 +1,10 @@
-// show_rays: the pixels that rays see, after one more round of samples; rays that see no further are ended.
+// show_rays: composites one more round of samples into the pixels of rays, and marks rays that are finished.
 //
 // threads   one per ray
-// reads     batch, march (first_ray: the first pixel; most_found: samples of a round), view, backdrop, spans, told [n_samples], colors [n_samples]
-// writes    rays (is_ended), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a: coverage),
-//           depths [n_pixels] (metres along z, mean over what is seen; 0 where nothing is)
+// reads     batch, march (first_ray: the first pixel; max_found: samples per round), view, backdrop, spans, log_density
+//           [n_samples], colors [n_samples]
+// writes    rays (is_finished), light [n_rays, 2] (rgb and transmittance; distance), pixels [n_pixels] (rgba8; a:
+//           coverage), depths [n_pixels] (meters along z, weighted mean; 0 for pixels without coverage)
 // twin      nerf/reference/ray.rs
 
 #import view
@@ -15,7 +16,7 @@
 
 struct Backdrop {
     srgb: vec3f,
-    radius_m: f32,         // of the scene: metres a unit
+    radius_m: f32,         // of the scene: meters per unit
 }
 
 @group(0) @binding(0) var<storage, read> batch: Batch;
@@ -31,7 +32,7 @@ struct Backdrop {
 @group(0) @binding(10) var<storage, read_write> light: array<vec4f>;
 
 const MIN_COVERAGE = 1e-3;
-// Behind what lets less light through nothing is looked at: it is half of the least difference of a color.
+// Rays with less transmittance are finished: it is half of the smallest difference of a color.
 const MIN_TRANSMITTANCE = 1.0 / 512.0;
 
 @compute @workgroup_size(64)

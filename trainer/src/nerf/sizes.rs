@@ -1,4 +1,4 @@
-//! How large a field is: no larger than what its images show.
+//! Sizes of a field, limited by the resolution of its images.
 
 use super::extent::{Extent, pixel_size_m};
 use super::options::{NerfBudget, NerfOptions};
@@ -8,17 +8,17 @@ use serde::{Deserialize, Serialize};
 
 /// Cells of the coarsest level along an axis.
 const N_CELLS_COARSEST: u32 = 16;
-/// How much finer each level is than the one before.
+/// Ratio of the resolutions of adjacent levels.
 const LEVEL_GROWTH: f64 = 1.5;
-/// Finest cells are this many pixels wide: finer ones would learn noise.
+/// Width of the finest cells in pixels: finer ones would fit noise.
 const PIXELS_PER_CELL: f64 = 1.5;
-/// Pixels of an image for each entry of a level: many images see the same place, and a surface is few of a level's cells.
+/// Pixels of an image per entry of a level: images overlap, and surfaces occupy few of a level's cells.
 const PIXELS_PER_ENTRY: f64 = 0.5;
-/// Levels of any field.
+/// Limits of the number of levels.
 pub(crate) const MIN_LEVELS: u32 = 4;
 pub(crate) const MAX_LEVELS: u32 = 16;
 const MIN_LOG2_ENTRIES: u32 = 12;
-/// Bytes of an entry: itself, its slopes, its moments.
+/// Bytes per entry: the entry, its gradients and its moments.
 const BYTES_PER_ENTRY: u64 = 8 + 8 + MOMENT_BYTES_PER_ENTRY;
 const MOMENT_BYTES_PER_ENTRY: u64 = 16;
 
@@ -29,17 +29,17 @@ pub(crate) struct Sizes {
     /// Cells of each level along an axis.
     pub(crate) n_cells: Vec<u32>,
     pub(crate) log2_entries: u32,
-    /// Whether depth tells where something is.
+    /// Whether there is depth to initialize the occupancy from.
     pub(crate) has_depth: bool,
-    /// Whether cells of the occupancy become finer once something is known.
+    /// Whether the occupancy cells are refined during training.
     #[serde(default)]
     pub(crate) can_refine: bool,
     pub(crate) nerf_budget: NerfBudget,
 }
 
-/// Whether most images have depth for most of what they show: then few cells hold anything, and finer ones cost little.
+/// Whether most images have depth for most of their pixels: then few cells are occupied, and finer ones cost little.
 fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
-    /// Every so manieth reading is looked at.
+    /// Only every `STRIDE`-th reading is checked.
     const STRIDE: usize = 61;
     let is_known = |depth: &DepthMap| {
         let readings = depth.depth_m.iter().step_by(STRIDE);
@@ -50,7 +50,7 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
 }
 
 impl Sizes {
-    /// Levels down to what a pixel sees, and entries for what an image shows, as far as limits allow.
+    /// Chooses levels down to the size of a pixel, and entries for the number of pixels in an image, within the limits.
     pub(crate) fn choose<'a>(
         options: &NerfOptions,
         nerf_budget: NerfBudget,
@@ -58,7 +58,7 @@ impl Sizes {
         keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
         extent: &Extent,
     ) -> Result<Self, Error> {
-        // The unit cube is four radii wide as the inner cube has it.
+        // The unit cube covers four radii at the scale of the inner cube.
         let cell_m = PIXELS_PER_CELL * pixel_size_m(keyframes.clone(), extent);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
         let finest = (4.0 * extent.radius_m / cell_m).clamp(64.0, 8192.0) as u32;
@@ -94,7 +94,7 @@ impl Sizes {
         GridShape { n_cells: self.n_cells.clone(), log2_entries: self.log2_entries }
     }
 
-    /// Refuses sizes that no field has.
+    /// Fails if a field cannot have these sizes.
     pub(crate) fn check(&self) -> Result<(), Error> {
         let NerfBudget { n_rays, n_samples, n_hidden, n_cells, n_steps, picture_rays, max_levels, .. } =
             self.nerf_budget;
@@ -114,7 +114,7 @@ impl Sizes {
         if is_usable {
             Ok(())
         } else {
-            Err(Error::CheckpointState { reason: format!("no field has such sizes: {self:?}") })
+            Err(Error::CheckpointState { reason: format!("unsupported field sizes: {self:?}") })
         }
     }
 }

@@ -1,8 +1,8 @@
-// sum_cells: the mean of what cells hold back, as a whole number, so that the order does not matter.
+// sum_cells: mean occupancy of all cells, as an integer, so that the order of additions does not matter.
 //
 // threads   one per 32 cells
-// reads     thickness
-// writes    thickness_sum (at most 1 a cell, in units of 1 / MOST_SUM of all)
+// reads     cell_occupancy
+// writes    occupancy_sum (mean of the occupancy, clamped to 0 to 1 per cell, times MAX_SUM)
 
 #import folded
 #import occupancy_sum

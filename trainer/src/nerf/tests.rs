@@ -1,4 +1,4 @@
-//! The whole field: it learns what a scene looks like, the same twice, and goes on where it stopped.
+//! Tests of the whole model: accuracy, determinism and resuming.
 
 use super::carve;
 use super::extent::Extent;
@@ -16,7 +16,7 @@ use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
 
-/// The ball's middle.
+/// Center of the ball.
 const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 const N_STEPS: u64 = 160;
 
@@ -34,12 +34,12 @@ fn options() -> NerfOptions {
     NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: 300, ..NerfOptions::default() }
 }
 
-/// The ball alone: pixels beside it are black, and have no depth.
+/// The ball alone: the pixels around it are black and have no depth.
 fn ball(n: usize) -> Vec<Arc<Keyframe>> {
     scenes::ring(&[scenes::ball(BALL_CENTER)], BALL_CENTER, n)
 }
 
-/// A ball on a floor, seen from above so that all that is seen is near.
+/// A ball on a floor, seen from above so that everything visible is near.
 fn ball_on_floor(n: usize) -> Vec<Arc<Keyframe>> {
     let view = |ix: usize| {
         let angle = 0.8 * ix as f64;
@@ -62,7 +62,7 @@ fn model_with(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
     model
 }
 
-/// Learns up to a step.
+/// Trains up to a step.
 fn train_until(model: &mut NerfModel, end: u64) {
     while model.progress().step < end {
         model.step(end - model.progress().step).unwrap();
@@ -111,7 +111,7 @@ fn novel_view_is_accurate_and_deterministic() {
     let without_depth = model.render(&RenderRequest { depth: false, ..request(test_view) }).unwrap();
     assert!(without_depth.depth_m.is_empty() && without_depth.rgba_srgb == picture.rgba_srgb);
 
-    // Somebody looks before all keyframes are there.
+    // Renders before all keyframes have been pushed.
     let mut one_by_one = model_with(options(), &seen[..2]);
     one_by_one.seed().unwrap();
     assert!(one_by_one.render(&request(test_view)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
@@ -119,12 +119,12 @@ fn novel_view_is_accurate_and_deterministic() {
     while one_by_one.progress().step < N_STEPS {
         one_by_one.step(1).unwrap();
     }
-    assert!(state(&mut model) == state(&mut one_by_one), "steps of a submit are not those of many");
+    assert!(state(&mut model) == state(&mut one_by_one), "results must not depend on the number of steps per submit");
     let mut other = model_with(NerfOptions { seed: 1, ..options() }, &seen);
     train_until(&mut other, 4);
     let mut first = model_with(options(), &seen);
     train_until(&mut first, 4);
-    assert!(state(&mut other).arrays != state(&mut first).arrays, "the seed changes nothing");
+    assert!(state(&mut other).arrays != state(&mut first).arrays, "the seed must change the result");
 }
 
 #[test]
@@ -153,7 +153,7 @@ fn resume_and_load_are_bit_exact() {
     let mut changed = keyframes.clone();
     changed[2] = other_lens;
     let error = NerfModel::resume(gpu(), &checkpoint, &changed).unwrap_err();
-    assert!(error.to_string().contains("has another lens"), "{error}");
+    assert!(error.to_string().contains("has different intrinsics"), "{error}");
 }
 
 #[test]
@@ -183,9 +183,13 @@ fn renders_crop_range_and_equirectangular() {
     let crop = |x: f64| Some(Aabb { world_from_box: to(x), min_m: [-0.5; 3], max_m: [0.5; 3] });
     let n_covered_in_crop = covered(&mut model, &RenderRequest { crop: crop(0.0), ..request.clone() });
     assert!(n_covered_in_crop > 1000, "{n_covered_in_crop} pixels of the ball in its box");
-    assert_eq!(covered(&mut model, &RenderRequest { crop: crop(5.0), ..request.clone() }), 0, "an empty box");
-    assert_eq!(covered(&mut model, &RenderRequest { far_m: 0.2, ..request.clone() }), 0, "before the ball");
-    // From the ball's middle there is something in all directions.
+    assert_eq!(covered(&mut model, &RenderRequest { crop: crop(5.0), ..request.clone() }), 0, "the box is empty");
+    assert_eq!(
+        covered(&mut model, &RenderRequest { far_m: 0.2, ..request.clone() }),
+        0,
+        "`far_m` ends in front of the ball"
+    );
+    // From the center of the ball, there is a surface in all directions.
     let all = RenderRequest {
         world_from_camera: Transform::translation(BALL_CENTER.x, BALL_CENTER.y, BALL_CENTER.z),
         size_px: [64, 32],
@@ -196,7 +200,8 @@ fn renders_crop_range_and_equirectangular() {
     assert_eq!((picture.size_px, picture.depth_m.len()), ([64, 32], 64 * 32));
 }
 
-/// Where depth is dense, cells become finer once something is known; stopping before or after changes nothing.
+/// With dense depth, cells are refined during training; resuming from before or after the refinement gives the same
+/// result.
 #[test]
 fn occupancy_cells_are_refined() {
     const PLANNED: u64 = 40;
@@ -213,7 +218,7 @@ fn occupancy_cells_are_refined() {
     train_until(&mut whole, END);
     let n_bytes =
         |checkpoint: &crate::checkpoint::Checkpoint| checkpoint.array("cell_occupancy", 4 << 24).map(<[u8]>::len);
-    assert!(n_bytes(&parts[0]).is_err() && n_bytes(&parts[1]).is_ok(), "it became finer between these steps");
+    assert!(n_bytes(&parts[0]).is_err() && n_bytes(&parts[1]).is_ok(), "the cells must be refined between these steps");
     let expected = state(&mut whole);
     for part in parts {
         let (mut resumed, _) = NerfModel::resume(gpu(), &part, &keyframes).unwrap();
@@ -222,8 +227,8 @@ fn occupancy_cells_are_refined() {
     }
 }
 
-/// Poses that drift from image to image are found along with the scene, where a trial says that it pays; stopping in its midst
-/// changes nothing.
+/// Poses with drift are corrected during training if a trial finds a significant gain. Resuming in the middle of the
+/// trial gives the same result.
 #[test]
 fn drifting_poses_are_corrected() {
     let true_keyframes = ball_on_floor(24);
@@ -241,7 +246,7 @@ fn drifting_poses_are_corrected() {
     };
     let drifted_keyframes: Vec<Arc<Keyframe>> = true_keyframes.iter().map(drifted).collect();
     let position_error_m = |found: &Transform, true_keyframes: &Keyframe| {
-        // Where a point half a metre ahead is seen.
+        // Compares the positions of a point half a meter ahead.
         let ahead = Point3::new(0.0, 0.0, 0.5);
         (found * ahead - true_keyframes.world_from_camera * ahead).norm()
     };
@@ -255,19 +260,19 @@ fn drifting_poses_are_corrected() {
     let options = |cameras| NerfOptions { cameras, n_planned_steps: 600, ..options() };
     let mut model = model_with(options(CameraRefinement::Try(vec![poses])), &drifted_keyframes);
     let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
-    train_until(&mut model, 90); // In the midst of the trial.
+    train_until(&mut model, 90); // In the middle of the trial.
     let checkpoint = state(&mut model);
     train_until(&mut model, 600);
     let after_m = mean_position_error_m(&mut model, &drifted_keyframes);
     assert!(model.report()[0].kept, "{:?}", model.report());
-    // A few hundred small steps, and where all images are moved together nobody can tell: 15 mm became 9.
+    // There are only a few hundred small steps, and a common motion of all images is unobservable: 15 mm became 9.
     assert!(after_m < 0.75 * before_m, "{before_m} m, then {after_m} m");
 
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &drifted_keyframes).unwrap();
-    assert_eq!(rest.len(), 6, "images held back come back");
+    assert_eq!(rest.len(), 6, "validation images must be returned");
     rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
     train_until(&mut resumed, 600);
-    assert!(state(&mut model).arrays == state(&mut resumed).arrays, "the trial begins again, and ends the same");
+    assert!(state(&mut model).arrays == state(&mut resumed).arrays, "the trial must restart and end the same");
 
     let folder = tempfile::tempdir().unwrap();
     model.save(folder.path()).unwrap();
@@ -286,11 +291,11 @@ fn drifting_poses_are_corrected() {
     let position_error_m = mean_position_error_m(&mut with_removed, &drifted_keyframes);
     assert!(
         (position_error_m - before_m).abs() < 1e-12 && with_removed.report().is_empty(),
-        "what was saved no longer fits"
+        "the trial must be aborted, because its snapshot no longer fits"
     );
     train_until(&mut with_removed, 120);
 
-    // Images of which none is held back cannot decide.
+    // No trial is possible without validation images.
     let mut without_validation = model_with(options(CameraRefinement::Try(vec![poses])), &true_keyframes);
     train_until(&mut without_validation, 120);
     assert!(
@@ -299,8 +304,8 @@ fn drifting_poses_are_corrected() {
     );
 }
 
-/// Light that changes is found along with the scene, where a trial says that it pays; images that were not learned from are drawn in
-/// that of their neighbors in time, and others in the mean light.
+/// Changing light is modeled during training if a trial finds a significant gain. Images not used for training are
+/// rendered with the interpolated embedding of their neighbors in time, and others with the mean embedding.
 #[test]
 fn changing_light_is_modeled() {
     const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
@@ -313,7 +318,7 @@ fn changing_light_is_modeled() {
             Arc::new(Keyframe { split, ..(**keyframe).clone() })
         })
         .collect();
-    // In the second half a lamp is off.
+    // A lamp is off in the second half.
     let lit = |keyframe: &Arc<Keyframe>| {
         let mut rgba = keyframe.rgba_srgb.to_vec();
         if keyframe.stamp.0 >= 16 {
@@ -325,17 +330,17 @@ fn changing_light_is_modeled() {
     let mut unchanged = model_with(options(CameraRefinement::Try(vec![GAINS])), &even);
     train_until(&mut unchanged, 100);
     assert!(!unchanged.report()[0].kept, "{:?}", unchanged.report());
-    assert_eq!(unchanged.n_total_steps().unwrap(), 100, "where the light stays nothing is taken back");
+    assert_eq!(unchanged.n_total_steps().unwrap(), 100, "no steps must be discarded under constant light");
     let mut model = model_with(options(CameraRefinement::Try(vec![GAINS])), &changing);
-    train_until(&mut model, 75); // In the midst of the trial.
+    train_until(&mut model, 75); // In the middle of the trial.
     let checkpoint = state(&mut model);
     train_until(&mut model, 200);
     assert!(model.report()[0].kept && model.report()[0].gain_db > 1.0, "{:?}", model.report());
     let (mut resumed, rest) = NerfModel::resume(gpu(), &checkpoint, &changing).unwrap();
-    assert_eq!(rest.len(), 8, "images held back come back");
+    assert_eq!(rest.len(), 8, "validation images must be returned");
     rest.into_iter().for_each(|keyframe| resumed.push(keyframe).unwrap());
     train_until(&mut resumed, 200);
-    assert!(state(&mut model) == state(&mut resumed), "the trial begins again, and ends the same");
+    assert!(state(&mut model) == state(&mut resumed), "the trial must restart and end the same");
 
     let like = |keyframe: &Keyframe, stamp: i64| RenderRequest {
         appearance_of: Some((keyframe.camera.clone(), Stamp(stamp))),
@@ -356,14 +361,14 @@ fn changing_light_is_modeled() {
         assert!(drawn.rgba_srgb == again.rgba_srgb && drawn.depth_m == again.depth_m);
     }
 
-    // Those that stay keep their light.
+    // The remaining images keep their embeddings.
     let before = model.render(&like(&changing[25], 25)).unwrap();
     model.remove(&changing[3].camera, changing[3].stamp).unwrap();
     assert!(model.render(&like(&changing[25], 25)).unwrap().rgba_srgb == before.rgba_srgb);
     train_until(&mut model, 203);
 }
 
-/// Numbers that no camera should send change nothing that they do not have to.
+/// Non-finite values in keyframes must not spread to the model.
 #[test]
 fn non_finite_keyframes_leave_no_nan() {
     let keyframes = ball(6);
@@ -398,7 +403,7 @@ fn test_and_removed_keyframes_are_not_trained_on() {
     let mut model = model_with(options(), &[Arc::new(Keyframe { split: Split::Test, ..(*keyframes[0]).clone() })]);
     assert!(model.is_idle() && model.step(5).unwrap() == 0);
     let empty = model.render(&request(&keyframes[0])).unwrap();
-    assert!(empty.depth_m.iter().all(|depth| *depth == 0.0), "there is nothing to draw");
+    assert!(empty.depth_m.iter().all(|depth| *depth == 0.0), "the picture must be empty");
     model.push(keyframes[1].clone()).unwrap();
     assert!(!model.is_idle());
     train_until(&mut model, 2);
@@ -423,7 +428,7 @@ fn rays_pass_pixel_centers_at_row_time() {
         let tau = ((f64::from(y) + 0.5) / f64::from(height) - 0.5) * 0.04;
         let place =
             |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - keyframe.principal_px[axis]) / keyframe.focal_px[axis];
-        // A turn about z moves the ray's x and y.
+        // A rotation about z moves the ray's x and y.
         let (u, v) = (place(x, 0), place(y, 1));
         let seen = Vector3::new(u - tau * 2.0 * v, v + tau * 2.0 * u, 1.0);
         let pose = &keyframe.world_from_camera;
@@ -451,7 +456,7 @@ fn images_are_sampled_evenly_without_masked_pixels() {
     }
     assert!(drawn.is_sorted_by_key(|ray| ray.embedding));
     let n_masked = drawn.iter().filter(|ray| ray.target_rgb >> 24 == 0).count();
-    assert!(n_masked < 30, "{n_masked} of 200 rays of the half masked image fall on its mask");
+    assert!(n_masked < 30, "{n_masked} of 200 rays of the half masked image are in its mask");
     assert_eq!(drawn, rays::draw(&images, &extent, &draw));
     assert_ne!(drawn, rays::draw(&images, &extent, &RaySampling { step: 10, ..draw }));
 }
@@ -460,7 +465,7 @@ fn images_are_sampled_evenly_without_masked_pixels() {
 fn extent_covers_cameras_and_ignores_far_points() {
     let keyframes = scenes::ring(&[scenes::ball(BALL_CENTER), scenes::floor()], BALL_CENTER, 18);
     let extent = Extent::of(keyframes.iter().map(|keyframe| &**keyframe));
-    assert!((1.0..2.5).contains(&extent.radius_m), "a floor without end makes {extent:?}");
+    assert!((1.0..2.5).contains(&extent.radius_m), "an endless floor must not enlarge the extent: {extent:?}");
     let off = Vector3::from(extent.center_m) - BALL_CENTER.coords;
     assert!(off.norm() < extent.radius_m, "{extent:?}");
     let without_depth_keyframes: Vec<Keyframe> =
@@ -468,7 +473,7 @@ fn extent_covers_cameras_and_ignores_far_points() {
     let extent = Extent::of(without_depth_keyframes.iter());
     assert!(
         (Vector3::from(extent.center_m) - BALL_CENTER.coords).norm() < 0.05,
-        "cameras look at the ball: {extent:?}"
+        "the center must be near the ball, which all cameras face: {extent:?}"
     );
     assert!((1.0..1.5).contains(&extent.radius_m), "{extent:?}");
     let alone = Extent::of(without_depth_keyframes[..1].iter());
@@ -518,13 +523,13 @@ fn depth_marks_free_and_occupied_cells() {
     let eye = Point3::from(depth.world_from_camera.translation.vector);
     let towards = (BALL_CENTER - eye).normalize();
     let surface = eye + towards * ((BALL_CENTER - eye).norm() - 0.3);
-    assert_eq!(hint_at(surface), Some(2), "the near side of the ball");
+    assert_eq!(hint_at(surface), Some(2), "near side of the ball");
     assert_eq!(hint_at(eye + (surface - eye) * 0.5), Some(1), "between camera and ball");
-    assert_eq!(hint_at(BALL_CENTER), None, "inside of the ball");
+    assert_eq!(hint_at(BALL_CENTER), None, "inside the ball");
     let mut cells: Vec<u32> = hints.iter().filter(|hint| **hint >> 30 != 0).map(|hint| hint & 0x3fff_ffff).collect();
     cells.sort_unstable();
-    assert!(cells.windows(2).all(|pair| pair[0] != pair[1]), "a cell is told twice");
-    assert!(hints.iter().any(|hint| hint >> 30 == 0), "beside the ball there is no end");
+    assert!(cells.windows(2).all(|pair| pair[0] != pair[1]), "a cell has two hints");
+    assert!(hints.iter().any(|hint| hint >> 30 == 0), "the space around the ball must be unbounded");
 }
 
 #[test]
@@ -540,7 +545,7 @@ fn depth_holes_mark_no_free_space() {
     };
     let depth = whole.depth.as_ref().unwrap();
     let [width, height] = depth.size_px;
-    // Every third pixel along both axes, or a whole window, lacks its reading.
+    // Removes the reading of every third pixel along both axes, or of a whole window.
     let punched = |is_hole: &dyn Fn(u32, u32) -> bool| {
         let mut depth_m = depth.depth_m.to_vec();
         for (ix, z_m) in (0..width * height).zip(&mut depth_m) {
@@ -550,11 +555,18 @@ fn depth_holes_mark_no_free_space() {
         }
         DepthMap { depth_m: depth_m.into(), ..depth.clone() }
     };
-    assert_eq!(hint_inside(Some(punched(&|x, y| x % 3 == 0 && y % 3 == 0))), None, "holes are looked through");
+    assert_eq!(
+        hint_inside(Some(punched(&|x, y| x % 3 == 0 && y % 3 == 0))),
+        None,
+        "small holes must not mark cells as unbounded"
+    );
     assert_eq!(hint_inside(Some(punched(&|x, y| x.abs_diff(width / 2) < 12 && y.abs_diff(height / 2) < 12))), Some(0));
-    assert_eq!(hint_inside(None), Some(0), "an image without depth sees nothing");
+    assert_eq!(hint_inside(None), Some(0), "an image without depth must mark cells as unbounded");
     let [wide, _] = depth.focal_px.map(|focal| focal * 1e3);
     let narrow = DepthMap { focal_px: [wide; 2], ..punched(&|_, _| false) };
     let hint_next_to_hole = carve::hints(&[&Keyframe { depth: Some(narrow), ..(*whole).clone() }], &extent, &march);
-    assert!(hint_next_to_hole.iter().filter(|hint| **hint >> 30 == 0).count() > 500, "colors beside depth see nothing");
+    assert!(
+        hint_next_to_hole.iter().filter(|hint| **hint >> 30 == 0).count() > 500,
+        "pixels outside the depth image must mark cells as unbounded"
+    );
 }

@@ -1,8 +1,9 @@
-// note_cells: how much light the visited cells hold back.
+// update_cells: opacity of the cells that this update evaluates.
 //
 // threads   one per point
-// reads     visit, steps ([1]: visits so far), told [n_points]
-// writes    thickness [n_cells^3]: largest share lately, over one step; negative: never visited; 0: no image looks at it
+// reads     occupancy_update, steps ([1]: updates so far), log_density [n_points]
+// writes    cell_occupancy [n_cells^3]: decayed maximum of the opacity over one step; negative: never updated; 0:
+//           outside all views
 // source    Mueller et al. 2022, appendix C
 
 #import folded
@@ -24,6 +25,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let cell = updated_cell(occupancy_update, steps[1], ix);
     let opacity = density_of(log_density[ix]) * occupancy_update.step;
     let previous = cell_occupancy[cell];
-    // What no image looks at never learns what is there, so nothing it says is worth a sample.
+    // The field is not trained outside all views, so its density there is meaningless and not worth a sample.
     if previous != OUTSIDE_VIEWS { cell_occupancy[cell] = max(max(occupancy_update.decay * previous, opacity), MIN_OCCUPANCY); }
 }

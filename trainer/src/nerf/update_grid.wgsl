@@ -1,10 +1,10 @@
-// learn_grid: one step of Adam for the entries of the grid that a sample has touched, and the largest sum of each level.
+// update_grid: one Adam step for the grid entries with a gradient, and the largest sum of each level.
 //
 // threads   one per entry
-// reads     rule, pace, levels [n_levels], scales [n_levels]
-// writes    grid, moments [n_entries] (first of both, second of both), v_grid (zero again), largest [n_levels]
+// reads     rule, step_scale, levels [n_levels], scales [n_levels]
+// writes    grid, moments [n_entries] (first of both, second of both), v_grid (reset to zero), largest [n_levels]
 // twin      optim/reference.rs
-// source    Mueller et al. 2022, section 4 (entries without a slope are left alone)
+// source    Mueller et al. 2022, section 4 (entries without a gradient stay unchanged)
 
 #import folded
 #import hash_grid

@@ -1,11 +1,13 @@
-// learn_images: sums the slopes of an image's rays and samples, and takes one step of Adam for its pose and its code.
+// update_images: sums the gradients of an image's rays and samples, and takes one Adam step for its pose and appearance
+// embedding.
 //
 // threads   one workgroup of 64 per image
-// reads     batch, rule, pace, rays (in the order of their images, as are their samples), v_rays [n_rays, 2], v_codes [n_samples]
-// writes    terms [n_images, TERM_STRIDE]
+// reads     batch, rule, step_scale, rays (in the order of their images, like their samples), v_rays [n_rays, 2],
+//           v_embeddings [n_samples]
+// writes    image_params [n_images, IMAGE_PARAM_STRIDE]
 // twin      nerf/reference/pose.rs, nerf/reference/field.rs, optim/reference.rs
 //
-// Terms are pulled towards nothing: an image moves, and differs in its light, only as far as it has reason to.
+// Weight decay keeps the parameters of an image near zero unless the images contradict that.
 
 #import folded
 #import ray_batch
@@ -14,12 +16,12 @@
 #import param_step
 
 struct ImageParamRule {
-    learned: u32,          // bit i: term i
+    learned: u32,          // bit i: parameter i
     n_images: u32,
-    rotation_rate: f32,        // radians a step, at the start
-    translation_rate: f32,       // units of the radius a step, at the start
-    embedding_rate: f32,        // a step, at the start
-    weight_decay: f32,             // share of a term that is lost in a step, at the start
+    rotation_rate: f32,        // radians per step, initially
+    translation_rate: f32,       // units of the scene radius per step, initially
+    embedding_rate: f32,        // per step, initially
+    weight_decay: f32,             // fraction by which a parameter decays per step, initially
     unused: vec2u,
 }
 
@@ -32,11 +34,11 @@ struct ImageParamRule {
 @group(0) @binding(6) var<storage, read_write> image_params: array<vec4f>;
 
 const MAX_ABS = 1e30;
-const PARTS = 3u;          // turn, shift, code: three terms each
+const PARTS = 3u;          // rotation, translation, embedding: three parameters each
 
 var<workgroup> wg_sums: array<vec4f, 192>; // [PARTS, 64]
 
-// The first ray of an image that is not before this one.
+// The first ray that belongs to this image or a later one.
 fn first_ray_of(image: u32) -> u32 {
     var begin = 0u;
     var end = batch.n_rays;
@@ -65,17 +67,17 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let end_sample = first_sample_of(end);
     for (var ix = first_sample_of(begin) + lane; ix < end_sample; ix += 64u) { sums[2] += v_embeddings[ix]; }
     for (var part = 0u; part < PARTS; part++) { wg_sums[part * 64u + lane] = sums[part]; }
-    workgroupBarrier(); // All have told.
+    workgroupBarrier(); // All lanes have written their sums.
     for (var stride = 32u; stride > 0u; stride /= 2u) {
         if lane < stride {
             for (var part = 0u; part < PARTS; part++) { wg_sums[part * 64u + lane] += wg_sums[part * 64u + lane + stride]; }
         }
-        workgroupBarrier(); // This half holds what the other knew.
+        workgroupBarrier(); // The lower half holds the sums of both halves.
     }
     let part = min(lane / 3u, PARTS - 1u);
     let gradient = wg_sums[part * 64u][lane % 3u];
     let is_learned = lane < IMAGE_PARAM_STRIDE && (rule.learned & (1u << lane)) != 0u;
-    // What is not finite teaches nothing; nor does an image without rays.
+    // Skips non-finite gradients, and images without rays.
     if image < rule.n_images && is_learned && begin < end && abs(gradient) < MAX_ABS {
         let at = image * IMAGE_PARAM_STRIDE + lane;
         let rate = step_scale.rate_frac * vec3f(rule.rotation_rate, rule.translation_rate, rule.embedding_rate)[part];

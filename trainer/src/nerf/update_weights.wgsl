@@ -1,10 +1,10 @@
-// learn_weights: sums the slopes towards the weights of all layers over the chunks of samples, and takes one step of Adam.
+// update_weights: sums the gradients of the weights of all layers over the chunks of samples, and takes one Adam step.
 //
-// threads   256 per 16 times 4 weights: 16 share the chunks among them
-// reads     rule, pace, batch, partial_sums [n_chunks, N_SUMS]
+// threads   256 per 16 times 4 weights: 16 threads share the chunks
+// reads     rule, step_scale, batch, partial_sums [n_chunks, N_SUMS]
 // writes    weights [n_weights], moments [n_weights / 4, 2] (first and second of 4 weights)
 // twin      optim/reference.rs
-// source    Kingma and Ba 2015; pull of Loshchilov and Hutter 2019 (AdamW)
+// source    Kingma and Ba 2015; weight decay of Loshchilov and Hutter 2019 (AdamW)
 
 #import ray_batch
 #import adam_rule
@@ -17,9 +17,9 @@
 @group(0) @binding(5) var<storage, read_write> moments: array<vec4f>;
 
 override CHUNK: u32;       // samples
-override N_SUMS: u32;      // vec4 of a chunk; those behind the weights are of none
+override N_SUMS: u32;      // vec4 per chunk; those past the weights are padding
 
-const WORDS = 16u;         // vec4 of weights of a workgroup
+const WORDS = 16u;         // vec4 of weights per workgroup
 const THREADS_PER_WEIGHT = 16u;
 const MAX_ABS = 1e30;
 
@@ -35,11 +35,11 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(local_invocation_index) lane:
         for (var chunk = lane / WORDS; chunk < n_chunks; chunk += THREADS_PER_WEIGHT) { sum += partial_sums[chunk * N_SUMS + ix]; }
     }
     wg_sums[lane] = sum;
-    workgroupBarrier(); // All shares are there before they are added up.
+    workgroupBarrier(); // All partial sums are written before they are added.
     if lane < WORDS && ix < n {
         var v = vec4f(0.0);
         for (var thread_ix = 0u; thread_ix < THREADS_PER_WEIGHT; thread_ix++) { v += wg_sums[thread_ix * WORDS + lane]; }
-        let is_usable = abs(v) < vec4f(MAX_ABS); // What is not finite teaches nothing.
+        let is_usable = abs(v) < vec4f(MAX_ABS); // Skip non-finite gradients.
         let first = select(moments[2u * ix], mix(v, moments[2u * ix], rule.betas.x), is_usable);
         let second = select(moments[2u * ix + 1u], mix(v * v, moments[2u * ix + 1u], rule.betas.y), is_usable);
         moments[2u * ix] = first;

@@ -1,11 +1,11 @@
-// weight_slopes: slopes towards the weights of all layers, summed over a chunk of the samples.
+// weight_gradients: gradients with respect to the weights of all layers, summed over a chunk of samples.
 //
 // threads   SUM_LANES per layer and chunk of CHUNK_TILES * 32 samples
-// reads     batch, held [n_tiles, n_held_rows, 8], v_held [n_tiles, n_slope_rows, 8]
+// reads     batch, activations [n_tiles, n_activation_rows, 8], v_activations [n_tiles, n_gradient_rows, 8]
 // writes    partial_sums [n_chunks, n_weights]
 // twin      nerf/reference/network.rs
 //
-// A thread has 4 outputs and 4 inputs of the layer; where that leaves threads over, they share the samples among them.
+// A thread computes 4 outputs and 4 inputs of the layer. If threads are left over, several share the samples.
 
 #import folded
 #import ray_batch
@@ -20,7 +20,7 @@
 override SUM_LANES: u32;
 override CHUNK_TILES: u32;
 
-const BANK = 576u;         // rows of slopes begin here: 64 strides
+const BANK = 576u;         // start of the rows of gradients: 64 strides
 
 var<workgroup> wg_rows: array<vec4f, 1152>;
 
@@ -34,12 +34,12 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let n_blocks = n_in * n_out;
     let n_shares = min(PARTS, SUM_LANES / n_blocks); // of the samples
     let share = lane / n_blocks;
-    // Rows of neighboring threads follow each other, so that they come from different memory banks.
+    // Neighboring threads read consecutive rows, so that they use different memory banks.
     let input = lane % n_blocks % n_in;
     let output = lane % n_blocks / n_in;
     let n_tiles = (batch.n_samples + TILE - 1u) / TILE;
     if first_tile < n_tiles {
-        var sums: mat4x4f; // a column an output
+        var sums: mat4x4f; // one column per output
         for (var tile = first_tile; tile < min(first_tile + CHUNK_TILES, n_tiles); tile++) {
             for (var item = lane; item < layer.n_in * PARTS; item += SUM_LANES) {
                 wg_rows[item / PARTS * STRIDE + item % PARTS] = activations[(tile * n_activation_rows() + layer.activation_row) * PARTS + item];
@@ -47,7 +47,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
             for (var item = lane; item < layer.n_out * PARTS; item += SUM_LANES) {
                 wg_rows[BANK + item / PARTS * STRIDE + item % PARTS] = v_activations[(tile * n_gradient_rows() + layer.v_row) * PARTS + item];
             }
-            workgroupBarrier(); // All rows of the tile are there before they are read.
+            workgroupBarrier(); // All rows of the tile are written before they are read.
             if share < n_shares {
                 for (var part = share; part < PARTS; part += n_shares) {
                     let h_at = input * STRIDE + part;
@@ -59,10 +59,10 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
                     sums += transpose(h) * v;
                 }
             }
-            workgroupBarrier(); // All have read before the next tile overwrites the rows.
+            workgroupBarrier(); // All lanes have read before the next tile overwrites the rows.
         }
         for (var j = 0u; j < 4u; j++) { wg_rows[4u * lane + j] = sums[j]; }
-        workgroupBarrier(); // All shares are there before they are added up.
+        workgroupBarrier(); // All partial sums are written before they are added.
         if share == 0u {
             for (var j = 0u; j < 4u; j++) {
                 var sum = vec4f(0.0);

@@ -1,11 +1,11 @@
-// weight_slopes_half: as weight_slopes, on cooperative matrices.
+// weight_gradients_half: like weight_gradients, with cooperative matrices.
 //
 // threads   256 per layer and chunk of CHUNK_TILES * 32 samples
-// reads     batch, held [n_tiles, n_held_rows, 8], v_held [n_tiles, n_slope_rows, 8]
+// reads     batch, activations [n_tiles, n_activation_rows, 8], v_activations [n_tiles, n_gradient_rows, 8]
 // writes    partial_sums [n_chunks, n_weights] (the last layer has 16 outputs)
 // twin      nerf/reference/network.rs
 //
-// A subgroup has 16 outputs and 16 inputs of the layer, over all samples of the chunk.
+// A subgroup computes 16 outputs and 16 inputs of the layer, over all samples of the chunk.
 
 #import number
 #import folded
@@ -43,7 +43,7 @@ fn main(
                 sums = coopMultiplyAdd(v, h, sums);
             }
         }
-        // Each has a name: naga 30 stores none that has not.
+        // The result needs a name: naga 30 cannot store unnamed ones.
         let total = sums * (1.0 / gradient_scale(batch.n_rays));
         let stride = layer.n_in;
         let first = 4u * (ix / N_LAYERS * n_weight_words() + layer.first_weight) + output * stride + input;

@@ -1,5 +1,5 @@
-// halve_weights: the weights of all layers as the matrices have them: in f16, with zeros for the outputs that are no color; then, for each, what
-// that leaves over.
+// weights_to_half: converts the weights of all layers to f16 for cooperative matrices, with zeros for padding outputs;
+// followed by the rounding error of each weight in f16.
 //
 // threads   one per four weights
 // reads     weights [n_weights / 4]

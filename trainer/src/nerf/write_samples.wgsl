@@ -2,7 +2,7 @@
 //
 // threads   8 per ray, each for a part of it
 // reads     batch, march, rays, n_found [n_rays], n_before [n_rays, 8], occupied
-// writes    spans [n_samples], points [n_samples] (middle of the sample, in the unit cube; w unused)
+// writes    spans [n_samples], points [n_samples] (center of the sample, in the unit cube; w unused)
 // twin      nerf/reference/march.rs
 
 #import folded

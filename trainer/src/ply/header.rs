@@ -1,14 +1,14 @@
-//! The header of a binary `.ply` file, and its tables. Source: Turk, "The PLY Polygon File Format", 1994.
+//! The header and tables of a binary `.ply` file. Source: Turk, "The PLY Polygon File Format", 1994.
 
-/// Longest header we look for; those of splats have about two thousand bytes.
+/// Maximum length of a header; those of splats have about two thousand bytes.
 const MAX_HEADER_BYTES: usize = 64 * 1024;
 
-/// What a file holds.
+/// The tables of a file.
 pub(super) struct Header {
     elements: Vec<Element>,
 }
 
-/// One table: `count` rows of `properties`, from byte `start` of the file on.
+/// One table: `count` rows of `properties`, starting at byte `start` of the file.
 struct Element {
     name: String,
     count: usize,
@@ -23,7 +23,7 @@ struct Property {
     offset: usize,
 }
 
-/// How a number is stored.
+/// Type of a stored number.
 #[derive(Clone, Copy, Debug)]
 enum NumberType {
     I8,
@@ -62,17 +62,17 @@ impl NumberType {
 }
 
 impl Header {
-    /// Reads the header and checks that the tables it promises are in the file.
+    /// Parses the header and checks that its tables fit into the file.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self, String> {
         const END: &[u8] = b"end_header\n";
         let searched = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
         let end = searched.windows(END.len()).position(|window| window == END);
-        let end = end.ok_or("no PLY header with unix line ends")?;
-        let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "header is not text")?;
+        let end = end.ok_or("no PLY header with Unix line endings")?;
+        let text = std::str::from_utf8(&bytes[..end]).map_err(|_| "the header is not UTF-8")?;
         let mut header = Self { elements: Vec::new() };
         let mut lines = text.lines();
         if lines.next() != Some("ply") {
-            return Err("does not begin with \"ply\"".to_owned());
+            return Err("the header does not begin with \"ply\"".to_owned());
         }
         for line in lines {
             header.parse_line(line)?;
@@ -88,7 +88,7 @@ impl Header {
     /// The table of this name.
     pub(super) fn table<'a>(&'a self, name: &str, bytes: &'a [u8]) -> Result<Table<'a>, String> {
         let element = self.elements.iter().find(|element| element.name == name);
-        let element = element.ok_or_else(|| format!("no element {name:?}"))?;
+        let element = element.ok_or_else(|| format!("element {name:?} is missing"))?;
         Ok(Table { element, rows: &bytes[element.start..element.start + element.count * element.row_bytes] })
     }
 
@@ -96,9 +96,9 @@ impl Header {
         let words: Vec<&str> = line.split_whitespace().collect();
         match (words.as_slice(), self.elements.last_mut()) {
             ([] | ["comment" | "obj_info", ..] | ["format", "binary_little_endian", "1.0"], _) => Ok(()),
-            (["format", other, ..], _) => Err(format!("format {other}, only binary_little_endian 1.0 is read")),
+            (["format", other, ..], _) => Err(format!("format {other}, expected binary_little_endian 1.0")),
             (["element", name, count], _) => {
-                let count = count.parse().map_err(|_| format!("element {name}: count {count:?} is no number"))?;
+                let count = count.parse().map_err(|_| format!("element {name}: count {count:?} is not a number"))?;
                 let name = (*name).to_owned();
                 self.elements.push(Element { name, count, start: 0, row_bytes: 0, properties: Vec::new() });
                 Ok(())
@@ -110,7 +110,7 @@ impl Header {
                 element.row_bytes += number_type.bytes();
                 Ok(())
             }
-            _ => Err(format!("header line {line:?} is not understood")),
+            _ => Err(format!("unknown header line {line:?}")),
         }
     }
 
@@ -120,7 +120,7 @@ impl Header {
             let end = element.count.checked_mul(element.row_bytes).and_then(|bytes| bytes.checked_add(start));
             match end {
                 Some(end) if end <= file_bytes => start = end,
-                _ => return Err(format!("cut off: {} rows of {:?} are not all there", element.count, element.name)),
+                _ => return Err(format!("truncated: fewer than {} rows of {:?}", element.count, element.name)),
             }
         }
         Ok(())
@@ -159,7 +159,7 @@ pub(super) struct Column<'a> {
 
 impl Column<'_> {
     /// The value as f32.
-    #[expect(clippy::cast_possible_truncation, reason = "splats are f32 whatever the file holds")]
+    #[expect(clippy::cast_possible_truncation, reason = "splats are always f32")]
     pub(super) fn f32(&self, row: usize) -> f32 {
         match self.property.number_type {
             NumberType::I8 => f32::from(i8::from_le_bytes(self.bytes(row))),
@@ -173,7 +173,7 @@ impl Column<'_> {
         }
     }
 
-    /// The value as packed bits; refused when the property is not 32 bits of them.
+    /// The value as packed bits. Fails if the property is not an unsigned 32-bit integer.
     pub(super) fn bits(&self, row: usize) -> Result<u32, String> {
         match self.property.number_type {
             NumberType::U32 => Ok(u32::from_le_bytes(self.bytes(row))),

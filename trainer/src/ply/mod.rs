@@ -1,4 +1,5 @@
-//! Splats in `.ply` files: the layout of Kerbl et al. 2023 in and out, the packed layout of `SuperSplat` in.
+//! Splats in `.ply` files: reads and writes the layout of Kerbl et al. 2023, and reads the packed layout of
+//! `SuperSplat`.
 
 mod header;
 mod packed;
@@ -9,13 +10,14 @@ use header::{Column, Header, Table};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Reads a `.ply` of splats: properties in any order, of any number type, colour degree from their count.
+/// Reads a `.ply` file of splats. Properties may have any order and number type; their count determines the degree of
+/// the spherical harmonics.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
-/// Writes a `.ply` of splats, little endian, f32; a broken disk leaves no file under this name that looks whole.
+/// Writes a `.ply` file of splats, little endian, f32. After a failed write, no partial file has this name.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     atomic_file::write(path, |file| {
         let mut file = BufWriter::new(file);
@@ -46,7 +48,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     })
 }
 
-/// The columns of the colour coefficients; files hold the higher ones of red first, then of green, then of blue.
+/// The columns of the color coefficients; files store the higher ones of red first, then green, then blue.
 struct ColorColumns<'a> {
     degree: u32,
     constant: [Column<'a>; 3],
@@ -67,7 +69,7 @@ impl<'a> ColorColumns<'a> {
     }
 }
 
-/// Degree of the colour and the columns `f_rest_*`.
+/// Degree of the spherical harmonics and the columns `f_rest_*`.
 fn rest_columns<'a>(table: &Table<'a>) -> Result<(u32, Vec<Column<'a>>), String> {
     let rest: Vec<_> = (0..).map_while(|ix| table.column(&format!("f_rest_{ix}")).ok()).collect();
     let degree = match rest.len() {

@@ -1,4 +1,5 @@
-//! The packed `.ply` of `SuperSplat`: 16 bytes a splat in chunks of 256 with common bounds, colour beyond the constant 8 bits.
+//! The packed `.ply` of `SuperSplat`: 16 bytes per splat in chunks of 256 with common bounds; higher color coefficients
+//! have 8 bits each.
 
 use super::header::{Column, Header, Table};
 use super::rest_columns;
@@ -7,16 +8,16 @@ use crate::splat::arrays::SplatArrays;
 const SPLATS_PER_CHUNK: usize = 256;
 /// Constant factor of the first spherical harmonic, `1 / (2 sqrt(pi))`.
 const SH_0: f32 = 0.282_094_8;
-/// The higher colour coefficients span -4 to 4.
+/// The higher color coefficients span -4 to 4.
 const REST_SPAN: f32 = 8.0;
-/// Opacities of 0 and 255 would have infinite logits; they are read as half a step inside.
+/// Opacities of 0 and 255 would have infinite logits; they are moved inside by half a step.
 const MIN_OPACITY: f32 = 0.5 / 255.0;
 
 /// Unpacks the splats of a file.
 pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, String> {
     let (chunks, vertices) = (header.table("chunk", bytes)?, header.table("vertex", bytes)?);
     if vertices.n_rows().div_ceil(SPLATS_PER_CHUNK) != chunks.n_rows() {
-        return Err(format!("{} splats do not fill {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
+        return Err(format!("{} splats do not match {} chunks of 256", vertices.n_rows(), chunks.n_rows()));
     }
     let bounds = Bounds::of(&chunks)?;
     let packed = vertices.columns(["packed_position", "packed_rotation", "packed_scale", "packed_color"])?;
@@ -24,7 +25,7 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
         true => {
             let sh = header.table("sh", bytes)?;
             if sh.n_rows() != vertices.n_rows() {
-                return Err(format!("colours of {} splats for {} of them", sh.n_rows(), vertices.n_rows()));
+                return Err(format!("element \"sh\" has {} rows, expected {}", sh.n_rows(), vertices.n_rows()));
             }
             rest_columns(&sh)?
         }
@@ -52,7 +53,7 @@ pub(super) fn splats(header: &Header, bytes: &[u8]) -> Result<SplatArrays, Strin
 struct Bounds<'a> {
     position: PropertyRange<'a>,
     log_scale: PropertyRange<'a>,
-    /// Older files have none: colour then spans 0 to 1.
+    /// Older files have none: color then spans 0 to 1.
     color: Option<PropertyRange<'a>>,
 }
 
@@ -76,7 +77,7 @@ impl<'a> Bounds<'a> {
     }
 }
 
-/// Least and largest value of three properties of each chunk.
+/// Minimum and maximum of three properties of each chunk.
 struct PropertyRange<'a> {
     min: [Column<'a>; 3],
     max: [Column<'a>; 3],
@@ -91,18 +92,18 @@ impl PropertyRange<'_> {
     }
 }
 
-/// Three fractions from 11, 10 and 11 bits, the first on top.
+/// Three fractions from 11, 10 and 11 bits, the first in the highest bits.
 fn three_fractions(bits: u32) -> [f32; 3] {
     [frac(bits >> 21, 11), frac(bits >> 11, 10), frac(bits, 11)]
 }
 
-/// The lowest `n_bits` bits, from 0 to 1.
+/// The lowest `n_bits` bits, scaled to 0 to 1.
 fn frac(bits: u32, n_bits: u32) -> f32 {
     let largest = (1_u32 << n_bits) - 1;
     (bits & largest) as f32 / largest as f32
 }
 
-/// Two bits name the largest of w x y z, which is positive; the other three follow in 10 bits each.
+/// Two bits select the largest of w x y z, which is positive; the other three follow in 10 bits each.
 fn rotation_wxyz(bits: u32) -> [f32; 4] {
     let largest_ix = (bits >> 30) as usize;
     let others = [20, 10, 0].map(|shift| (frac(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
@@ -114,7 +115,7 @@ fn rotation_wxyz(bits: u32) -> [f32; 4] {
     wxyz
 }
 
-/// A higher colour coefficient from its byte: the ends are exact, between them the middle of the step.
+/// A higher color coefficient from its byte: the ends are exact, other values are the center of their step.
 fn higher_coefficient(byte: f32) -> f32 {
     let frac = match byte {
         0.0 => 0.0,
@@ -128,7 +129,7 @@ fn higher_coefficient(byte: f32) -> f32 {
 mod tests {
     use super::*;
 
-    /// Packs a rotation as the format asks.
+    /// Packs a rotation as specified by the format.
     #[expect(clippy::cast_possible_truncation, reason = "a step of 10 bits")]
     fn packed(wxyz: [f32; 4]) -> u32 {
         let largest_ix = (0..4).max_by(|&a, &b| wxyz[a].abs().total_cmp(&wxyz[b].abs())).unwrap();

@@ -1,9 +1,9 @@
-//! Reading and writing of `.ply` files.
+//! Tests of reading and writing `.ply` files.
 
 use super::*;
 use crate::splat::cloud::synthetic_cloud;
 
-/// The first splats of a cloud, with fewer colour coefficients.
+/// The first splats of a cloud, with fewer color coefficients.
 fn cloud_of_degree(sh_degree: u32) -> SplatArrays {
     let cloud = synthetic_cloud(5, 1);
     let n_kept = (sh_degree as usize + 1).pow(2);
@@ -22,7 +22,7 @@ fn every_degree_round_trips_bit_for_bit() {
     }
     write(&path, &SplatArrays::default()).unwrap();
     assert_eq!(read(&path).unwrap().n_splats(), 0);
-    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file stays");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file remains");
 }
 
 #[test]
@@ -43,7 +43,7 @@ fn layout_matches_other_programs() {
 #[test]
 fn properties_are_read_in_any_order_and_type() {
     let mut file = b"ply\r\n".to_vec();
-    assert!(from_bytes(&file).unwrap_err().contains("unix line ends"));
+    assert!(from_bytes(&file).unwrap_err().contains("Unix line endings"));
     file.clear();
     let names = ["rot_3", "rot_2", "rot_1", "rot_0", "f_dc_2", "f_dc_1", "f_dc_0", "opacity", "scale_2", "scale_1"];
     file.extend_from_slice(b"ply\nformat binary_little_endian 1.0\ncomment any order\nelement vertex 1\n");
@@ -66,13 +66,13 @@ fn broken_files_are_rejected_with_the_reason() {
     let mut file = Vec::new();
     write_to(&mut file, &cloud_of_degree(0)).unwrap();
     let error_of = |bytes: &[u8]| from_bytes(bytes).unwrap_err();
-    assert!(error_of(&file[..file.len() - 1]).contains("cut off: 5 rows of \"vertex\""));
+    assert!(error_of(&file[..file.len() - 1]).contains("truncated: fewer than 5 rows of \"vertex\""));
     assert!(error_of(b"solid").contains("no PLY header"));
     let text = String::from_utf8_lossy(&file).into_owned();
     assert!(error_of(text.replace("binary_little_endian", "ascii").as_bytes()).contains("format ascii"));
     assert!(error_of(text.replace("opacity", "opacitx").as_bytes()).contains("no property \"opacity\""));
-    assert!(error_of(text.replace("vertex 5", "vertex 99999999999999999999").as_bytes()).contains("no number"));
-    assert!(error_of(text.replace("vertex 5", "vertex 9999999999999999999").as_bytes()).contains("cut off"));
+    assert!(error_of(text.replace("vertex 5", "vertex 99999999999999999999").as_bytes()).contains("not a number"));
+    assert!(error_of(text.replace("vertex 5", "vertex 9999999999999999999").as_bytes()).contains("truncated"));
     let folder = tempfile::tempdir().unwrap();
     let mut not_finite = cloud_of_degree(0);
     not_finite.means[2][0] = f32::NAN;
@@ -87,7 +87,7 @@ fn packed_files_of_another_program_are_read() {
     let Some(folder) = crate::test_data::folder("splats") else { return };
     let small = read(&folder.join("test.ply")).unwrap();
     assert_eq!((small.n_splats(), small.sh_degree), (64, 3));
-    // The bounds are those of the file's only chunk.
+    // The bounds of the file's only chunk.
     let bounds = [-1.3947..=0.0, -0.8957..=0.0, 0.0..=0.5489];
     assert!(small.means.iter().all(|mean| (0..3).all(|axis| bounds[axis].contains(&mean[axis]))));
     let guitar = read(&folder.join("guitar.compressed.ply")).unwrap();
@@ -102,5 +102,5 @@ fn packed_file_with_missing_colors_is_rejected() {
         |name: &str| std::fs::read(format!("{}/../fuzz/seeds/model/{name}", env!("CARGO_MANIFEST_DIR"))).unwrap();
     assert_eq!(from_bytes(&seed("ply-packed")[1..]).unwrap().n_splats(), 2);
     let error = from_bytes(&seed("ply-packed-colours-missing")[1..]).unwrap_err();
-    assert_eq!(error, "colours of 1 splats for 2 of them");
+    assert_eq!(error, "element \"sh\" has 1 rows, expected 2");
 }

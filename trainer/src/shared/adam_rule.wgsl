@@ -1,20 +1,20 @@
-// learn_rule: how parameters of a field learn.
+// adam_rule: settings of the Adam optimizer for a radiance field.
 
 struct AdamRule {
-    rate: f32,             // at the start
-    final_rate_frac: f32,  // what is left of it at the end of the planned steps
-    betas: vec2f,          // of Adam
-    epsilon: f32,          // of Adam
-    weight_decay: f32,             // of weights towards zero, per step and unit of rate
+    rate: f32,             // initial learning rate
+    final_rate_frac: f32,  // fraction of the initial rate that remains after the planned steps
+    betas: vec2f,          // Adam's betas
+    epsilon: f32,          // Adam's epsilon
+    weight_decay: f32,             // decay of weights towards zero, per step and unit of rate
     n_planned_steps: f32,
     unused: f32,
 }
 
-// How far the next step goes; made anew at the end of each.
+// Scale of the next step; recomputed at the end of each step.
 struct StepScale {
-    rate_frac: f32,        // of the rate at the start
+    rate_frac: f32,        // fraction of the initial rate
     unused: f32,
-    correction: vec2f,     // one over what is missing from the means over the steps so far
+    correction: vec2f,     // 1 / (1 - beta^step) for both means: Adam's bias correction
 }
 
 fn step_scale_at(rule: AdamRule, step: f32) -> StepScale {

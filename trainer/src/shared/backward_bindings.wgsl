@@ -1,4 +1,4 @@
-// backward_bindings: what both forms of `backward` read and write, and what they have in common.
+// backward_bindings: bindings and code shared by both variants of `backward`.
 
 #import tile
 #import gradient
@@ -11,7 +11,7 @@ const N_PARTS_OF_GRADIENT = 12u;
 
 #import gradients
 
-// A lane's pixels: their slopes, and what lies around the splat at hand.
+// A lane's pixels: upstream gradients and compositing state around the current splat.
 struct Pixels {
     v_red: Px,
     v_green: Px,
@@ -19,8 +19,8 @@ struct Pixels {
     v_depth: Px,
     error: Px,
     last: PxU,
-    transmittance: Px, // in front of the splat at hand
-    behind: Px,        // what lies behind it, times its gradient
+    transmittance: Px, // in front of the current splat
+    behind: Px,        // color behind the current splat, times its gradient
 }
 
 fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
@@ -42,9 +42,10 @@ fn pixels_at(tile: Tile, first: vec2u) -> Pixels {
     return out;
 }
 
-// What a lane's pixels add to the gradient of the splat at hand, which then lies in front of them.
+// Contribution of a lane's pixels to the gradient of the current splat; moves the splat to the front part of the blend.
 //
-// Behind a splat lies `pixel_totals` minus what lies in front of it, so one number a pixel goes along beside the transmittance.
+// The color behind a splat is `pixel_totals` minus the color in front of it, so each pixel carries one extra number
+// next to its transmittance.
 fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, splat: ProjectedSplat) -> Gradient {
     let falloff = select(Px(0.0), exp2(-power), hit);
     let unclamped = splat.position.w * falloff;
@@ -68,7 +69,7 @@ fn passed(pixels: ptr<function, Pixels>, hit: PxB, power: Px, dx: Px, dy: f32, s
     );
 }
 
-// From the sums of `passed` to the gradient; see `halved`.
+// Converts the sums of `passed` to the gradient; see `halved`.
 fn finished(sum: Gradient, half: vec4f) -> Gradient {
     let moved = LN_2 * sum.position.xy;
     return Gradient(

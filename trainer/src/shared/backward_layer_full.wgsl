@@ -1,10 +1,10 @@
-// backward_layer: slopes towards what goes into a layer, from rows of a bank to rows of the other.
+// backward_layer: gradients with respect to the inputs of a layer, from rows of one bank to rows of the other.
 
 fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
     let part = lane % PARTS;
     let n_words = layer.n_in / 4u;
     for (var group = lane / PARTS; group < n_words; group += LANES / PARTS) {
-        var sums: mat4x4f; // a column a row
+        var sums: mat4x4f; // one column per row
         for (var j = 0u; j < layer.n_out; j += 4u) {
             let at = layer.from_bank + j * STRIDE + part;
             let v = mat4x4f(wg_rows[at], wg_rows[at + STRIDE], wg_rows[at + 2u * STRIDE], wg_rows[at + 3u * STRIDE]);
@@ -16,5 +16,6 @@ fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
             put_four(BANK - layer.from_bank, 4u * group + i, part, layer_output(layer, tile, 4u * group + i, part, sums[i]));
         }
     }
-    workgroupBarrier(); // The rows are there before the next layer reads them, and this one has read what that overwrites.
+    // This layer has read its inputs and written its rows before the next layer reads or overwrites them.
+    workgroupBarrier();
 }

@@ -1,22 +1,23 @@
-// bins: squares of 4 x 4 tiles. A splat is listed once a bin, with a mask of the tiles it touches there.
+// bins: squares of 4 x 4 tiles. A splat is listed once per bin, with a mask of the tiles it touches there.
 //
-// Few lists of many entries: sorting splats into them costs a fraction of sorting them into tiles, and a tile finds its
-// own in its bin's list by one bit each. What a splat touches is decided once, by `count_bins`, and kept as integers.
+// There are few lists with many entries. Sorting splats into bins costs a fraction of sorting them into tiles, and a
+// tile finds its splats in its bin's list by testing one bit per entry. `count_bins` decides once which tiles a splat
+// touches and stores the result as integers.
 
 const BIN_TILES = 4u;
-const BLOCK = 256u;        // splats of a workgroup, neighbours in depth
-const WINDOW_BINS = 256u;  // bins a workgroup looks at
-const GROUP = 16u;         // blocks whose counts are summed by one workgroup
+const BLOCK = 256u;        // splats per workgroup, neighbors in depth order
+const WINDOW_BINS = 256u;  // bins that a workgroup processes
+const GROUP = 16u;         // blocks whose counts one workgroup sums
 
 // The tiles that a splat touches.
 struct Touched {
     bin: u32,              // column and row (high 16 bits) of its first bin
     first: u32,            // bit 4 row + column of the tiles in that bin; high 16 bits: in the bin to the right
-    second: u32,           // the same one row of bins below
+    second: u32,           // the same, one row of bins below
 }
 
 // Larger splats touch all tiles of a rectangle: `first` and `second` are the first and past-the-last columns and rows.
-const LARGE = 0xffffffffu; // as `bin`
+const LARGE = 0xffffffffu; // value of `bin`
 
 fn n_bins(n_tiles: vec2u) -> vec2u {
     return (n_tiles + vec2u(BIN_TILES - 1u)) / BIN_TILES;
@@ -39,7 +40,7 @@ fn bits_between(begin: u32, end: u32) -> u32 {
     return (1u << end) - (1u << min(begin, end));
 }
 
-// The mask of the tiles it touches in one of these bins.
+// Mask of the tiles that the splat touches in one of these bins.
 fn tiles_in_bin(touched: Touched, column: u32, row: u32) -> u32 {
     if touched.bin == LARGE {
         let corner = vec2u(column, row) * BIN_TILES;

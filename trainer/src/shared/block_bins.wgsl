@@ -1,9 +1,9 @@
-// block_bins: which splats of a block reach which bins, as bits in workgroup memory. After `bins`.
+// block_bins: which splats of a block reach which bins, as bits in workgroup memory. Import after `bins`.
 
 const WORDS = BLOCK / 32u;
 var<workgroup> wg_reaching: array<atomic<u32>, 2048>; // [WINDOW_BINS, WORDS]
 
-// What a workgroup works on.
+// The block and the window of bins that a workgroup processes.
 struct BlockAndWindow {
     block: u32,
     n_blocks: u32,
@@ -27,7 +27,7 @@ fn set_reached_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
     let reached = bins_of(touched);
     for (var row = reached.z; row < reached.w; row++) {
         for (var column = reached.x; column < reached.y; column++) {
-            let bin = row * at.bins.x + column - at.first_bin; // Wraps where the bin is before the window.
+            let bin = row * at.bins.x + column - at.first_bin; // Wraps around if the bin is before the window.
             if bin < at.n_bins && tiles_in_bin(touched, column, row) != 0u {
                 atomicOr(&wg_reaching[bin * WORDS + lane / 32u], 1u << (lane % 32u));
             }
@@ -36,7 +36,7 @@ fn set_reached_bins(lane: u32, at: BlockAndWindow, touched: Touched) {
     workgroupBarrier(); // All bits are set.
 }
 
-// How many of the block's first `n` splats reach a bin of the window.
+// Number of the block's first `n` splats that reach a bin of the window.
 fn n_reaching(bin: u32, n: u32) -> u32 {
     var sum = 0u;
     for (var word = 0u; word < WORDS; word++) {

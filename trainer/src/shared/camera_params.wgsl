@@ -1,39 +1,40 @@
-// camera_terms: what may be wrong about a camera, learned along with the splats.
+// camera_params: calibration parameters of cameras, optimized together with the splats.
 //
-// Terms of a camera, shared by all its images, and of a single image are stored alike: 16 a camera, 16 an image.
+// Parameters of a camera (shared by all its images) and of a single image have the same layout: 16 per camera, 16 per
+// image.
 
-// A term is a vec4f: its value, Adam's two moments, and how many steps it has taken.
+// A parameter is a vec4f: its value, Adam's two moments, and the number of steps it has taken.
 
-const ROTATION = 0u;           // rotation vector of the camera's own axes, radians
-const TRANSLATION = 3u;          // metres: camera_from_world becomes turn and shift after camera_from_world
+const ROTATION = 0u;           // rotation vector in the camera's axes, radians
+const TRANSLATION = 3u;          // meters; rotation and translation are applied after camera_from_world
 const TIME_OFFSET = 6u;          // seconds that the poses lag behind the images
-const LOG_FOCAL = 7u;      // two
-const PRINCIPAL = 9u;      // two, focal lengths
-const LOG_GAIN = 11u;      // of red, green and blue
+const LOG_FOCAL = 7u;      // two values
+const PRINCIPAL = 9u;      // two values, in focal lengths
+const LOG_GAIN = 11u;      // red, green and blue
 const N_PARAMS = 16u;
 
-// One image: where its terms lie, and how its camera moved.
+// One image: the location of its parameters and the motion of its camera.
 struct Lens {
     linear: vec4f,         // velocity of the camera in its own axes, m/s
     angular: vec4f,        // rad/s
-    camera_params: u32,     // first term of its camera
-    image_params: u32,      // first of its own
+    camera_params: u32,     // index of the first parameter of its camera
+    image_params: u32,      // index of the first parameter of the image
     unused: vec2u,
 }
 
-// Which terms are learned, and how fast.
+// Which parameters are optimized, and at what rate.
 struct CameraRule {
-    camera_mask: u32,        // bit i: term i of a camera
-    image_mask: u32,         // likewise of an image
+    camera_mask: u32,        // bit i: parameter i of a camera
+    image_mask: u32,         // likewise for an image
     rotation_rate: f32,        // radians
     translation_rate_m: f32,
     time_offset_rate: f32,       // seconds
     focal_rate: f32,
     gain_rate: f32,
-    image_decay: f32,       // share by which a step pulls an image's own terms towards nothing
+    image_decay: f32,       // fraction by which a step decays an image's parameters towards zero
 }
 
-// The rotation by a rotation vector (Rodrigues).
+// Rotates `v` by a rotation vector (Rodrigues).
 fn rotated(by: vec3f, v: vec3f) -> vec3f {
     let angle = length(by);
     if angle < 1e-12 { return v; }

@@ -1,7 +1,7 @@
-// capacity: how much there is memory for.
+// capacity: sizes of buffers that can overflow.
 
 struct Capacity {
-    n_entries: u32,    // of the bins' lists
-    n_slots: u32,      // gradients of intersections; 0: nothing is learned, and they need no memory
+    n_entries: u32,    // entries of the bins' lists
+    n_slots: u32,      // gradients of intersections; 0 when not training, which needs no slots
     unused: vec2u,
 }

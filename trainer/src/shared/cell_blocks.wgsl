@@ -1,8 +1,8 @@
-// cell_blocks: the blocks that cells of the occupancy are told of in, behind the cells themselves.
+// cell_blocks: blocks of occupancy cells, stored behind the cells.
 
 const MAX_BLOCKS = 16u; // along an axis
 
-// Cells of a block along an axis, of so many.
+// Cells per block along an axis, for a grid of `n_cells`.
 fn block_cells_of(n_cells: u32) -> u32 {
     return max(n_cells / MAX_BLOCKS, 1u);
 }

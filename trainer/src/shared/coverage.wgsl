@@ -1,6 +1,6 @@
-// coverage: how a splat covers a lane's pixels. After `pixels`.
+// coverage: how a splat covers a lane's pixels. Import after `pixels`.
 
-// With one pixel's value replaced or read: indexing by a variable would put all of a lane's values into memory.
+// Set or get one pixel's value. Indexing by a variable would spill a lane's values to memory.
 fn put(all: Px, k: u32, value: f32) -> Px {
     return select(all, Px(value), INDEX == PxU(k));
 }
@@ -19,29 +19,29 @@ fn pick_u(all: PxU, k: u32) -> u32 {
 
 const LN_2 = 0.6931471805599453;
 
-// A conic as the pixels need it: its quadratic form gives the falloff as a power of 2; w: the largest power drawn.
+// A conic scaled for the pixels: its quadratic form gives the falloff as a power of 2; w: the largest power drawn.
 fn halved(conic: vec4f) -> vec4f {
     return conic * vec4f(0.5, 1.0, 0.5, 0.5) / LN_2;
 }
 
-// The falloff is 2 to minus this; `offset` from pixel to splat.
+// The falloff is 2^-power; `dx` and `dy` point from the pixel to the splat.
 fn power_at(half: vec4f, dx: Px, dy: f32) -> Px {
     return (half.x * dx + half.y * dy) * dx + half.z * dy * dy;
 }
 
-// From 0 to the largest: as integers, negative numbers and NaN lie above.
+// Whether the power is between 0 and the maximum. Compared as integers, where negative numbers and NaN are larger.
 fn within_reach(half: vec4f, power: Px) -> PxB {
     return bitcast<PxU>(power) <= PxU(bitcast<u32>(half.w));
 }
 
-// A lane's pixels and what lies in front of the splat at hand.
+// A lane's pixels, composited up to the current splat.
 struct Blend {
     red: Px,
     green: Px,
     blue: Px,
     depth: Px,
     transmittance: Px,
-    past_last: PxU,    // of the contributors, counted in the bin's list
+    past_last: PxU,    // past the last contributor, counted in the bin's list
     live: PxB,
 }
 
@@ -49,7 +49,7 @@ fn unblended(live: PxB) -> Blend {
     return Blend(Px(0.0), Px(0.0), Px(0.0), Px(0.0), Px(1.0), PxU(0u), live);
 }
 
-// Blends in a splat where it reaches; `hit` is what it reaches, `rank` its place in the bin's list.
+// Composites a splat into the pixels of `hit`; `rank` is its position in the bin's list.
 fn blended(before: Blend, hit: PxB, power: Px, opacity_and_depth: vec2f, color: vec3f, rank: u32) -> Blend {
     var after = before;
     let alpha = min(Px(MAX_ALPHA), opacity_and_depth.x * exp2(-power));

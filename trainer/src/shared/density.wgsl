@@ -1,15 +1,15 @@
-// density: what the first network tells, as density per unit of length.
+// density: converts the output of the first network to density per unit of length.
 
-// The logarithm ends here, so that no density is infinite.
+// Upper limit of the logarithm, so that no density is infinite.
 const MAX_LOG_DENSITY = 12.0;
-// Added to what the network tells: a field that knows nothing is thin.
+// Added to the network's output. Keeps an untrained field thin.
 const LOG_DENSITY_BIAS = 0.0;
 
 fn density_of(log_density: f32) -> f32 {
     return exp(min(log_density + LOG_DENSITY_BIAS, MAX_LOG_DENSITY));
 }
 
-// Whether a density would be larger if it could.
+// Whether a density is clamped at the maximum.
 fn is_log_density_clamped(log_density: f32) -> bool {
     return log_density + LOG_DENSITY_BIAS >= MAX_LOG_DENSITY;
 }

@@ -1,4 +1,4 @@
-// depth_frame: one depth image, the color image that goes with it, and where both cameras were.
+// depth_view: one depth image, the matching color image, and the poses of both cameras.
 
 struct DepthView {
     depth_row_0: vec4f,       // depth_from_field, upper three rows
@@ -33,7 +33,7 @@ fn color_from_field(depth_view: DepthView, point: vec3f) -> vec3f {
     return vec3f(dot(depth_view.color_row_0, p), dot(depth_view.color_row_1, p), dot(depth_view.color_row_2, p));
 }
 
-// Point on the ray of a place in the depth image whose z is 1.
+// Ray through a position in the depth image, scaled to z = 1.
 fn ray_of(depth_view: DepthView, position_px: vec2f) -> vec3f {
     return vec3f((position_px - depth_view.depth_principal_px) / depth_view.depth_focal_px, 1.0);
 }

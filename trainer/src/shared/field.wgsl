@@ -1,16 +1,17 @@
-// field: a signed distance field in blocks of 8x8x8 voxels, and how a voxel's words are read.
+// field: a signed distance field in blocks of 8x8x8 voxels, and the packing of a voxel's words.
 //
-// Coordinates of the field are metres from its anchor, along the world's axes. Voxel i covers [i, i + 1) voxel_m, its
-// center lies at i + 0.5. A chunk is 8x8x8 blocks; `keys` is a hash table of chunks with open addressing, and row h of
-// `entries` tells, for the chunk at place h of that table, the slot of each of its blocks plus one, 0 where there is none.
+// Field coordinates are meters from the anchor, along the world's axes. Voxel i covers [i, i + 1) voxel_m; its center
+// is at i + 0.5. A chunk is 8x8x8 blocks. `keys` is a hash table of chunks with open addressing. Row h of `entries`
+// belongs to the chunk at position h of that table: it holds the slot of each of its blocks plus one, or 0 for missing
+// blocks.
 //
 // source    Niessner et al. 2013 (voxel hashing); Oleynikova et al. 2017 (Voxblox); chunks of blocks are ours: a ray
 //           crosses empty ones in one step, and one word is enough for a key
 
 struct Field {
     voxel_m: f32,
-    truncation_m: f32,        // least
-    scale_m: f32,             // most truncation; also the distance that the largest stored number stands for
+    truncation_m: f32,        // minimum truncation
+    scale_m: f32,             // maximum truncation; also the distance that the largest stored number represents
     noise_per_m2: f32,        // standard deviation of depth at 1 m; it grows with the square
     max_depth_m: f32,
     max_weight: u32,          // in 256ths
@@ -20,12 +21,12 @@ struct Field {
 
 const BLOCK_VOXELS = 512u;
 const NO_BLOCK = 0u;
-const BLOCK_REQUESTED = 0xffffffffu; // Taken note of where the pool was full.
+const BLOCK_REQUESTED = 0xffffffffu; // Requested while the pool was full.
 const WEIGHT_ONE = 256.0;
 const MAX_PROBES = 128u;
 const CHUNK_LIMIT = vec3i(1023, 1023, 511);
 
-// Distance along the surface's normal up to which a reading of this depth says something, metres.
+// Truncation distance along the surface normal for a reading at this depth, meters.
 fn truncation_at(field: Field, depth_m: f32) -> f32 {
     return clamp(3.0 * field.noise_per_m2 * depth_m * depth_m, field.truncation_m, field.scale_m);
 }
@@ -43,12 +44,12 @@ fn voxel_in_block(voxel: vec3i) -> u32 {
     return local.z * 64u + local.y * 8u + local.x;
 }
 
-// Whether the chunk can have a key.
+// Whether the chunk is close enough to the anchor to have a key.
 fn chunk_in_range(chunk: vec3i) -> bool {
     return all(chunk >= -CHUNK_LIMIT) && all(chunk < CHUNK_LIMIT);
 }
 
-// Never 0: that is an empty place.
+// Never 0, which marks an empty position.
 fn key_of(chunk: vec3i) -> u32 {
     let at = vec3u(chunk + CHUNK_LIMIT + 1);
     return ~((at.x << 21u) | (at.y << 10u) | at.z);

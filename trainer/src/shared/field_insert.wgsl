@@ -1,8 +1,9 @@
-// field_insert: finds the row of a chunk, or gives it one. Which row it gets is a matter of luck and reaches no result.
+// field_insert: finds the row of a chunk, or inserts it. The row depends on thread timing, but no result depends on the
+// row.
 //
 // needs     field, status and keys as arrays of atomics
 
-// The row plus one; 0 where the table is too full.
+// The row plus one; 0 if the table is too full.
 fn insert_chunk(chunk: vec3i) -> u32 {
     let key = key_of(chunk);
     var at = hash_of(key) & (field.n_chunk_slots - 1u);
@@ -17,7 +18,8 @@ fn insert_chunk(chunk: vec3i) -> u32 {
             there = exchange.old_value;
         }
         if there == key { return at + 1u; }
-        if there != 0u { at = (at + 1u) & (field.n_chunk_slots - 1u); } // Else the exchange failed for no reason: again.
+        // Otherwise the weak exchange failed spuriously: retry.
+        if there != 0u { at = (at + 1u) & (field.n_chunk_slots - 1u); }
     }
     return 0u;
 }

@@ -1,8 +1,8 @@
-// field_lookup: finds chunks and blocks of a field that nobody adds to meanwhile.
+// field_lookup: finds chunks and blocks of a field that does not change meanwhile.
 //
 // needs     field, keys and entries as plain arrays
 
-// The row of a chunk plus one; 0 where there is none.
+// The row of a chunk plus one; 0 if there is no such chunk.
 fn find_row(chunk: vec3i) -> u32 {
     if !chunk_in_range(chunk) { return 0u; }
     let key = key_of(chunk);
@@ -16,18 +16,18 @@ fn find_row(chunk: vec3i) -> u32 {
     return 0u;
 }
 
-// The slot plus one of a block whose chunk has this row plus one; 0 where there is none.
+// The slot plus one of a block in the chunk with this row plus one; 0 if there is no such block.
 fn slot_in_row(row: u32, block: vec3i) -> u32 {
     if row == 0u { return 0u; }
     return entries[(row - 1u) * BLOCK_VOXELS + voxel_in_block(block)];
 }
 
-// The slot of a block plus one; 0 where there is none.
+// The slot of a block plus one; 0 if there is no such block.
 fn find_slot(block: vec3i) -> u32 {
     return slot_in_row(find_row(block >> vec3u(3u)), block);
 }
 
-// Where neighbor 0 to 26 of a block lies from it, in blocks; 13 is the block itself.
+// Offset of neighbor 0 to 26 from a block, in blocks; 13 is the block itself.
 fn around(ix: u32) -> vec3i {
     return vec3i(vec3u(ix % 3u, ix / 3u % 3u, ix / 9u)) - 1;
 }

@@ -1,6 +1,7 @@
-// forward_layer: one layer, from what goes in to what comes out; where that goes into another layer, it does so too.
+// forward_layer: evaluates one layer; the outputs may be the inputs of the next layer.
 //
-// What goes in and the weights are two numbers of f16 each, the second what the first leaves over: with 11 bits alone colors were noisy.
+// Each input and weight is the sum of two f16 numbers, the second holding the rounding error of the first: with 11 bits
+// alone, colors were noisy.
 
 var<workgroup> wg_residuals: array<vec4<f16>, 640>;
 
@@ -29,13 +30,15 @@ fn evaluate_layer(layer: Layer, tile: u32, lane: u32) {
         coopStoreT(left, &wg_sums[row * STRIDE], STRIDE);
         coopStoreT(right, &wg_sums[row * STRIDE + 4u], STRIDE);
     }
-    workgroupBarrier(); // The sums are there before they are read, and what went in was read before it is overwritten.
+    // The sums are complete before they are read, and the inputs were read before they are overwritten.
+    workgroupBarrier();
     if layer.stored_row != NOT_STORED {
         for (var item = lane; item < layer.n_out * PARTS; item += LANES) {
             let row = item / PARTS;
             let part = item % PARTS;
             put_four(0u, row, part, layer_output(layer, tile, row, part, out_four(0u, row, part)));
         }
-        workgroupBarrier(); // The rows are there before the next layer reads them, and the sums were read before it overwrites them.
+        // The rows are written before the next layer reads them, and the sums were read before it overwrites them.
+        workgroupBarrier();
     }
 }

@@ -1,7 +1,7 @@
-// gradient: what one intersection, or the sum of a splat's, tells about the splat as it is drawn.
+// gradient: gradient of the loss with respect to a projected splat, from one intersection or summed over all.
 
 struct Gradient {
     position: vec4f,      // mean_px.xy, depth, opacity
-    conic: vec4f,      // A, B, C; w: absolute error seen, weighted by contribution
+    conic: vec4f,      // A, B, C; w: absolute error, weighted by contribution
     color: vec4f,      // rgb; w unused
 }

@@ -1,4 +1,4 @@
-// gradient_sum: what the intersections of a splat tell, added up in their order.
+// gradient_sum: adds the gradients of a splat's intersections in their order.
 
 @group(0) @binding(4) var<storage, read> slot_begins: array<u32>;
 @group(0) @binding(5) var<storage, read> gradients: array<Gradient>;

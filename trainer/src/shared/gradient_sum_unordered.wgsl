@@ -1,4 +1,4 @@
-// gradient_sum: takes the sum in which the intersections of a splat have met, and leaves zeros for the next step.
+// gradient_sum: reads the sum that a splat's intersections were added to, and resets it to zero for the next step.
 
 @group(0) @binding(5) var<storage, read_write> gradients: array<Gradient>;
 

@@ -1,8 +1,9 @@
-// gradients: the intersections of a splat meet in its sum, in any order. Only to be measured: two steps differ by rounding.
+// gradients: the intersections of a splat are added to its sum in any order. For benchmarks only: results differ by
+// rounding between runs.
 
-@group(0) @binding(9) var<storage, read_write> gradients: array<atomic<f32>>; // 12 a splat, see `Gradient`
+@group(0) @binding(9) var<storage, read_write> gradients: array<atomic<f32>>; // 12 per splat, see `Gradient`
 
-// Where the gradients of a tile's entry go.
+// Slot for the gradient of a tile's entry.
 fn slot_of(entry: u32, tile: Tile) -> u32 {
     return entries[entry].x;
 }

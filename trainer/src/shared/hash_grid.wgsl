@@ -1,15 +1,15 @@
-// hash_grid: which entries of a level a point lies between.
+// hash_grid: the entries of a level that surround a point.
 
 struct Level {
     n_cells: u32,
-    begin: u32,             // its first entry
-    mask: u32,              // entries less one, a power of two less one; 0: an entry a corner
+    begin: u32,             // index of its first entry
+    mask: u32,              // entries minus one, a power of two minus one; 0: one entry per corner
     unused: u32,
 }
 
 struct Cell {
     first: vec3u,           // corner nearest to zero
-    share: vec3f,           // of the way to the corner opposite
+    share: vec3f,           // position between the first corner and the opposite one, 0 to 1
 }
 
 fn cell_of(level: Level, at: vec3f) -> Cell {

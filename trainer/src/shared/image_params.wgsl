@@ -1,7 +1,9 @@
-// image_terms: what is learned about an image. Its pose: how it is turned about where its rays begin, rotation vector in world, radians;
-// how it is shifted in world, in units of the scene's radius. Its code: light and exposure, as the network of colors takes them. A term is
-// its value, Adam's two means, and the steps it took.
+// image_params: parameters optimized per image.
+//
+// The pose: rotation about the origin of its rays, as a rotation vector in world, radians; and translation in world, in
+// units of the scene radius. The appearance embedding: an input of the color network that represents light and
+// exposure. A parameter is its value, Adam's two moments, and the number of steps it has taken.
 
-const IMAGE_PARAM_STRIDE = 9u;    // of an image
-const TRANSLATION = 3u;          // the first of the shift
-const EMBEDDING = 6u;           // the first of the code, which has three numbers at most
+const IMAGE_PARAM_STRIDE = 9u;    // parameters per image
+const TRANSLATION = 3u;          // index of the first translation parameter
+const EMBEDDING = 6u;           // index of the first of up to three embedding parameters

@@ -1,4 +1,4 @@
-// lane_sums: adds up over the lanes of a subgroup in whatever order the hardware takes. Only to be measured.
+// lane_sums: sums over the lanes of a subgroup in the order the hardware chooses. For benchmarks only.
 
 fn sum_of_lanes(mine: vec4f) -> vec4f {
     return subgroupAdd(mine);

@@ -1,22 +1,23 @@
-// march: how a ray is walked through the parts of the scene that hold something. After `ray_batch`,
-// `march_params`, `space`, `cell_blocks` and `occupied` of the kernel.
+// march: walks a ray through the occupied parts of the scene. Import after `ray_batch`, `march_params`, `space`,
+// `cell_blocks` and `occupied` of the kernel.
 //
 // twin      nerf/reference/march.rs
 // source    occupancy: Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them
 //
-// Pieces are numbered along the ray; where a piece lies follows from its number, so that several threads may walk one ray.
+// Segments are numbered along the ray. A segment's position follows from its number, so several threads can walk one
+// ray.
 
 const FAR = 1e9;
 
 struct Path {
-    enter: f32,            // where the inner cube begins along the ray, or what is looked at
+    enter: f32,            // where the ray enters the inner cube; `begin` of the ray if it misses the cube
     leave: f32,
     n_before: f32,         // steps before the inner cube
     n_inside: f32,
     n_segments: u32,
 }
 
-// Steps, as a share of all to infinity, that lead so far away from the inner cube: each is the longer the further out it lies.
+// Steps taken to get this far from the inner cube, as a fraction of the steps to infinity: steps grow with distance.
 fn share_of(distance: f32) -> f32 { return 1.0 - 1.0 / (1.0 + distance); }
 fn distance_of(share: f32) -> f32 { return 1.0 / (1.0 - share) - 1.0; }
 
@@ -30,7 +31,7 @@ fn path_of(march: March, ray: Ray) -> Path {
     let leave = min(far.x, min(far.y, far.z));
     var path = Path(ray.begin, ray.begin, 0.0, 0.0, 0u);
     if leave > enter { path = Path(enter, leave, share_of(enter - ray.begin) / march.step, (leave - enter) / march.step, 0u); }
-    // The last step to infinity is left out.
+    // Leave out the last step, which reaches infinity.
     var n = path.n_before + path.n_inside + min(share_of(max(ray.end - path.leave, 0.0)) / march.step, 1.0 / march.step - 1.0);
     if ray.end < path.leave { n = path.n_before + (ray.end - path.enter) / march.step; }
     if ray.end < path.enter { n = path.n_before - share_of(path.enter - ray.end) / march.step; }
@@ -38,7 +39,7 @@ fn path_of(march: March, ray: Ray) -> Path {
     return path;
 }
 
-// Distance along the ray after so many steps.
+// Distance along the ray after this many steps.
 fn distance_at(march: March, path: Path, steps: f32) -> f32 {
     if steps < path.n_before { return path.enter - distance_of((path.n_before - steps) * march.step); }
     let inside = steps - path.n_before;
@@ -51,8 +52,9 @@ fn bit_of(first_word: u32, n: u32, cell: vec3u) -> bool {
     return (occupied[first_word + ix / 32u] >> (ix % 32u) & 1u) == 1u;
 }
 
-// Steps from `at` on, the first of which has its middle in an empty box of the unit cube, that all have it there; one where the box
-// reaches out of the inner cube, inside of which the unit cube and the world differ by a factor alone and all steps are alike.
+// Number of steps from `at` whose midpoints all lie in the same empty box of the unit cube; the midpoint of the first
+// one does. Returns one if the box reaches out of the inner cube: only inside it do unit cube and world differ by a
+// constant factor, which makes all steps equal.
 fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes: u32) -> u32 {
     let size = 4.0 / f32(n_boxes);
     let low = vec3f(box) * size - 2.0;
@@ -63,14 +65,14 @@ fn n_empty_steps(march: March, at: vec3f, direction: vec3f, box: vec3u, n_boxes:
     return u32(clamp(min(ends.x, min(ends.y, ends.z)) / march.step - 0.5, 1.0, 4096.0));
 }
 
-// A piece of a ray in a cell that holds something; `end_ix` where there is none before that.
+// A segment of a ray in an occupied cell; its `ix` is `end_ix` if there is none before that.
 struct RaySegment {
     ix: u32,
     begin: f32,
     end: f32,
 }
 
-// The first such piece from number `from_ix` on.
+// The first such segment from number `from_ix`.
 fn next_segment(march: March, ray: Ray, path: Path, from_ix: u32, end_ix: u32) -> RaySegment {
     let block_cells = block_cells_of(march.n_cells);
     let n_blocks = march.n_cells / block_cells;

@@ -1,16 +1,16 @@
-// march_params: how rays are walked. After `ray_batch`.
+// march_params: parameters for walking rays. Import after `ray_batch`.
 
 struct March {
     step: f32,             // inside the inner cube
-    max_samples: u32,     // of a ray, where there is room for so many of each; half as many where not, and so on
-    n_cells: u32,          // of the occupancy along an axis
-    first_ray: u32,        // of this batch among all of a picture
-    max_found: u32,       // pieces of a ray that are looked for
+    max_samples: u32,     // per ray if the buffers can hold that many for each, otherwise half as many, and so on
+    n_cells: u32,          // cells of the occupancy grid along an axis
+    first_ray: u32,        // index of this batch's first ray within a picture
+    max_found: u32,       // maximum number of segments to find per ray
     unused: u32,
     unused_2: vec2u,
 }
 
-// Pieces that are kept of those found: every `stride`-th from `phase` on, each standing for as many.
+// Selects every `stride`-th of the segments found, from `phase` on; each one represents `stride` segments.
 struct Thinning {
     stride: u32,
     phase: u32,

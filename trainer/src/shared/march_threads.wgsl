@@ -1,4 +1,4 @@
-// march_shares: the part of a ray that one of several threads walks. After `march`.
+// march_threads: the part of a ray that one of several threads walks. Import after `march`.
 
 const THREADS_PER_RAY = 8u;
 

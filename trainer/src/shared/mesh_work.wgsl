@@ -1,12 +1,12 @@
-// mesh_work: which blocks get new triangles, and where these go.
+// mesh_work: which blocks are meshed, and where their triangles are stored.
 
-// Which of the listed blocks a dispatch does.
+// The part of the block list that one dispatch meshes.
 struct MeshBatch {
     first: u32,
     max_blocks: u32,
 }
 
-// A block that was done.
+// A meshed block.
 struct BlockMeshRange {
     block_coord: array<i32, 3>,     // in blocks
     first_vertex: u32,
@@ -17,11 +17,11 @@ struct BlockMeshRange {
 
 struct MeshVertex {
     position_m: array<f32, 3>, // from the field's anchor
-    edge: u32,                // of the block's cubes: 3 (81 z + 9 y + x) + axis, from the voxel it begins at, 0 to 8
+    edge: u32,                // 3 (81 z + 9 y + x) + axis, where the edge begins at voxel x, y, z (0 to 8) of the block
     normal: u32,              // octahedral, two 16-bit numbers
     color: u32,               // rgb8
 }
 
-// Indices into `room`.
-const N_VERTICES = 0u;        // of the piece, those included that found no room
+// Indices into the counters of vertices and triangles.
+const N_VERTICES = 0u;        // of the batch, including those that did not fit
 const N_TRIANGLES = 1u;

@@ -1,4 +1,4 @@
-// model: sizes of the splat model, and one splat as it is drawn.
+// model: sizes of the splat model, and one projected splat.
 
 struct Model {
     n_splats: u32,
@@ -7,7 +7,7 @@ struct Model {
     n_sh_rest: u32,    // planes of sh_rest in use: 3 ((sh_degree + 1)^2 - 1)
 }
 
-// What rasterizing needs of one visible splat.
+// Inputs of rasterization for one visible splat.
 struct ProjectedSplat {
     position: vec4f,      // mean_px.xy, depth along z, opacity
     conic: vec4f,      // A, B, C; w: reach = 2 ln(255 opacity)

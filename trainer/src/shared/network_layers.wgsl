@@ -1,5 +1,5 @@
-// network_layers: the layers of both networks: widths, rows of a tile that hold what goes in and the slopes of what comes out, and
-// where their weights begin. After `network_tile`.
+// network_layers: the layers of both networks: widths, the tile rows that hold inputs and output gradients, and the
+// start of their weights. Import after `network_tile`.
 
 const N_LAYERS = 5u;
 
@@ -8,7 +8,7 @@ struct Layer {
     n_out: u32,
     activation_row: u32,
     v_row: u32,
-    first_weight: u32,     // in vec4
+    first_weight: u32,     // in vec4f
 }
 
 fn layer_of(ix: u32) -> Layer {

@@ -1,8 +1,8 @@
-// number: the numbers that layers take and leave: f32.
+// number: number type of layer inputs and outputs: f32.
 
 alias Four = vec4f;
 
 fn narrowed(v: vec4f) -> Four { return v; }
 
-// What slopes are multiplied by while they are such numbers, where a step has so many rays.
+// Factor on gradients while they are stored in this type, for a step with this many rays.
 fn gradient_scale(n_rays: u32) -> f32 { return 1.0; }

@@ -1,3 +1,3 @@
-// thickness_sum: the unit of the sum of what cells hold back, a whole number.
+// occupancy_sum: unit of the sum of cell occupancies, an integer.
 
-const MAX_SUM = 4294967040.0; // All cells hold back everything; the largest f32 that is a u32.
+const MAX_SUM = 4294967040.0; // The sum if all cells are opaque; the largest f32 that is a u32.

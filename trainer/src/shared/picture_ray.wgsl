@@ -1,6 +1,7 @@
-// picture_ray: the ray of a pixel of a view, and how depth along the view's axis becomes distance along the ray. After `view`.
+// picture_ray: the ray of a pixel of a view, and the conversion from depth along the view's axis to distance along the
+// ray. Import after `view`.
 //
-// source    the shutter's motion to first order, as in `projection`
+// source    motion during the shutter time to first order, as in `projection`
 
 struct PixelRay {
     origin: vec3f,
@@ -12,7 +13,7 @@ fn rotated_to_world(v: vec3f) -> vec3f {
     return view.camera_row_0.xyz * v.x + view.camera_row_1.xyz * v.y + view.camera_row_2.xyz * v.z;
 }
 
-// The part of a range of depths that lies between two corners of a box, in the box's frame.
+// Part of a range of depths that is inside a box, in the box's frame.
 fn within_box(range: vec2f, origin: vec3f, along: vec3f, low: vec3f, high: vec3f) -> vec2f {
     let safe = select(along, vec3f(1e-12), abs(along) < vec3f(1e-12));
     let a = (low - origin) / safe;
@@ -26,7 +27,7 @@ fn ray_of_pixel(pixel: vec2u) -> PixelRay {
     let position_px = vec2f(pixel) + 0.5;
     let tau = position_px.y / f32(view.size_px.y) - 0.5;
     let direction = vec3f((position_px - view.principal_px) / view.focal_px, 1.0);
-    // A point moves by -tau (v + w x p) in the camera; the ray undoes that.
+    // The shutter motion moves a point by -tau (v + w x p) in the camera; the ray undoes that.
     let rotated = direction + tau * cross(view.shutter_angular.xyz, direction);
     let origin = view.center_in_world.xyz + rotated_to_world(tau * view.shutter_linear.xyz);
     let along = rotated_to_world(rotated);

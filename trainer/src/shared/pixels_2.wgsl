@@ -1,4 +1,4 @@
-// pixels: 2 neighbours in a row, handled together by one lane.
+// pixels: 2 neighbors in a row, processed together by one lane.
 
 alias Px = vec2f;
 alias PxU = vec2u;

@@ -1,4 +1,4 @@
-// pixels: 4 neighbours in a row, handled together by one lane.
+// pixels: 4 neighbors in a row, processed together by one lane.
 
 alias Px = vec4f;
 alias PxU = vec4u;

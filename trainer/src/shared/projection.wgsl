@@ -1,9 +1,9 @@
-// projection: where a splat lands on the image, and the pieces its gradient needs.
+// projection: projects a splat to the image, and keeps the intermediate values its gradient needs.
 //
 // twin      splat/reference/project.rs
 // source    Zwicker et al. 2001 (EWA volume splatting); Kerbl et al. 2023, section 4; the clamp of x/z and y/z in the
-//           Jacobian and the low-pass of 0.3 pixels squared are those of gsplat (0.3 at full size). The shift by the row's share of the
-//           readout moves the point, and its Jacobian, by the camera's twist.
+//           Jacobian and the low-pass of 0.3 pixels squared are those of gsplat (0.3 at full size). The motion of the
+//           camera during the readout, up to the splat's row, moves the point and its Jacobian by the camera's twist.
 
 const MIN_ALPHA = 0.00392156862745098; // 1 / 255
 const MAX_ALPHA = 0.999;
@@ -11,18 +11,18 @@ const MIN_TRANSMITTANCE = 1e-4;
 
 struct Projection {
     visible: bool,
-    point: vec3f,             // in camera, after the shutter's shift
-    tau: f32,                 // share of the readout, -0.5 to 0.5
+    point: vec3f,             // in camera, after the shutter motion
+    tau: f32,                 // fraction of the readout, -0.5 to 0.5
     mean_px: vec2f,
     covariance: vec3f,        // xx, xy, yy with the low-pass, pixels squared
     determinant: f32,
-    jacobian_x: vec3f,        // rows of the pinhole's Jacobian
+    jacobian_x: vec3f,        // rows of the pinhole Jacobian
     jacobian_y: vec3f,
     unclamped: vec2f,         // 1 where x/z, y/z is inside the clamp
     rotation: mat3x3f,        // of the splat, columns are its axes in world
     axes: mat3x3f,            // camera_from_splat axes times scale: covariance_in_camera = axes * transpose(axes)
     scale: vec3f,
-    camera_rotation: mat3x3f, // camera_from_world with the shutter's turn
+    camera_rotation: mat3x3f, // camera_from_world, including the rotation during the shutter
 }
 
 fn rotation_of(q_wxyz: vec4f) -> mat3x3f {
@@ -35,7 +35,7 @@ fn rotation_of(q_wxyz: vec4f) -> mat3x3f {
     );
 }
 
-// The matrix of `axis x`.
+// The matrix of the cross product `axis x`.
 fn cross_matrix(axis: vec3f) -> mat3x3f {
     return mat3x3f(vec3f(0.0, axis.z, -axis.y), vec3f(-axis.z, 0.0, axis.x), vec3f(axis.y, -axis.x, 0.0));
 }
@@ -71,7 +71,7 @@ fn project_splat(view: View, mean: vec3f, rotation_wxyz: vec4f, log_scale: vec3f
     let row_y = out.jacobian_y * out.axes;
     let low_pass_px2 = view.center_in_world.w;
     out.covariance = vec3f(dot(row_x, row_x) + low_pass_px2, dot(row_x, row_y), dot(row_y, row_y) + low_pass_px2);
-    // The determinant without cancellation: that of the splat alone is a squared cross product.
+    // The determinant without cancellation: the splat's own part is a squared cross product.
     let area = cross(row_x, row_y);
     out.determinant = dot(area, area) + low_pass_px2 * (out.covariance.x + out.covariance.z - low_pass_px2);
     return out;

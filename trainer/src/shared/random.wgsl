@@ -1,4 +1,4 @@
-// random: numbers from a hash of where and when they are needed, so that no state travels between threads.
+// random: hashes of a position and a time, so that threads share no random state.
 //
 // source    Jarzynski and Olano 2020 (PCG3D)
 

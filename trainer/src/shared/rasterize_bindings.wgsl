@@ -1,4 +1,4 @@
-// rasterize_bindings: what both forms of `rasterize` read and write.
+// rasterize_bindings: bindings and code shared by both variants of `rasterize`.
 
 #import tile
 
@@ -6,7 +6,7 @@
 @group(0) @binding(7) var<storage, read_write> depth: array<f32>;
 @group(0) @binding(8) var<storage, read_write> last: array<u32>;
 
-// Writes a lane's pixels, the first of them at `first`.
+// Writes a lane's pixels, starting at `first`.
 fn write_pixels(first: vec2u, on_image: PxB, blend: Blend) {
     for (var k = 0u; k < PX; k++) {
         if !any(on_image & (INDEX == PxU(k))) { continue; }

@@ -3,26 +3,26 @@
 struct Batch {
     n_rays: u32,
     n_samples: u32,
-    max_samples: u32,      // of a ray, so that all rays find room
+    max_samples: u32,      // per ray, limited so that all rays fit
     unused: u32,
 }
 
 struct Ray {
-    origin: vec3f,          // in units of the scene's radius, as all lengths here
+    origin: vec3f,          // in units of the scene radius, like all lengths here
     first_sample: u32,
     direction: vec3f,       // of length 1
     n_samples: u32,
-    begin: f32,             // along the ray: what lies before is not looked at
+    begin: f32,             // start of the visible range along the ray
     end: f32,
     embedding: u32,              // of the image it belongs to
-    target_rgb: u32,        // rgba8; a = 0: not seen
+    target_rgb: u32,        // rgba8; a = 0: no observation
     target_distance: f32,   // along the ray; 0: unknown
-    jitter: f32,             // of its samples, in steps, 0 to 1
-    is_finished: u32,          // 1: of a picture, and nothing more can be seen along it
-    next_segment: u32,        // of a picture's ray: the first that was not looked for yet
+    jitter: f32,             // offset of its samples, in steps, 0 to 1
+    is_finished: u32,          // 1: a picture's ray that has reached full opacity or its end
+    next_segment: u32,        // for a picture's ray: the first segment not searched yet
 }
 
-// A sample's part of a ray.
+// Interval of a ray that a sample covers.
 struct Span {
     begin: f32,
     end: f32,

@@ -1,19 +1,19 @@
-// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes, all of one subgroup, on adapters whose lanes read
-// memory one after the other: a workgroup reads each value once, and what windows share of it stays in the lanes.
+// rows_and_columns: windows of 11 x 11 pixels for a workgroup of 8 lanes in one subgroup. For adapters whose lanes read
+// memory one after the other: a workgroup reads each value once and shares it between windows by shuffles.
 //
-// A lane has 4 neighbouring pixels of a row, and the workgroup goes down the rows. The two lanes at either side only look:
-// what is left is a tile's width. After `supervision`.
+// A lane holds 4 neighboring pixels of a row, and the workgroup moves down the rows. The two lanes at either side only
+// supply the border; the rest covers the width of a tile. Import after `supervision`.
 
 const LANES = 8u;
-const STRIP_TILES = 2u;    // of a workgroup, below each other
-const N_ROWS = STRIP_TILES * TILE_PX + 2u * HALO; // that it looks at
+const STRIP_TILES = 2u;    // tiles per workgroup, one below the other
+const N_ROWS = STRIP_TILES * TILE_PX + 2u * HALO; // rows that it reads
 
-// What a workgroup works on.
+// The strip that a workgroup processes.
 struct ColorStrip {
     in_grid: bool,
     channel: u32,
-    corner: vec2i,     // of the lane's pixels in the first row looked at
-    writes: bool,      // whether the lane does more than look
+    corner: vec2i,     // of the lane's pixels in the first row that is read
+    writes: bool,      // false for lanes that only supply the border
 }
 
 fn color_strip(group: u32, lane: u32, n_tiles: vec2u) -> ColorStrip {
@@ -28,7 +28,7 @@ fn color_strip(group: u32, lane: u32, n_tiles: vec2u) -> ColorStrip {
 
 const G = GAUSSIAN;
 
-// What the rows so far add to the windows that end one, two, ... rows further down.
+// Contributions of the rows so far to the windows that end one, two, ... rows further down.
 struct Windows {
     in_1: vec4f,
     in_2: vec4f,
@@ -42,7 +42,7 @@ struct Windows {
     in_10: vec4f,
 }
 
-// Adds a row to the windows; the sums down the one that ends with it.
+// Adds a row to the windows and returns the vertical sums of the window that ends with it.
 fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
     let before = *windows;
     let finished = before.in_1 + G[10] * row;
@@ -61,7 +61,7 @@ fn add_row(windows: ptr<function, Windows>, row: vec4f) -> vec4f {
     return finished;
 }
 
-// The sums along the row, around each of the lane's pixels; the Gaussian is the same both ways.
+// Horizontal sums around each of the lane's pixels; the Gaussian is symmetric.
 fn along_row(lane: u32, own: vec4f) -> vec4f {
     let left = subgroupShuffle(own, (lane - 1u) & 7u);
     let right = subgroupShuffle(own, (lane + 1u) & 7u);

@@ -1,8 +1,9 @@
-// rows: what goes into layers and what comes out, in workgroup memory; the kernel is a function `work`.
+// rows: inputs and outputs of layers in workgroup memory; the kernel is a function `work`.
 //
-// Rows lie in two banks, which layers read from and write to in turn. In a layer a thread works on four rows of four samples.
+// Rows are in two banks that layers alternately read from and write to. Within a layer, a thread computes four rows of
+// four samples.
 
-const BANK = 576u;                 // rows of the other bank begin here: 64 strides
+const BANK = 576u;                 // start of the second bank: 64 strides
 
 var<workgroup> wg_rows: array<vec4f, 1152>;
 
@@ -17,8 +18,8 @@ fn put(bank: u32, row: u32, sample: u32, value: f32) {
 
 fn put_four(bank: u32, row: u32, part: u32, value: vec4f) { wg_rows[bank + row * STRIDE + part] = value; }
 
-// What goes into a layer.
+// Inputs of a layer.
 fn four(bank: u32, row: u32, part: u32) -> vec4f { return wg_rows[bank + row * STRIDE + part]; }
 
-// What came out of one.
+// Outputs of a layer.
 fn out_four(bank: u32, row: u32, part: u32) -> vec4f { return wg_rows[bank + row * STRIDE + part]; }

@@ -1,10 +1,10 @@
-// rows: what goes into layers and what comes out, in workgroup memory; the kernel is a function `work`.
+// rows: inputs and outputs of layers in workgroup memory; the kernel is a function `work`.
 //
-// What goes in is of f16, what comes out of f32: there is one bank of each. A subgroup works on 16 rows of all samples. Whether what rounding
-// to f16 leaves over is kept is up to the layers (`put_residual`, `put_residuals`).
+// Inputs are f16 and outputs f32, with one bank of each. A subgroup computes 16 rows of all samples. The layers decide
+// whether to keep the rounding error of f16 (`put_residual`, `put_residuals`).
 
 const BANK = 0u;
-const HALF_STRIDE = 10u;           // as STRIDE, in vec4 of f16
+const HALF_STRIDE = 10u;           // like STRIDE, in vec4 of f16
 
 var<workgroup> wg_halves: array<vec4<f16>, 640>;
 var<workgroup> wg_sums: array<vec4f, 576>;
@@ -33,8 +33,8 @@ fn put_four(bank: u32, row: u32, part: u32, value: vec4f) {
     put_residuals(row * HALF_STRIDE + part, value - vec4f(high));
 }
 
-// What goes into a layer.
+// Inputs of a layer.
 fn four(bank: u32, row: u32, part: u32) -> vec4f { return vec4f(wg_halves[row * HALF_STRIDE + part]); }
 
-// What came out of one.
+// Outputs of a layer.
 fn out_four(bank: u32, row: u32, part: u32) -> vec4f { return wg_sums[row * STRIDE + part]; }

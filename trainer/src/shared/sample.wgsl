@@ -1,13 +1,12 @@
-// sample: what the networks told about a sample, as the compositing wants it. After `ray_batch` and
-// `density`.
+// sample: the networks' outputs for a sample, converted for compositing. Import after `ray_batch` and `density`.
 
 struct Sample {
     begin: f32,
     end: f32,
     density: f32,
-    transmitted: f32,         // of the light that comes to it
+    transmitted: f32,         // fraction of incoming light that passes through
     rgb: vec3f,
-    is_clamped: bool,      // whether its density is the largest there is
+    is_clamped: bool,      // whether its density is at the maximum
 }
 
 fn sample_at(ix: u32) -> Sample {

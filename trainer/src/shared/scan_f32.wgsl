@@ -2,18 +2,18 @@
 
 var<workgroup> wg_scan_f32: array<f32, 256>;
 
-// The sum of the values of the lanes up to and including `lane`. Every lane must call it.
+// Returns the sum of the values of the lanes up to and including `lane`. Every lane must call it.
 fn inclusive_scan_f32(lane: u32, value: f32) -> f32 {
     wg_scan_f32[lane] = value;
-    workgroupBarrier(); // The values are there before the first step reads them.
+    workgroupBarrier(); // The values are written before the first step reads them.
     for (var stride = 1u; stride < 256u; stride *= 2u) {
         var below = 0.0;
         if lane >= stride { below = wg_scan_f32[lane - stride]; }
-        workgroupBarrier(); // All have read before anyone writes.
+        workgroupBarrier(); // All lanes have read before any writes.
         wg_scan_f32[lane] += below;
-        workgroupBarrier(); // All have written before anyone reads.
+        workgroupBarrier(); // All lanes have written before any reads.
     }
     let inclusive = wg_scan_f32[lane];
-    workgroupBarrier(); // The array may be used again after this.
+    workgroupBarrier(); // The array may be reused after this.
     return inclusive;
 }

@@ -1,4 +1,4 @@
-// space: the world, in units of the scene's radius around its middle, in the unit cube.
+// space: contracts the world, in units of the scene radius around its center, to the unit cube.
 
 // twin: nerf/reference/space.rs
 fn contract(at: vec3f) -> vec3f {

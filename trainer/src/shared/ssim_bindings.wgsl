@@ -1,4 +1,4 @@
-// ssim_bindings: what both forms of `ssim` read and write, and what they have in common.
+// ssim_bindings: bindings and code shared by both variants of `ssim`.
 
 #import view
 #import supervision
@@ -18,7 +18,8 @@ struct SimilarityGradients {
     of_product: Value,
 }
 
-// Slopes of the similarity towards E[x], E[x x] and E[x y], from the means over a window of picture x and keyframe y.
+// Gradients of the similarity with respect to E[x], E[x x] and E[x y], from the means over a window of picture x and
+// keyframe y.
 fn similarity_gradients(x: Value, y: Value, xx: Value, yy: Value, xy: Value) -> SimilarityGradients {
     const C1 = 0.0001;
     const C2 = 0.0009;

@@ -1,4 +1,4 @@
-// ssim_upstream: the slope of the structural similarity towards a pixel's color, for a workgroup of a tile.
+// ssim_upstream: gradient of the structural similarity with respect to a pixel's color, for a workgroup of a tile.
 
 var<workgroup> wg_gradients: array<vec4f, 676>;
 var<workgroup> wg_rows: array<vec4f, 416>;
@@ -20,14 +20,14 @@ fn ssim_upstream(lane: u32, corner: vec2i, at: u32, picture: vec3f, expected: ve
             }
             wg_gradients[i] = gradient;
         }
-        workgroupBarrier(); // The window's slopes are there.
+        workgroupBarrier(); // The window's gradients are written.
         for (var i = lane; i < SPAN * TILE_PX; i += 256u) {
             let from_ = (i / TILE_PX) * SPAN + i % TILE_PX;
             var sum = vec4f(0.0);
             for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_gradients[from_ + k]; }
             wg_rows[i] = sum;
         }
-        workgroupBarrier(); // The rows are there; the next channel writes them only after its own first barrier.
+        workgroupBarrier(); // The rows are written; the next channel overwrites them only after its own first barrier.
         var sum = vec4f(0.0);
         for (var k = 0u; k < WINDOW; k++) { sum += gaussian[k] * wg_rows[lane + k * TILE_PX]; }
         v_color[channel] = sum.x + 2.0 * picture[channel] * sum.y + expected[channel] * sum.z;

@@ -1,8 +1,8 @@
-// strips: a workgroup of 8 lanes, all of one subgroup, takes a tile in strips of two rows, 4 neighbouring pixels a lane.
+// strips: a workgroup of 8 lanes in one subgroup processes a tile in strips of two rows, 4 neighboring pixels per lane.
 //
-// For software adapters: their lanes read memory one after the other, whoever needs the value, while a shuffle is one
-// instruction. So each lane reads one splat of eight, and the splats travel by shuffle. Branches cost both sides there;
-// only loops end early, so what does not reach a strip is left out of the loop over splats.
+// For software adapters: their lanes read memory one after the other, while a shuffle is one instruction. Each lane
+// therefore reads one splat of eight, and splats are passed on by shuffles. On these adapters a branch costs both of
+// its sides; only loops end early. Splats that do not reach a strip are therefore left out of the loop.
 
 const LANES = 8u;
 const N_STRIPS = 8u;
@@ -12,13 +12,13 @@ const N_STRIPS = 8u;
 const QUEUE = 512u;
 var<workgroup> wg_queue: array<u32, QUEUE>;
 
-// Where in its tile the lane's first pixel of a strip lies.
+// Position within the tile of the lane's first pixel of a strip.
 fn strip_px(strip: u32, lane: u32) -> vec2u {
     return vec2u((lane & 3u) * PX, strip * 2u + (lane >> 2u));
 }
 
-// Whether a splat may reach the two rows whose first has its pixel centres at `top`; exact but for a margin that
-// outweighs the rounding of c - b b / a.
+// Whether a splat may reach two rows, the first of which has its pixel centers at `top`. Exact except for a margin that
+// exceeds the rounding error of c - b b / a.
 fn reaches_strip(position: vec4f, conic: vec4f, top: f32) -> bool {
     let dy = max(max(top - position.y, position.y - (top + 1.0)), 0.0);
     let min_distance = (conic.z - conic.y * conic.y / conic.x - 1e-5 * conic.z) * dy * dy;
@@ -37,16 +37,16 @@ fn max_of_lanes(own: u32) -> u32 {
     return max(all, subgroupShuffleXor(all, 4u));
 }
 
-// Queues the tile's entries from word `next` on, in order, until the queue might overflow or the list ends: x how many,
-// y the next word.
+// Queues the tile's entries in order, starting at word `next`, until the queue might overflow or the list ends. Returns
+// their number (x) and the next word (y).
 fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {
-    workgroupBarrier(); // Nobody reads the queue any more.
+    workgroupBarrier(); // No lane reads the previous queue anymore.
     var n = 0u;
     var word = next;
     while word * 32u < tile.end && n + LANES * 32u <= QUEUE {
         var bits = entries_of(tile, word + lane);
         let n_mine = countOneBits(bits);
-        // The sum over the lanes below, by doubling.
+        // The prefix sum over the lanes, by doubling.
         var upto = n_mine;
         for (var stride = 1u; stride < LANES; stride *= 2u) {
             let below = subgroupShuffle(upto, max(lane, stride) - stride);
@@ -61,6 +61,6 @@ fn queue_entries(lane: u32, next: u32, tile: Tile) -> vec2u {
         n += subgroupShuffle(upto, LANES - 1u);
         word += LANES;
     }
-    workgroupBarrier(); // The queue is there.
+    workgroupBarrier(); // The queue is written.
     return vec2u(n, word);
 }

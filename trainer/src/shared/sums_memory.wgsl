@@ -1,4 +1,4 @@
-// sums: adds up over the 32 lanes of a workgroup through its memory, where there are no subgroups; the kernel is a
+// sums: sums over the 32 lanes of a workgroup through its memory, for adapters without subgroups; the kernel is a
 // function `backward`.
 
 var<workgroup> wg_lanes: array<f32, 384>; // [LANES, 12]
@@ -8,18 +8,18 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     backward(folded(wg, n_wgs), lane);
 }
 
-// Writes the sum of what every lane tells.
+// Writes the sum of all lanes' gradients.
 fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
     for (var k = 0u; k < 4u; k++) {
         wg_lanes[lane * N_PARTS_OF_GRADIENT + k] = mine.position[k];
         wg_lanes[lane * N_PARTS_OF_GRADIENT + 4u + k] = mine.conic[k];
         wg_lanes[lane * N_PARTS_OF_GRADIENT + 8u + k] = mine.color[k];
     }
-    workgroupBarrier(); // All have told.
+    workgroupBarrier(); // All lanes have written their gradients.
     if lane < N_PARTS_OF_GRADIENT {
         var sum = 0.0;
         for (var k = 0u; k < LANES; k++) { sum += wg_lanes[k * N_PARTS_OF_GRADIENT + lane]; }
         write_gradient(slot, lane, sum);
     }
-    workgroupBarrier(); // All are summed before the next splat is told of.
+    workgroupBarrier(); // All sums are complete before the next splat's gradients are written.
 }

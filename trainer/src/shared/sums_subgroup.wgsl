@@ -1,7 +1,7 @@
-// sums: adds up over the 32 lanes of a workgroup by shuffles; the kernel is a function `backward`.
+// sums: sums over the 32 lanes of a workgroup by shuffles; the kernel is a function `backward`.
 
 override SUBGROUP = 32u;
-var<workgroup> wg_parts: array<f32, 96>; // [LANES / 4, 12], of the subgroups where the workgroup has several
+var<workgroup> wg_parts: array<f32, 96>; // [LANES / 4, 12], per subgroup if the workgroup has several
 
 @compute @workgroup_size(LANES)
 fn main(
@@ -11,7 +11,7 @@ fn main(
     backward(folded(wg, n_wgs), subgroup * SUBGROUP + sub_lane);
 }
 
-// The sum over each four neighbouring lanes of component 2 (lane % 2) + lane / 2 % 2.
+// Sum over each group of four neighboring lanes of component 2 (lane % 2) + lane / 2 % 2.
 fn sum_of_four(lane: u32, mine: vec4f) -> f32 {
     let odd = (lane & 1u) != 0u;
     let two = select(mine.xy, mine.zw, odd) + subgroupShuffleXor(select(mine.zw, mine.xy, odd), 1u);
@@ -19,7 +19,7 @@ fn sum_of_four(lane: u32, mine: vec4f) -> f32 {
     return select(two.x, two.y, high) + subgroupShuffleXor(select(two.y, two.x, high), 2u);
 }
 
-// Writes the sum of what every lane tells.
+// Writes the sum of all lanes' gradients.
 fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
     var sum = vec3f(sum_of_four(lane, mine.position), sum_of_four(lane, mine.conic), sum_of_four(lane, mine.color));
     for (var stride = 4u; stride < min(SUBGROUP, LANES); stride *= 2u) { sum += subgroupShuffleXor(sum, stride); }
@@ -33,10 +33,10 @@ fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
             wg_parts[at + 4u] = sum.y;
             wg_parts[at + 8u] = sum.z;
         }
-        workgroupBarrier(); // All subgroups have told.
+        workgroupBarrier(); // All subgroups have written their sums.
         value = 0.0;
         for (var subgroup = 0u; subgroup < LANES / SUBGROUP; subgroup++) { value += wg_parts[subgroup * N_PARTS_OF_GRADIENT + min(part, 11u)]; }
-        workgroupBarrier(); // All have read before the next splat is told of.
+        workgroupBarrier(); // All lanes have read before the next splat's sums are written.
     }
     if lane < N_PARTS_OF_GRADIENT { write_gradient(slot, part, value); }
 }

@@ -1,5 +1,5 @@
-// sums: adds up over the lanes of each subgroup in whatever order the hardware takes; the kernel is a function `backward`.
-// Only to be measured, with the `gradients` that meet.
+// sums: sums over the lanes of each subgroup in the order the hardware chooses; the kernel is a function `backward`.
+// For benchmarks only, together with `gradients_unordered`.
 
 override SUBGROUP = 32u;
 
@@ -11,7 +11,7 @@ fn main(
     backward(folded(wg, n_wgs), subgroup * SUBGROUP + sub_lane);
 }
 
-// Adds the sum of what every lane of the subgroup tells; 16 of them at least.
+// Adds the sum over all lanes of the subgroup, which has at least 16.
 fn write_gradient_sum(lane: u32, slot: u32, mine: Gradient) {
     let position = subgroupAdd(mine.position);
     let conic = subgroupAdd(mine.conic);

@@ -1,13 +1,13 @@
-// supervision: what the picture is compared with and how.
+// supervision: the targets of the loss and its weights.
 
 #import random
 
 struct Supervision {
     background_srgb: vec4f,   // behind everything; w unused
-    dssim_frac: f32,          // share of D-SSIM in the color loss
-    depth_weight: f32,        // per metre
+    dssim_frac: f32,          // weight of D-SSIM in the color loss, 0 to 1
+    depth_weight: f32,        // per meter
     depth_clip_m: f32,        // past which a reading is ignored
-    random_background: f32,   // above 0: up to this bright, and another one every step, so that leaving a place bare never pays
+    random_background: f32,   // maximum of a background that changes per step, so that bare areas add loss; 0: off
 }
 
 const WINDOW = 11u;

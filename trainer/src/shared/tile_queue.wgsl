@@ -1,28 +1,28 @@
 // tile_queue: the splats of a tile, 32 at a time, for a workgroup of 32 lanes. For kernels that bind the bins' lists.
 //
-// A lane has two neighbouring pixels in each quarter of 8 x 8 of the tile, so that a splat is looked at only in the
-// quarters it touches. Small workgroups with little memory: more of them hide each other's waiting.
+// A lane has two neighboring pixels in each 8 x 8 quarter of the tile, so that a splat is evaluated only in the
+// quarters it touches. Workgroups are small and use little memory: more of them run at once and hide latency.
 
 #import tiles
 
 const LANES = 32u;
 const BATCH = LANES;
-const WORDS = 8u;          // of 32 entries, looked through at once
+const WORDS = 8u;          // of 32 entries, searched at once
 var<workgroup> wg_words: array<u32, WORDS>;
 var<workgroup> wg_queue: array<u32, 256>;
 var<workgroup> wg_splats: array<ProjectedSplat, BATCH>;  // conic: `halved`; color.w: bits of the rank in the bin's list
 var<workgroup> wg_quarters: array<u32, BATCH>; // that the splat may touch, see `quarters_touched`
 
-// Where in its quarter the lane's first pixel lies.
+// Position within a quarter of the lane's first pixel.
 fn lane_px(lane: u32) -> vec2u {
     return vec2u(lane % 4u * 2u, lane / 4u);
 }
 
-// Queues the tile's entries out of the next `WORDS` words, in order; returns how many. Every lane must call it.
+// Queues the tile's entries from the next `WORDS` words in order and returns their number. Every lane must call it.
 fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
     if lane < WORDS { wg_words[lane] = entries_of(tile, first + lane); }
-    workgroupBarrier(); // The words are there, and nobody reads the queue any more.
-    // Four lanes a word.
+    workgroupBarrier(); // The words are written, and no lane reads the previous queue anymore.
+    // Four lanes per word.
     let mine = lane / 4u;
     let shift = lane % 4u * 8u;
     var n = 0u;
@@ -38,13 +38,13 @@ fn queue_words(lane: u32, first: u32, tile: Tile) -> u32 {
         bits &= bits - 1u;
         at++;
     }
-    workgroupBarrier(); // The queue is there.
+    workgroupBarrier(); // The queue is written.
     return n;
 }
 
-// Takes a batch from the queue, a splat a lane. Every lane must call it.
+// Takes a batch from the queue, one splat per lane. Every lane must call it.
 fn take_batch(lane: u32, batch: u32, n_queued: u32, tile: Tile) {
-    workgroupBarrier(); // Nobody reads the last batch any more.
+    workgroupBarrier(); // No lane reads the previous batch anymore.
     if batch + lane < n_queued {
         let entry = wg_queue[batch + lane];
         var splat = projected_splats[entries[entry].x];
@@ -53,5 +53,5 @@ fn take_batch(lane: u32, batch: u32, n_queued: u32, tile: Tile) {
         splat.conic = halved(splat.conic);
         wg_splats[lane] = splat;
     }
-    workgroupBarrier(); // The batch is there.
+    workgroupBarrier(); // The batch is written.
 }

@@ -8,7 +8,7 @@
 struct Ellipse {
     mean_px: vec2f,
     conic: vec3f,       // A, B, C of A dx^2 + 2 B dx dy + C dy^2
-    reach: f32,         // the ellipse is where that is <= reach = 2 ln(255 opacity)
+    reach: f32,         // the ellipse is the set where that is <= reach = 2 ln(255 opacity)
 }
 
 const TILE_MARGIN_PX = 0.01;
@@ -27,7 +27,8 @@ fn tile_rows(ellipse: Ellipse, n_tiles: vec2u) -> vec2i {
     return vec2i(begin, select(begin, end, last >= first));
 }
 
-// Leftmost and rightmost point of the ellipse between two heights, both relative to its mean and one of them within it.
+// Leftmost and rightmost x of the ellipse between two heights relative to its mean; at least one height is within the
+// ellipse.
 fn span_between(ellipse: Ellipse, top: f32, bottom: f32) -> vec2f {
     let a = ellipse.conic.x;
     let b = ellipse.conic.y;

@@ -1,4 +1,4 @@
-// view: one virtual or real camera, and where it looks.
+// view: one virtual or real camera and its pose.
 //
 // source    conventions of ARCHITECTURE.md: x right, y down, z forward; pixel centers at + 0.5
 
@@ -11,7 +11,7 @@ struct View {
     principal_px: vec2f,
     size_px: vec2u,
     n_tiles: vec2u,
-    shutter_linear: vec4f,     // twist of the camera times the readout time, metres; w: near_m
+    shutter_linear: vec4f,     // twist of the camera times the readout time, meters; w: near_m
     shutter_angular: vec4f,    // radians; w: far_m
     crop_row_0: vec4f,         // box_from_world, upper three rows
     crop_row_1: vec4f,
@@ -27,7 +27,7 @@ fn camera_from_world(view: View, point_in_world: vec3f) -> vec3f {
     return vec3f(dot(view.camera_row_0, point), dot(view.camera_row_1, point), dot(view.camera_row_2, point));
 }
 
-// Whether a point may be drawn.
+// Whether a point is inside the crop box. True if there is none.
 fn inside_crop(view: View, point_in_world: vec3f) -> bool {
     if view.crop_min.w == 0.0 { return true; }
     let point = vec4f(point_in_world, 1.0);
@@ -35,7 +35,7 @@ fn inside_crop(view: View, point_in_world: vec3f) -> bool {
     return all(point_in_box >= view.crop_min.xyz) && all(point_in_box <= view.crop_max.xyz);
 }
 
-// The workgroup's number when counts are folded to x and y.
+// Index of the workgroup when dispatch counts are folded to x and y.
 fn folded(wg: vec3u, n_wgs: vec3u) -> u32 {
     return wg.y * n_wgs.x + wg.x;
 }

@@ -96,7 +96,7 @@ fn other_data_and_unknown_states_are_rejected() {
     };
     assert!(SplatTrainer::resume(gpu.clone(), &checkpoint, &keyframes).is_ok());
     let message = resume_error(&checkpoint, &keyframes[..5]).to_string();
-    assert_eq!(message, "the checkpoint is of other data: image 5 of camera \"test\" is not there to be learned from");
+    assert_eq!(message, "the checkpoint belongs to different data: image 5 of camera \"test\" is missing");
     let error_with_changed_keyframe = |change: &dyn Fn(&mut Keyframe)| {
         let mut other = keyframes.clone();
         change(Arc::make_mut(&mut other[3]));
@@ -105,11 +105,11 @@ fn other_data_and_unknown_states_are_rejected() {
     assert!(
         error_with_changed_keyframe(&|keyframe| keyframe.size_px = [48, 40]).contains("has 48x40 pixels, had 96x80")
     );
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.depth = None).contains("another depth image"));
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.focal_px[0] += 1.0).contains("another lens"));
+    assert!(error_with_changed_keyframe(&|keyframe| keyframe.depth = None).contains("different depth image"));
+    assert!(error_with_changed_keyframe(&|keyframe| keyframe.focal_px[0] += 1.0).contains("different intrinsics"));
     assert!(
         error_with_changed_keyframe(&|keyframe| keyframe.world_from_camera.translation.x += 1e-6)
-            .contains("another pose")
+            .contains("different pose")
     );
     assert!(error_with_changed_keyframe(&|keyframe| keyframe.camera = "other".into()).contains("not there"));
 

@@ -1,9 +1,9 @@
-//! Splats in `.spz` files (Niantic): versions 2 and 3 in, version 3 out.
+//! Splats in `.spz` files (Niantic): reads versions 2 and 3, writes version 3.
 //!
-//! A gzip stream of a header and, one after the other, the means, opacities, constant colors, scales, rotations and higher
-//! color coefficients of all splats, each value rounded to few bits (`quantize.rs`). Axes there are right, up, back; ours
-//! are those of our `.ply`, which other programs take for right, down, front. So y and z change sign here, exactly as those
-//! programs do it: the same model as `.ply` and as `.spz` lies in the same place in every viewer.
+//! A gzip stream of a header, followed by the means, opacities, constant colors, scales, rotations and higher color
+//! coefficients of all splats, each value rounded to few bits (`quantize.rs`). Axes in `.spz` are right, up, back; ours
+//! are those of our `.ply`, which other programs interpret as right, down, front. Like those programs, we change the
+//! signs of y and z, so that a model has the same pose in every viewer, whether loaded from `.ply` or `.spz`.
 //!
 //! Source: "SPZ file format", Niantic, versions 2 and 3, <https://github.com/nianticlabs/spz>.
 
@@ -20,28 +20,29 @@ use std::path::Path;
 const MAGIC: [u8; 4] = *b"NGSP";
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 const HEADER_BYTES: usize = 16;
-/// Oldest version that is read: the one before held its means as 16-bit floats.
+/// Oldest version that is read: the previous one stored means as 16-bit floats.
 const MIN_VERSION: u32 = 2;
-/// Newest version that is read, and the one that is written. Later ones are not gzip streams.
+/// Newest version that is read, and the version that is written. Later ones are not gzip streams.
 const MAX_VERSION: u32 = 3;
-/// Bit of the header's flags: more follows the splats.
+/// Bit of the header's flags: extensions follow the splats.
 const HAS_EXTENSIONS: u8 = 2;
-/// More splats than this are taken for a damaged header.
+/// Maximum number of splats; a header with more counts as damaged.
 const MAX_SPLATS: u32 = 100_000_000;
-/// Most bits behind the point of a mean: steps of 15 micrometres.
+/// Maximum number of fractional bits of a mean: steps of 15 micrometers.
 const MAX_FRACTIONAL_BITS: u8 = 16;
-/// Signs of the higher color coefficients when y and z change theirs: negative where the function is odd in them.
+/// Signs of the higher color coefficients after changing the signs of y and z: negative for functions that are odd in
+/// them.
 const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
-/// Reads a `.spz` of splats.
+/// Reads a `.spz` file of splats.
 pub fn read(path: &Path) -> Result<SplatArrays, Error> {
     let bytes = std::fs::read(path).map_err(|source| Error::Read { path: path.to_owned(), source })?;
     from_bytes(&bytes).map_err(|reason| Error::SplatFile { path: path.to_owned(), reason })?.checked()
 }
 
-/// Writes a `.spz` of splats; a broken disk leaves no file under this name that looks whole.
+/// Writes a `.spz` file of splats. After a failed write, no partial file has this name.
 ///
-/// Values past what the format holds end at its bounds, except means, which are refused beyond 8388 km.
+/// Values outside the range of the format are clamped, except means: coordinates beyond 8388 km are an error.
 pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     let uncompressed = uncompressed_bytes(&splats.clone().checked()?)?;
     atomic_file::write(path, |file| {
@@ -51,7 +52,7 @@ pub fn write(path: &Path, splats: &SplatArrays) -> Result<(), Error> {
     })
 }
 
-/// What the file says before the splats.
+/// The header of a file.
 struct Header {
     version: u32,
     n_splats: usize,
@@ -64,19 +65,19 @@ impl Header {
     fn parse(bytes: [u8; HEADER_BYTES]) -> Result<Self, String> {
         let word = |at: usize| u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
         if bytes[..4] != MAGIC {
-            return Err("what is packed in it does not begin with \"NGSP\"".to_owned());
+            return Err("the decompressed data does not begin with \"NGSP\"".to_owned());
         }
         let (version, n_splats, [sh_degree, fractional_bits, flags, _]) =
             (word(4), word(8), [bytes[12], bytes[13], bytes[14], bytes[15]]);
         check_version(version)?;
         if n_splats > MAX_SPLATS {
-            return Err(format!("the header speaks of {n_splats} splats, at most {MAX_SPLATS} are read"));
+            return Err(format!("the header has {n_splats} splats, expected at most {MAX_SPLATS}"));
         }
         if sh_degree > 3 {
-            return Err(format!("colour degree {sh_degree}, at most 3"));
+            return Err(format!("spherical harmonics of degree {sh_degree}, expected at most 3"));
         }
         if fractional_bits > 23 {
-            return Err(format!("means with {fractional_bits} fractional bits, at most 23 fit in"));
+            return Err(format!("means have {fractional_bits} fractional bits, expected at most 23"));
         }
         Ok(Self { version, n_splats: n_splats as usize, sh_degree: sh_degree.into(), fractional_bits, flags })
     }
@@ -89,7 +90,7 @@ impl Header {
         if self.version == 2 { 3 } else { 4 }
     }
 
-    /// Bytes of all splats.
+    /// Size of all splats in bytes.
     fn n_body_bytes(&self) -> u64 {
         self.n_splats as u64 * (16 + self.rotation_bytes() + 3 * self.n_higher_coefficients()) as u64
     }
@@ -98,7 +99,7 @@ impl Header {
 fn check_version(version: u32) -> Result<(), String> {
     match version {
         MIN_VERSION..=MAX_VERSION => Ok(()),
-        _ => Err(format!("version {version} of the format, only {MIN_VERSION} and {MAX_VERSION} are read")),
+        _ => Err(format!("format version {version}, expected {MIN_VERSION} or {MAX_VERSION}")),
     }
 }
 
@@ -109,7 +110,7 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
         check_version(u32::from_le_bytes(*version))?;
     }
     if !bytes.starts_with(&GZIP) {
-        return Err("it does not begin as a gzip stream".to_owned());
+        return Err("not a gzip stream".to_owned());
     }
     let mut gzip = GzDecoder::new(bytes);
     let mut header = [0; HEADER_BYTES];
@@ -119,9 +120,9 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
     gzip.by_ref().take(header.n_body_bytes()).read_to_end(&mut body).map_err(|error| read_error(&error))?;
     if (body.len() as u64) < header.n_body_bytes() {
         let (n_splats, n_bytes) = (header.n_splats, header.n_body_bytes());
-        return Err(format!("cut off: its {n_splats} splats take {n_bytes} bytes, there are {}", body.len()));
+        return Err(format!("truncated: {n_splats} splats need {n_bytes} bytes, found {}", body.len()));
     }
-    // Reading to the end checks the sum of the stream, too.
+    // Reading to the end also verifies the checksum of the stream.
     let n_more = std::io::copy(&mut gzip, &mut std::io::sink()).map_err(|error| read_error(&error))?;
     if n_more > 0 && header.flags & HAS_EXTENSIONS == 0 {
         return Err(format!("{n_more} bytes follow the last splat"));
@@ -134,12 +135,12 @@ fn from_bytes(bytes: &[u8]) -> Result<SplatArrays, String> {
 
 fn read_error(error: &std::io::Error) -> String {
     match error.kind() {
-        ErrorKind::UnexpectedEof => "cut off".to_owned(),
+        ErrorKind::UnexpectedEof => "truncated".to_owned(),
         _ => format!("damaged ({error})"),
     }
 }
 
-/// The splats of a body that is as long as the header says.
+/// Decodes the splats of a body whose length matches the header.
 fn splats(header: &Header, body: &[u8]) -> SplatArrays {
     let n_splats = header.n_splats;
     let mut rest = body;
@@ -181,15 +182,15 @@ fn splats(header: &Header, body: &[u8]) -> SplatArrays {
     }
 }
 
-/// Half a turn about x: ours to theirs, and back.
+/// Rotation by half a turn about x: converts between our axes and those of the format.
 fn flipped([x, y, z]: [f32; 3]) -> [f32; 3] {
     [x, -y, -z]
 }
 
-/// Header and splats before they are packed.
+/// Encodes header and splats before compression.
 fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     let n_splats = u32::try_from(splats.n_splats()).ok().filter(|n| *n <= MAX_SPLATS).ok_or_else(|| {
-        Error::SplatArrays(format!("{} of them, .spz is written of at most {MAX_SPLATS}", splats.n_splats()))
+        Error::SplatArrays(format!("found {} splats, .spz holds at most {MAX_SPLATS}", splats.n_splats()))
     })?;
     let fractional_bits = fractional_bits(&splats.means)?;
     let mut bytes = MAGIC.to_vec();
@@ -218,13 +219,13 @@ fn uncompressed_bytes(splats: &SplatArrays) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// As many bits behind the point as leave room for the mean that is furthest out.
+/// Largest number of fractional bits with which the mean farthest out still fits.
 fn fractional_bits(means: &[[f32; 3]]) -> Result<u8, Error> {
     let max_coordinate_m = means.as_flattened().iter().map(|meters| f64::from(meters.abs())).fold(0.0, f64::max);
     let fits = |bits: &u8| max_coordinate_m * f64::from(1_u32 << bits) <= f64::from(quantize::MAX_FIXED);
     (0..=MAX_FRACTIONAL_BITS).rev().find(fits).ok_or_else(|| {
         Error::SplatArrays(format!(
-            "a mean lies {max_coordinate_m:.0} m out, .spz holds at most {} m",
+            "a mean has a coordinate of {max_coordinate_m:.0} m, .spz holds at most {} m",
             quantize::MAX_FIXED
         ))
     })

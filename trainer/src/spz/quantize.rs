@@ -1,13 +1,13 @@
-//! How `.spz` rounds each value to few bits.
+//! Rounding of each value to few bits in `.spz`.
 #![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "ranges are clamped before each cast")]
 
 use std::f64::consts::FRAC_1_SQRT_2;
 
-/// Largest magnitude of a mean: a signed number of 24 bits.
+/// Maximum magnitude of a mean: a signed 24-bit number.
 pub(super) const MAX_FIXED: i32 = (1 << 23) - 1;
-/// Constant colors, which are mostly small, get the whole range of a byte by this factor.
+/// Constant colors are mostly small; this factor spreads them over the range of a byte.
 const COLOR_SCALE: f64 = 0.15;
-/// Largest magnitude of a component of a rotation: 9 bits.
+/// Maximum magnitude of a component of a rotation: 9 bits.
 const MAX_COMPONENT: u32 = (1 << 9) - 1;
 
 fn byte(value: f64) -> u8 {
@@ -21,7 +21,7 @@ pub(super) fn fixed_from_mean(meters: f32, fractional_bits: u8) -> [u8; 3] {
 }
 
 pub(super) fn mean_from_fixed([low, middle, high]: [u8; 3], fractional_bits: u8) -> f32 {
-    let fixed = i32::from_le_bytes([0, low, middle, high]) >> 8; // The sign is carried down.
+    let fixed = i32::from_le_bytes([0, low, middle, high]) >> 8; // An arithmetic shift extends the sign.
     (f64::from(fixed) / f64::from(1_u32 << fractional_bits)) as f32
 }
 
@@ -29,7 +29,7 @@ pub(super) fn byte_from_opacity_logit(logit: f32) -> u8 {
     byte(255.0 / (1.0 + (-f64::from(logit)).exp()))
 }
 
-/// The outermost bytes stand for opacities in the middle of their half step: 0 and 1 have no finite logit.
+/// The outermost bytes decode to the center of their half step: opacities of 0 and 1 have no finite logit.
 pub(super) fn opacity_logit_from_byte(byte: u8) -> f32 {
     let opacity = f64::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln() as f32
@@ -51,8 +51,8 @@ pub(super) fn log_scale_from_byte(byte: u8) -> f32 {
     f32::from(byte) / 16.0 - 10.0
 }
 
-/// Other programs round further, to 5 bits at degree 1 and 4 above. That costs a sixth of a decibel and saves a seventh of
-/// the bytes.
+/// Rounds a higher color coefficient to 8 bits. Other programs use 5 bits at degree 1 and 4 above, which costs a sixth
+/// of a decibel and saves a seventh of the bytes.
 pub(super) fn byte_from_sh(coefficient: f32) -> u8 {
     byte(f64::from(coefficient) * 128.0 + 128.0)
 }
@@ -61,9 +61,11 @@ pub(super) fn sh_from_byte(byte: u8) -> f32 {
     (f32::from(byte) - 128.0) / 128.0
 }
 
-/// The index of the largest component in the upper two bits, then sign and magnitude of the other three in order.
+/// Encodes the index of the largest component in the upper two bits, then sign and magnitude of the other three in
+/// order.
 ///
-/// Source of the idea: Fiedler 2015, "Snapshot compression". Signs are turned so that the component left out is positive.
+/// Source of the idea: Fiedler 2015, "Snapshot compression". Signs are chosen so that the omitted component is
+/// positive.
 pub(super) fn smallest_from_rotation(xyzw: [f32; 4]) -> [u8; 4] {
     let xyzw = xyzw.map(f64::from);
     let length = xyzw.iter().map(|part| part * part).sum::<f64>().sqrt();
@@ -97,7 +99,7 @@ pub(super) fn rotation_from_smallest(bytes: [u8; 4]) -> [f32; 4] {
     xyzw.map(|part| part as f32)
 }
 
-/// Version 2: x, y and z, a byte each; w is what is left and positive.
+/// Version 2: one byte each for x, y and z; w follows from the unit length and is positive.
 pub(super) fn rotation_from_three(bytes: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.0);
     [x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()].map(|part| part as f32)

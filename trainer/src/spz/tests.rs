@@ -1,11 +1,11 @@
-//! Reading and writing of `.spz` files.
+//! Tests of reading and writing `.spz` files.
 
 use super::*;
 use crate::splat::cloud::synthetic_cloud;
 use crate::splat::reference::sh;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// Splats of a cloud, with fewer colour coefficients.
+/// Splats of a cloud, with fewer color coefficients.
 fn cloud_of_degree(n_splats: usize, sh_degree: u32) -> SplatArrays {
     let cloud = synthetic_cloud(n_splats, 1);
     let n_kept = (sh_degree as usize + 1).pow(2);
@@ -24,12 +24,12 @@ fn quaternion(wxyz: [f32; 4]) -> UnitQuaternion<f64> {
     UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
 }
 
-/// Largest difference of two lists.
+/// Checks the largest difference of two lists against a tight bound.
 fn assert_max_difference(what: &str, got: &[f32], expected: &[f32], bound: f32) {
     assert_eq!(got.len(), expected.len(), "{what}");
     let worst = got.iter().zip(expected).map(|(got, expected)| (got - expected).abs()).fold(0.0, f32::max);
-    assert!(worst <= bound * 1.0001, "{what}: {worst} off, at most {bound}");
-    assert!(worst > 0.5 * bound, "{what}: {worst} off, the bound {bound} is loose");
+    assert!(worst <= bound * 1.0001, "{what}: largest difference {worst}, expected at most {bound}");
+    assert!(worst > 0.5 * bound, "{what}: largest difference {worst}, the bound {bound} is too loose");
 }
 
 #[test]
@@ -79,7 +79,7 @@ fn every_value_round_trips_within_its_step() {
                 0.5 / 128.0,
             );
         }
-        // What was rounded once stays as it is, except rotations whose two largest components are nearly the same.
+        // A second round trip changes nothing, except rotations whose two largest components are nearly equal.
         write(&path, &decoded).unwrap();
         let decoded_twice = read(&path).unwrap();
         assert!(
@@ -91,16 +91,16 @@ fn every_value_round_trips_within_its_step() {
     }
     write(&path, &SplatArrays::default()).unwrap();
     assert_eq!(read(&path).unwrap().n_splats(), 0);
-    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file stays");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no partial file remains");
 }
 
-/// Every byte of a file of one splat, worked out by hand from the description of the format.
+/// Every byte of a file with one splat, computed by hand from the format's specification.
 #[test]
 fn one_splat_file_has_the_specified_bytes() {
     let splat = SplatArrays {
         means: vec![[1.0, -2.0, 3.0]],
         log_scales: vec![[-10.0, -3.0, 5.9375]],
-        // A quarter of a turn about y, with the other sign and twice the length.
+        // A quarter turn about y, with the opposite sign and twice the length.
         rotations_wxyz: vec![[-2.0, 0.0, -2.0, 0.0]],
         opacity_logits: vec![0.0],
         sh: vec![[0.0, 1.0, -9.0], [0.25, 0.5, -0.5], [0.0, 1.0, -1.0], [0.125, 0.0, 0.0]],
@@ -108,15 +108,16 @@ fn one_splat_file_has_the_specified_bytes() {
     };
     #[rustfmt::skip]
     let expected = [
-        b'N', b'G', b'S', b'P', 3, 0, 0, 0, 1, 0, 0, 0, 1, 16, 0, 0, // One splat of degree 1, 16 bits behind the point.
-        0x00, 0x00, 0x01, 0x00, 0x00, 0x02, 0x00, 0x00, 0xfd,        // 1, 2 and -3 times 2^16: y and z are turned.
+        b'N', b'G', b'S', b'P', 3, 0, 0, 0, 1, 0, 0, 0, 1, 16, 0, 0, // One splat of degree 1, 16 fractional bits.
+        0x00, 0x00, 0x01, 0x00, 0x00, 0x02, 0x00, 0x00, 0xfd,        // 1, 2 and -3 times 2^16: y and z change sign.
         128,                                                         // Half of 255, rounded up.
-        128, 166, 0,                                                 // 127.5 + 38.25 each, and past the lower end.
+        128, 166, 0,                                                 // 127.5 + 38.25 each, clamped at the lower end.
         0, 112, 255,                                                 // 16 (log scale + 10)
-        // x = 0, -y = -1/sqrt(2), -z = 0, w = 1/sqrt(2): y is the first of the two largest, so signs turn and it goes.
+        // x = 0, -y = -1/sqrt(2), -z = 0, w = 1/sqrt(2): y is the first of the two largest, so signs flip and y is
+        // omitted.
         0xff, 0x03, 0x00, 0x40,                                      // 01, x 0 0, z 0 0, w 1 511
         96, 64, 192,                                                 // -y: 128 - 32, - 64, + 64
-        128, 0, 255,                                                 // -z: 128, - 128, + 128 past the upper end
+        128, 0, 255,                                                 // -z: 128, - 128, + 128 clamped at the upper end
         144, 128, 128,                                               // x: 128 + 16
     ];
     assert_eq!(uncompressed_bytes(&splat).unwrap(), expected);
@@ -132,7 +133,7 @@ fn one_splat_file_has_the_specified_bytes() {
     assert!(quaternion(decoded.rotations_wxyz[0]).angle_to(&quaternion(splat.rotations_wxyz[0])).to_degrees() < 1.5);
 }
 
-/// Colors seen along a direction are those of the turned splat seen along the turned direction.
+/// Colors viewed along a direction equal those of the flipped splat viewed along the flipped direction.
 #[test]
 fn colors_follow_the_axis_flip() {
     let coefficients: Vec<[f64; 3]> = synthetic_cloud(1, 5).sh.iter().map(|rgb| rgb.map(f64::from)).collect();
@@ -159,22 +160,22 @@ fn broken_files_are_rejected_with_the_reason() {
         uncompressed[at] = to;
         error_of(&packed(&uncompressed))
     };
-    assert_eq!(error_of(b"ply\n"), "it does not begin as a gzip stream");
-    assert_eq!(error_of(b""), "it does not begin as a gzip stream");
-    assert_eq!(error_of(b"NGSP\x04\0\0\0rest"), "version 4 of the format, only 2 and 3 are read");
+    assert_eq!(error_of(b"ply\n"), "not a gzip stream");
+    assert_eq!(error_of(b""), "not a gzip stream");
+    assert_eq!(error_of(b"NGSP\x04\0\0\0rest"), "format version 4, expected 2 or 3");
     assert!(error_of(&uncompressed).contains("gzip"));
-    assert_eq!(error_with_byte(0, b'X'), "what is packed in it does not begin with \"NGSP\"");
-    assert_eq!(error_with_byte(4, 1), "version 1 of the format, only 2 and 3 are read");
-    assert_eq!(error_with_byte(8, 6), "cut off: its 6 splats take 264 bytes, there are 220");
+    assert_eq!(error_with_byte(0, b'X'), "the decompressed data does not begin with \"NGSP\"");
+    assert_eq!(error_with_byte(4, 1), "format version 1, expected 2 or 3");
+    assert_eq!(error_with_byte(8, 6), "truncated: 6 splats need 264 bytes, found 220");
     assert_eq!(error_with_byte(8, 4), "44 bytes follow the last splat");
-    assert!(error_with_byte(11, 255).contains("4278190085 splats, at most 100000000"));
-    assert!(error_with_byte(11, 5).contains("cut off: its 83886085 splats"));
-    assert_eq!(error_with_byte(12, 4), "colour degree 4, at most 3");
-    assert!(error_with_byte(12, 3).contains("cut off"));
+    assert!(error_with_byte(11, 255).contains("4278190085 splats, expected at most 100000000"));
+    assert!(error_with_byte(11, 5).contains("truncated: 83886085 splats"));
+    assert_eq!(error_with_byte(12, 4), "spherical harmonics of degree 4, expected at most 3");
+    assert!(error_with_byte(12, 3).contains("truncated"));
     assert!(error_with_byte(13, 32).contains("32 fractional bits"));
-    assert_eq!(error_of(&packed(&uncompressed[..7])), "cut off");
+    assert_eq!(error_of(&packed(&uncompressed[..7])), "truncated");
     for length in 2..whole.len() {
-        assert!(error_of(&whole[..length]).contains("cut off"), "{length} of {} bytes", whole.len());
+        assert!(error_of(&whole[..length]).contains("truncated"), "{length} of {} bytes", whole.len());
     }
     assert_eq!(error_of(&[&whole[..], b"tail"].concat()), "4 bytes follow the gzip stream");
     let mut damaged = whole.clone();
@@ -206,7 +207,7 @@ fn unwritable_values_are_reported() {
     let path = folder.path().join("scene.spz");
     let mut cloud = cloud_of_degree(3, 0);
     cloud.means[1][2] = 9e6;
-    assert!(write(&path, &cloud).unwrap_err().to_string().contains("9000000 m out"));
+    assert!(write(&path, &cloud).unwrap_err().to_string().contains("a coordinate of 9000000 m"));
     cloud.means[1][2] = 8e6;
     write(&path, &cloud).unwrap();
     assert!((read(&path).unwrap().means[1][2] - 8e6).abs() < 1.0);
@@ -224,8 +225,8 @@ fn files_of_another_program_are_read() {
         assert_eq!((splats.n_splats(), splats.sh_degree), (4, 0), "{name}");
         assert!(splats.means.as_flattened().iter().all(|meters| [0.0, 1.0, -1.0].contains(meters)), "{name}");
         assert!(splats.log_scales.as_flattened().iter().all(|scale| (scale - 0.1_f32.ln()).abs() < 0.04), "{name}");
-        assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all unturned");
+        assert!(splats.rotations_wxyz.iter().all(|wxyz| wxyz[0] > 0.999), "{name}: all are identity");
     }
     let newer = read(&folder.join("minimal-v4.spz")).unwrap_err().to_string();
-    assert!(newer.ends_with("version 4 of the format, only 2 and 3 are read"), "{newer}");
+    assert!(newer.ends_with("format version 4, expected 2 or 3"), "{newer}");
 }

@@ -1,4 +1,4 @@
-//! The kernels against their f64 twins, with optional features and without.
+//! Tests of the kernels against their f64 twins, with optional features and without.
 
 use super::block::{Blocks, GridCoord, N_VOXELS, stored_distance};
 use super::buffers::{Capacity, FieldBuffers};
@@ -19,10 +19,10 @@ use nalgebra::{Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-/// What rounding of distances to 16 bits, and of weights to whole 256ths, may make over a few frames.
+/// Tolerance for rounding distances to 16 bits, and weights to whole 256ths, over a few images.
 const DISTANCE_QUANTA: f64 = 4.0;
 const COLOR_ABS: f64 = 5e-4;
-/// Share of voxels and pixels where a decision may fall the other way in f32.
+/// Fraction of voxels and pixels for which f32 may decide differently.
 const MAX_UNDECIDED_FRAC: f64 = 2e-3;
 
 fn gpu_variants() -> [GpuOptions; 2] {
@@ -70,7 +70,7 @@ fn fused_voxels_match_twin() {
     }
 }
 
-/// Fuses the keyframes one after the other, on the GPU and in the twin; both give room to the same blocks.
+/// Fuses the keyframes one after the other, on the GPU and in the twin, which allocates the same blocks.
 fn fused_with_twin(options: &GpuOptions, keyframes: &[Arc<Keyframe>]) -> (Blocks, VoxelBlocks, VoxelGrid) {
     let mut model = TsdfModel::new(Gpu::open(options).unwrap(), scenes::options()).unwrap();
     let mut twin = VoxelBlocks::new();
@@ -110,7 +110,7 @@ fn compare(got: &Blocks, twin: &VoxelBlocks, voxel_grid: &VoxelGrid) {
         }
     }
     assert!(n_observed > 50 * N_VOXELS && n_colored > 20 * N_VOXELS, "{n_observed} {n_colored}");
-    assert!((n_off as f64) < MAX_UNDECIDED_FRAC * n_observed as f64, "{n_off} of {n_observed} are off");
+    assert!((n_off as f64) < MAX_UNDECIDED_FRAC * n_observed as f64, "{n_off} of {n_observed} voxels differ");
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn pictures_match_twin() {
             }
         }
         assert!(n_hits > 2000, "{n_hits}");
-        assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} are off");
+        assert!((n_off as f64) < 0.01 * n_hits as f64, "{n_off} of {n_hits} pixels differ");
         mismatches.assert_none();
     }
 }
@@ -203,7 +203,7 @@ fn readings_match_twin() {
         let mut mismatches = Mismatches::default();
         for (ix, (got, expected)) in got.iter().zip(reference::readings(depth, &voxel_grid)).enumerate() {
             mismatches.check(format!("depth {ix}"), got[0].into(), expected.depth_m, 1e-9, 1e-6);
-            mismatches.check(format!("turned {ix}"), got[1].into(), expected.ray_dot_normal, 2e-4, 1e-4);
+            mismatches.check(format!("ray_dot_normal {ix}"), got[1].into(), expected.ray_dot_normal, 2e-4, 1e-4);
         }
         mismatches.assert_none();
     }
@@ -218,7 +218,7 @@ fn non_finite_depth_is_ignored() {
         let depth = Arc::make_mut(keyframe).depth.as_mut().unwrap();
         depth.depth_m = depth.depth_m.iter().enumerate().map(|(ix, z)| fill(ix, *z)).collect::<Vec<_>>().into();
     };
-    // Holes in one, the same places poisoned in the other.
+    // Holes in one copy, non-finite values at the same pixels in the other.
     let mut with_holes = finite.clone();
     replace_depth(&mut with_holes[1], &|ix, z| if ix % 11 == 3 { 0.0 } else { z });
     replace_depth(&mut non_finite[1], &|ix, z| if ix % 11 == 3 { bad_values[ix % bad_values.len()] } else { z });
@@ -244,11 +244,11 @@ fn non_finite_depth_is_ignored() {
     }
 }
 
-/// What f32 makes of places of a metre or two, metres.
+/// Rounding error of positions of a meter or two in f32, meters.
 const POSITION_ABS_M: f64 = 1e-6;
-/// Normals are told in 16 bits a number.
+/// Normals are stored in 16 bits per component.
 const NORMAL_ABS: f64 = 2e-4;
-/// Colors are told in 8 bits; one more where f32 rounds the other way.
+/// Colors are stored in 8 bits; plus the rounding error of f32.
 const MESH_COLOR_ABS: f64 = 0.51 / 255.0;
 
 fn edge_of(vertex: &Vertex) -> u32 {
@@ -256,7 +256,7 @@ fn edge_of(vertex: &Vertex) -> u32 {
     u32::try_from(3 * (81 * z + 9 * y + x)).unwrap() + u32::try_from(axis).unwrap()
 }
 
-/// Every difference between a block's triangles and its twin's.
+/// Collects all differences between a block's triangles and its twin's.
 fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &BlockMesh, twin: &BlockTriangles) {
     let edges = |corners: &[u32; 3]| corners.map(|ix| got.vertices[ix as usize].edge);
     let got_edges: Vec<_> = got.triangles.iter().map(edges).collect();
@@ -271,7 +271,7 @@ fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &
         for axis in 0..3 {
             let label = |what: &str| format!("{what} {axis} at {block_coord:?} {:?}", expected.between);
             let along_m = f64::from(vertex.position_m[axis]);
-            mismatches.check(label("place"), along_m, expected.position_m[axis], POSITION_ABS_M, 0.0);
+            mismatches.check(label("position"), along_m, expected.position_m[axis], POSITION_ABS_M, 0.0);
             mismatches.check(label("normal"), f64::from(normal[axis]), expected.normal[axis], NORMAL_ABS, 0.0);
             let part = f64::from(color[axis]) / 255.0;
             mismatches.check(label("color"), part, expected.color_srgb[axis], MESH_COLOR_ABS, 0.0);
@@ -281,7 +281,7 @@ fn compare_triangles(mismatches: &mut Mismatches, block_coord: GridCoord, got: &
 
 #[test]
 fn triangles_match_twin() {
-    // The second does a few blocks at a time and has to make room first.
+    // The second capacity processes a few blocks at a time and must grow first.
     let capacities = [MeshCapacity::default(), MeshCapacity { n_blocks: 100, n_vertices: 1, n_triangles: 1 }];
     for (options, mesh_capacity) in gpu_variants().into_iter().zip(capacities) {
         let (blocks, voxel_grid, _) = fused(&options, &scene());

@@ -1,7 +1,7 @@
-// allocate_blocks: gives room to every block that the rays of a depth image cross near their surface.
+// allocate_blocks: allocates every block that the rays of a depth image cross near the surface.
 //
 // threads   one per pixel of the depth image
-// reads     field, frame, readings [n_pixels]
+// reads     field, depth_view, readings [n_pixels]
 // writes    status, keys, entries, coords [n_block_slots] (block coordinates of a slot)
 // twin      tsdf/reference/allocate.rs
 // source    Niessner et al. 2013, section 4.2; steps from block to block: Amanatides and Woo 1987
@@ -56,7 +56,8 @@ override WG_SIZE = 64u;
 fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u, @builtin(local_invocation_index) lane: u32) {
     let at = folded(wg, n_wgs) * WG_SIZE + lane;
     if at >= depth_view.depth_size_px.x * depth_view.depth_size_px.y { return; } // Allowed here: no barrier below.
-    if atomicLoad(&status[STOPPED]) != 0u { return; } // A frame before this one is to be done again first.
+    // An earlier depth image failed and must be fused first.
+    if atomicLoad(&status[STOPPED]) != 0u { return; }
     let depth_m = readings[at].x;
     if !(depth_m > 0.0) { return; }
     let pixel = vec2u(at % depth_view.depth_size_px.x, at / depth_view.depth_size_px.x);
@@ -69,7 +70,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let last = vec3i(floor(end));
     let toward = sign(last - block);
     let along = end - begin;
-    // Share of the way to the next face along each axis, and between faces.
+    // Fraction of the ray up to the next face along each axis, and between faces.
     let next_face = vec3f(block + max(toward, vec3i(0)));
     var reached = select(vec3f(2.0), (next_face - begin) / along, toward != vec3i(0));
     let between = select(vec3f(2.0), abs(1.0 / along), toward != vec3i(0));

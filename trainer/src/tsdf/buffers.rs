@@ -1,4 +1,4 @@
-//! The field's memory: a pool of blocks, and the table that finds them.
+//! GPU memory of the field: a pool of blocks, and the hash table that locates them.
 
 use super::block::{Block, Blocks, GridCoord, N_VOXELS};
 use super::chosen_grid::VoxelGrid;
@@ -9,9 +9,9 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
 use std::collections::BTreeSet;
 
-/// Bytes of a block on the GPU: distances, colors, its place, and whether it changed or is seen.
+/// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and `visible`.
 pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
-/// Bytes of a chunk: a key and the slots of its blocks.
+/// Bytes per chunk: a key and the slots of its blocks.
 pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
 /// Blocks gathered at once.
 const GATHER_BATCH: usize = 2048;
@@ -24,7 +24,7 @@ pub(crate) struct Capacity {
     pub(crate) n_chunks: u32,
 }
 
-/// What the kernels work on.
+/// Buffers of a field.
 #[derive(Debug)]
 pub(crate) struct FieldBuffers {
     pub(crate) capacity: Capacity,
@@ -39,7 +39,7 @@ pub(crate) struct FieldBuffers {
     pub(crate) visible: Buffer,
 }
 
-/// Most blocks that the adapter can bind.
+/// Maximum number of blocks that the adapter can bind.
 pub(crate) fn max_blocks(gpu: &Gpu) -> u32 {
     u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
 }
@@ -63,7 +63,7 @@ impl FieldBuffers {
         })
     }
 
-    /// Bytes that `n_blocks` blocks take, with the table.
+    /// Bytes of `n_blocks` blocks including the table.
     pub(crate) fn bytes(&self, n_blocks: u64) -> u64 {
         n_blocks * BYTES_PER_BLOCK + u64::from(self.capacity.n_chunks) * BYTES_PER_CHUNK
     }
@@ -72,12 +72,13 @@ impl FieldBuffers {
         gpu.read(&self.status, status::LEN)
     }
 
-    /// Blocks that have a slot.
+    /// Number of blocks that have a slot.
     pub(crate) fn n_blocks(&self, gpu: &Gpu) -> Result<u32, Error> {
         Ok(self.counters(gpu)?[status::N_BLOCKS].min(self.capacity.n_blocks))
     }
 
-    /// The same blocks with other sizes; what was asked for and found no room is forgotten, frames can be fused again.
+    /// A copy of the field with another capacity. Forgets blocks that were requested but did not fit, so that their
+    /// depth images can be fused again.
     pub(crate) fn resized(
         &self,
         gpu: &Gpu,
@@ -109,7 +110,7 @@ impl FieldBuffers {
         }
     }
 
-    /// Enters `n` blocks into the empty table; false where it is too small.
+    /// Inserts `n` blocks into the empty table. Returns false if the table is too small.
     fn index(&self, gpu: &Gpu, pipelines: &Pipelines, n: u32) -> Result<bool, Error> {
         let mut list = Passes::default();
         passes::index(gpu, &mut list, pipelines, self, n);
@@ -117,7 +118,7 @@ impl FieldBuffers {
         Ok(self.counters(gpu)?[status::FAILED] == 0)
     }
 
-    /// A field of given blocks.
+    /// A field with the given blocks.
     pub(crate) fn with_blocks(
         gpu: &Gpu,
         pipelines: &Pipelines,
@@ -147,14 +148,14 @@ impl FieldBuffers {
         gpu.write(&self.colors, 8 * 512 * slot, bytemuck::cast_slice(&block.colors));
     }
 
-    /// Places of the blocks, by slot.
+    /// Coordinates of the blocks, by slot.
     pub(crate) fn block_coords(&self, gpu: &Gpu) -> Result<Vec<GridCoord>, Error> {
         let n = self.n_blocks(gpu)? as usize;
         let coords: Vec<[i32; 4]> = gpu.read(&self.coords, n)?;
         Ok(coords.into_iter().map(|[x, y, z, _]| [x, y, z]).collect())
     }
 
-    /// The blocks of some slots.
+    /// Reads the blocks in these slots.
     pub(crate) fn read(&self, gpu: &Gpu, pipelines: &Pipelines, slots: &[u32]) -> Result<Vec<Block>, Error> {
         let mut blocks = Vec::with_capacity(slots.len());
         for part in slots.chunks(GATHER_BATCH) {
@@ -177,14 +178,14 @@ impl FieldBuffers {
         Ok(blocks)
     }
 
-    /// All blocks.
+    /// Reads all blocks.
     pub(crate) fn read_all(&self, gpu: &Gpu, pipelines: &Pipelines) -> Result<Blocks, Error> {
         let block_coords = self.block_coords(gpu)?;
         let slots: Vec<u32> = (0..).take(block_coords.len()).collect();
         Ok(block_coords.into_iter().zip(self.read(gpu, pipelines, &slots)?).collect())
     }
 
-    /// Places of the blocks that changed since the last call.
+    /// Returns the coordinates of the blocks that changed since the last call.
     pub(crate) fn take_changed(&self, gpu: &Gpu) -> Result<Vec<GridCoord>, Error> {
         let block_coords = self.block_coords(gpu)?;
         let changed: Vec<u32> = gpu.read(&self.changed, block_coords.len())?;
@@ -197,12 +198,12 @@ impl FieldBuffers {
             .collect())
     }
 
-    /// Says that nothing changed.
+    /// Marks all blocks as unchanged.
     pub(crate) fn clear_changed(&self, gpu: &Gpu) {
         gpu.clear(&self.changed, 0, self.changed.bytes());
     }
 
-    /// Says that these blocks changed, and no others.
+    /// Marks exactly these blocks as changed.
     pub(crate) fn set_changed(&self, gpu: &Gpu, changed: &BTreeSet<GridCoord>) -> Result<(), Error> {
         let flags: Vec<u32> =
             self.block_coords(gpu)?.iter().map(|block_coord| u32::from(changed.contains(block_coord))).collect();
@@ -210,8 +211,8 @@ impl FieldBuffers {
         Ok(())
     }
 
-    /// Takes the blocks of `evicted` (slots, in order) out of the pool and puts `added` in, which must
-    /// fit. Nothing may be in flight, and no changes untold.
+    /// Removes the blocks of `evicted` (slots, in order) from the pool and adds `added`, which must fit. No submit may
+    /// be in flight, and all changes must have been taken.
     pub(crate) fn swap_blocks(
         &mut self,
         gpu: &Gpu,
@@ -223,7 +224,7 @@ impl FieldBuffers {
         let block_coords = self.block_coords(gpu)?;
         let n_after = n_before as usize - evicted.len() + added.len();
         let gone: BTreeSet<u32> = evicted.iter().copied().collect();
-        // What lies past the new end moves into the holes; then those that come fill the rest.
+        // Blocks past the new end move into the holes; added blocks fill the rest.
         let end = u32::try_from(n_after).unwrap_or(u32::MAX);
         let moved_slots: Vec<u32> = (end.min(n_before)..n_before).filter(|slot| !gone.contains(slot)).collect();
         let moved = self.read(gpu, pipelines, &moved_slots)?;
@@ -244,7 +245,7 @@ impl FieldBuffers {
         self.set_n(gpu, pipelines, end)
     }
 
-    /// Says that the first `n` slots hold blocks, and enters them into an emptied table.
+    /// Sets the number of blocks to `n` and rebuilds the table.
     fn set_n(&mut self, gpu: &Gpu, pipelines: &Pipelines, n: u32) -> Result<(), Error> {
         gpu.clear(&self.keys, 0, self.keys.bytes());
         gpu.clear(&self.entries, 0, self.entries.bytes());
@@ -252,7 +253,7 @@ impl FieldBuffers {
         counters[status::N_BLOCKS] = n;
         clear_failure(&mut counters);
         gpu.write(&self.status, 0, bytemuck::cast_slice(&counters));
-        // There were as many chunks before, or more; only a clash of their places could fill the table up.
+        // There were at least as many chunks before, so only hash collisions could fill the table.
         if self.index(gpu, pipelines, n)? {
             return Ok(());
         }
@@ -264,7 +265,7 @@ impl FieldBuffers {
     }
 }
 
-/// Clears what a failed frame left, bounds and the number of chunks: they are counted anew.
+/// Clears the flags of a failed depth image, and the bounds and number of chunks, which are recounted.
 fn clear_failure(counters: &mut [u32]) {
     for ix in [status::FAILED, status::TABLE_FULL, status::STOPPED] {
         counters[ix] = 0;

@@ -1,8 +1,9 @@
-// cast_rays: a picture of the field: the first surface along each pixel's ray that faces the camera.
+// cast_rays: renders the field: the first surface along each pixel's ray that faces the camera.
 //
 // threads   one per pixel, in squares of 8x8
 // reads     view (in the field's frame), field, backdrop, status (bounds), keys, entries, geometry, colors
-// writes    pixels [n_pixels] (rgba8; a: 255 where there is a surface), depths [n_pixels] (metres along z; 0 where nothing is)
+// writes    pixels [n_pixels] (rgba8; a: 255 where there is a surface), depths [n_pixels] (meters along z; 0 without a
+//           surface)
 // twin      tsdf/reference/cast.rs
 // source    sphere tracing: Hart 1996; in truncated fields: Newcombe et al. 2011, section 3.3
 
@@ -32,13 +33,13 @@ const N_BISECTIONS = 8u;
 const CONVERGED_VOXELS = 1e-3;           // voxels
 const UNKNOWN = 1e9;
 
-// Of the chunk and block looked up last.
+// Cache of the chunk and block looked up last.
 var<private> cached_chunk: vec3i;
 var<private> cached_row: u32;
 var<private> cached_block: vec3i;
 var<private> cached_slot: u32;
 
-// The row plus one; 0 where there is none.
+// The row of a chunk plus one; 0 if there is no such chunk.
 fn row_of(chunk: vec3i) -> u32 {
     if any(chunk != cached_chunk) {
         cached_chunk = chunk;
@@ -47,7 +48,7 @@ fn row_of(chunk: vec3i) -> u32 {
     return cached_row;
 }
 
-// The slot plus one; 0 where there is none.
+// The slot of a block plus one; 0 if there is no such block.
 fn slot_of(block: vec3i) -> u32 {
     if any(block != cached_block) {
         cached_block = block;
@@ -56,14 +57,14 @@ fn slot_of(block: vec3i) -> u32 {
     return cached_slot;
 }
 
-// Place of a voxel in the pool plus one; 0 where it has none.
+// Index of a voxel in the pool plus one; 0 if its block does not exist.
 fn pool_ix_of(voxel: vec3i) -> u32 {
     let slot = slot_of(voxel >> vec3u(3u));
     if slot == 0u { return 0u; }
     return (slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel) + 1u;
 }
 
-// Distance in voxels between eight voxels' centers, or UNKNOWN where one of them was not seen.
+// Distance in voxels, interpolated between eight voxel centers; UNKNOWN if one of them was not observed.
 fn distance_at(point: vec3f) -> f32 {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -90,7 +91,7 @@ fn distance_at(point: vec3f) -> f32 {
     return sum * field.scale_m / field.voxel_m;
 }
 
-// Color between the centers of those of eight voxels that have one; grey where none has.
+// Color interpolated between those of eight voxels that have one; gray if none has.
 fn color_at(point: vec3f) -> vec3f {
     let corner = floor(point - 0.5);
     let share = point - 0.5 - corner;
@@ -110,7 +111,7 @@ fn color_at(point: vec3f) -> vec3f {
 
 struct Ray {
     origin: vec3f,            // voxels
-    along: vec3f,             // voxels per metre of depth
+    along: vec3f,             // voxels per meter of depth
     begin_m: f32,
     end_m: f32,
 }
@@ -134,7 +135,7 @@ fn exit_depth_m(ray: Ray, corner: vec3i, size: i32) -> f32 {
     return within_box(vec2f(0.0, 1e30), ray.origin, ray.along, vec3f(corner), vec3f(corner + size)).y;
 }
 
-// Depth of the crossing between a place outside and one inside; UNKNOWN where what lies between was not seen.
+// Depth of the zero crossing between a point outside and one inside; UNKNOWN if space between them was not observed.
 fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, inside_distance: f32, speed: f32) -> f32 {
     var low = vec2f(outside_m, outside_distance);
     var high = vec2f(inside_m, inside_distance);
@@ -150,12 +151,14 @@ fn crossing(ray: Ray, outside_m: f32, inside_m: f32, outside_distance: f32, insi
     return at_m;
 }
 
-// Depth of the first surface that faces the camera; UNKNOWN where there is none.
+// Depth of the first surface that faces the camera; UNKNOWN if there is none.
 fn march(ray: Ray) -> f32 {
     let speed = length(ray.along);
     var at_m = ray.begin_m;
-    var outside = vec2f(-1.0, 0.0); // Depth and distance of the last place known to be outside; depth -1: none.
-    var short_steps_until_m = -1.0; // Up to this depth steps are short: a long one passed a place that nobody saw.
+    // Depth and distance of the last point known to be outside; depth -1: none.
+    var outside = vec2f(-1.0, 0.0);
+    // Steps are short up to this depth, because a long step passed an unobserved voxel.
+    var short_steps_until_m = -1.0;
     for (var i = 0u; i < MAX_STEPS; i++) {
         if !(at_m < ray.end_m) { break; }
         let point = ray.origin + ray.along * at_m;
@@ -173,7 +176,8 @@ fn march(ray: Ray) -> f32 {
         let word = geometry[(slot - 1u) * BLOCK_VOXELS + voxel_in_block(voxel)];
         let nearest = stored_distance(word) * field.scale_m / field.voxel_m;
         let takes_short_steps = at_m < short_steps_until_m;
-        if stored_weight(word) == 0u { // One of the eight around, so they say nothing either.
+        // An unobserved voxel among the eight makes the interpolated distance unknown.
+        if stored_weight(word) == 0u {
             at_m += select(1.0, 0.25, takes_short_steps) / speed;
             continue;
         }

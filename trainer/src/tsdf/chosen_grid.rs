@@ -1,4 +1,4 @@
-//! How finely a scene is divided: given, or from the first depth image.
+//! Voxel size and related settings of a field: given, or chosen from the first depth image.
 
 use super::block::WEIGHT_ONE;
 use super::options::TsdfOptions;
@@ -7,42 +7,44 @@ use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
-/// Finest and coarsest voxels that are chosen unasked, metres.
+/// Range of automatically chosen voxel sizes, meters.
 const VOXEL_RANGE_M: [f64; 2] = [0.001, 0.2];
-/// Voxels of the least truncation.
+/// Minimum truncation in voxels.
 const TRUNCATION_VOXELS: f64 = 4.0;
-/// How many times the least truncation noise may make of it.
+/// Maximum factor by which depth noise increases the truncation.
 const MAX_TRUNCATION_FACTOR: f64 = 4.0;
-/// Of `max_bytes` the field may take for what one image shows when voxels are chosen: the scene goes on beyond it.
+/// Fraction of `max_bytes` that one image's surface may take when the voxel size is chosen: the scene extends beyond
+/// it.
 const ONE_IMAGE_FRAC: f64 = 0.1;
 
-/// A field's voxels, settled.
+/// Voxel size and related settings of a field.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VoxelGrid {
-    /// Edge of a voxel, metres.
+    /// Edge of a voxel, meters.
     pub voxel_m: f64,
-    /// Least truncation, metres.
+    /// Minimum truncation, meters.
     pub truncation_m: f64,
-    /// Most truncation, and the distance that the largest stored number stands for, metres.
+    /// Maximum truncation, and the distance that the largest stored number represents, meters.
     pub scale_m: f64,
-    /// Standard deviation of depth at 1 m, metres.
+    /// Standard deviation of depth at 1 m, meters.
     pub noise_per_m2: f64,
-    /// Depth beyond this is not believed, metres.
+    /// Readings beyond this depth are ignored, meters.
     pub max_depth_m: f64,
-    /// Most weight of a voxel, in 256ths.
+    /// Maximum weight of a voxel, in 256ths.
     pub max_weight: u32,
-    /// Where the field's coordinates begin, in world: near the first camera, so that f32 is fine anywhere.
+    /// Origin of the field's coordinates, in world, meters. It is near the first camera, where f32 is precise.
     pub anchor_m: [f64; 3],
 }
 
 impl VoxelGrid {
-    /// Settles what the options leave open by the first depth image; `None` where that shows nothing.
+    /// Chooses settings that the options leave open from the first depth image. Returns `None` if the image has no
+    /// valid readings.
     ///
-    /// A voxel is as wide as a pixel at the median depth, no less than the noise there, and wide enough that what
-    /// this image shows takes a tenth of `max_bytes`. Noise is what is left of depth when a plane through neighbors is
-    /// taken away: of `|z[-1] - 2 z[0] + z[1]|` the 90th percentile over `1.6449 sqrt(6)`. Not the median: where a sensor
-    /// tells whole steps that is 0.
+    /// The voxel size is that of a pixel at the median depth, at least the noise there, and large enough that the
+    /// surface in this image takes a tenth of `max_bytes`. Noise is the deviation of depth from a plane through its
+    /// neighbors: the 90th percentile of `|z[-1] - 2 z[0] + z[1]|` over `1.6449 sqrt(6)`. The median would be 0 for
+    /// sensors that report depth in discrete steps.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
     pub fn choose(options: &TsdfOptions, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();
@@ -51,7 +53,7 @@ impl VoxelGrid {
         let noise_per_m2 = positive(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
         let by_noise_m = noise_per_m2 * median_m * median_m;
-        // A surface of n pixels has n (px / voxel)^2 voxels, and its band about as many blocks as a 16th of them.
+        // A surface of n pixels has n (px / voxel)^2 voxels, and its truncation band has about a 16th as many blocks.
         let area_m2 = n_valid as f64 * px_m * px_m;
         let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {
             let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / super::buffers::BYTES_PER_BLOCK as f64;
@@ -80,7 +82,7 @@ impl VoxelGrid {
         Some(voxel_grid)
     }
 
-    /// Metres from the anchor along the world's axes.
+    /// Transform to meters from the anchor along the world's axes.
     pub fn field_from_world(&self) -> Transform {
         let [x, y, z] = self.anchor_m;
         Transform::from_parts(Translation3::new(-x, -y, -z), UnitQuaternion::identity())
@@ -91,7 +93,7 @@ fn positive(given: Option<f64>) -> Option<f64> {
     given.filter(|value| value.is_finite() && *value > 0.0)
 }
 
-/// Index and depth of the pixels that may be believed.
+/// Index and depth of the valid pixels.
 fn valid_depths<'a>(options: &'a TsdfOptions, depth: &'a DepthMap) -> impl Iterator<Item = (usize, f64)> + 'a {
     let depths = depth.depth_m.iter().map(|z| f64::from(*z)).enumerate();
     depths.filter(|(_, z)| *z > 0.01 && *z <= options.max_depth_m)
@@ -108,7 +110,7 @@ fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
     quantile(&mut second_differences, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
 }
 
-/// The value that so many tenths lie below.
+/// The value below which `tenths` tenths of the values lie.
 fn quantile(values: &mut [f64], tenths: usize) -> Option<f64> {
     let at = values.len() * tenths / 10;
     if values.is_empty() {

@@ -1,4 +1,4 @@
-// end_frame: counts the frame, or stops the following ones where it failed, and empties the list of visible blocks.
+// end_keyframe: counts the fused depth image, or stops later ones if it failed, and empties the list of visible blocks.
 //
 // threads   one
 // writes    status

@@ -1,10 +1,10 @@
-// find_visible: lists the blocks that a depth image may say something about. Their order is a matter of luck and reaches
-// no result: each is worked on by itself.
+// find_visible: lists the blocks that a depth image may observe. Their order depends on thread timing, but no result
+// does: blocks are processed independently.
 //
 // threads   one per block
-// reads     field, frame, coords [n_blocks]
+// reads     field, depth_view, coords [n_blocks]
 // writes    status (N_VISIBLE), visible [N_VISIBLE] (slots)
-// twin      tsdf/reference/integrate.rs, fn may_see
+// twin      tsdf/reference/integrate.rs
 
 #import field
 #import field_status

@@ -1,4 +1,4 @@
-// gather_blocks: copies some blocks to the front of other buffers, to be read there.
+// gather_blocks: copies selected blocks to contiguous buffers for reading back.
 //
 // groups    one per block; 64 threads
 // reads     listed [n_listed] (slots), geometry, colors

@@ -1,9 +1,9 @@
-// index_blocks: enters the blocks of the pool into an empty table.
+// index_blocks: inserts the blocks of the pool into an empty table.
 //
 // threads   one per block
 // reads     field, status (N_BLOCKS), coords [n_blocks]
 // writes    status (bounds, TABLE_FULL), keys, entries
-// twin      none: `model` tests that blocks are found again
+// twin      none: tests of `model` check that blocks are found again
 
 #import field
 #import field_status

@@ -1,17 +1,18 @@
-// integrate: fuses one depth image, and the color image that goes with it, into the visible blocks.
+// integrate: fuses one depth image, and the matching color image, into the visible blocks.
 //
-// groups    as many as there are: each takes a visible block after the other; 64 threads, one per column along z
-// reads     field, frame, readings [depth pixels], image [color pixels] (rgba8; a = 0 where masked), coords,
-//           visible [N_VISIBLE]
-// writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 where a voxel changed)
+// groups    any number: each processes visible blocks in turn; 64 threads, one per column along z
+// reads     field, depth_view, readings [depth pixels], image [color pixels] (rgba8; a = 0 where masked), coords,
+//           visible [N_VISIBLE], status (N_VISIBLE)
+// writes    geometry, colors [n_blocks * 512], changed [n_blocks] (1 if a voxel changed)
 // twin      tsdf/reference/integrate.rs
-// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of
-//           its cosine, as an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox:
-//           inverse square of distance, drop behind the surface). Ours: distances are taken along the surface's normal,
-//           and what is seen through loses weight instead of gaining a distance it cannot have: to see past a voxel says
-//           that nothing solid is there, not how far the nearest surface is.
-// software  lanes go through a loop together, once more where its test comes first, and through what is not for them too: so
-//           loops are tested at their end, and a column's colors, which few voxels have, wait for a loop of their own
+// source    Curless and Levoy 1996, section 3; weights: Newcombe et al. 2011 (angle; here the square of its cosine, as
+//           an error across the ray moves the surface by its tangent) and Oleynikova et al. 2017 (Voxblox: inverse
+//           square of distance, drop behind the surface). Ours: distances are measured along the surface's normal, and
+//           carving reduces the weight of a voxel instead of assigning a distance. A ray that passes through a voxel
+//           shows that nothing solid is there, but not how far away the nearest surface is.
+// software  software adapters run all lanes through a loop together, one more time if its test comes first, and through
+//           both sides of a branch. Loops are therefore tested at their end, and colors, which few voxels of a column
+//           have, are fused in a separate loop
 
 #import field
 #import field_status
@@ -29,13 +30,13 @@
 @group(0) @binding(8) var<storage, read_write> colors: array<vec2u>;
 @group(0) @binding(9) var<storage, read_write> changed: array<atomic<u32>>;
 
-// Least cosine between ray and normal that distances are shortened by: normals of steeper surfaces are mostly noise.
+// Minimum cosine between ray and normal for scaling distances: normals of steeper surfaces are mostly noise.
 const MIN_RAY_DOT_NORMAL = 0.3;
-// One look through a solid voxel takes back as many looks at it: where what lies behind is one truncation away, and where it is
-// two away or more. What is nearer may be no more than a wrong pose.
+// Number of observations of a solid voxel that one observation through it cancels: if the surface behind is one
+// truncation away, and if it is two away or more. A nearer surface may be caused by a pose error.
 const CARVING_NEAR = 1.0;
 const CARVING_FAR = 4.0;
-// Colors are kept this near to the surface, voxels: what pictures and meshes read.
+// Colors are stored up to this distance from the surface, in voxels: pictures and meshes read no others.
 const COLOR_VOXELS = 2.0;
 
 fn reading_at(pixel: vec2i) -> vec2f {
@@ -43,7 +44,7 @@ fn reading_at(pixel: vec2i) -> vec2f {
     return readings[u32(inside.y) * depth_view.depth_size_px.x + u32(inside.x)];
 }
 
-// Between four readings where all are believed, else the nearest one.
+// Interpolates four readings if all are valid, otherwise returns the nearest one.
 fn reading_near(position_px: vec2f) -> vec2f {
     let corner = floor(position_px - 0.5);
     let share = position_px - 0.5 - corner;
@@ -63,7 +64,7 @@ fn pixel_at(pixel: vec2i) -> vec4f {
     return unpack4x8unorm(image[u32(inside.y) * depth_view.color_size_px.x + u32(inside.x)]);
 }
 
-// Color at a point, between four pixels; alpha is less than 1 where it falls outside the image or on a mask.
+// Color at a point, interpolated between four pixels; alpha is less than 1 outside the image or on a mask.
 fn color_near(point_in_field: vec3f) -> vec4f {
     let point = color_from_field(depth_view, point_in_field);
     let position_px = depth_view.color_focal_px * point.xy / point.z + depth_view.color_principal_px;
@@ -89,10 +90,10 @@ fn fuse_color(at: u32, point_in_field: vec3f, weight_gain: u32) {
     colors[at] = vec2u(rgb.x | (rgb.y << 16u), rgb.z | (min(sum, field.max_weight) << 16u));
 }
 
-// What became of a voxel.
+// Result of fusing a reading into a voxel.
 struct Fused {
     changed: bool,
-    color_gain: u32,          // weight that its color is to gain; 0: too far from the surface
+    color_gain: u32,          // weight to add to its color; 0: too far from the surface
 }
 
 const UNCHANGED = Fused(false, 0u);
@@ -107,7 +108,7 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let distance_m = (reading.x - point.z) * max(reading.y, MIN_RAY_DOT_NORMAL);
     let truncation_m = truncation_at(field, reading.x);
     let ray_m = length(ray_of(depth_view, position_px));
-    // Along the ray, not the normal: past the rim of a thing a ray soon leaves it again.
+    // Along the ray rather than the normal: past the rim of an object, a ray soon leaves it again.
     let behind_m = (point.z - reading.x) * ray_m;
     if !(behind_m <= truncation_m) { return UNCHANGED; } // Hidden.
     let nearness = min(1.0, 1.0 / (reading.x * reading.x));
@@ -117,8 +118,8 @@ fn fuse(at: u32, point_in_field: vec3f) -> Fused {
     let old = geometry[at];
     let weight = stored_weight(old);
     if distance_m > truncation_m {
-        // Seen through: that counts against what was taken for solid, and says nothing else. How well it is seen is a
-        // matter of where the voxel is, not of what lies behind it.
+        // Carving only reduces the weight of solid voxels. The accuracy depends on the position of the voxel, not on
+        // the surface behind it.
         if weight == 0u || stored_distance(old) >= 0.0 { return UNCHANGED; }
         let carving = mix(CARVING_NEAR, CARVING_FAR, min(distance_m / truncation_m - 1.0, 1.0));
         let weight_loss = u32(max(floor(carving * WEIGHT_ONE * min(1.0, 1.0 / (point.z * point.z)) + 0.5), 1.0));
@@ -147,8 +148,8 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         let begin = slot * BLOCK_VOXELS + lane;
         let first = coords[slot].xyz * 8 + vec3i(vec3u(lane & 7u, lane >> 3u, 0u));
         var any_changed = false;
-        var stale = 0u;         // Bit z: the color of this voxel is due,
-        var gains = vec2u(0u); // and byte z is the weight it gains, less one.
+        var stale = 0u;         // Bit z: the color of this voxel must be fused;
+        var gains = vec2u(0u); // byte z: the weight it gains, minus one.
         var z = 0u;
         loop {
             let fused = fuse(begin + z * 64u, center_of(first, z));

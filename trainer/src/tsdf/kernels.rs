@@ -1,4 +1,4 @@
-//! The kernels of this model, compiled.
+//! The compiled kernels of this model.
 
 use crate::Error;
 use crate::gpu::{Gpu, Kernel, Pipeline, Source};
@@ -42,7 +42,7 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("march_cubes"),
 ];
 
-/// All of them, compiled.
+/// All compiled pipelines of the model.
 #[derive(Debug)]
 pub(crate) struct Pipelines {
     pub(crate) readings: Pipeline,
@@ -80,7 +80,7 @@ mod tests {
     use crate::splat::View;
     use crate::tsdf::params::{Backdrop, BlockMeshRange, DepthView, Field, MeshBatch, MeshVertex};
 
-    /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that knows it.
+    /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that declares it.
     fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
         let layouts = super::KERNELS.iter().filter_map(|kernel| {
             let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();

@@ -1,10 +1,10 @@
-// list_due: lists the blocks whose triangles may be others than before: those that changed and all beside them, whose
-// cubes and normals read their voxels. The list's order is a matter of luck; each block is worked on by itself.
+// list_stale: lists the blocks whose triangles may have changed: blocks that changed and all neighbors, whose cubes and
+// normals read their voxels. The order depends on thread timing; blocks are processed independently.
 //
 // groups    one per block of the pool; 32 threads, 27 of them for the block or a neighbor each
 // reads     field, status, coords, changed, keys, entries
-// writes    is_due [n_block_slots] (all 0 before), due [1 + n_due] (how many, 0 before; then slots)
-// twin      none: mesh/tests.rs compares a mesh that followed with one made at once
+// writes    is_stale [n_block_slots] (all 0 before), stale [1 + n_stale] (count, 0 before; then slots)
+// twin      none: mesh/tests.rs compares an incrementally updated mesh with one built at once
 
 #import field
 #import field_status

@@ -1,14 +1,15 @@
-// march_cubes: the triangles of the cubes whose lowest corner lies in a block, for each block of a piece of a list. Cubes
-// with a corner that nobody saw have none.
+// march_cubes: the triangles of the cubes whose lowest corner is in a block, for each block of a batch. Cubes with an
+// unobserved corner have none.
 //
 // groups    one per block; 256 threads, two cubes each
-// reads     field, piece, coords, keys, entries, geometry, colors, due [1 + n_due] (how many, then slots),
-//           cases [256 * 6] (how many triangles, then each one's edges, five bits each: corner, axis)
-// writes    needed (how much is needed), parts [n_most], vertices, triangles [3 each] (counterclockwise as seen from
-//           outside; indices into `vertices`). Where a block's triangles go is a matter of luck, their order is not;
-//           a block that finds no room writes none.
+// reads     field, batch, coords, keys, entries, geometry, colors, stale [1 + n_stale] (count, then slots), cases [256
+//           * 6] (number of triangles, then each one's edges, five bits each: corner, axis)
+// writes    needed (required capacity), parts [max_blocks], vertices, triangles [3 each] (counterclockwise when viewed
+//           from outside; indices into `vertices`). The position of a block's triangles depends on thread timing, their
+//           order does not; a block that does not fit writes none.
 // twin      tsdf/reference/march.rs
-// source    Lorensen and Cline 1987; ours: a block's room by one atomic addition after a scan within the block
+// source    Lorensen and Cline 1987; ours: a block's range is allocated by one atomic addition after a scan within the
+//           block
 
 #import field
 #import field_lookup
@@ -30,33 +31,33 @@
 @group(0) @binding(11) var<storage, read_write> vertices: array<MeshVertex>;
 @group(0) @binding(12) var<storage, read_write> triangles: array<u32>;
 
-// What a block's vertices and normals read: one voxel before it and two behind, along each axis.
+// Voxels that a block's vertices and normals read: one before it and two behind, along each axis.
 const TILE_VOXELS = 1331u;
 const TILE_STEPS = vec3u(1u, 11u, 121u);
-// Edges of the block's cubes, nine voxels along each axis, and the words that hold a bit of each.
+// Edges of the block's cubes, nine voxels along each axis, and the words that hold one bit per edge.
 const CUBE_EDGES = 2187u;
 const EDGE_STEPS = vec3u(3u, 27u, 243u);
 const USED_WORDS = 69u;
 const CASE_WORDS = 6u;
 const GRAY = vec3f(0.5);
 
-var<workgroup> wg_slots: array<u32, 27>;           // plus one, of the blocks around
+var<workgroup> wg_slots: array<u32, 27>;           // plus one, of the neighboring blocks
 var<workgroup> wg_words: array<u32, TILE_VOXELS>;
 var<workgroup> wg_used: array<atomic<u32>, USED_WORDS>;
-var<workgroup> wg_before: array<u32, USED_WORDS>;  // Vertices of the words before.
-var<workgroup> wg_edges: array<u32, CUBE_EDGES>;   // that have a vertex, in order
-var<workgroup> wg_begin: vec2u;                    // Where the block's vertices and triangles go.
+var<workgroup> wg_before: array<u32, USED_WORDS>;  // Number of vertices in the words before.
+var<workgroup> wg_edges: array<u32, CUBE_EDGES>;   // edges that have a vertex, in order
+var<workgroup> wg_begin: vec2u;                    // Where the block's vertices and triangles are written.
 
 fn corner_of(corner: u32) -> vec3u {
     return vec3u(corner & 1u, (corner >> 1u) & 1u, corner >> 2u);
 }
 
-// Voxels of the block and those around, from -1 on, in the tile.
+// Index in the tile of a voxel of the block or its surroundings, from -1 on.
 fn tile_ix(voxel: vec3u) -> u32 {
     return dot(voxel + 1u, TILE_STEPS);
 }
 
-// Bit c of a cube's case: corner c lies inside; 0 where one was not seen.
+// Bit c of a cube's case: corner c is inside; 0 if any corner was not observed.
 fn case_of(cube: vec3u) -> u32 {
     let first = tile_ix(cube);
     var inside = 0u;
@@ -69,7 +70,7 @@ fn case_of(cube: vec3u) -> u32 {
     return select(0u, inside, is_observed);
 }
 
-// Number of a triangle's edge among those of all the block's cubes.
+// Index of a triangle's edge among those of all the block's cubes.
 fn edge_of(cube: vec3u, codes: u32, corner: u32) -> u32 {
     let code = (codes >> (5u * corner)) & 31u;
     return dot(cube + corner_of(code & 7u), EDGE_STEPS) + (code >> 3u);
@@ -79,7 +80,7 @@ fn cube_of(ix: u32) -> vec3u {
     return vec3u(ix & 7u, (ix >> 3u) & 7u, ix >> 6u);
 }
 
-// Notes which edges have a vertex; returns how many triangles there are.
+// Marks the edges that have a vertex; returns the number of triangles.
 fn mark_edges(cube_ix: u32) -> u32 {
     let cube = cube_of(cube_ix);
     let row = CASE_WORDS * case_of(cube);
@@ -93,7 +94,7 @@ fn mark_edges(cube_ix: u32) -> u32 {
     return n;
 }
 
-// Returns where the next cube's triangles go.
+// Writes a cube's triangles and returns the position of the next cube's triangles.
 fn write_triangles(cube_ix: u32, begin: u32) -> u32 {
     let cube = cube_of(cube_ix);
     let row = CASE_WORDS * case_of(cube);
@@ -108,7 +109,7 @@ fn write_triangles(cube_ix: u32, begin: u32) -> u32 {
     return begin + n;
 }
 
-// Change of the distance along an axis, from both sides where both were seen.
+// Derivative of the distance along an axis, two-sided if both neighbors were observed.
 fn gradient_along(at: u32, step: u32) -> f32 {
     let low = wg_words[at - step];
     let here = wg_words[at];
@@ -123,13 +124,14 @@ fn gradient_at(at: u32) -> vec3f {
     return vec3f(gradient_along(at, TILE_STEPS.x), gradient_along(at, TILE_STEPS.y), gradient_along(at, TILE_STEPS.z));
 }
 
-// Place of a voxel in the pool plus one, given from the block before this one; 0 where it has none.
+// Index of a voxel in the pool plus one, with coordinates relative to the preceding block; 0 if its block does not
+// exist.
 fn pool_ix_of(voxel: vec3u) -> u32 {
     let slot = wg_slots[dot(voxel >> vec3u(3u), vec3u(1u, 3u, 9u))];
     return select(0u, (slot - 1u) * BLOCK_VOXELS + voxel_in_block(vec3i(voxel)) + 1u, slot != 0u);
 }
 
-// Red, green, blue and 1; all 0 where the voxel has none.
+// Red, green, blue and 1; all 0 if the voxel has no color.
 fn color_at(voxel: vec3u) -> vec4f {
     let pool_ix = pool_ix_of(voxel + 8u);
     if pool_ix == 0u { return vec4f(0.0); }
@@ -160,7 +162,7 @@ fn vertex_of(block: vec3i, edge: u32) -> MeshVertex {
     let normal = select(vec3f(along) * sign(there - here), gradient / gradient_norm, gradient_norm > 1e-12);
     let near = color_at(voxel);
     let far = color_at(voxel + along);
-    // That of the one that has a color, where not both do.
+    // If only one of them has a color, use that one.
     let only = select(vec4f(GRAY, 1.0), near + far, near.a + far.a > 0.0);
     let rgba = select(only, mix(near, far, share), near.a * far.a > 0.0);
     return MeshVertex(array(position_m.x, position_m.y, position_m.z), edge, octahedral(normal), pack4x8unorm(rgba));
@@ -173,14 +175,14 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let block = coords[stale[1u + batch.first + ix]].xyz;
     if lane < 27u { wg_slots[lane] = find_slot(block + around(lane)); }
     if lane < USED_WORDS { atomicStore(&wg_used[lane], 0u); }
-    workgroupBarrier(); // Slots are known before voxels are looked for.
+    workgroupBarrier(); // Slots are written before voxels are looked up.
     for (var at = lane; at < TILE_VOXELS; at += 256u) {
         let pool_ix = pool_ix_of(vec3u(at % 11u, at / 11u % 11u, at / 121u) + 7u);
         var word = 0u;
         if pool_ix != 0u { word = geometry[pool_ix - 1u]; }
         wg_words[at] = word;
     }
-    workgroupBarrier(); // All voxels are there, and no edge is marked.
+    workgroupBarrier(); // All voxels are written, and no edge is marked.
     let n_triangles = mark_edges(2u * lane) + mark_edges(2u * lane + 1u);
     workgroupBarrier(); // All edges are marked.
     var used_bits = 0u;
@@ -202,7 +204,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
         wg_begin = begin;
         parts[ix] = BlockMeshRange(array(block.x, block.y, block.z), begin.x, n.x, begin.y, n.y);
     }
-    workgroupBarrier(); // The block's room and the list of its edges are known.
+    workgroupBarrier(); // The block's ranges and the list of its edges are written.
     let begin = wg_begin;
     if begin.x + n.x > arrayLength(&vertices) || 3u * (begin.y + n.y) > arrayLength(&triangles) { return; }
     for (var at = lane; at < n.x; at += 256u) {

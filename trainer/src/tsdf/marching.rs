@@ -1,4 +1,4 @@
-//! Makes the triangles of blocks on the GPU and brings them to the host.
+//! Extracts the triangles of blocks on the GPU and reads them back.
 
 use super::block::GridCoord;
 use super::buffers::FieldBuffers;
@@ -9,14 +9,14 @@ use super::passes;
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes};
 
-/// How much is done at once.
+/// Sizes of a batch of blocks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MeshCapacity {
-    /// Blocks of a dispatch; a field's list may be longer.
+    /// Maximum number of blocks per dispatch; a field's list may be longer.
     pub(crate) n_blocks: u32,
-    /// At the start; grown to what a piece needs.
+    /// Initial capacity; grown to the needs of a batch.
     pub(crate) n_vertices: u32,
-    /// Likewise.
+    /// Initial capacity; grown to the needs of a batch.
     pub(crate) n_triangles: u32,
 }
 
@@ -26,7 +26,7 @@ impl Default for MeshCapacity {
     }
 }
 
-/// What the kernels of the mesh write.
+/// Buffers that the mesh kernels write.
 #[derive(Debug)]
 pub(crate) struct MeshBuffers {
     pub(crate) mesh_capacity: MeshCapacity,
@@ -40,11 +40,11 @@ pub(crate) struct MeshBuffers {
     pub(crate) triangles: Buffer,
 }
 
-/// Words of `needed`: vertices, triangles.
+/// Number of words in `needed`: vertices, triangles.
 const N_NEEDED: usize = 2;
 
 impl MeshBuffers {
-    /// For a pool of so many blocks.
+    /// Buffers for a pool of `n_block_slots` blocks.
     pub(crate) fn new(gpu: &Gpu, mesh_capacity: MeshCapacity, n_block_slots: u32) -> Result<Self, Error> {
         Ok(Self {
             mesh_capacity,
@@ -61,12 +61,12 @@ impl MeshBuffers {
         })
     }
 
-    /// Whether a pool of so many blocks can be listed.
+    /// Whether the buffers are large enough for a pool of `n_block_slots` blocks.
     pub(crate) fn has_capacity_for(&self, n_block_slots: u32) -> bool {
         self.is_stale.bytes() >= 4 * u64::from(n_block_slots)
     }
 
-    /// Makes the triangles of the blocks that changed, and of those beside them, anew.
+    /// Extracts the triangles of the blocks that changed, and of their neighbors.
     pub(crate) fn mesh_changed(
         &mut self,
         gpu: &Gpu,
@@ -79,7 +79,7 @@ impl MeshBuffers {
         self.mesh_listed(gpu, pipelines, field)
     }
 
-    /// Makes the triangles of the blocks in these slots.
+    /// Extracts the triangles of the blocks in these slots.
     pub(crate) fn mesh_slots(
         &mut self,
         gpu: &Gpu,
@@ -92,7 +92,7 @@ impl MeshBuffers {
         self.mesh_listed(gpu, pipelines, field)
     }
 
-    /// GPU time of the passes of [`Self::mesh_changed`] over the first piece, which reads nothing back.
+    /// GPU time of the passes of [`Self::mesh_changed`] over the first batch, without read-back.
     pub(crate) fn profile(
         &self,
         gpu: &Gpu,
@@ -149,7 +149,7 @@ impl MeshBuffers {
         Ok(())
     }
 
-    /// Reads what a piece made.
+    /// Reads the triangles of a batch.
     fn read_back(
         &self,
         gpu: &Gpu,
@@ -177,7 +177,7 @@ impl MeshBuffers {
     }
 }
 
-/// The 256 cases as the kernel reads them: how many triangles, and three edges of each in five bits: corner, axis.
+/// The 256 cases in the format of the kernel: number of triangles, and three edges of each in five bits: corner, axis.
 fn case_words() -> Vec<u32> {
     CASES
         .iter()

@@ -1,4 +1,4 @@
-//! The surface of a field as triangles.
+//! Triangle mesh of the surface of a field.
 
 mod cases;
 mod cluster;
@@ -16,17 +16,17 @@ pub use ply::write as write_ply;
 #[cfg(test)]
 mod tests;
 
-/// Triangles with shared vertices, in order of the blocks they come from.
+/// Triangles with shared vertices, in the order of their blocks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
-    /// What positions are counted from, in world, metres: f32 is fine near it.
+    /// Origin of the positions, in world, meters. f32 is precise near it.
     pub origin_m: [f64; 3],
-    /// From `origin_m`, along the world's axes, metres.
+    /// Relative to `origin_m`, along the world's axes, meters.
     pub positions_m: Vec<[f32; 3]>,
-    /// Out of the surface, of length 1; along the world's axes.
+    /// Outward normals of length 1, along the world's axes.
     pub normals: Vec<[f32; 3]>,
     /// Red, green, blue.
     pub colors_srgb: Vec<[u8; 3]>,
-    /// Counterclockwise as seen from outside.
+    /// Vertex indices, counterclockwise when viewed from outside.
     pub triangles: Vec<[u32; 3]>,
 }

@@ -1,4 +1,4 @@
-//! The distance field as a [`Method`]: a step fuses a keyframe.
+//! The distance field as a [`Method`]: one step fuses one keyframe.
 
 mod budget;
 mod checkpoint;
@@ -27,19 +27,20 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Most keyframes of a submit: their images lie on the GPU at once.
+/// Maximum number of keyframes per submit: their images are on the GPU at once.
 const KEYFRAMES_PER_SUBMIT: usize = 4;
-/// Room at the start.
+/// Initial capacity.
 const INITIAL_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
-/// Fewer blocks show no scene: voxels are chosen so that one image takes a tenth of them.
+/// Minimum number of blocks that the budget must allow: the voxel size is chosen so that one image takes a tenth of
+/// them.
 const MIN_BLOCKS: u32 = 256;
-/// The table at the start, and the fewest blocks.
+/// Minimum budget: the initial table and the minimum number of blocks.
 pub(super) const MIN_BYTES: u64 =
     INITIAL_CAPACITY.n_chunks as u64 * buffers::BYTES_PER_CHUNK + MIN_BLOCKS as u64 * buffers::BYTES_PER_BLOCK;
 
 /// A colored distance field built from keyframes with depth.
 ///
-/// Each keyframe is fused once, in the order they are pushed in; keyframes without depth say nothing and are passed over.
+/// Each keyframe is fused once, in the order they are pushed. Keyframes without depth are ignored.
 #[derive(Debug)]
 pub struct TsdfModel {
     gpu: Arc<Gpu>,
@@ -50,22 +51,22 @@ pub struct TsdfModel {
     slots: Vec<KeyframeSlot>,
     canvas: Option<Canvas>,
     passes: Passes,
-    /// Not known to be fused, in order; the first of them may be in flight.
+    /// Keyframes not confirmed as fused yet, in order. The first ones may be in flight.
     pending: VecDeque<Arc<Keyframe>>,
     fused: Vec<KeyframeSignature>,
-    /// Keyframes that a loaded state waits for; nobody may bring them.
+    /// Pending keyframes of a loaded checkpoint that were not provided.
     unmatched: Vec<KeyframeSignature>,
     in_flight: Option<InFlight>,
-    /// Blocks that found no room on the GPU.
+    /// Blocks that do not fit on the GPU.
     host_blocks: Blocks,
-    /// Blocks that changed since the mesh was made, besides those that the GPU has flags for.
+    /// Blocks that changed since the mesh was updated, in addition to those flagged on the GPU.
     stale: BTreeSet<GridCoord>,
     mesher: Mesher,
     mesh_buffers: Option<MeshBuffers>,
     n_resident: u32,
     n_skipped: u64,
     n_outside: u32,
-    /// Frames the GPU had counted when it was last asked.
+    /// Counter of fused depth images when the GPU was last read.
     n_fused_on_gpu: u32,
     step: u64,
     step_millis: f64,
@@ -81,7 +82,7 @@ struct InFlight {
 }
 
 impl TsdfModel {
-    /// An empty model; refused where it may not even have the memory of the smallest.
+    /// An empty model. Fails if `max_bytes` is below the minimum.
     pub fn new(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
         match options.max_bytes {
             Some(max_bytes) if max_bytes < MIN_BYTES => {
@@ -91,7 +92,7 @@ impl TsdfModel {
         }
     }
 
-    /// An empty model; where it may have less memory than the smallest it leaves out what it finds no room for.
+    /// An empty model. If `max_bytes` is below the minimum, it skips depth images that do not fit.
     pub(super) fn without_budget_check(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
         Ok(Self {
             pipelines: Pipelines::new(&gpu)?,
@@ -120,32 +121,32 @@ impl TsdfModel {
         })
     }
 
-    /// How it was asked to be built.
+    /// Options of this model.
     pub fn options(&self) -> &TsdfOptions {
         &self.options
     }
 
-    /// How finely the scene is divided; `None` before the first depth.
+    /// Voxel size and related settings; `None` before the first depth image.
     pub fn voxel_grid(&self) -> Option<&VoxelGrid> {
         self.voxel_grid.as_ref()
     }
 
-    /// Keyframes that showed more at once than the memory allowed holds; they were left out.
+    /// Number of keyframes that were skipped because they observe more blocks than fit into memory.
     pub fn n_skipped(&self) -> u64 {
         self.n_skipped
     }
 
-    /// Readings whose surface lay further out than blocks have places for.
+    /// Number of readings whose surface was too far out for block coordinates.
     pub fn n_outside(&self) -> u32 {
         self.n_outside
     }
 
-    /// Blocks that wait in host memory.
+    /// Number of blocks in host memory.
     pub fn n_host_blocks(&self) -> usize {
         self.host_blocks.len()
     }
 
-    /// All blocks, in order of their places.
+    /// All blocks, ordered by their coordinates.
     pub fn blocks(&mut self) -> Result<Blocks, Error> {
         self.finish_in_flight()?;
         let mut blocks = self.host_blocks.clone();
@@ -155,7 +156,7 @@ impl TsdfModel {
         Ok(blocks)
     }
 
-    /// Most blocks the GPU may hold beside the table that finds them.
+    /// Maximum number of blocks on the GPU, in addition to the table.
     fn max_blocks(&self) -> u32 {
         self.max_blocks_with_table(self.field.as_ref().map_or(INITIAL_CAPACITY, |field| field.capacity).n_chunks)
     }
@@ -167,9 +168,10 @@ impl TsdfModel {
         buffers::max_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 
-    /// Settles voxels by the first depth image that shows something; those before it are done with. False where none does.
+    /// Chooses the voxel size from the first depth image with valid readings and discards earlier ones. Returns whether
+    /// there was one.
     fn begin(&mut self) -> Result<bool, Error> {
-        // What one binding holds is a limit as good as any.
+        // The size of one binding limits the field like a budget does.
         let max_bytes = Some(u64::from(self.max_blocks()) * buffers::BYTES_PER_BLOCK);
         let options = TsdfOptions { max_bytes, ..self.options.clone() };
         while self.voxel_grid.is_none() {
@@ -187,7 +189,8 @@ impl TsdfModel {
         Ok(!self.pending.is_empty())
     }
 
-    /// Fuses one keyframe where none was: then there is something to show. No more than that, or looking would count as learning.
+    /// Fuses one keyframe if none was fused yet, so that there is something to render. It fuses no more, so that
+    /// rendering does not train.
     fn fuse_one(&mut self) -> Result<(), Error> {
         while self.step == 0 && !self.pending.is_empty() {
             self.step(1)?;
@@ -205,7 +208,7 @@ impl TsdfModel {
         n
     }
 
-    /// Takes the first pending keyframe for done.
+    /// Marks the first pending keyframe as fused.
     fn skip_first(&mut self) {
         if let Some(keyframe) = self.pending.pop_front() {
             self.fused.push(KeyframeSignature::of(&keyframe));
@@ -213,7 +216,7 @@ impl TsdfModel {
         }
     }
 
-    /// Lists the passes of a pending keyframe.
+    /// Records the passes of a pending keyframe.
     fn record(&mut self, pending_ix: usize, slot_ix: usize) -> Result<(), Error> {
         let (Some(voxel_grid), Some(keyframe)) = (&self.voxel_grid, self.pending.get(pending_ix)) else {
             return Ok(());
@@ -235,7 +238,7 @@ impl TsdfModel {
         Ok(())
     }
 
-    /// Waits for the submit in flight and takes note of what it did; says whether something found no room.
+    /// Waits for the submit in flight and applies its counters. Returns whether the buffers overflowed.
     fn finish_in_flight(&mut self) -> Result<bool, Error> {
         let Some(in_flight) = self.in_flight.take() else { return Ok(false) };
         let counters: Vec<u32> = in_flight.status.finish(&self.gpu)?;
@@ -244,7 +247,7 @@ impl TsdfModel {
         self.apply_counters(&counters)
     }
 
-    /// Counts what was fused; makes room where there was none and says so.
+    /// Counts fused keyframes. If the buffers overflowed, grows them and returns true.
     fn apply_counters(&mut self, counters: &[u32]) -> Result<bool, Error> {
         for _ in 0..counters[status::N_FUSED].wrapping_sub(self.n_fused_on_gpu) {
             self.skip_first();
@@ -260,7 +263,7 @@ impl TsdfModel {
         Ok(failed)
     }
 
-    /// Gives a field that was too small more room, on the GPU or by sending blocks to wait.
+    /// Grows a field that overflowed, on the GPU or by moving blocks to host memory.
     fn grow(&mut self, counters: &[u32]) -> Result<(), Error> {
         let (Some(voxel_grid), Some(field)) = (&self.voxel_grid, &self.field) else { return Ok(()) };
         let mut capacity = field.capacity;
@@ -270,11 +273,11 @@ impl TsdfModel {
         let (n_blocks_needed, n_blocks_allowed) =
             (counters[status::N_BLOCKS], self.max_blocks_with_table(capacity.n_chunks));
         if n_blocks_needed > capacity.n_blocks {
-            let n_blocks_wanted = n_blocks_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
-            capacity.n_blocks = n_blocks_wanted.min(n_blocks_allowed).max(capacity.n_blocks);
+            let n_blocks_target = n_blocks_needed.max(capacity.n_blocks.saturating_add(capacity.n_blocks / 2));
+            capacity.n_blocks = n_blocks_target.min(n_blocks_allowed).max(capacity.n_blocks);
         }
         if capacity != field.capacity {
-            log::debug!("tsdf: room for {capacity:?}");
+            log::debug!("tsdf: grown to {capacity:?}");
             let resized = field.resized(&self.gpu, &self.pipelines, voxel_grid, capacity)?;
             self.passes.clear_bindings();
             self.field = Some(resized);
@@ -282,7 +285,7 @@ impl TsdfModel {
         if n_blocks_needed > n_blocks_allowed { self.evict(n_blocks_needed - n_blocks_allowed) } else { Ok(()) }
     }
 
-    /// Draws one pinhole view.
+    /// Renders one pinhole view.
     fn draw_view(&mut self, camera: &Camera, background_srgb: [f32; 3], depth: bool) -> Result<Picture, Error> {
         if !self.record_picture(camera, background_srgb)? {
             return Ok(Picture::empty(camera.size_px, background_srgb, depth));
@@ -295,7 +298,7 @@ impl TsdfModel {
         read.finish_with(&self.gpu, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
-    /// GPU time of a pinhole picture, milliseconds, without bringing it to the host; `None` where the adapter tells none.
+    /// GPU time of a pinhole picture, milliseconds, without reading it back; `None` if the adapter has no timestamps.
     pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
         self.finish_in_flight()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
@@ -305,7 +308,7 @@ impl TsdfModel {
         self.passes.submit_timed_total(&self.gpu)
     }
 
-    /// Lists what a picture takes; false where there is nothing to draw.
+    /// Records the passes of a picture. Returns false if there is nothing to render.
     fn record_picture(&mut self, camera: &Camera, background_srgb: [f32; 3]) -> Result<bool, Error> {
         let [width, height] = camera.size_px;
         let n = u64::from(width) * u64::from(height);
@@ -324,7 +327,7 @@ impl TsdfModel {
     }
 }
 
-/// The camera, and what it is cropped to, in the field's frame.
+/// The camera and its crop box in the field's frame.
 fn in_field(camera: &Camera, voxel_grid: &VoxelGrid) -> Camera {
     let field_from_world = voxel_grid.field_from_world();
     let mut camera = camera.clone();
@@ -353,8 +356,8 @@ impl Method for TsdfModel {
         Ok(())
     }
 
-    /// A keyframe that was not fused yet is forgotten. What was fused stays: sums do not tell who gave what; it fades as
-    /// others look at the same place.
+    /// Removes a keyframe that was not fused yet. Fused keyframes stay, because their contribution to the sums is
+    /// unknown; they fade as later keyframes observe the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?;
         self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
@@ -373,7 +376,7 @@ impl Method for TsdfModel {
         }
         let n_in_flight = self.in_flight.as_ref().map_or(0, |in_flight| in_flight.n_keyframes);
         let n_left = (self.pending.len() - n_in_flight.min(self.pending.len())) as u64;
-        let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not know of those in flight.
+        let n_asked = n.saturating_sub(n_in_flight as u64); // `progress` does not include keyframes in flight.
         let n_keyframes = usize::try_from(n_asked.min(n_left)).unwrap_or(usize::MAX).min(self.keyframes_per_submit());
         if n_keyframes == 0 {
             self.finish_in_flight()?;
@@ -385,12 +388,12 @@ impl Method for TsdfModel {
         }
         let field = self.field.as_ref().ok_or(Error::DeviceLost)?;
         let status = self.passes.submit_reading(&self.gpu, &[(&field.status, 4 * status::LEN)]);
-        let failed = self.finish_in_flight()?; // The submit before; this one runs meanwhile.
+        let failed = self.finish_in_flight()?; // Waits for the previous submit while this one runs.
         if !failed {
             self.in_flight = Some(InFlight { status, n_keyframes, since });
-        } // Else this one found the failure too and did nothing.
+        } // Otherwise the new submit found the failure too and did nothing.
         if n_keyframes as u64 == n_asked || n_keyframes as u64 == n_left {
-            self.finish_in_flight()?; // The caller stops here: the count must be true.
+            self.finish_in_flight()?; // The caller expects a correct count.
         }
         Ok(n_keyframes as u64)
     }

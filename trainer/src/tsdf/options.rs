@@ -1,4 +1,4 @@
-//! How a distance field is built.
+//! Options of a distance field.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,18 +6,20 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TsdfOptions {
-    /// Edge of a voxel, metres; `None`: from the first depth image, see [`super::VoxelGrid::choose`].
+    /// Edge of a voxel, meters; `None`: chosen from the first depth image, see [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
-    /// Least distance from a surface that is kept, metres; `None`: four voxels.
+    /// Minimum truncation distance, meters; `None`: four voxels.
     pub truncation_m: Option<f64>,
-    /// Standard deviation of depth at 1 m, metres; it grows with the square. `None`: from the first depth image.
+    /// Standard deviation of depth at 1 m, meters; it grows with the square of depth. `None`: estimated from the first
+    /// depth image.
     pub noise_per_m2: Option<f64>,
-    /// Depth beyond this is not believed, metres.
+    /// Readings beyond this depth are ignored, meters.
     pub max_depth_m: f64,
-    /// Most weight a voxel has, in looks from 1 m; the smaller, the sooner moved things fade. Up to 255.
+    /// Maximum weight of a voxel, in observations from 1 m; up to 255. With a smaller maximum, moved objects fade
+    /// sooner.
     pub max_weight: f64,
-    /// Most bytes of GPU memory that blocks and the table that finds them may take; past them blocks furthest from the camera wait in
-    /// host memory. (What the table grows by once all room is taken comes on top.)
+    /// Maximum GPU memory for blocks and their table, in bytes. When it is used up, the blocks farthest from the camera
+    /// move to host memory. (Growth of the table after that point is added on top.)
     pub max_bytes: Option<u64>,
 }
 

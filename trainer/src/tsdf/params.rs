@@ -1,4 +1,4 @@
-//! Small structs the kernels read, with the layouts of their WGSL twins.
+//! Small structs that kernels read, with the layouts of their WGSL counterparts.
 
 use super::chosen_grid::VoxelGrid;
 use crate::Keyframe;
@@ -57,7 +57,7 @@ pub(crate) struct DepthView {
 }
 
 impl DepthView {
-    /// `None` where the keyframe has no depth.
+    /// Returns `None` if the keyframe has no depth.
     pub(crate) fn of(keyframe: &Keyframe, voxel_grid: &VoxelGrid) -> Option<Self> {
         let depth = keyframe.depth.as_ref()?;
         let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;

@@ -1,4 +1,4 @@
-//! What a frame, a picture and a rebuilt table take, as lists of passes.
+//! Lists of passes for fusing a depth image, rendering a picture and rebuilding the table.
 
 use super::buffers::FieldBuffers;
 use super::kernels::Pipelines;
@@ -8,10 +8,10 @@ use crate::gpu::{Buffer, Gpu, Passes};
 use crate::splat::View;
 use crate::{Error, Keyframe};
 
-/// Most workgroups that share the visible blocks: enough to fill any GPU.
+/// Maximum number of workgroups that share the visible blocks: enough to fill any GPU.
 const MAX_INTEGRATE_GROUPS: u32 = 8192;
 
-/// One keyframe on the GPU, and what is made of its depth.
+/// Buffers for one keyframe, and the readings derived from its depth.
 #[derive(Debug)]
 pub(crate) struct KeyframeSlot {
     depth_view: Buffer,
@@ -22,7 +22,7 @@ pub(crate) struct KeyframeSlot {
 }
 
 impl KeyframeSlot {
-    /// Room for images like these.
+    /// Buffers for images of these sizes.
     pub(crate) fn new(gpu: &Gpu, n_depth_pixels: u64, n_color_pixels: u64) -> Result<Self, Error> {
         Ok(Self {
             depth_view: gpu.uniform_with("tsdf.depth_view", &<DepthView as bytemuck::Zeroable>::zeroed()),
@@ -38,7 +38,7 @@ impl KeyframeSlot {
         self.depth.bytes() >= 4 * n_depth_pixels && self.image.bytes() >= 4 * n_color_pixels
     }
 
-    /// Takes a keyframe's images; they must fit.
+    /// Uploads a keyframe's images, which must fit.
     pub(crate) fn upload(&mut self, gpu: &Gpu, keyframe: &Keyframe, depth_view: &DepthView) {
         let Some(depth) = &keyframe.depth else { return };
         gpu.write(&self.depth_view, 0, bytemuck::bytes_of(depth_view));
@@ -53,7 +53,7 @@ impl KeyframeSlot {
     }
 }
 
-/// Fuses a frame.
+/// Fuses a depth image.
 pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, slot: &KeyframeSlot) {
     let FieldBuffers { capacity, field, status, keys, entries, coords, geometry, colors, changed, visible } = buffers;
     let KeyframeSlot { depth_view, depth, image, readings, n_pixels } = slot;
@@ -104,7 +104,7 @@ pub(crate) fn fuse(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers:
     list.dispatch(gpu, &pipelines.end_keyframe, 1, &[("status", status)]);
 }
 
-/// Enters the first `n` blocks into the empty table.
+/// Inserts the first `n` blocks into the empty table.
 pub(crate) fn index(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, n: u32) {
     let FieldBuffers { field, status, keys, entries, coords, .. } = buffers;
     list.dispatch(
@@ -115,7 +115,7 @@ pub(crate) fn index(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers
     );
 }
 
-/// Copies `n` listed blocks to the front of other buffers.
+/// Copies `n` listed blocks to contiguous buffers.
 pub(crate) fn gather(
     gpu: &Gpu,
     list: &mut Passes,
@@ -139,7 +139,7 @@ pub(crate) fn gather(
     );
 }
 
-/// Lists the blocks whose triangles may be others than before.
+/// Lists the blocks whose triangles may have changed.
 pub(crate) fn list_stale(
     gpu: &Gpu,
     list: &mut Passes,
@@ -167,7 +167,7 @@ pub(crate) fn list_stale(
     );
 }
 
-/// Makes the triangles of a piece of the list.
+/// Extracts the triangles of a batch of the list.
 pub(crate) fn march(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers: &FieldBuffers, mesh: &MeshBuffers) {
     let FieldBuffers { capacity, field, keys, entries, coords, geometry, colors, .. } = buffers;
     list.clear(&mesh.needed);
@@ -193,7 +193,7 @@ pub(crate) fn march(gpu: &Gpu, list: &mut Passes, pipelines: &Pipelines, buffers
     );
 }
 
-/// A picture and where it is drawn.
+/// Buffers that a picture is rendered into.
 #[derive(Debug)]
 pub(crate) struct Canvas {
     view: Buffer,
@@ -221,7 +221,7 @@ impl Canvas {
     }
 }
 
-/// Draws what the canvas is aimed at.
+/// Renders the view of the canvas.
 pub(crate) fn draw(
     gpu: &Gpu,
     list: &mut Passes,

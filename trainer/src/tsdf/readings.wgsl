@@ -1,12 +1,12 @@
-// readings: which pixels of a depth image are to be believed, and how their surface is turned.
+// readings: which pixels of a depth image are valid, and the orientation of their surface.
 //
 // threads   one per pixel of the depth image
-// reads     field, frame, depth [n_pixels] (bits of metres along z)
-// writes    readings [n_pixels]: depth in metres, 0 where it is not to be believed; and the ray with z = 1 times the
-//           surface's unit normal, so that a difference in z times it is a distance along the normal
+// reads     field, depth_view, depth [n_pixels] (bits of meters along z)
+// writes    readings [n_pixels]: depth in meters, 0 for invalid pixels; and the ray with z = 1 times the surface's unit
+//           normal, which converts a difference in z to a distance along the normal
 // twin      tsdf/reference/readings.rs
-// source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the limit on slopes, and normals
-//           from further apart where a surface is flat, are ours
+// source    normals by differences: Newcombe et al. 2011 (KinectFusion), section 3.2; the slope limit, and wider
+//           differences on flat surfaces, are ours
 
 #import field
 #import depth_view
@@ -18,18 +18,18 @@
 @group(0) @binding(3) var<storage, read_write> readings: array<vec2f>;
 
 const MIN_DEPTH_M = 0.01;
-// Normals are taken from pixels this far apart on each side where noise allows no better.
+// Wide differences for normals use pixels this far apart on each side, to reduce noise.
 const WIDE_STEP = 3;
-// Of the noise, what three depths in a row may bend by and still be of one flat surface: 2.45 standard deviations.
+// Largest second difference of depths on a flat surface, in units of noise: 2.45 standard deviations.
 const MAX_FLAT_NOISES = 6.0;
-// Steepest surface that is believed, as change of depth over distance across: steeper ones are edges.
+// Steepest valid surface, as change of depth over lateral distance: steeper ones are edges.
 const MAX_SLOPE = 6.0;
 
-// 0 where there is none. Finiteness is tested on the bits: the compiler may assume there is no NaN.
+// Depth of a pixel; 0 if invalid. Finiteness is tested on the bits: the compiler may assume there is no NaN.
 fn depth_at(pixel: vec2i) -> f32 {
     if any(pixel < vec2i(0)) || any(pixel >= vec2i(depth_view.depth_size_px)) { return 0.0; }
     let bits = depth[u32(pixel.y) * depth_view.depth_size_px.x + u32(pixel.x)];
-    if bits == 0u || bits >= 0x7f800000u { return 0.0; } // Zero, negative, infinite or no number.
+    if bits == 0u || bits >= 0x7f800000u { return 0.0; } // Zero, negative, infinite or NaN.
     let depth_m = bitcast<f32>(bits);
     return select(0.0, depth_m, depth_m >= MIN_DEPTH_M && depth_m <= field.max_depth_m);
 }
@@ -52,7 +52,7 @@ fn tangent_along(pixel: vec2i, step: vec2i, center_m: f32, focal_px: f32) -> Sid
     let has_high = high_m > 0.0;
     let has_low = low_m > 0.0;
     let is_edge = (has_high && abs(high_m - center_m) > limit) || (has_low && abs(low_m - center_m) > limit);
-    // Where the surface goes on straight, within its noise, from further apart: then noise turns the normal less.
+    // On a surface that is flat within its noise, wider differences reduce the noise of the normal.
     let far_high_m = depth_at(pixel + WIDE_STEP * step);
     let far_low_m = depth_at(pixel - WIDE_STEP * step);
     let is_flat = min(far_high_m, far_low_m) > 0.0

@@ -1,5 +1,5 @@
-//! The model as a whole: what it draws, carves, keeps and gives up.
-#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "shares of small counts")]
+//! Tests of the whole model: rendering, carving, memory limits, saving and resuming.
+#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "fractions of small counts")]
 
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
@@ -22,7 +22,7 @@ fn model_with(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     model
 }
 
-/// Takes in all keyframes that wait.
+/// Fuses all pending keyframes.
 pub(super) fn fuse_all(model: &mut TsdfModel) {
     while !model.is_idle() {
         model.step(u64::MAX).unwrap();
@@ -67,7 +67,7 @@ fn rendered_view_matches_input_depth() {
     let mut sorted = errors;
     sorted.sort_by(f64::total_cmp);
     let of = |share: f64| sorted[(share * sorted.len() as f64) as usize];
-    // At the rim of the ball a pixel may fall to the other side.
+    // At the rim of the ball, a pixel may hit the background instead.
     assert!(of(0.5) < 0.0005 && of(0.95) < 0.002 && of(0.98) < 0.02, "{} {} {}", of(0.5), of(0.95), of(0.98));
     assert!(picture.rgba_srgb.chunks_exact(4).zip(&picture.depth_m).all(|(rgba, z)| (rgba[3] == 255) == (*z > 0.0)));
 }
@@ -91,16 +91,16 @@ fn removed_object_is_carved() {
     keyframes.extend(without_ball);
     let mut model = fused_model(scenes::options(), &keyframes);
     let n_after = near_ball(&mut model);
-    assert!(n_before > 500 && n_after * 50 < n_before, "{n_after} of {n_before} vertices of the ball are left");
+    assert!(n_before > 500 && n_after * 50 < n_before, "{n_after} of {n_before} vertices of the ball remain");
     // The floor is still there.
     let picture = model.render(&scenes::request(view_of(&keyframes[0]))).unwrap();
     assert!(picture.depth_m.iter().filter(|depth| **depth > 0.0).count() > 5000);
 }
 
-/// Looks past where a thing was until its mesh is gone, after `n_with` looks at it: of its upper part, and of the part that is
-/// nearer to the floor than five voxels.
+/// Observes a ball `n_with` times, then observes the scene without it until its mesh is gone. Returns the number of
+/// those later observations: for its upper part, and for the part within five voxels of the floor.
 fn n_views_until_removed(n_with: usize) -> [usize; 2] {
-    const MAX_LOOKS: usize = 200;
+    const MAX_VIEWS: usize = 200;
     let [with_ball, without_ball] = [&[scenes::ball(BALL_CENTER), scenes::floor()][..], &[scenes::floor()]]
         .map(|shapes| scenes::ring(shapes, BALL_CENTER, 4));
     let mut n_pushed = 0;
@@ -125,8 +125,8 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
         add_view(&mut model, &with_ball);
     }
     let before = n_left(&mut model);
-    let mut n_views = [MAX_LOOKS; 2];
-    for n in 1..=MAX_LOOKS {
+    let mut n_views = [MAX_VIEWS; 2];
+    for n in 1..=MAX_VIEWS {
         add_view(&mut model, &without_ball);
         let now = n_left(&mut model);
         for part in 0..2 {
@@ -134,7 +134,7 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
                 n_views[part] = n_views[part].min(n);
             }
         }
-        if n_views.iter().all(|n| *n < MAX_LOOKS) {
+        if n_views.iter().all(|n| *n < MAX_VIEWS) {
             break;
         }
     }
@@ -143,10 +143,10 @@ fn n_views_until_removed(n_with: usize) -> [usize; 2] {
 
 #[test]
 fn removed_object_fades_faster_than_it_was_built() {
-    // Measured 2, 7 and 17 looks; the lower part, which new distances overwrite, is gone at once.
+    // Measured: 2, 7 and 17 observations. The lower part is overwritten by new distances and disappears at once.
     for (n_with, max_views) in [(8, 3), (32, 9), (100, 20)] {
         let n_views = n_views_until_removed(n_with);
-        assert!(n_views.iter().all(|n| *n <= max_views), "{n_with} looks at it, gone after {n_views:?}");
+        assert!(n_views.iter().all(|n| *n <= max_views), "observed {n_with} times, gone after {n_views:?}");
     }
 }
 
@@ -176,12 +176,12 @@ fn keyframes_without_depth_are_ignored() {
 fn back_faces_are_not_drawn() {
     let keyframes = ball_on_floor(4);
     let mut model = fused_model(scenes::options(), &keyframes);
-    // Just under the floor's surface, looking up and along: the floor's back is not drawn.
+    // Just below the floor's surface, looking up and along: the back of the floor must not be rendered.
     let eye = Point3::new(BALL_CENTER.x, BALL_CENTER.y - 0.5, -0.33);
     let picture = model.render(&scenes::request(scenes::look_at(eye, eye + Vector3::new(0.0, 0.3, 1.0)))).unwrap();
     let nearest = picture.depth_m.iter().copied().filter(|depth| *depth > 0.0).fold(f32::INFINITY, f32::min);
     assert!(nearest > 0.05, "{nearest}");
-    // Looking down from inside there is nothing at all.
+    // Looking down from inside, nothing is visible.
     let down = scenes::look_at(eye, eye - Vector3::new(0.0, 0.3, 1.0));
     assert!(model.render(&scenes::request(down)).unwrap().depth_m.iter().all(|depth| *depth == 0.0));
 }
@@ -245,7 +245,7 @@ fn fusion_is_deterministic() {
 
 #[test]
 fn rendering_fuses_at_most_one_keyframe() {
-    // So fine that the first frame finds no room at first.
+    // Voxels so fine that the first depth image overflows the pool at first.
     let mut model = model_with(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
     model.step(2).unwrap();
     model.render(&scenes::request(view_of(&ball_on_floor(1)[0]))).unwrap();
@@ -265,7 +265,7 @@ fn step_fuses_exactly_the_requested_keyframes() {
 
 #[test]
 fn growing_pool_keeps_results() {
-    // Voxels so fine that the pool and the table begin too small.
+    // Voxels so fine that the initial pool and table are too small.
     let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };
     let keyframes = ball_on_floor(3);
     let mut grown = fused_model(fine.clone(), &keyframes);
@@ -279,7 +279,7 @@ fn growing_pool_keeps_results() {
 
 #[test]
 fn swapping_to_host_memory_is_lossless() {
-    // Two places, each seen twice in turn: only one of them finds room at a time.
+    // Two places, observed twice in alternation: only one of them fits at a time.
     let far = Point3::new(8.0, 0.0, 0.1);
     let shapes = [scenes::ball(BALL_CENTER), scenes::ball(far)];
     let options = || TsdfOptions { max_depth_m: 3.0, ..scenes::options() };
@@ -310,7 +310,7 @@ fn swapping_to_host_memory_is_lossless() {
         assert!(same(&limited.render(&request).unwrap(), &unlimited.render(&request).unwrap()));
     }
     assert!(limited.mesh().unwrap() == unlimited.mesh().unwrap());
-    // Less than one image needs: it is left out, and said so.
+    // Less than one image needs: images are skipped and counted.
     let mut too_small = model_with_budget(20_000);
     assert_eq!((too_small.n_skipped(), too_small.progress().step), (8, 8));
     assert!(too_small.render(&scenes::request(view_of(&keyframes[0]))).is_ok());
@@ -384,7 +384,7 @@ fn resume_is_bit_exact() {
         TsdfModel::resume(gpu(), checkpoint, keyframes).map(drop).unwrap_err().to_string()
     };
     let checkpoint = checkpoint_of(&mut parts);
-    assert!(refused(&checkpoint, &keyframes[1..]).contains("image 0 of camera \"test\" is not there"));
+    assert!(refused(&checkpoint, &keyframes[1..]).contains("image 0 of camera \"test\" is missing"));
     let broken = |change: &dyn Fn(&mut Checkpoint)| {
         let mut other = checkpoint.clone();
         change(&mut other);
@@ -392,7 +392,7 @@ fn resume_is_bit_exact() {
     };
     assert!(broken(&|other| other.method = "splat".into()).contains("\"splat\""));
     assert!(broken(&|other| other.state["n_blocks"] = 1.into()).contains("\"block_coords\" has"));
-    assert!(broken(&|other| other.state["voxel_grid"]["voxel_m"] = (-1.0).into()).contains("no field"));
+    assert!(broken(&|other| other.state["voxel_grid"]["voxel_m"] = (-1.0).into()).contains("invalid voxel grid"));
     assert!(broken(&|other| other.state["future"] = 1.into()).contains("unknown field"));
 }
 
@@ -458,7 +458,7 @@ fn voxel_size_follows_pixel_size_and_noise() {
     };
     noisy.depth_m =
         noisy.depth_m.iter().map(|z| z + 0.08 * (0..4).map(|_| uniform()).sum::<f32>()).collect::<Vec<_>>().into();
-    // The sum of four uniform numbers has a deviation of 1 / sqrt(3).
+    // The sum of four uniform numbers has a standard deviation of 1 / sqrt(3).
     let expected = 0.08 / 3.0f64.sqrt() / 4.0;
     let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), &noisy).unwrap();
     assert!((chosen_grid.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen_grid:?}, expected {expected}");
@@ -470,7 +470,8 @@ fn voxel_size_follows_pixel_size_and_noise() {
     assert_eq!(depth.depth_m.len(), (SIZE_PX[0] * SIZE_PX[1]) as usize);
 }
 
-/// What a frame of 640x480 costs: `cargo test --release -p trainer --lib measure_640x480_keyframe -- --ignored --nocapture`.
+/// Measures the cost of a 640x480 keyframe: `cargo test --release -p trainer --lib measure_640x480_keyframe --
+/// --ignored --nocapture`.
 #[test]
 #[ignore = "a measurement"]
 fn measure_640x480_keyframe() {
@@ -521,7 +522,7 @@ fn measure_640x480_keyframe() {
         let mesh = model.mesh().unwrap();
         let joined = begin.elapsed().as_secs_f64() * 1e3 - updated;
         eprintln!(
-            "mesh after one more frame: {n} blocks anew {updated:.1} ms, {} triangles joined {joined:.1} ms of wall time",
+            "mesh after one more keyframe: {n} blocks meshed in {updated:.1} ms, {} triangles joined in {joined:.1} ms of wall time",
             mesh.triangles.len()
         );
     }

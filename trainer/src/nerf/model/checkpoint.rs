@@ -1,4 +1,4 @@
-//! The state of a field on the way, and a field in a folder.
+//! Checkpoints of a field, and saved fields in folders.
 
 use super::NerfModel;
 use super::images::{FieldSnapshot, Trials};
@@ -18,12 +18,12 @@ use std::path::Path;
 use std::sync::Arc;
 
 const METHOD: &str = "nerf";
-/// What is learned of images.
+/// Name of the array of image parameters.
 const IMAGE_PARAMS: &str = "image_params";
-/// The field: a checkpoint of what pictures need.
+/// The saved field: a checkpoint of the arrays needed for rendering.
 const FIELD_FILE: &str = "field.nerf";
 
-/// All but the arrays.
+/// The state without its arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NerfState {
@@ -32,14 +32,14 @@ struct NerfState {
     images: Vec<KeyframeSignature>,
     is_extent_stale: bool,
     n_hinted: usize,
-    /// Where there is a field.
+    /// `None` before a field exists.
     field: Option<(Extent, Sizes)>,
-    /// Of images, along with the field.
+    /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     are_trials_finished: bool,
     parts: Vec<TrialReport>,
     n_discarded_steps: u64,
-    /// How many images there is room for in what is learned of them.
+    /// Number of images that the parameter array can hold.
     image_capacity: Option<u32>,
 }
 
@@ -52,7 +52,7 @@ fn invalid_state(reason: String) -> Error {
 }
 
 impl FieldSnapshot {
-    /// How many images there is room for in what is learned of them.
+    /// Number of images that the parameter array can hold.
     fn image_capacity(&self) -> Option<u32> {
         let image_params = self.arrays.iter().find(|array| array.name == IMAGE_PARAMS)?;
         u32::try_from(image_params.bytes.len() / (IMAGE_PARAM_STRIDE * size_of::<ImageParam>())).ok()
@@ -60,14 +60,14 @@ impl FieldSnapshot {
 }
 
 impl FieldTrainer {
-    /// What pictures need, by name.
+    /// Buffers needed for rendering, by name.
     fn render_buffers(&self) -> Vec<(String, &Buffer)> {
         [("grid", &self.field.grid), ("occupied", &self.occupancy.occupied), ("weights", &self.field.weights)]
             .map(|(name, buffer)| (name.to_owned(), buffer))
             .to_vec()
     }
 
-    /// All that decides how it goes on, by name.
+    /// Buffers needed to continue training, by name.
     fn learned_params(&self) -> Vec<(String, &Buffer)> {
         let mut all = self.render_buffers();
         all.extend(
@@ -87,7 +87,7 @@ impl FieldTrainer {
     }
 }
 
-/// Buffers on their way to the host.
+/// Starts reading buffers back to the host.
 fn begin_read(gpu: &Gpu, buffers: Vec<(String, &Buffer)>) -> Vec<(String, PendingRead)> {
     let read = |buffer: &Buffer| {
         gpu.begin_read(buffer, usize::try_from(buffer.bytes() / 4).expect("a buffer fits into memory"))
@@ -124,7 +124,7 @@ impl NerfModel {
         })
     }
 
-    /// The field as it is; what was sent must be done.
+    /// Snapshot of the field. No submit may be in flight.
     pub(super) fn snapshot(&self) -> Result<FieldSnapshot, Error> {
         let reads = self
             .field
@@ -134,7 +134,7 @@ impl NerfModel {
         Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
     }
 
-    /// Makes the field what it was; what was sent must be done.
+    /// Restores a snapshot. No submit may be in flight.
     pub(super) fn restore(&mut self, snapshot: &FieldSnapshot) -> Result<(), Error> {
         (self.step, self.learned_params) = (snapshot.step, snapshot.learned_params);
         self.n_hinted = snapshot.n_hinted.min(self.images.len());
@@ -155,7 +155,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// In the midst of a trial the state from before it, with which the trial begins again.
+    /// During a trial, saves the state from before the trial, which restarts when resumed.
     pub(super) fn take_checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
         self.finish_in_flight()?;
         let (gpu, mut state) = (self.gpu.clone(), self.state()?);
@@ -175,14 +175,14 @@ impl NerfModel {
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
-    /// The model that a checkpoint holds with some of its buffers, without keyframes.
+    /// Restores a model from a checkpoint with the given subset of buffers, without keyframes.
     fn of_state(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
         buffers: impl Fn(&FieldTrainer) -> Vec<(String, &Buffer)>,
     ) -> Result<(Self, NerfState), Error> {
         if checkpoint.method != METHOD {
-            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!("it was written by method {:?}", checkpoint.method)));
         }
         let state: NerfState =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
@@ -206,8 +206,8 @@ impl NerfModel {
         Ok((model, state))
     }
 
-    /// Goes on from a checkpoint as if learning had not stopped. What it had learned from must be among `keyframes`; the
-    /// others come back, to be pushed or kept for testing.
+    /// Resumes training from a checkpoint as if it had not stopped. `keyframes` must include all that the model was
+    /// trained on. Returns the others, to be pushed or kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
@@ -221,7 +221,7 @@ impl NerfModel {
         Ok((model, rest))
     }
 
-    /// A saved field, to be drawn.
+    /// Loads a saved field for rendering.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let checkpoint = Checkpoint::read(&folder.join(FIELD_FILE))?;
         let mut model = Self::of_state(gpu, &checkpoint, FieldTrainer::render_buffers)?.0;

@@ -1,9 +1,10 @@
-//! What is learned about images with the field: their poses and their codes (light and exposure), whether that pays, and what it says
-//! about images that were not learned from.
+//! Image parameters optimized with the field: pose corrections and appearance embeddings (light and exposure). Trials
+//! decide which of them are kept, and interpolation predicts them for images without training.
 //!
-//! From a fixed step on one after the other is tried, unless it is plain that it brings nothing: the field goes on for some steps with it,
-//! is put back, and goes on for as many without. It stays where it foretells images that were held back until then, each from what is
-//! known of those before and after it in time.
+//! From a fixed step on, candidates are tried one after the other, unless a quick check shows no gain. The field is
+//! trained for some steps with the candidate, restored, and trained for as many steps without it. The candidate is kept
+//! if it improves the prediction of validation images, whose parameters are interpolated from training images before
+//! and after them in time.
 
 use super::NerfModel;
 use crate::checkpoint::Array;
@@ -19,19 +20,19 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
-/// The step from which anything is learned about images (before, nothing is known to look for), the one at which trials begin, and the
-/// steps that each takes with and without: one of so many of the planned steps.
+/// Fractions (1 / divisor) of the planned steps: start of optimizing image parameters (earlier, the field is too
+/// coarse), start of trials, and length of each half of a trial.
 const POSE_START_DIVISOR: u64 = 32;
 const TRIAL_START_DIVISOR: u64 = 8;
 const TRIAL_LENGTH_DIVISOR: u64 = 16;
-/// The fewest images held back that can decide.
+/// Minimum number of validation images for a trial.
 const MIN_VALIDATION_IMAGES: usize = 4;
-/// Batches of rays that judge: some hundred rays an image.
+/// Batches of rays for a comparison: some hundred rays per image.
 const VALIDATION_BATCHES: u64 = 8;
-/// Seed of what they look at.
+/// Seed for choosing the rays of a comparison.
 const VALIDATION_SEED: u64 = 0x6a75_6467;
 
-/// The field at some step, in host memory.
+/// Snapshot of the field at some step, in host memory.
 #[derive(Debug)]
 pub(super) struct FieldSnapshot {
     pub(super) arrays: Vec<Array>,
@@ -41,10 +42,10 @@ pub(super) struct FieldSnapshot {
     pub(super) learned_params: ParamSet,
 }
 
-/// What may be worth learning of images.
+/// Trials of image parameters.
 #[derive(Debug, Default)]
 pub(super) struct Trials {
-    /// In the order in which they are tried; the first is on trial unless trials wait.
+    /// Candidates in the order of their trials; the first is on trial unless the phase is `Waiting`.
     remaining: VecDeque<ParamSet>,
     pub(super) finished: Vec<TrialReport>,
     trial_phase: TrialPhase,
@@ -52,7 +53,7 @@ pub(super) struct Trials {
 
 #[derive(Debug, Default)]
 enum TrialPhase {
-    /// The next one begins at its step.
+    /// The next trial starts at its step.
     #[default]
     Waiting,
     Variant {
@@ -61,17 +62,17 @@ enum TrialPhase {
     Baseline {
         before: FieldSnapshot,
         variant: FieldSnapshot,
-        /// Mean squared error of each image held back, with it.
+        /// Mean squared error of each validation image with the variant.
         variant_errors: Vec<f64>,
     },
 }
 
-/// Of all terms those that a field learns.
+/// The subset of calibration parameters that a field can optimize.
 fn image_params_of_set(set: ParamSet) -> ParamSet {
     ParamSet { image_poses: set.image_poses, image_gains: set.image_gains, ..ParamSet::NONE }
 }
 
-/// What is learned without a trial.
+/// Parameters that are always optimized, without a trial.
 pub(super) fn given(choice: &CameraRefinement) -> ParamSet {
     match choice {
         CameraRefinement::Always(set) => image_params_of_set(*set),
@@ -90,7 +91,7 @@ impl Trials {
         Self { remaining, finished: Vec::new(), trial_phase: TrialPhase::Waiting }
     }
 
-    /// Those left after some have ended.
+    /// The trials that remain after some have finished.
     #[must_use]
     pub(super) fn after(mut self, finished: Vec<TrialReport>, are_finished: bool) -> Self {
         self.remaining
@@ -102,7 +103,7 @@ impl Trials {
         self.remaining.is_empty()
     }
 
-    /// In the midst of a trial the field from before it.
+    /// During a trial, the field from before it.
     pub(super) fn before(&self) -> Option<&FieldSnapshot> {
         match &self.trial_phase {
             TrialPhase::Waiting => None,
@@ -112,7 +113,7 @@ impl Trials {
 }
 
 impl NerfModel {
-    /// What the next step learns of images.
+    /// Image parameters that the next step optimizes.
     pub(super) fn params_learned_now(&self) -> ParamSet {
         if self.step >= self.options.n_planned_steps / POSE_START_DIVISOR {
             self.learned_params
@@ -121,7 +122,7 @@ impl NerfModel {
         }
     }
 
-    /// The step at which trials have something to do.
+    /// The step at which a trial starts or changes its phase.
     fn next_trial_step(&self) -> Option<u64> {
         let share = |of: u64| (self.options.n_planned_steps / of).max(1);
         let at = match &self.trials.trial_phase {
@@ -133,12 +134,12 @@ impl NerfModel {
         (!self.trials.are_finished()).then_some(at)
     }
 
-    /// Steps until trials have something to do.
+    /// Steps until a trial starts or changes its phase.
     pub(super) fn steps_to_trial(&self) -> u64 {
         self.next_trial_step().map_or(u64::MAX, |at| at.saturating_sub(self.step).max(1))
     }
 
-    /// Begins a trial, puts the field back, or decides.
+    /// Starts a trial, switches to its baseline, or decides it, if due.
     pub(super) fn advance_trials_when_due(&mut self) -> Result<(), Error> {
         while self.next_trial_step().is_some_and(|at| self.step >= at) {
             self.finish_in_flight()?;
@@ -151,7 +152,10 @@ impl NerfModel {
         let Some(candidate) = self.trials.remaining.front().copied() else { return Ok(()) };
         match std::mem::take(&mut self.trials.trial_phase) {
             TrialPhase::Waiting if self.validation_images.len() < MIN_VALIDATION_IMAGES => {
-                log::info!("{candidate}: {} images held back are too few to judge by", self.validation_images.len());
+                log::info!(
+                    "{candidate}: no trial: {} validation images found, at least {MIN_VALIDATION_IMAGES} needed",
+                    self.validation_images.len()
+                );
                 self.end_trials();
             }
             TrialPhase::Waiting => match self.rule_out(candidate)? {
@@ -184,12 +188,12 @@ impl NerfModel {
 
     fn end_trial(&mut self, part: TrialReport) {
         log::info!(
-            "{}: {:+.2} dB on {} held-back images (standard error {:.2}): {}",
+            "{}: {:+.2} dB on {} validation images (standard error {:.2}): {}",
             part.part,
             part.gain_db,
             part.n_images,
             part.standard_error_db,
-            if part.kept { "learned from here on" } else { "does not pay" },
+            if part.kept { "kept" } else { "rejected: no significant gain" },
         );
         self.trials.finished.push(part);
         self.trials.remaining.pop_front();
@@ -198,7 +202,7 @@ impl NerfModel {
         }
     }
 
-    /// A field that begins anew in the midst of a trial, or loses an image, has nothing to compare with what was saved.
+    /// Ends all trials. Needed when the field is recreated or loses an image: snapshots then no longer match it.
     pub(super) fn abort_trials(&mut self) -> Result<(), Error> {
         let Some(before) = self.trials.before() else { return Ok(()) };
         self.learned_params = before.learned_params;
@@ -209,7 +213,7 @@ impl NerfModel {
         Ok(())
     }
 
-    /// What was held back is learned from.
+    /// Ends all trials; validation images become training images.
     fn end_trials(&mut self) {
         self.trials.remaining.clear();
         self.trials.trial_phase = TrialPhase::Waiting;
@@ -217,8 +221,9 @@ impl NerfModel {
         self.is_extent_stale = true;
     }
 
-    /// What a candidate would buy, where that can be told without learning it and is nothing: other light, where pictures multiplied by
-    /// what the images before and after them ask for come no nearer to images held back.
+    /// Estimates the gain of a candidate without training it, and returns a report if there is none. For appearance:
+    /// scales pictures by gains interpolated from training images, and checks whether that brings them closer to the
+    /// validation images.
     fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<TrialReport>, Error> {
         if !candidate.image_gains {
             return Ok(None);
@@ -226,7 +231,7 @@ impl NerfModel {
         let (training_images, validation_images) = (self.images.clone(), self.validation_images.clone());
         let own = self.compare(&training_images, &[])?;
         let log_gains: Vec<f64> = own.iter().map(Comparison::log_gain).collect();
-        // What all images ask for is the brightness of the field.
+        // The mean over all images is the brightness of the field itself.
         let mean = log_gains.iter().sum::<f64>() / log_gains.len().max(1) as f64;
         let mut known: BTreeMap<&str, BTreeMap<i64, [f64; 1]>> = BTreeMap::new();
         for (image, log_gain) in training_images.iter().zip(log_gains) {
@@ -243,7 +248,7 @@ impl NerfModel {
         let baseline = compared.iter().map(|own| own.error_with_gain(1.0));
         let part = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
         log::info!(
-            "{}: multiplying pictures would bring {:+.2} dB on {} held-back images (standard error {:.2})",
+            "{}: no trial: scaling brightness gains {:+.2} dB on {} validation images (standard error {:.2})",
             part.part,
             part.gain_db,
             part.n_images,
@@ -252,7 +257,8 @@ impl NerfModel {
         Ok((!part.kept).then_some(part))
     }
 
-    /// Mean squared error of color of each image held back, from where and in what light those before and after it say it was taken.
+    /// Mean squared color error of each validation image, with its pose and embedding interpolated from training images
+    /// before and after it.
     fn validation_errors(&mut self) -> Result<Vec<f64>, Error> {
         let corrections = self.learned_corrections()?;
         let correction_of = |image: &RayImage| corrections.get(image.keyframe.camera.as_ref());
@@ -269,7 +275,7 @@ impl NerfModel {
         Ok(compared.iter().map(|own| own.error / f64::max(own.n_rays, 1.0)).collect())
     }
 
-    /// What the field shows of images with these codes (none where there are none), beside what they show.
+    /// Compares images with their renderings, using these appearance embeddings (neutral ones if empty).
     fn compare(
         &mut self,
         images: &[RayImage],
@@ -293,12 +299,12 @@ impl NerfModel {
         Ok(sums)
     }
 
-    /// What was learned about each camera; empty where nothing is. What was sent must be done.
+    /// Optimized correction of each camera; empty if none is optimized. No submit may be in flight.
     pub(super) fn learned_corrections(&self) -> Result<BTreeMap<String, CameraCorrection>, Error> {
         let Some((extent, field_trainer)) = &self.field else { return Ok(BTreeMap::new()) };
         let image_params = field_trainer.image_param_values(&self.gpu, self.images.len())?;
         let mut corrections: BTreeMap<String, CameraCorrection> = BTreeMap::new();
-        // Nothing is known yet of images that the field was not told of.
+        // Later images are not part of the field yet and have no parameters.
         for (image, image_params) in self.images.iter().zip(&image_params).take(self.n_hinted) {
             let correction = corrections.entry(image.keyframe.camera.to_string()).or_default();
             if self.learned_params.image_poses {
@@ -316,7 +322,7 @@ impl NerfModel {
         Ok(corrections)
     }
 
-    /// New images begin with the codes of those before and after them.
+    /// Initializes the embeddings of new images from those of images before and after them.
     pub(super) fn initialize_embeddings(&mut self) -> Result<(), Error> {
         if !self.learned_params.image_gains || self.n_hinted == self.images.len() {
             return Ok(());
@@ -337,7 +343,8 @@ impl NerfModel {
         Ok(())
     }
 
-    /// The code of an image of a camera at some time, from those before and after it; else the mean of all.
+    /// Appearance embedding of a camera's image at some time, interpolated from those before and after it. Falls back
+    /// to the mean of all.
     pub(super) fn embedding_of(&mut self, image: Option<&(Arc<str>, Stamp)>) -> Result<[f64; EMBEDDING_DIM], Error> {
         let corrections = self.camera_corrections()?;
         let embedding_of_image = image
@@ -349,7 +356,8 @@ impl NerfModel {
     }
 }
 
-/// Turn and shift after `camera_from_world`, in the camera's axes, of those that a field has: about the camera and in world.
+/// Converts a field's pose correction (rotation about the camera, translation in world) to rotation and translation
+/// after `camera_from_world`, in the camera's axes.
 fn drift_of(keyframe: &Keyframe, [a, b, c, x, y, z, ..]: &[f64; IMAGE_PARAM_STRIDE], extent: &Extent) -> [f64; 6] {
     let given = &keyframe.world_from_camera;
     let rotation = UnitQuaternion::from_scaled_axis(Vector3::new(*a, *b, *c));
@@ -361,7 +369,7 @@ fn drift_of(keyframe: &Keyframe, [a, b, c, x, y, z, ..]: &[f64; IMAGE_PARAM_STRI
     [rotation_rad.x, rotation_rad.y, rotation_rad.z, translation_m.x, translation_m.y, translation_m.z]
 }
 
-/// Sums over the rays of an image, and over colors where pictures (seen) and images (shown) are multiplied.
+/// Sums over the rays of an image; products are summed over rays and color channels.
 #[derive(Clone, Copy, Debug, Default)]
 struct Comparison {
     error: f64,
@@ -382,19 +390,19 @@ impl Comparison {
         }
     }
 
-    /// Logarithm of the gain that brings the picture nearest to the image.
+    /// Logarithm of the gain that minimizes the squared error of the picture.
     fn log_gain(&self) -> f64 {
         let gain = self.sum_rendered_target / self.sum_rendered_sq;
         if gain > 0.0 && gain.is_finite() { gain.ln() } else { 0.0 }
     }
 
-    /// Sum of squared differences where the picture is multiplied.
+    /// Sum of squared errors of the picture scaled by `gain`.
     fn error_with_gain(&self, gain: f64) -> f64 {
         gain * gain * self.sum_rendered_sq - 2.0 * gain * self.sum_rendered_target + self.sum_target_sq
     }
 }
 
-/// What something learned of images bought, from the mean squared errors of the same images with and without.
+/// Gain of a candidate, from mean squared errors of the same images with it and without it.
 fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> TrialReport {
     let gains: Vec<f64> = variant
         .iter()
@@ -438,12 +446,9 @@ mod tests {
         let baseline = [1e-3; 6];
         assert!(measure_gain(POSES, &baseline.map(|error| 0.8 * error), &baseline).kept);
         assert!(!measure_gain(POSES, &baseline, &baseline).kept);
-        assert!(
-            !measure_gain(POSES, &baseline.map(|error| 0.999 * error), &baseline).kept,
-            "less than is worth having"
-        );
+        assert!(!measure_gain(POSES, &baseline.map(|error| 0.999 * error), &baseline).kept, "below the minimum gain");
         let mixed = [0.5e-3, 2e-3, 0.5e-3, 2e-3, 0.5e-3, 1.2e-3];
-        assert!(!measure_gain(POSES, &mixed, &baseline).kept, "chance");
-        assert!(!measure_gain(POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few");
+        assert!(!measure_gain(POSES, &mixed, &baseline).kept, "not significant");
+        assert!(!measure_gain(POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few images");
     }
 }

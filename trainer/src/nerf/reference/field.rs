@@ -1,17 +1,17 @@
-//! Density and color of a point that is looked at along a direction.
+//! Density and color of a point viewed along a direction.
 
 use super::grid::{self, GridShape, N_FEATURES};
 use super::network::Network;
 use super::space::{contract, contract_backward};
 
-/// Numbers that the first network hands on to the second, after the density.
+/// Geometry features: outputs of the first network, after the density, that are inputs of the second.
 pub const N_GEOMETRY_FEATURES: usize = 15;
 /// Basis functions of the direction: spherical harmonics up to degree 3.
 pub const N_DIRECTION: usize = 16;
-/// The logarithm of the density ends here, so that no density is infinite.
+/// Upper limit of the logarithm of the density, so that no density is infinite.
 pub const MAX_LOG_DENSITY: f64 = 12.0;
 
-/// Added to what the network tells of the logarithm: a field that knows nothing is thin.
+/// Added to the network's log density. Keeps an untrained field thin.
 pub const LOG_DENSITY_BIAS: f64 = 0.0;
 
 /// All parameters of a field.
@@ -21,20 +21,20 @@ pub struct Field {
     pub shape: GridShape,
     /// Entries of the grid.
     pub table: Vec<[f64; N_FEATURES]>,
-    /// From what the grid holds to the logarithm of the density and what is handed on.
+    /// Maps grid features to log density and geometry features.
     pub density: Network,
-    /// From direction, what is handed on, and the code of the image, to color before the sigmoid.
+    /// Maps direction, geometry features and the image's appearance embedding to color before the sigmoid.
     pub color: Network,
 }
 
-/// Gradient of a loss by the parameters of a field.
+/// Gradient of a loss with respect to the parameters of a field.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldGrad {
-    /// By the entries of the grid.
+    /// With respect to the entries of the grid.
     pub table: Vec<[f64; N_FEATURES]>,
-    /// By the weights of the first network.
+    /// With respect to the weights of the first network.
     pub density: Vec<f64>,
-    /// By the weights of the second.
+    /// With respect to the weights of the second network.
     pub color: Vec<f64>,
 }
 
@@ -49,10 +49,10 @@ impl FieldGrad {
     }
 }
 
-/// What a point is like, and what it was computed from.
+/// Density and color of a point, and the intermediate values.
 #[derive(Clone, Debug)]
 pub struct Point {
-    /// Per unit of length, which is the scene's radius.
+    /// Per unit of length, which is the scene radius.
     pub density: f64,
     /// 0 to 1.
     pub rgb: [f64; 3],
@@ -62,7 +62,7 @@ pub struct Point {
 }
 
 impl Field {
-    /// Sizes of the two networks, with hidden layers of a width: one in the first, two in the second.
+    /// Layer sizes of the two networks for a hidden width: one hidden layer in the first, two in the second.
     pub fn sizes(shape: &GridShape, width: usize, embedding_dim: usize) -> [Vec<usize>; 2] {
         [
             vec![shape.n_outputs(), width, 1 + N_GEOMETRY_FEATURES],
@@ -70,7 +70,8 @@ impl Field {
         ]
     }
 
-    /// Density and color of a point, in units of the scene's radius around its middle, looked at along a direction of length 1, in an image with a code.
+    /// Density and color of a point, in units of the scene radius around its center, viewed along a direction of length
+    /// 1, with an appearance embedding.
     pub fn point(&self, at: [f64; 3], direction: [f64; 3], embedding: &[f64]) -> Point {
         let contracted = contract(at);
         let density_layers = self.density.forward(&grid::interpolate(&self.shape, &self.table, contracted));
@@ -83,8 +84,8 @@ impl Field {
         Point { density, rgb, contracted, density_layers, color_layers }
     }
 
-    /// Carries slopes towards density and color back to the parameters, where they add up; those towards the point and
-    /// towards the image's code come back.
+    /// Backpropagates gradients of density and color. Adds those of the parameters to the field's gradient; returns
+    /// those of the point and of the appearance embedding.
     pub fn point_backward(
         &self,
         at: [f64; 3],

@@ -1,6 +1,6 @@
 //! The hash grid: levels of cubic cells whose corners hold two numbers each.
 
-/// Numbers that each corner of a level holds.
+/// Features per corner of a level.
 pub const N_FEATURES: usize = 2;
 
 /// Sizes of a grid.
@@ -8,12 +8,13 @@ pub const N_FEATURES: usize = 2;
 pub struct GridShape {
     /// Cells along an axis, from the coarsest level to the finest.
     pub n_cells: Vec<u32>,
-    /// Most entries of a level, as a power of two; a level with fewer corners has one entry each, others share them by a hash.
+    /// Maximum number of entries of a level, as log2. A level with fewer corners has one entry per corner; in larger
+    /// levels, corners share entries by a hash.
     pub log2_entries: u32,
 }
 
 impl GridShape {
-    /// Levels between two numbers of cells, evenly over the logarithm.
+    /// Levels with numbers of cells between two values, evenly spaced on a logarithmic scale.
     pub fn between(coarsest: u32, finest: u32, n_levels: u32, log2_entries: u32) -> Self {
         let growth = (f64::from(finest) / f64::from(coarsest)).ln() / f64::from(n_levels.max(2) - 1);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "rounded between two u32")]
@@ -28,7 +29,7 @@ impl GridShape {
         u32::try_from(n_corners.min(max_entries)).expect("at most 2^log2_entries, which is a u32")
     }
 
-    /// First entry of a level.
+    /// Index of the first entry of a level.
     pub fn begin(&self, level: usize) -> u32 {
         (0..level).map(|level| self.n_entries(level)).sum()
     }
@@ -38,12 +39,12 @@ impl GridShape {
         self.begin(self.n_cells.len())
     }
 
-    /// Numbers that come out of a look-up.
+    /// Number of features that a lookup returns.
     pub fn n_outputs(&self) -> usize {
         self.n_cells.len() * N_FEATURES
     }
 
-    /// Place of a corner among all entries; source of the hash: Mueller et al. 2022, equation 4.
+    /// Index of a corner's entry among all entries. Source of the hash: Mueller et al. 2022, equation 4.
     pub fn entry(&self, level: usize, corner: [u32; 3]) -> u32 {
         let side = self.n_cells[level] + 1;
         let [x, y, z] = corner;
@@ -62,11 +63,11 @@ impl GridShape {
 struct Corner {
     entry: usize,
     weight: f64,
-    /// Of the weight towards the point, which is in units of the cube.
+    /// Gradient of the weight with respect to the point, which is in units of the cube.
     weight_gradient: [f64; 3],
 }
 
-/// The corners of the cell of a level around a point of the unit cube; a point outside counts as the nearest one inside.
+/// Corners of the cell of a level around a point of the unit cube. Points outside are clamped to the cube.
 fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     let n_cells = f64::from(shape.n_cells[level]);
     let scaled = at.map(|x| x.clamp(0.0, 1.0) * n_cells);
@@ -86,7 +87,7 @@ fn corners(shape: &GridShape, level: usize, at: [f64; 3]) -> [Corner; 8] {
     })
 }
 
-/// What a point of the unit cube finds: two numbers a level, between the eight corners of its cell.
+/// Interpolates the features at a point of the unit cube: two per level, from the eight corners of its cell.
 pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3]) -> Vec<f64> {
     let mut features = Vec::with_capacity(shape.n_outputs());
     for level in 0..shape.n_cells.len() {
@@ -98,7 +99,7 @@ pub fn interpolate(shape: &GridShape, table: &[[f64; N_FEATURES]], at: [f64; 3])
     features
 }
 
-/// Carries slopes towards what was found back to the table, where they add up, and to the point.
+/// Backpropagates gradients of the features. Adds those of the table to it; returns the gradient of the point.
 pub fn interpolate_backward(
     shape: &GridShape,
     table: &[[f64; N_FEATURES]],

@@ -1,33 +1,33 @@
-//! How a ray is walked through the parts of the scene that hold something.
+//! Walks a ray through the occupied parts of the scene.
 //!
 //! Source: occupancy of Mueller et al. 2022, appendix C; steps grow outside the inner cube as contraction shrinks them.
 
 use super::space::contract;
 
-/// How rays are walked; lengths in units of the scene's radius.
+/// Parameters for walking rays; lengths are in units of the scene radius.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct March {
     /// Length of a step inside the inner cube.
     pub step: f64,
-    /// Most samples of a ray.
+    /// Maximum number of samples per ray.
     pub max_samples: usize,
     /// Cells of the occupancy along an axis.
     pub n_cells: usize,
 }
 
-/// A piece of a ray in a cell that holds something.
+/// A segment of a ray in an occupied cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RaySegment {
-    /// Where it begins.
+    /// Begin along the ray.
     pub begin: f64,
-    /// How long it is.
+    /// Length along the ray.
     pub length: f64,
 }
 
-/// Directions less steep than this along an axis count as that steep.
+/// Components of a direction smaller than this are replaced by it.
 const MIN_DIRECTION: f64 = 1e-9;
 
-/// How a ray goes through the inner cube, and in how many steps.
+/// The part of a ray inside the inner cube, and its number of steps.
 #[derive(Clone, Copy, Debug)]
 struct Path {
     enter: f64,
@@ -38,7 +38,7 @@ struct Path {
 }
 
 impl Path {
-    /// Distance along the ray after so many steps.
+    /// Distance along the ray after `n` steps.
     fn distance_at(&self, step: f64, n: f64) -> f64 {
         let distance_at_share = |share: f64| 1.0 / (1.0 - share) - 1.0;
         let inside = n - self.n_before;
@@ -53,7 +53,7 @@ impl Path {
 }
 
 impl March {
-    /// Number of the cell around a point, and how far the point is from the cell's nearest side, in cells.
+    /// Index of the cell around a point, and the distance to the cell's nearest side, in cells.
     pub fn cell(&self, at: [f64; 3]) -> (usize, f64) {
         let scaled = contract(at).map(|x| x * self.n_cells as f64);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the cube")]
@@ -62,11 +62,12 @@ impl March {
         (cell[0] + self.n_cells * (cell[1] + self.n_cells * cell[2]), margin)
     }
 
-    /// All pieces of a ray between two distances, the first of them `jitter` of a step behind `range[0]`; and the least margin
-    /// of any cell that was asked about, and of the number of pieces.
+    /// All segments of a ray between two distances that are in occupied cells; the steps are offset by `jitter` steps
+    /// from `range[0]`. Also returns a margin: the smallest distance to a cell's side, in cells, or of the number of
+    /// steps to an integer.
     ///
-    /// Steps are even inside the inner cube; outside, the step at a distance u from where the ray meets it is (1 + u)^2 as long, so
-    /// that 1 / (1 + u) changes by the same number with each.
+    /// Steps have constant length inside the inner cube. Outside, the step at a distance u from the cube is longer by
+    /// (1 + u)^2, so that each step changes 1 / (1 + u) by the same amount.
     pub fn segments(
         &self,
         (origin, direction): ([f64; 3], [f64; 3]),
@@ -120,10 +121,11 @@ impl March {
         path
     }
 
-    /// The spans of the samples that are kept of the pieces: no more than `max_samples`, each standing for as many.
+    /// The spans of the samples selected from the segments: at most `max_samples`, each representing the same number of
+    /// segments.
     pub fn spans(&self, segments: &[RaySegment], jitter: f64) -> Vec<[f64; 2]> {
         let stride = segments.len().div_ceil(self.max_samples).max(1);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of the stride")]
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of the stride")]
         let phase = ((jitter * stride as f64) as usize).min(stride - 1);
         let span = |segment: &RaySegment| {
             let (middle, reach) = (segment.begin + 0.5 * segment.length, 0.5 * segment.length * stride as f64);

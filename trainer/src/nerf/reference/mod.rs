@@ -1,11 +1,11 @@
-//! The plain CPU version of the field in f64: what every kernel of `nerf` is compared with.
+//! Plain CPU version of the field in f64: the twin of every kernel of `nerf`.
 //!
-//! A point is contracted into the unit cube (`space`), looked up in a hash grid (`grid`), and two networks (`network`) turn
-//! what is found there into density and color (`field`). Samples along a ray are composited, and the loss of a ray is taken
-//! and carried back (`ray`), to the pose of its image too (`pose`).
+//! A point is contracted to the unit cube (`space`) and looked up in a hash grid (`grid`). Two networks (`network`) map
+//! its features to density and color (`field`). Samples along a ray are composited, and the loss of a ray is computed
+//! and backpropagated (`ray`), also to the pose of its image (`pose`).
 //!
-//! Source: Mueller et al. 2022 (Instant NGP); Barron et al. 2022 (Mip-NeRF 360, contraction and distortion); Tancik et al.
-//! 2023 (Nerfstudio, appearance codes).
+//! Source: Mueller et al. 2022 (Instant NGP); Barron et al. 2022 (Mip-NeRF 360, contraction and distortion); Tancik et
+//! al. 2023 (Nerfstudio, appearance embeddings).
 
 pub mod field;
 pub mod grid;

@@ -1,21 +1,21 @@
-//! A small fully connected network without biases: hidden layers end at zero (`ReLU`), the last one does not.
+//! A small fully connected network without biases: hidden layers have a `ReLU`, the last one does not.
 
 /// Weights of a network.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Network {
-    /// Numbers that go in, those of each hidden layer, and those that come out.
+    /// Number of inputs, width of each hidden layer, and number of outputs.
     pub sizes: Vec<usize>,
-    /// Layer after layer, `[outputs, inputs]` each.
+    /// Layer by layer, `[outputs, inputs]` each.
     pub weights: Vec<f64>,
 }
 
 impl Network {
-    /// Weights of a network of these sizes.
+    /// Number of weights of a network of these sizes.
     pub fn n_weights(sizes: &[usize]) -> usize {
         sizes.windows(2).map(|pair| pair[0] * pair[1]).sum()
     }
 
-    /// What every layer holds for an input, the input first; hidden layers as they go on, cut at zero.
+    /// Activations of every layer for an input: the input first, then hidden layers after the `ReLU`, then the output.
     pub fn forward(&self, input: &[f64]) -> Vec<Vec<f64>> {
         let mut layers = vec![input.to_vec()];
         let mut begin = 0;
@@ -32,7 +32,8 @@ impl Network {
         layers
     }
 
-    /// Carries slopes towards the output back to the weights, where they add up, and to the input.
+    /// Backpropagates gradients of the output. Adds those of the weights to `v_weights`; returns the gradient of the
+    /// input.
     pub fn backward(&self, layers: &[Vec<f64>], upstream: &[f64], v_weights: &mut [f64]) -> Vec<f64> {
         let mut v_out = upstream.to_vec();
         let mut end = self.weights.len();

@@ -1,8 +1,8 @@
-//! Rays as the pose of their image is moved: turned about where they begin, and shifted.
+//! Correction of rays by the pose of their image: rotation about their origin, and translation.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-/// What is wrong about the pose of an image, as far as its rays tell.
+/// Pose correction of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ImagePose {
     /// Rotation vector in world, radians.
@@ -12,16 +12,17 @@ pub struct ImagePose {
 }
 
 impl ImagePose {
-    /// Origin and direction of a ray.
+    /// Corrected origin and direction of a ray.
     pub fn apply_pose(&self, origin: [f64; 3], direction: [f64; 3]) -> ([f64; 3], [f64; 3]) {
         let rotation = UnitQuaternion::from_scaled_axis(Vector3::from(self.rotation_rad));
         ((Vector3::from(origin) + Vector3::from(self.translation)).into(), (rotation * Vector3::from(direction)).into())
     }
 
-    /// Slopes towards a further small turn and shift of a ray, from those towards the places of its samples.
+    /// Gradients with respect to a small additional rotation and translation of a ray, from those of the positions of
+    /// its samples.
     ///
-    /// * `direction`: of the ray as it is aimed now, of length 1.
-    /// * `sample_positions`: distance along the ray and slope of each sample.
+    /// * `direction`: corrected direction of the ray, of length 1.
+    /// * `sample_positions`: distance along the ray and gradient of each sample.
     pub fn gradients(direction: [f64; 3], sample_positions: &[(f64, [f64; 3])]) -> Self {
         let (mut v_origin, mut v_direction) = (Vector3::zeros(), Vector3::zeros());
         for (distance, gradient) in sample_positions {

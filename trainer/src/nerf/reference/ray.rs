@@ -1,5 +1,4 @@
-//! Samples along a ray, what they add up to, and how far that is from what an image shows there. Lengths are in units of the
-//! scene's radius.
+//! Compositing of samples along a ray, and the loss of the result. Lengths are in units of the scene radius.
 
 /// One sample of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,20 +21,20 @@ impl Sample {
     }
 }
 
-/// What a ray sees.
+/// Composited color and depth of a ray.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedRay {
     /// Premultiplied.
     pub rgb: [f64; 3],
-    /// What is left of the light behind all samples.
+    /// Fraction of light from behind that passes all samples.
     pub transmittance: f64,
     /// Sum of the weights times the distance along the ray.
     pub distance: f64,
-    /// Share of each sample in the picture.
+    /// Weight of each sample in the composited color.
     pub weights: Vec<f64>,
 }
 
-/// Adds up the samples of a ray, near ones first (Max 1995).
+/// Composites the samples of a ray from front to back (Max 1995).
 pub fn composite(samples: &[Sample]) -> RenderedRay {
     let mut rendered = RenderedRay { rgb: [0.0; 3], transmittance: 1.0, distance: 0.0, weights: Vec::new() };
     for sample in samples {
@@ -51,26 +50,26 @@ pub fn composite(samples: &[Sample]) -> RenderedRay {
     rendered
 }
 
-/// Slopes of a loss towards what a ray sees.
+/// Gradients of a loss with respect to the outputs of compositing.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Upstream {
-    /// Towards the premultiplied color.
+    /// With respect to the premultiplied color.
     pub rgb: [f64; 3],
-    /// Towards what is left of the light.
+    /// With respect to the transmittance.
     pub transmittance: f64,
-    /// Towards the distance.
+    /// With respect to the distance.
     pub distance: f64,
-    /// Towards each weight alone.
+    /// With respect to each weight directly.
     pub weights: Vec<f64>,
 }
 
-/// Slopes towards density and color of each sample.
+/// Gradients with respect to density and color of each sample.
 pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: &Upstream) -> Vec<(f64, [f64; 3])> {
     let v_weight = |ix: usize| {
         let color: f64 = (0..3).map(|channel| upstream.rgb[channel] * samples[ix].rgb[channel]).sum();
         color + upstream.distance * samples[ix].middle() + upstream.weights[ix]
     };
-    // What lies behind a sample loses as much light as the sample takes.
+    // A sample takes light from all samples behind it.
     let mut behind = rendered.transmittance * upstream.transmittance;
     let mut gradients = Vec::with_capacity(samples.len());
     for ix in (0..samples.len()).rev() {
@@ -86,7 +85,8 @@ pub fn composite_backward(samples: &[Sample], rendered: &RenderedRay, upstream: 
     gradients
 }
 
-/// How far the weights of a ray are spread, and the slope towards each of them: zero where all light comes from one place.
+/// Distortion loss: spread of the weights along a ray, and the gradient with respect to each of them. Zero if all
+/// weight is at one position.
 ///
 /// Distances count as `near / t`, so that spread far away costs less. Source: Barron et al. 2022, equation 15, summed in one
 /// pass as in Sun et al. 2022.
@@ -116,7 +116,7 @@ pub fn distortion(samples: &[Sample], weights: &[f64], near: f64) -> (f64, Vec<f
     (loss, gradients)
 }
 
-/// What an image shows where a ray ends.
+/// Color and distance that an image shows for a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Target {
     /// 0 to 1.
@@ -125,29 +125,30 @@ pub struct Target {
     pub distance: f64,
 }
 
-/// How much each part of the loss counts.
+/// Weights of the parts of the loss.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weights {
-    /// Of the distance, per unit.
+    /// Weight of the distance, per unit.
     pub distance_weight: f64,
-    /// Differences of distance beyond this pull no more.
+    /// Differences of distance beyond this have no gradient.
     pub distance_clip: f64,
-    /// Of the spread.
+    /// Weight of the distortion.
     pub distortion: f64,
-    /// Where the places of the spread begin.
+    /// Near end of the distances compared by the distortion loss.
     pub near: f64,
-    /// Of light that is held back elsewhere than where the depth says.
+    /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
     pub line_of_sight: f64,
-    /// So close to a distance, per itself and at least, light may be held back.
+    /// Opacity this close to the measured distance is allowed: a fraction of the distance, and an offset added to it.
     pub band: [f64; 2],
     /// Color behind everything.
     pub background_rgb: [f64; 3],
 }
 
-/// Loss of one ray, and its slopes.
+/// Loss of one ray, and its gradients.
 ///
-/// Where the distance is known, light should be held back there and nowhere else (line of sight: Rematas et al. 2022,
-/// equations 9 to 12, with a band in place of a bell); glass, which a depth camera looks through, may still hold back some.
+/// Where the distance is known, opacity should be there and nowhere else (line of sight: Rematas et al. 2022, equations
+/// 9 to 12, with a band in place of a bell). Some opacity elsewhere remains possible, for example of glass, which a
+/// depth camera sees through.
 pub fn loss(samples: &[Sample], rendered: &RenderedRay, target: &Target, weights: &Weights) -> (f64, Upstream) {
     let (distortion_loss, v_weights) = distortion(samples, &rendered.weights, weights.near);
     let mut upstream = Upstream {

@@ -1,4 +1,5 @@
-//! A small field and rays through it, for tests of the reference and of the kernels; numbers that f32 holds exactly.
+//! A small field and rays through it, for tests of the reference and of the kernels. Uses numbers that f32 holds
+//! exactly.
 
 use super::field::{Field, FieldGrad};
 use super::grid::GridShape;
@@ -13,7 +14,7 @@ fn rounded(value: f64) -> f64 {
 pub(crate) const EMBEDDING_DIM: usize = 3;
 
 fn shape() -> GridShape {
-    GridShape::between(2, 13, 4, 6) // The first level has an entry a corner, the others share 64.
+    GridShape::between(2, 13, 4, 6) // The first level has one entry per corner, the others share 64.
 }
 
 fn network(random: &mut Random, sizes: Vec<usize>) -> Network {
@@ -33,7 +34,7 @@ pub(crate) fn field(seed: u64) -> Field {
     }
 }
 
-/// A ray with samples within the inner cube and outside of it, its image's code and target.
+/// A ray with samples inside and outside the inner cube, with appearance embedding and target.
 pub(crate) struct Ray {
     pub(crate) origin: [f64; 3],
     pub(crate) direction: [f64; 3],
@@ -76,7 +77,7 @@ pub(crate) fn samples(field: &Field, ray: &Ray) -> Vec<Sample> {
     samples_viewed_along(field, ray, ray.direction)
 }
 
-/// The samples of a ray as they look along another direction.
+/// The samples of a ray, with colors viewed along another direction.
 fn samples_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> Vec<Sample> {
     let sample = |span: &[f64; 2]| {
         let point = field.point(sample_position(ray, *span), direction, &ray.embedding);
@@ -89,16 +90,17 @@ pub(crate) fn loss(field: &Field, ray: &Ray) -> f64 {
     loss_viewed_along(field, ray, ray.direction)
 }
 
-/// As [`loss`], with colors as they look along another direction.
+/// Like [`loss`], with colors viewed along another direction.
 pub(crate) fn loss_viewed_along(field: &Field, ray: &Ray, direction: [f64; 3]) -> f64 {
     let samples = samples_viewed_along(field, ray, direction);
     ray::loss(&samples, &ray::composite(&samples), &ray.target, &WEIGHTS).0
 }
 
-/// Distance along a ray and slope of each of its samples.
+/// Distance along a ray and gradient of each of its samples.
 pub(crate) type SamplePositions = Vec<(f64, [f64; 3])>;
 
-/// Gradient by the parameters, by the places of the samples (with their distance along the ray), and by the image's code.
+/// Gradient with respect to the parameters, the positions of the samples (with their distance along the ray), and the
+/// appearance embedding.
 pub(crate) fn gradient(field: &Field, ray: &Ray) -> (FieldGrad, SamplePositions, Vec<f64>) {
     let samples = samples(field, ray);
     let rendered = ray::composite(&samples);

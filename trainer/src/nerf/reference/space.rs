@@ -1,7 +1,7 @@
-//! The world in the unit cube: what is near as it is, what is far drawn in.
+//! Contraction of the world to the unit cube: near space is scaled uniformly, far space is compressed.
 
-/// A point, in units of the scene's radius around its middle, in the unit cube: the inner cube from -1 to 1 fills the middle
-/// half along each axis, all that lies around it the shell between.
+/// Contracts a point, given in units of the scene radius around its center, to the unit cube. The inner cube from -1 to
+/// 1 fills the central half along each axis; everything outside maps to the surrounding shell.
 ///
 /// Source: Barron et al. 2022, equation 10, with the largest coordinate in place of the length, so that cubes stay cubes.
 pub fn contract(at: [f64; 3]) -> [f64; 3] {
@@ -12,7 +12,7 @@ pub fn contract(at: [f64; 3]) -> [f64; 3] {
     at.map(|x| (x / largest * (2.0 - 1.0 / largest) + 2.0) / 4.0)
 }
 
-/// Carries a slope towards the contracted point back to the point.
+/// Backpropagates a gradient from the contracted point to the point.
 pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
     let (axis, max_abs) = largest(at);
     if max_abs <= 1.0 {
@@ -27,7 +27,7 @@ pub fn contract_backward(at: [f64; 3], upstream: [f64; 3]) -> [f64; 3] {
     gradient.map(|v| v / 4.0)
 }
 
-/// The axis of the largest coordinate, and its size.
+/// The axis with the largest absolute coordinate, and that absolute value.
 pub(crate) fn largest(point: [f64; 3]) -> (usize, f64) {
     let larger =
         |best: (usize, f64), axis: usize| if point[axis].abs() > best.1 { (axis, point[axis].abs()) } else { best };

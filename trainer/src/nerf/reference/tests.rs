@@ -1,4 +1,4 @@
-//! Gradients against central differences, and the parts against what they are defined by.
+//! Gradients against central differences, and each part against its definition.
 
 use super::field::Field;
 use super::grid::{self, GridShape};
@@ -50,9 +50,15 @@ fn ray_gradients_match_central_differences() {
             };
             let along = |step: f64| std::array::from_fn(|other| if other == axis { step } else { 0.0 });
             let translated = |step: f64| moved(ImagePose { translation: along(step), ..ImagePose::default() });
-            mismatches.check(format!("{seed}: shift {axis}"), pose.translation[axis], central(translated), ABS, REL);
+            mismatches.check(
+                format!("{seed}: translation {axis}"),
+                pose.translation[axis],
+                central(translated),
+                ABS,
+                REL,
+            );
             let rotated = |step: f64| moved(ImagePose { rotation_rad: along(step), ..ImagePose::default() });
-            mismatches.check(format!("{seed}: turn {axis}"), pose.rotation_rad[axis], central(rotated), ABS, REL);
+            mismatches.check(format!("{seed}: rotation {axis}"), pose.rotation_rad[axis], central(rotated), ABS, REL);
         }
         for ix in 0..EMBEDDING_DIM {
             let moved = |step: f64| {
@@ -60,7 +66,7 @@ fn ray_gradients_match_central_differences() {
                 embedding[ix] += step;
                 loss(&field, &Ray { embedding, spans: ray.spans.clone(), ..ray })
             };
-            mismatches.check(format!("{seed}: code {ix}"), v_embedding[ix], central(moved), ABS, REL);
+            mismatches.check(format!("{seed}: embedding {ix}"), v_embedding[ix], central(moved), ABS, REL);
         }
     }
     mismatches.assert_none();
@@ -91,7 +97,7 @@ fn contraction_is_linear_inside_and_bounded_outside() {
 #[test]
 fn grid_interpolates_linearly_between_corners() {
     let shape = GridShape { n_cells: vec![4], log2_entries: 10 };
-    // A linear function is found again everywhere.
+    // Interpolation reproduces a linear function everywhere.
     let linear = |at: [f64; 3]| [0.3 + at[0] - 2.0 * at[1] + 0.5 * at[2], at[0] * 3.0 - at[2]];
     let mut table = vec![[0.0; 2]; shape.n_entries_total() as usize];
     for ix in 0..125u32 {
@@ -115,7 +121,7 @@ fn levels_grow_evenly_and_large_levels_hash() {
     assert_eq!((shape.n_entries(0), shape.n_entries(15)), (17 * 17 * 17, 1 << 19));
     let hit: std::collections::BTreeSet<u32> =
         (0..20_000).map(|ix| shape.entry(15, [ix % 29, ix / 29 % 31, ix / 899])).collect();
-    assert!(hit.len() > 19_000, "few share an entry while there are many more entries: {}", hit.len());
+    assert!(hit.len() > 19_000, "few corners may share an entry while entries are plentiful: {} distinct", hit.len());
     assert!(hit.iter().all(|entry| *entry >= shape.begin(15) && *entry < shape.n_entries_total()));
 }
 
@@ -131,7 +137,7 @@ fn weights_sum_to_one_and_opaque_samples_occlude() {
     assert!((rendered.distance - (first * 1.25 + (1.0 - first) * 1.75)).abs() < 1e-9);
 }
 
-/// The sum over all pairs, as it is defined.
+/// Compares with the sum over all pairs, which is the definition.
 #[test]
 fn one_pass_distortion_equals_pairwise_sum() {
     let samples: Vec<Sample> = [[1.0, 1.4], [1.5, 1.9], [1.9, 4.0], [6.0, 7.0]]
@@ -153,5 +159,5 @@ fn one_pass_distortion_equals_pairwise_sum() {
     }
     assert!((ray::distortion(&samples, &weights, 0.5).0 - expected).abs() < 1e-12);
     let alone = ray::distortion(&samples, &[0.0, 1e-9, 0.0, 0.0], 0.5);
-    assert!(alone.0 < 1e-12, "light from one short place is not spread: {}", alone.0);
+    assert!(alone.0 < 1e-12, "weight at one position has no distortion: {}", alone.0);
 }

@@ -1,21 +1,21 @@
-//! How a surface crosses a cube, for each of the 256 ways its corners can lie inside or outside.
+//! How a surface crosses a cube, for each of the 256 combinations of corners inside and outside.
 //!
-//! The idea is that of marching cubes (Lorensen and Cline 1987); the table is made here, not copied: on each face every run
-//! of inside corners is cut off by one segment, so two cubes agree on the face they share, and segments join to loops.
+//! The method is marching cubes (Lorensen and Cline 1987), but the table is computed: on each face, one segment
+//! separates every run of inside corners. Two cubes therefore agree on a shared face, and segments join to loops.
 
 use std::sync::LazyLock;
 
-/// A cube's edge: the corner it begins at, as bits x, y, z, and the axis it runs along.
+/// A cube's edge: the corner where it begins, as bits x, y, z, and its axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::tsdf) struct Edge {
     pub(in crate::tsdf) corner: usize,
     pub(in crate::tsdf) axis: usize,
 }
 
-/// Triangles of each case, as edges; bit c of a case's number says that corner c is inside.
+/// Triangles of each case, as edges; bit c of a case's number is set if corner c is inside.
 pub(in crate::tsdf) static CASES: LazyLock<[Vec<[Edge; 3]>; 256]> = LazyLock::new(|| std::array::from_fn(triangles));
 
-/// Corners of the six faces, counterclockwise as seen from outside.
+/// Corners of the six faces, counterclockwise when viewed from outside.
 const FACES: [[usize; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
 
 fn edge_between(a: usize, b: usize) -> Edge {
@@ -40,7 +40,8 @@ fn triangles(case: usize) -> Vec<[Edge; 3]> {
     triangles
 }
 
-/// Where the surface cuts the faces, each segment so that the inside is on its right as seen from outside the cube.
+/// Segments where the surface crosses the faces. The inside is on the right of each segment when viewed from outside
+/// the cube.
 fn segments(case: usize) -> Vec<(Edge, Edge)> {
     let is_inside = |corner: usize| case >> corner & 1 == 1;
     let mut segments = Vec::new();
@@ -81,7 +82,7 @@ mod tests {
 
     #[test]
     fn triangles_face_away_from_the_inside() {
-        // Corner 0 alone is inside: the normal points to where all coordinates grow.
+        // Only corner 0 is inside: the normal points towards increasing coordinates.
         let edge_center = |edge: Edge| -> [f64; 3] {
             std::array::from_fn(|axis| if axis == edge.axis { 0.5 } else { (edge.corner >> axis & 1) as f64 })
         };
@@ -91,7 +92,7 @@ mod tests {
 
     #[test]
     fn loops_are_closed_within_the_cube() {
-        // An edge of a triangle that does not lie on a face of the cube belongs to two triangles.
+        // An edge of a triangle that is not on a face of the cube belongs to two triangles.
         for triangles in CASES.iter() {
             for triangle in triangles {
                 for side in 0..3 {

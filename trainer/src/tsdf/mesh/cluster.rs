@@ -1,10 +1,10 @@
-//! Fewer triangles: vertices that share a cell of a coarse grid become one.
+//! Mesh simplification: vertices in the same cell of a coarse grid are merged.
 
 use super::Mesh;
 use nalgebra::Vector3;
 use std::collections::{BTreeSet, HashMap};
 
-/// What the vertices of a cell add up to.
+/// Sums over the vertices of a cell.
 #[derive(Default)]
 struct CellSum {
     n: f64,
@@ -14,8 +14,8 @@ struct CellSum {
 }
 
 impl Mesh {
-    /// The mesh with one vertex per cell of a grid of this width, at the mean of those it stands for; triangles whose
-    /// corners meet vanish. A width that is no positive number changes nothing.
+    /// Returns the mesh with one vertex per cell of a grid of this width, at the mean of the merged vertices. Triangles
+    /// with coinciding corners are removed. A width that is not a positive number leaves the mesh unchanged.
     ///
     /// Source: Rossignac and Borrel 1993, with means instead of representatives.
     #[must_use]
@@ -57,7 +57,7 @@ fn normal_of(sum: &CellSum) -> [f32; 3] {
     sum.normal.try_normalize(1e-9).unwrap_or_else(Vector3::z).map(|along| along as f32).into()
 }
 
-/// The triangles that are left, each once, whichever corner it begins with.
+/// The remaining triangles, each once, regardless of which corner it starts with.
 fn merged(triangles: &[[u32; 3]], cell_of_vertex: &[u32]) -> Vec<[u32; 3]> {
     let mut seen = BTreeSet::new();
     let mut kept = Vec::new();

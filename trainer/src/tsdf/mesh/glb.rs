@@ -14,12 +14,13 @@ const UNSIGNED_INT: u32 = 5125;
 const VERTICES: u32 = 34_962;
 const INDICES: u32 = 34_963;
 
-/// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: a node turns it; another holds the origin.
+/// Writes a mesh. glTF has y up and z towards the viewer, the world has z up: one node holds that rotation, another the
+/// origin.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     atomic_file::write(path, |file| file.write_all(&to_bytes(mesh)))
 }
 
-/// The file.
+/// Encodes the file.
 pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
     let parts = parts(mesh);
     let mut json = description(mesh, &parts).to_string().into_bytes();
@@ -45,7 +46,7 @@ pub(super) fn to_bytes(mesh: &Mesh) -> Vec<u8> {
 /// Positions, normals, colors and indices, each a multiple of 4 bytes.
 fn parts(mesh: &Mesh) -> [Vec<u8>; 4] {
     let floats = |values: &[[f32; 3]]| values.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
-    // glTF takes vertex colors for linear.
+    // glTF expects linear vertex colors.
     let colors = mesh.colors_srgb.iter().flatten().flat_map(|byte| linear(*byte).to_le_bytes()).collect();
     let indices = mesh.triangles.iter().flatten().flat_map(|ix| ix.to_le_bytes()).collect();
     [floats(&mesh.positions_m), floats(&mesh.normals), colors, indices]

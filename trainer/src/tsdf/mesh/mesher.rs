@@ -1,4 +1,4 @@
-//! A mesh that follows a field: the triangles of its blocks, joined when the whole is asked for.
+//! An incrementally updated mesh: triangles per block, joined on request.
 
 use super::Mesh;
 use crate::gpu::f32_of;
@@ -8,21 +8,21 @@ use crate::tsdf::params::MeshVertex;
 use nalgebra::Vector3;
 use std::collections::{BTreeMap, HashMap};
 
-/// The triangles of the cubes whose lowest corner lies in one block.
+/// The triangles of the cubes whose lowest corner is in one block.
 #[derive(Debug)]
 pub(in crate::tsdf) struct BlockMesh {
     pub(in crate::tsdf) vertices: Vec<MeshVertex>,
     pub(in crate::tsdf) triangles: Vec<[u32; 3]>,
 }
 
-/// The triangles of blocks as they were made last.
+/// The most recent triangles of each block.
 #[derive(Debug, Default)]
 pub(in crate::tsdf) struct Mesher {
     meshes: BTreeMap<GridCoord, BlockMesh>,
 }
 
 impl Mesher {
-    /// Takes what blocks have now in place of what they had.
+    /// Replaces the triangles of these blocks.
     pub(in crate::tsdf) fn replace(&mut self, made: impl IntoIterator<Item = (GridCoord, BlockMesh)>) {
         for (block_coord, mesh) in made {
             if mesh.triangles.is_empty() {
@@ -33,7 +33,7 @@ impl Mesher {
         }
     }
 
-    /// All triangles, in order of their blocks; a vertex that blocks share is there once.
+    /// All triangles, in the order of their blocks; vertices shared by blocks are merged.
     pub(in crate::tsdf) fn mesh(&self, voxel_grid: &VoxelGrid) -> Mesh {
         let mut whole = Mesh { origin_m: voxel_grid.anchor_m, ..Mesh::default() };
         let mut shared_vertices: HashMap<(GridCoord, u32), u32> = HashMap::new();
@@ -57,14 +57,14 @@ impl Mesher {
     }
 }
 
-/// Names an edge that may belong to several blocks: its first voxel in the field, and its axis.
+/// Key of an edge that may belong to several blocks: its first voxel in the field, and its axis.
 fn shared_key(block: GridCoord, edge: u32) -> Option<(GridCoord, u32)> {
     let local = [edge / 3 % 9, edge / 27 % 9, edge / 243].map(u32::cast_signed);
     let is_shared = local.iter().any(|along| matches!(*along, 0 | BLOCK_EDGE));
     is_shared.then(|| (std::array::from_fn(|axis| BLOCK_EDGE * block[axis] + local[axis]), edge % 3))
 }
 
-/// The direction that two numbers of an octahedron's map stand for.
+/// Decodes a unit vector from its two octahedral coordinates.
 ///
 /// Source: Cigolle et al. 2014, "A survey of efficient representations for independent unit vectors", section 3.
 pub(in crate::tsdf) fn unit_of(octahedral: u32) -> [f32; 3] {

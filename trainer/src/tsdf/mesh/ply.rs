@@ -1,14 +1,14 @@
-//! Meshes as binary `.ply` (Turk 1994), as other programs read it.
+//! Meshes as binary `.ply` (Turk 1994), for other programs.
 
 use super::Mesh;
 use crate::{Error, atomic_file};
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-/// Beyond this distance from the world's origin places are written as doubles, metres.
+/// Positions are written as doubles if the origin is farther than this from the world's origin, meters.
 const FAR_M: f64 = 1000.0;
 
-/// Writes a mesh in world metres.
+/// Writes a mesh in world, in meters.
 pub fn write(path: &Path, mesh: &Mesh) -> Result<(), Error> {
     atomic_file::write(path, |file| {
         let mut file = BufWriter::new(file);

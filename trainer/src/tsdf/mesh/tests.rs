@@ -1,4 +1,4 @@
-//! Meshes of known shapes: how far off they are, whether they are closed, and the files.
+//! Meshes of known shapes: accuracy, closedness, and the files.
 
 use super::{Mesh, write_glb, write_ply};
 use crate::gpu::{Gpu, GpuOptions};
@@ -24,13 +24,13 @@ fn vertex_positions(mesh: &Mesh) -> impl Iterator<Item = Point3<f64>> {
     mesh.positions_m.iter().map(move |vertex| (Vector3::from(vertex.map(f64::from)) + origin).into())
 }
 
-/// Mean and largest distance of the vertices from a shape, metres.
+/// Mean and largest distance of the vertices from a shape, meters.
 fn errors_m(mesh: &Mesh, shape: &TestShape) -> (f64, f64) {
     let errors: Vec<f64> = vertex_positions(mesh).map(|vertex| shape.distance_m(&vertex).abs()).collect();
     (errors.iter().sum::<f64>() / errors.len() as f64, errors.iter().copied().fold(0.0, f64::max))
 }
 
-/// How often each edge is there, in either direction.
+/// Number of occurrences of each edge, in either direction.
 fn edges(mesh: &Mesh) -> BTreeMap<[u32; 2], i32> {
     let mut edges = BTreeMap::new();
     for [a, b, c] in &mesh.triangles {
@@ -52,11 +52,11 @@ fn ball_mesh() -> (Mesh, TestShape, f64) {
 fn mesh_of_ball_is_closed_and_round() {
     let (mesh, ball, voxel_m) = ball_mesh();
     let (mean_m, max_m) = errors_m(&mesh, &ball);
-    assert!(mean_m < 0.1 * voxel_m && max_m < 0.5 * voxel_m, "mean {mean_m} m, most {max_m} m");
+    assert!(mean_m < 0.1 * voxel_m && max_m < 0.5 * voxel_m, "mean {mean_m} m, largest {max_m} m");
     let open = edges(&mesh).into_values().filter(|n| *n != 2).count();
-    assert_eq!(open, 0, "of {} triangles", mesh.triangles.len());
+    assert_eq!(open, 0, "open edges of {} triangles", mesh.triangles.len());
     assert!(mesh.triangles.len() > 1000);
-    // Euler: a closed surface without holes.
+    // Euler characteristic of a closed surface without holes.
     let n_edges = edges(&mesh).len();
     assert_eq!(mesh.positions_m.len() + mesh.triangles.len(), n_edges + 2);
     let TestShape::Sphere { center_m, .. } = ball else { unreachable!("a ball is a sphere") };
@@ -73,7 +73,7 @@ fn mesh_of_ball_is_closed_and_round() {
         })
         .sum::<f64>()
         / mesh.positions_m.len() as f64;
-    assert!(off < 0.02, "colors are off by {off}");
+    assert!(off < 0.02, "mean color error {off}");
 }
 
 #[test]
@@ -82,13 +82,13 @@ fn mesh_of_slanted_wall_is_flat() {
     let wall = TestShape::Plane { normal, offset_m: 0.05 };
     let mut model = model(scenes::options(), &scenes::ring(&[wall], Point3::origin(), 4));
     let mut mesh = model.mesh().unwrap();
-    // Where pixels are not wider than voxels; far out they are, and slanted.
+    // Only near vertices: far away, pixels are wider than voxels and the wall is seen at an angle.
     let is_near = vertex_positions(&mesh).map(|vertex| vertex.coords.norm() < 0.8).collect::<Vec<_>>();
     let mut near = is_near.iter();
     mesh.positions_m.retain(|_| near.next() == Some(&true));
     assert!(mesh.positions_m.len() > 1000);
     let (mean_m, max_m) = errors_m(&mesh, &wall);
-    assert!(mean_m < 0.002 && max_m < 0.01, "mean {mean_m} m, most {max_m} m");
+    assert!(mean_m < 0.002 && max_m < 0.01, "mean {mean_m} m, largest {max_m} m");
 }
 
 #[test]
@@ -124,7 +124,7 @@ fn clustered_mesh_is_smaller_and_close() {
     }
 }
 
-/// Numbers of the header, then the bytes behind it.
+/// The text of the header, and the bytes after it.
 fn ply_parts(bytes: &[u8]) -> (String, &[u8]) {
     let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
     (String::from_utf8(bytes[..end].to_vec()).unwrap(), &bytes[end..])

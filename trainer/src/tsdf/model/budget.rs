@@ -1,7 +1,7 @@
-//! Blocks that find no room on the GPU wait in host memory until a camera sees them again.
+//! Keeps blocks that do not fit on the GPU in host memory until a camera observes them again.
 //!
-//! Before a frame is fused, every block it could touch is brought back: so the field has the bits it would have with room
-//! for all.
+//! Before a depth image is fused, every block it could change is loaded back. The field therefore equals, bit for bit,
+//! one with unlimited memory.
 
 use super::super::block::{Blocks, GridCoord};
 use super::super::chosen_grid::VoxelGrid;
@@ -13,12 +13,12 @@ use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
 
-/// Share of the pool that is made free at once, so that not every frame sends blocks away.
+/// Fraction of the pool that is freed at once, so that not every image evicts blocks.
 const EVICTED_FRAC: f64 = 0.125;
-/// Added to the radius of a block, voxels: who decides on the GPU rounds differently.
+/// Added to the radius of a block, voxels: the test on the GPU rounds differently.
 const SLACK_VOXELS: f64 = 0.5;
 
-/// What a camera can see, roughly.
+/// Approximate view frustum of a camera.
 struct ViewFrustum {
     camera_from_field: Transform,
     center_m: Point3<f64>,
@@ -52,7 +52,7 @@ impl ViewFrustum {
         (Vector3::from(block.map(|along| f64::from(along) + 0.5)) * self.block_m).into()
     }
 
-    /// At least where the kernel `find_visible` says so.
+    /// Conservative: true at least for all blocks that the kernel `find_visible` lists.
     fn may_be_visible(&self, block: GridCoord) -> bool {
         let center = self.camera_from_field * self.center_of_block_m(block);
         let radius_m = self.block_m * (7.0 + SLACK_VOXELS) / 8.0;
@@ -86,20 +86,23 @@ impl TsdfModel {
         ))
     }
 
-    /// Makes room for at least `n` blocks more than there is, for the next frame; leaves the frame out where it cannot.
+    /// Frees slots for at least `n` more blocks before the next depth image; skips the image if that is not possible.
     pub(super) fn evict(&mut self, n: u32) -> Result<(), Error> {
         let Some(frustum) = self.next_frustum() else { return Ok(()) };
         let n_spare = f64::from(self.max_blocks()) * EVICTED_FRAC;
         let n_sent = self.swap_blocks(&frustum, n as usize, n_spare, Blocks::new())?;
         if n_sent < n as usize {
             self.n_skipped += 1;
-            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.max_blocks());
+            log::warn!(
+                "tsdf: skipped an image that observes more than the {} blocks that fit into memory",
+                self.max_blocks()
+            );
             self.skip_first();
         }
         Ok(())
     }
 
-    /// Brings back what the next frame could touch, and fuses it.
+    /// Loads the blocks that the next depth image could change, and fuses it.
     pub(super) fn step_with_host_blocks(&mut self, n: u64) -> Result<u64, Error> {
         let before = self.step;
         let n = n.min(self.pending.len() as u64).min(1);
@@ -110,7 +113,7 @@ impl TsdfModel {
             self.load_blocks(&frustum, false)?;
         }
         if self.step != before {
-            return Ok(n); // The frame was left out; the next one wants other blocks.
+            return Ok(n); // The image was skipped; the next one needs other blocks.
         }
         self.record(0, 0)?;
         self.passes.submit(&self.gpu);
@@ -119,7 +122,7 @@ impl TsdfModel {
         Ok(n)
     }
 
-    /// Brings back what a picture shows, the nearest first where not all fit.
+    /// Loads the blocks that a picture shows, nearest first if not all fit.
     pub(super) fn load_visible(&mut self, camera: &Camera) -> Result<(), Error> {
         let Some(voxel_grid) = self.voxel_grid.as_ref().filter(|_| !self.host_blocks.is_empty()) else { return Ok(()) };
         let lens = [camera.focal_px, camera.principal_px];
@@ -127,7 +130,8 @@ impl TsdfModel {
         self.load_blocks(&frustum, true)
     }
 
-    /// Brings the waiting blocks that may be seen; `allows_partial` of them, else a frame that cannot have all is left out.
+    /// Loads visible blocks from host memory. If not all fit: loads some if `allows_partial`, otherwise skips the next
+    /// depth image.
     fn load_blocks(&mut self, frustum: &ViewFrustum, allows_partial: bool) -> Result<(), Error> {
         let mut visible_host_blocks: Vec<GridCoord> =
             self.host_blocks.keys().copied().filter(|block| frustum.may_be_visible(*block)).collect();
@@ -141,7 +145,10 @@ impl TsdfModel {
         let n_free_slots = field.capacity.n_blocks as usize - n_observed.min(field.capacity.n_blocks as usize);
         if visible_host_blocks.len() > n_free_slots && !allows_partial {
             self.n_skipped += 1;
-            log::warn!("tsdf: one image shows more than {} blocks hold; it is left out", self.max_blocks());
+            log::warn!(
+                "tsdf: skipped an image that observes more than the {} blocks that fit into memory",
+                self.max_blocks()
+            );
             self.skip_first();
             return Ok(());
         }
@@ -155,8 +162,8 @@ impl TsdfModel {
         self.swap_blocks(frustum, n, 0.0, added).map(drop)
     }
 
-    /// Sends at least `n` blocks that the cone does not see to wait, the furthest first, and `n_spare` more where there are;
-    /// puts `added` in. Says how many went.
+    /// Evicts up to `n + n_spare` blocks outside the frustum to host memory, farthest first; then adds `added`. Returns
+    /// how many were evicted.
     fn swap_blocks(&mut self, frustum: &ViewFrustum, n: usize, n_spare: f64, added: Blocks) -> Result<usize, Error> {
         let Some(field) = &mut self.field else { return Ok(0) };
         self.stale.extend(field.take_changed(&self.gpu)?);
@@ -168,7 +175,7 @@ impl TsdfModel {
             .collect();
         invisible_slots
             .sort_by(|(_, a), (_, b)| frustum.distance_m(*b).total_cmp(&frustum.distance_m(*a)).then_with(|| a.cmp(b)));
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a u32")]
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a u32")]
         invisible_slots.truncate(n + n_spare as usize);
         let evicted: BTreeSet<u32> = invisible_slots.iter().map(|(slot, _)| *slot).collect();
         let slots: Vec<u32> = evicted.iter().copied().collect();

@@ -1,4 +1,4 @@
-//! The state of a field on the way: all that decides how it goes on, bit for bit.
+//! Checkpoints of a field: everything needed to continue bit for bit.
 
 use super::super::block::{Block, Blocks, GridCoord, N_VOXELS};
 use super::super::buffers::{Capacity, FieldBuffers};
@@ -17,7 +17,7 @@ const BLOCK_COORDS: &str = "block_coords";
 const GEOMETRY: &str = "geometry";
 const COLORS: &str = "colors";
 
-/// All but the blocks.
+/// The state without the blocks.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TsdfState {
@@ -27,7 +27,7 @@ pub(super) struct TsdfState {
     pub(super) n_skipped: u64,
     pub(super) n_blocks: u64,
     pub(super) fused: Vec<KeyframeSignature>,
-    /// Pushed and not fused, in order.
+    /// Pushed but not fused yet, in order.
     pub(super) pending: Vec<KeyframeSignature>,
 }
 
@@ -37,7 +37,7 @@ impl TsdfModel {
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, arrays))))
     }
 
-    /// The state and the blocks, in order of their places.
+    /// The state, and the blocks ordered by their coordinates.
     pub(super) fn state(&mut self) -> Result<(serde_json::Value, Vec<Array>), Error> {
         let blocks = self.blocks()?;
         let state = TsdfState {
@@ -53,8 +53,8 @@ impl TsdfModel {
         Ok((state, arrays_of(&blocks)))
     }
 
-    /// Goes on from a checkpoint as if nothing had stopped. What it had seen must be among `keyframes`; the others come
-    /// back, to be pushed or kept for testing.
+    /// Resumes from a checkpoint as if it had not stopped. `keyframes` must include all that the model had received.
+    /// Returns the others, to be pushed or kept for testing.
     pub fn resume(
         gpu: Arc<Gpu>,
         checkpoint: &Checkpoint,
@@ -68,10 +68,10 @@ impl TsdfModel {
         Ok((model, rest))
     }
 
-    /// The model a checkpoint holds, without the keyframes it waits for.
+    /// Restores a model from a checkpoint, without its pending keyframes.
     pub(super) fn of_state(gpu: Arc<Gpu>, checkpoint: &Checkpoint) -> Result<Self, Error> {
         if checkpoint.method != METHOD {
-            return Err(invalid_state(format!("it is of the method {:?}", checkpoint.method)));
+            return Err(invalid_state(format!("it was written by method {:?}", checkpoint.method)));
         }
         let state: TsdfState =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
@@ -105,7 +105,7 @@ fn check_lattice(voxel_grid: &VoxelGrid) -> Result<(), Error> {
         && voxel_grid.noise_per_m2 >= 0.0
         && voxel_grid.truncation_m > voxel_grid.voxel_m
         && voxel_grid.max_weight <= 65_535;
-    if is_usable { Ok(()) } else { Err(invalid_state(format!("no field has such voxels: {voxel_grid:?}"))) }
+    if is_usable { Ok(()) } else { Err(invalid_state(format!("invalid voxel grid: {voxel_grid:?}"))) }
 }
 
 fn arrays_of(blocks: &Blocks) -> Vec<Array> {
@@ -120,7 +120,8 @@ fn arrays_of(blocks: &Blocks) -> Vec<Array> {
 }
 
 fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
-    let n_bytes = |each: u64| n_blocks.checked_mul(each).ok_or_else(|| invalid_state(format!("{n_blocks} blocks")));
+    let n_bytes =
+        |each: u64| n_blocks.checked_mul(each).ok_or_else(|| invalid_state(format!("too many blocks: {n_blocks}")));
     let block_coords = checkpoint.array(BLOCK_COORDS, n_bytes(12)?)?;
     let geometry = checkpoint.array(GEOMETRY, n_bytes(4 * 512)?)?;
     let colors = checkpoint.array(COLORS, n_bytes(8 * 512)?)?;
@@ -134,7 +135,11 @@ fn blocks_of(checkpoint: &Checkpoint, n_blocks: u64) -> Result<Blocks, Error> {
             colors: colors.chunks_exact(8).map(|both| [word(&both[..4]), word(&both[4..])]).collect(),
         });
     let blocks: Blocks = block_coords.zip(blocks).collect();
-    if blocks.len() as u64 == n_blocks { Ok(blocks) } else { Err(invalid_state("a block is there twice".to_owned())) }
+    if blocks.len() as u64 == n_blocks {
+        Ok(blocks)
+    } else {
+        Err(invalid_state("duplicate block coordinates".to_owned()))
+    }
 }
 
 pub(super) fn invalid_state(reason: String) -> Error {

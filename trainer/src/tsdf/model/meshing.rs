@@ -1,4 +1,4 @@
-//! The mesh of a field: only what changed is made anew.
+//! Incremental meshing: only blocks that changed are meshed again.
 
 use super::TsdfModel;
 use crate::Error;
@@ -9,20 +9,20 @@ use crate::tsdf::marching::{MeshBuffers, MeshCapacity};
 use crate::tsdf::mesh::{BlockMesh, Mesh};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Blocks that are done at once in a field of their own, where not all are on the GPU.
+/// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field.
 const BLOCKS_PER_BATCH: usize = 512;
-/// Chunks of such a field at the start.
+/// Initial number of chunks of such a temporary field.
 const CHUNKS_PER_BATCH: u32 = 256;
 
 impl TsdfModel {
-    /// The surface in world as it is now; only what changed since the last call is made anew.
+    /// The current surface in world. Meshes only blocks that changed since the last call.
     pub fn mesh(&mut self) -> Result<Mesh, Error> {
         self.update_mesh()?;
         Ok(self.voxel_grid.as_ref().map_or_else(Mesh::default, |voxel_grid| self.mesher.mesh(voxel_grid)))
     }
 
-    /// Makes the triangles of what changed since the last call and brings them to the host, without joining them to one mesh;
-    /// says how many blocks it were.
+    /// Meshes the blocks that changed since the last call and reads their triangles back, without joining them to one
+    /// mesh. Returns the number of blocks.
     pub fn update_mesh(&mut self) -> Result<usize, Error> {
         self.finish_in_flight()?;
         if self.field.is_none() {
@@ -34,8 +34,8 @@ impl TsdfModel {
         Ok(n)
     }
 
-    /// GPU time of making the triangles of what changed since the last [`Self::update_mesh`]; they stay due, and nothing is
-    /// brought to the host. Empty where the adapter tells no times, or blocks wait in host memory.
+    /// GPU time of meshing the blocks that changed since the last [`Self::update_mesh`]. They stay marked as changed,
+    /// and nothing is read back. Empty if the adapter has no timestamps, or if blocks are in host memory.
     pub fn profile_mesh(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
         let Some(field) = self.field.as_ref().filter(|_| self.host_blocks.is_empty()) else { return Ok(Vec::new()) };
@@ -43,7 +43,7 @@ impl TsdfModel {
         buffers.profile(&self.gpu, &self.pipelines, field)
     }
 
-    /// All blocks are on the GPU, and so is the list of those that are due.
+    /// Meshes changed blocks if all blocks are on the GPU.
     fn mesh_on_gpu(&mut self) -> Result<Vec<(GridCoord, BlockMesh)>, Error> {
         let Some(field) = &self.field else { return Ok(Vec::new()) };
         if !self.stale.is_empty() {
@@ -57,7 +57,8 @@ impl TsdfModel {
         Ok(block_meshes)
     }
 
-    /// Some blocks wait in host memory: those that are due are put into a small field with all beside them, a few at a time.
+    /// Meshes changed blocks if some blocks are in host memory: loads them with their neighbors into a small temporary
+    /// field, a batch at a time.
     fn mesh_in_batches(&mut self) -> Result<Vec<(GridCoord, BlockMesh)>, Error> {
         let (Some(voxel_grid), Some(field)) = (&self.voxel_grid, &self.field) else { return Ok(Vec::new()) };
         self.stale.extend(field.take_changed(&self.gpu)?);
@@ -89,13 +90,13 @@ impl TsdfModel {
     }
 }
 
-/// A block and those that touch it.
+/// A block and its 26 neighbors.
 fn around(block_coord: &GridCoord) -> impl Iterator<Item = GridCoord> + use<> {
     let [x, y, z] = *block_coord;
     (0..27).map(move |ix| [x + ix % 3 - 1, y + ix / 3 % 3 - 1, z + ix / 9 - 1])
 }
 
-/// What is kept, made anew where it is too small for a pool of so many blocks.
+/// Returns the kept buffers, or allocates new ones if they are too small for a pool of this size.
 fn ensure_mesh_buffers<'a>(
     kept: &'a mut Option<MeshBuffers>,
     gpu: &Gpu,

@@ -1,4 +1,4 @@
-//! A field in a folder: the mesh for other programs, and the blocks for this one.
+//! Saved fields in folders: the mesh for other programs, and the blocks for resuming.
 
 use super::TsdfModel;
 use super::checkpoint::{METHOD, invalid_state};
@@ -13,9 +13,9 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-/// The blocks: a checkpoint whose arrays are deflated.
+/// The blocks: a checkpoint with deflated arrays.
 const BLOCKS_FILE: &str = "field.blocks";
-/// Most bytes that an array may have when it is inflated.
+/// Maximum size of an inflated array in bytes.
 const MAX_ARRAY_BYTES: u64 = 1 << 36;
 
 impl TsdfModel {
@@ -24,7 +24,7 @@ impl TsdfModel {
         folder.join(BLOCKS_FILE).is_file()
     }
 
-    /// A saved field, to be drawn or added to.
+    /// Loads a saved field, for rendering or further fusion.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let path = folder.join(BLOCKS_FILE);
         let mut checkpoint = Checkpoint::read(&path)?;

@@ -1,4 +1,5 @@
-//! Twin of `allocate_blocks.wgsl`: which blocks rays cross, found by another way: the faces they pass, in order.
+//! Twin of `allocate_blocks.wgsl`: finds the blocks that rays cross by a different method, from the faces they pass in
+//! order.
 
 use super::readings::{Reading, ray_of};
 use crate::DepthMap;
@@ -7,24 +8,24 @@ use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
 
-/// The blocks of one depth image.
+/// The blocks that one depth image requires.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RequiredBlocks {
     /// Crossed for at least `margin` of a block's edge.
     pub definite: BTreeSet<GridCoord>,
-    /// Crossed, or passed by within `margin`.
+    /// Crossed, or closer to the ray than `margin`.
     pub possible: BTreeSet<GridCoord>,
 }
 
 impl VoxelGrid {
-    /// Distance from the surface up to which a reading of this depth says something, metres.
+    /// Truncation distance for a reading at this depth, meters.
     pub fn truncation_at(&self, depth_m: f64) -> f64 {
         (3.0 * self.noise_per_m2 * depth_m * depth_m).clamp(self.truncation_m, self.scale_m)
     }
 }
 
-/// The blocks that get room; `margin` in blocks, what rounding may decide.
-#[expect(clippy::cast_possible_truncation, reason = "places are rounded down on purpose")]
+/// The blocks to allocate. `margin`: tolerance for rounding, in blocks.
+#[expect(clippy::cast_possible_truncation, reason = "coordinates are rounded down on purpose")]
 pub fn required_blocks(depth: &DepthMap, readings: &[Reading], voxel_grid: &VoxelGrid, margin: f64) -> RequiredBlocks {
     let field_from_depth = voxel_grid.field_from_world() * depth.world_from_camera;
     let width = depth.size_px[0] as usize;
@@ -59,7 +60,7 @@ fn is_clear_of_faces(point: &Vector3<f64>, margin: f64) -> bool {
     point.iter().all(|along| (margin..1.0 - margin).contains(&(along - along.floor())))
 }
 
-/// Shares of the way between the faces that the line passes.
+/// Intervals of the line between the faces it passes, as fractions of its length.
 fn intervals(begin: &Vector3<f64>, end: &Vector3<f64>) -> Vec<(f64, f64)> {
     let mut cuts = vec![0.0, 1.0];
     for axis in 0..3 {

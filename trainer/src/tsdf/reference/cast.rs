@@ -1,27 +1,27 @@
-//! Twin of `cast_rays.wgsl`: the first crossing from outside to inside, found by small even steps.
+//! Twin of `cast_rays.wgsl`: finds the first crossing from outside to inside by small constant steps.
 
 use crate::tsdf::block::{Blocks, block_of, voxel_ix};
 use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::{Point3, Vector3};
 
-/// Length of a step, voxels: short, because nothing is clever here.
+/// Length of a step, voxels.
 const STEP_VOXELS: f64 = 0.05;
 
 /// A ray in the field's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// Where it begins, metres from the anchor.
+    /// Origin, meters from the anchor.
     pub origin_m: Point3<f64>,
-    /// Change per metre of depth.
+    /// Change per meter of depth.
     pub along: Vector3<f64>,
-    /// Depths between which a surface is looked for, metres.
+    /// Range of depths that is searched for a surface, meters.
     pub range_m: [f64; 2],
 }
 
-/// Where a ray meets the surface.
+/// Intersection of a ray with the surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Depth, metres.
+    /// Depth, meters.
     pub depth_m: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
@@ -45,8 +45,8 @@ pub fn cast(blocks: &Blocks, voxel_grid: &VoxelGrid, ray: &Ray) -> Option<Hit> {
     None
 }
 
-/// Eight voxels around a point given in voxels, and their shares.
-#[expect(clippy::cast_possible_truncation, reason = "places are rounded down on purpose")]
+/// The eight voxels around a point given in voxels, and their interpolation weights.
+#[expect(clippy::cast_possible_truncation, reason = "coordinates are rounded down on purpose")]
 fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
     let corner = point.map(|along| (along - 0.5).floor());
     let share = point.map(|along| along - 0.5) - corner;
@@ -57,7 +57,7 @@ fn around(point: &Vector3<f64>) -> impl Iterator<Item = ([i32; 3], f64)> {
     })
 }
 
-/// Distance as a share of the field's scale; `None` where one of the eight voxels was not seen.
+/// Distance as a fraction of the field's scale; `None` if one of the eight voxels was not observed.
 fn distance_at(blocks: &Blocks, point: &Vector3<f64>) -> Option<f64> {
     around(point)
         .try_fold(0.0, |sum, (voxel, part)| Some(sum + part * blocks.get(&block_of(voxel))?.distance(voxel_ix(voxel))?))

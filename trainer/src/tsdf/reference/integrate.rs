@@ -1,4 +1,4 @@
-//! Twin of `integrate.wgsl`, on all blocks given: those the camera does not see it leaves as they are.
+//! Twin of `integrate.wgsl`, applied to all given blocks; those outside the camera's view stay unchanged.
 
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::{GridCoord, N_VOXELS};
@@ -7,16 +7,16 @@ use crate::{DepthMap, Keyframe};
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 
-/// What is known of a voxel.
+/// State of a voxel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Voxel {
-    /// Signed distance to the surface, metres.
+    /// Signed distance to the surface, meters.
     pub distance_m: f64,
-    /// In 256ths, whole; 0: not seen.
+    /// In 256ths, an integer; 0: not observed.
     pub weight: f64,
     /// sRGB, 0 to 1.
     pub color_srgb: [f64; 3],
-    /// In 256ths, whole.
+    /// In 256ths, an integer.
     pub color_weight: f64,
 }
 
@@ -28,7 +28,7 @@ const CARVING_NEAR: f64 = 1.0;
 const CARVING_FAR: f64 = 4.0;
 const COLOR_VOXELS: f64 = 2.0;
 
-/// Fuses a keyframe with depth into the blocks given.
+/// Fuses a keyframe with depth into the given blocks.
 pub fn integrate(blocks: &mut VoxelBlocks, keyframe: &Keyframe, readings: &[Reading], voxel_grid: &VoxelGrid) {
     let Some(depth) = &keyframe.depth else { return };
     for (block_coord, voxels) in blocks {
@@ -112,7 +112,7 @@ fn projected(point: &Point3<f64>, focal: [f64; 2], principal: [f64; 2], size_px:
     (point.z > 0.0 && inside).then_some(block_coord)
 }
 
-/// The four pixels around a place, clamped to the image, and the shares of the right and the lower ones.
+/// The four pixels around a position, clamped to the image, and the interpolation weights of the right and lower ones.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the image")]
 fn corners(position_px: [f64; 2], size_px: [u32; 2]) -> ([usize; 4], [f64; 2]) {
     let base = position_px.map(|along| (along - 0.5).floor());
@@ -126,7 +126,7 @@ fn mixed(values: [f64; 4], share: [f64; 2]) -> f64 {
     mix(mix(values[0], values[1], share[0]), mix(values[2], values[3], share[0]), share[1])
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place inside the image")]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a position inside the image")]
 fn reading_near(depth: &DepthMap, readings: &[Reading], position_px: [f64; 2]) -> Reading {
     let (at, share) = corners(position_px, depth.size_px);
     let four = at.map(|ix| readings[ix]);
@@ -144,7 +144,7 @@ fn color_near(keyframe: &Keyframe, position_px: [f64; 2]) -> [f64; 4] {
     std::array::from_fn(|part| mixed(at.map(|ix| f64::from(keyframe.rgba_srgb[4 * ix + part]) / 255.0), share))
 }
 
-/// Voxels that nobody has seen.
+/// A block of voxels that were never observed.
 pub fn unobserved() -> Vec<Voxel> {
     vec![Voxel { color_srgb: Vector3::zeros().into(), ..Voxel::default() }; N_VOXELS]
 }

@@ -5,32 +5,32 @@ use crate::tsdf::mesh::CASES;
 use nalgebra::Vector3;
 use std::collections::HashMap;
 
-/// Color where none was seen.
+/// Color of voxels without one.
 const GRAY: f64 = 0.5;
 
 /// A vertex of a block's triangles.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vertex {
-    /// Between this voxel, counted from the block's first one, and the next along the axis.
+    /// The edge of the vertex: from this voxel, relative to the block's first one, to the next along the axis.
     pub between: (GridCoord, usize),
-    /// From the field's anchor, along the world's axes, metres.
+    /// Relative to the field's anchor, along the world's axes, meters.
     pub position_m: [f64; 3],
-    /// Out of the surface, of length 1.
+    /// Outward normal of length 1.
     pub normal: [f64; 3],
     /// Red, green, blue, 0 to 1.
     pub color_srgb: [f64; 3],
 }
 
-/// The triangles of the cubes whose lowest corner lies in one block.
+/// The triangles of the cubes whose lowest corner is in one block.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct BlockTriangles {
     /// In the order in which triangles first use them.
     pub vertices: Vec<Vertex>,
-    /// Counterclockwise as seen from outside, in order of the cubes, x fastest.
+    /// Counterclockwise when viewed from outside, in the order of the cubes, x fastest.
     pub triangles: Vec<[usize; 3]>,
 }
 
-/// A block with those around it.
+/// A block and its neighbors.
 struct BlockNeighborhood<'a> {
     block_coord: GridCoord,
     blocks: [Option<&'a Block>; 27],
@@ -47,7 +47,7 @@ impl<'a> BlockNeighborhood<'a> {
         Self { block_coord, blocks: found }
     }
 
-    /// The block of a voxel given from this block's first one, -8 to 15, and its place in it.
+    /// The block of a voxel given relative to this block's first one, -8 to 15, and the voxel's index in it.
     fn at(&self, voxel: GridCoord) -> Option<(&'a Block, usize)> {
         let [x, y, z] = voxel.map(|along| along.div_euclid(BLOCK_EDGE) + 1);
         let block = self.blocks[usize::try_from(9 * z + 3 * y + x).ok()?]?;
@@ -58,7 +58,7 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.distance(ix))
     }
 
-    /// Change of the distance along the axes, from both sides where both were seen.
+    /// Derivative of the distance along the axes, two-sided if both neighbors were observed.
     fn gradient(&self, voxel: GridCoord) -> Vector3<f64> {
         let here = self.distance(voxel);
         Vector3::from_fn(|axis, _| {
@@ -80,7 +80,7 @@ impl<'a> BlockNeighborhood<'a> {
         self.at(voxel).and_then(|(block, ix)| block.color_srgb(ix))
     }
 
-    /// Which corners of the cube that begins at `voxel` lie inside; `None` where one was not seen.
+    /// Which corners of the cube that begins at `voxel` are inside; `None` if any was not observed.
     fn case_of(&self, voxel: GridCoord) -> Option<usize> {
         (0..8).try_fold(0, |case, corner| {
             let is_inside = self.distance(moved(voxel, corner))? < 0.0;
@@ -112,7 +112,7 @@ fn moved(voxel: GridCoord, corner: usize) -> GridCoord {
     std::array::from_fn(|axis| voxel[axis] + i32::from(corner >> axis & 1 == 1))
 }
 
-/// Makes the triangles of a block; cubes with a corner that nobody saw have none.
+/// Extracts the triangles of a block; cubes with an unobserved corner have none.
 pub fn march(blocks: &Blocks, block_coord: GridCoord, voxel_m: f64) -> BlockTriangles {
     let around = BlockNeighborhood::new(blocks, block_coord);
     let mut triangles_of_block = BlockTriangles::default();

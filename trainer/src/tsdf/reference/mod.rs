@@ -1,4 +1,4 @@
-//! What the kernels do, in f64 and without regard to speed.
+//! f64 twins of the kernels, written for clarity rather than speed.
 
 mod allocate;
 mod cast;

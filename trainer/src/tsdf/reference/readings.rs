@@ -4,10 +4,10 @@ use crate::DepthMap;
 use crate::tsdf::chosen_grid::VoxelGrid;
 use nalgebra::Vector3;
 
-/// What a pixel says.
+/// A pixel's depth and surface orientation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reading {
-    /// Metres along z; 0 where the pixel is not to be believed.
+    /// Meters along z; 0 for invalid pixels.
     pub depth_m: f64,
     /// The ray with z = 1 times the surface's unit normal.
     pub ray_dot_normal: f64,
@@ -18,13 +18,13 @@ const MAX_FLAT_NOISES: f64 = 6.0;
 const MIN_DEPTH_M: f64 = 0.01;
 const MAX_SLOPE: f64 = 6.0;
 
-/// The ray through a place of the image whose z is 1.
+/// The ray through a position in the image, scaled to z = 1.
 pub(super) fn ray_of(depth: &DepthMap, position_px: [f64; 2]) -> Vector3<f64> {
     let along = |axis: usize| (position_px[axis] - depth.principal_px[axis]) / depth.focal_px[axis];
     Vector3::new(along(0), along(1), 1.0)
 }
 
-/// Which pixels are to be believed, and how their surface is turned.
+/// Which pixels are valid, and the orientation of their surface.
 pub fn readings(depth: &DepthMap, voxel_grid: &VoxelGrid) -> Vec<Reading> {
     let [width, height] = depth.size_px.map(i64::from);
     (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).map(|pixel| reading(depth, voxel_grid, pixel)).collect()
