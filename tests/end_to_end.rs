@@ -464,7 +464,7 @@ fn replay_without_training_keyframes_reports_the_reason() {
     std::fs::write(folder.join("once.toml"), once).expect("room on the disk");
     std::fs::write(folder.join("other.toml"), text.replace("camera.wrist", "camera.front")).expect("room on the disk");
     events(folder, &["record", "once.toml", "--sim", "--out", "one.mcap", "--json"]);
-    for (rig, reason) in [("rig.toml", "the only keyframe is held out"), ("other.toml", "are of \"wrist\"")] {
+    for (rig, reason) in [("rig.toml", "the only keyframe is a test image"), ("other.toml", "are from \"wrist\"")] {
         let output = fieldrig(
             folder,
             &["run", rig, "--from", "one.mcap", "--out", &format!("out-{rig}"), "--listen", "127.0.0.1:0"],
