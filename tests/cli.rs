@@ -172,7 +172,7 @@ fn invalid_arguments_exit_with_2() {
     assert!(!out.exists(), "what is refused leaves nothing behind");
     let out = folder.path().join("refused");
     let to = ["--listen", "127.0.0.1:0", "--out", out.to_str().expect("a plain name")];
-    for (flag, value) in [("--max-splats", "9"), ("--refine", "mount"), ("--count", "to-cap")] {
+    for (flag, value) in [("--max-splats", "9"), ("--refine", "extrinsics"), ("--count", "to-cap")] {
         for method in ["nerf", "tsdf"] {
             let run = ["run", &rig, "--sim", "--method", method, flag, value];
             assert_fails_with(&[&run[..], &to].concat(), 2, &[flag, "method", method]);
