@@ -366,7 +366,7 @@ fn record_reports_losses_and_does_not_overwrite() {
     let done: Value = serde_json::from_slice(&output.stdout).expect("a JSON object");
     assert_eq!((done["images"].as_i64(), done["depth_images"].as_i64()), (Some(N_IMAGES), Some(N_IMAGES)));
     let n_dropped = done["dropped"]["wrist"]["images"].as_u64().expect("a number");
-    assert!(n_dropped > 0 && printed.contains(&format!("camera \"wrist\" lost {n_dropped} color")), "{printed}");
+    assert!(n_dropped > 0 && printed.contains(&format!("camera \"wrist\" dropped {n_dropped} color")), "{printed}");
 
     let before = std::fs::read(folder.join("scan.mcap")).expect("a recording");
     let itself = ["run", "rig.toml", "--from", "scan.mcap", "--record", "scan.mcap", "--listen", "127.0.0.1:0"];
