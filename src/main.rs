@@ -73,8 +73,7 @@ fn main() -> ExitCode {
 }
 
 /// Keeps software Vulkan from printing an irrelevant error on machines without a desktop: it looks for a Wayland
-/// display
-/// there, and its library complains if there is none, unless the display is given as an absolute path.
+/// display there, and its library complains if there is none, unless the display is given as an absolute path.
 #[expect(unsafe_code, reason = "that library can only be configured through the environment")]
 fn keep_wayland_quiet() {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() && std::env::var_os("WAYLAND_DISPLAY").is_none() {

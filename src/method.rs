@@ -39,8 +39,8 @@ pub(crate) struct ModelSpec {
 
 impl ModelSpec {
     /// Creates an untrained model. A distance field uses only the memory limit of the options and the alignment; a
-    /// neural field
-    /// also uses the seed, the planned steps and the camera refinement. Everything else comes from the keyframes.
+    /// neural field also uses the seed, the planned steps and the camera refinement. Everything else comes from the
+    /// keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>) -> anyhow::Result<Box<dyn Method>> {
         let Self { kind, options } = self;
         Ok(match kind {
@@ -107,8 +107,7 @@ fn saved_options<T: serde::de::DeserializeOwned>(checkpoint: &Checkpoint) -> any
 /// The kind of model in a folder, from the method in `model.json` or else from the files; `None` if neither identifies
 /// one.
 ///
-/// # Errors
-/// If the folder contains several models, or `model.json` is invalid.
+/// # Errors If the folder contains several models, or `model.json` is invalid.
 pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<ModelKind>> {
     expect_one_model(folder)?;
     #[derive(serde::Deserialize)]

@@ -27,8 +27,7 @@ static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
 /// Maximum number of output chunks that wait to be written. Up to this many, a terminal that accepts no output, such as
-/// one
-/// behind a broken connection, does not block the program.
+/// one behind a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
@@ -173,8 +172,7 @@ pub(crate) fn report(text: impl Display) {
 }
 
 /// Prints the error that ends the program to stderr. Like the log, it goes through the writer thread, so a terminal
-/// that accepts
-/// no output does not prevent the program from exiting with the right code.
+/// that accepts no output does not prevent the program from exiting with the right code.
 pub(crate) fn error(error: &anyhow::Error) {
     let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("error: {error:#}\n").into_bytes())));
 }
@@ -200,8 +198,7 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
 
 /// Prints one JSON object on its own line, as [`report`] does.
 ///
-/// # Errors
-/// If the value cannot be serialized as JSON.
+/// # Errors If the value cannot be serialized as JSON.
 pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
     report(json_text(value)?);
     Ok(())

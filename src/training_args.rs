@@ -14,8 +14,7 @@ pub(crate) const REALIGN: &str = "base.realign";
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
     /// Scene model: splat (Gaussian splats), nerf (neural radiance field), tsdf (signed distance field with a mesh), or
-    /// several
-    /// separated by commas. `train` and `run` train several at once, `bench curve` one after the other
+    /// several separated by commas. `train` and `run` train several at once, `bench curve` one after the other
     /// [default: train.method of the rig file, else splat]
     #[arg(long, value_name = "METHOD", value_parser = methods)]
     pub(crate) method: Option<Methods>,
@@ -31,17 +30,14 @@ pub(crate) struct TrainingArgs {
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS_RANGE))]
     pub(crate) max_splats: Option<u64>,
     /// Calibration parameters to estimate: auto (those that improve validation images), none, or a list of base,
-    /// extrinsics,
-    /// time-offset, joints, depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated by commas.
-    /// Images
-    /// with depth are registered before training; without depth, the parameters are optimized with the scene. base
-    /// estimates the
-    /// pose of a mobile base at every station [default: base; for data on disk with a GPU: auto]
+    /// extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated
+    /// by commas. Images with depth are registered before training; without depth, the parameters are optimized with
+    /// the scene. base estimates the pose of a mobile base at every station [default: base; for data on disk with a
+    /// GPU: auto]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true)]
     pub(crate) refine: Vec<Refine>,
     /// How the number of splats is chosen: to-cap (grow to --max-splats) or tested (grow to --max-splats, then halve as
-    /// long as
-    /// that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk with a GPU: tested]
+    /// long as that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }

@@ -1,13 +1,11 @@
 //! Disturbances of keyframes, one size at a time.
 //!
 //! A clock offset and an exposure step affect all images including test images, as they would on a robot. Pose noise
-//! affects only
-//! training images: test images keep their true poses, so that the scores measure the model.
+//! affects only training images: test images keep their true poses, so that the scores measure the model.
 //!
 //! A disturbance is a stateless function of its size, a seed and the keyframes. Its effect on one keyframe does not
-//! depend on the
-//! order of the others. All sizes with one seed share their random directions, which keeps curves over the size free of
-//! extra noise.
+//! depend on the order of the others. All sizes with one seed share their random directions, which keeps curves over
+//! the size free of extra noise.
 
 use crate::bench::statistics::Interpolation;
 use kinematics::{Stamp, Transform, Twist, transform};

@@ -71,8 +71,8 @@ pub(crate) struct Growth {
     /// Median resident memory in that time.
     pub(crate) resident_bytes: f64,
     /// Theil-Sen slope: the median of the slopes between all pairs of samples.
+    pub(crate) bytes_per_hour: f64,
     /// The slope as a percentage of `resident_bytes`.
-    /// The same as a share of `resident_bytes`.
     pub(crate) percent_per_hour: f64,
 }
 

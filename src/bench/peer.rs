@@ -31,8 +31,7 @@ struct File {
 impl Peer {
     /// Reads a file.
     ///
-    /// # Errors
-    /// If the file is unreadable or has another format.
+    /// # Errors If the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self, BadArgument> {
         let invalid = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;

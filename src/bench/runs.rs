@@ -148,8 +148,7 @@ pub(crate) struct Runs<'a> {
 impl NamedData {
     /// The scene model, for a bench of a single method.
     ///
-    /// # Errors
-    /// If there are several.
+    /// # Errors If there are several.
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec, BadArgument> {
         match &self.model_specs[..] {
             [one] => Ok(one),
@@ -163,8 +162,7 @@ impl NamedData {
 
     /// The training options of splats, for a bench of splats.
     ///
-    /// # Errors
-    /// If the method is another one.
+    /// # Errors If the method is another one.
     pub(crate) fn splats(&self) -> Result<&SplatOptions, BadArgument> {
         match &self.model_specs[..] {
             [ModelSpec { kind: ModelKind::Splat, options }] => Ok(options),

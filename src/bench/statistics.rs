@@ -35,7 +35,7 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     Some((values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt())
 }
 
-/// When a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
+/// Time at which a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
 ///
 /// For a curve that starts above the target, this is the time of its first point.
 pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
@@ -58,10 +58,10 @@ pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
 
 /// How values between two levels of a disturbance are interpolated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-/// Linear in the level.
-    /// On a straight line over the level.
+pub(crate) enum Interpolation {
+    /// Linear in the level.
+    Linear,
     /// Linear in the logarithm of the level, which must be above 0.
-    /// On a straight line over the logarithm of the level, which is above 0.
     Log,
 }
 

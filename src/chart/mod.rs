@@ -1,8 +1,7 @@
 //! Line charts, drawn once for both SVG and PNG.
 //!
 //! The colors are those of Okabe and Ito (2008), which color-blind people can distinguish. The dots of lines also
-//! differ in shape,
-//! for grayscale prints.
+//! differ in shape, for grayscale prints.
 
 mod axis;
 pub(crate) mod drawing;

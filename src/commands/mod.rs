@@ -52,8 +52,7 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
 }
 
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
-/// and
-/// `no-matrices` only cooperative matrices.
+/// and `no-matrices` only cooperative matrices.
 pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     open_gpu_with(GpuOptions::default())
 }

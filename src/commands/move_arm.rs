@@ -129,8 +129,7 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
 }
 
 /// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an arm to its limits. A
-/// joint that
-/// is already outside may stay there.
+/// joint that is already outside may stay there.
 fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
     let chain = open::chain_of(rig)?;
     for (ix, joint) in rig.arm.joints.iter().enumerate() {

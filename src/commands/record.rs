@@ -28,8 +28,7 @@ pub(crate) struct Args {
     #[arg(long, requires = "sim")]
     lockstep: bool,
     /// Stop after S seconds of device time [default: until Ctrl-C or until the devices end; required with --lockstep,
-    /// unless
-    /// the rig file ends the simulation]
+    /// unless the rig file ends the simulation]
     #[arg(long, value_name = "S", value_parser = number_in_range(0.1..=1e7))]
     seconds: Option<f64>,
     /// Print JSON, one object per line

@@ -56,16 +56,14 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags.
-    /// New
-    /// keyframes are added; --record and --listen are not restored
+    /// New keyframes are added; --record and --listen are not restored
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image; time before --resume counts [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
-    /// With
-    /// --lockstep, a seed then gives one result
+    /// With --lockstep, a seed then gives one result
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Optimizer steps between two keyframes; needs --lockstep or --from [default: 10]
@@ -77,8 +75,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
     listen: SocketAddr,
     /// Folder for the results and the effective rig file; several methods get a subfolder each. A folder that contains
-    /// a model is
-    /// refused [default: a new folder in runs]
+    /// a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]

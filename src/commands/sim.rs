@@ -10,16 +10,14 @@ pub(crate) struct Args {
     /// Rig file to emulate (TOML), or a scene: static-arm or mobile-arm
     ///
     /// Each device is emulated as its driver in the rig file expects: `franka` as a controller at arm.address, `can` as
-    /// motors
-    /// on the buses of [arm.bus], `udp` as datagrams, `realsense` as a .bag file. Scenes include a rig file.
+    /// motors on the buses of [arm.bus], `udp` as datagrams, `realsense` as a .bag file. Scenes include a rig file.
     rig_or_scene: String,
     /// Folder for the rig file to run against the emulated devices, the robot description and the camera recordings
     /// [default: sim-NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Length of the playback in seconds; then devices stand still until Ctrl-C. A 640x480 RGB-D camera at 15 Hz writes
-    /// 60 MB per second
-    /// into the folder
+    /// 60 MB per second into the folder
     #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = number_in_range(0.1..=86_400.0))]
     seconds: f64,
     /// Play back this recording of the same rig instead of a simulation

@@ -48,13 +48,11 @@ pub(crate) struct Args {
     #[command(flatten)]
     training: TrainingArgs,
     /// Continue from the checkpoint in this folder, on the same data and with its flags; no other flag is needed. A
-    /// larger --steps
-    /// or --seconds continues a finished run; model settings cannot be changed
+    /// larger --steps or --seconds continues a finished run; model settings cannot be changed
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
     /// Repeat the timing-dependent decisions of an earlier run and get the same model. Takes the run's decisions.jsonl
-    /// and needs
-    /// its data
+    /// and needs its data
     #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
@@ -62,8 +60,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
     /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, so
-    /// one seed
-    /// gives one result
+    /// one seed gives one result
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
     /// Steps over which the learning rate decays and the model grows [default: --steps, else 7000]
@@ -72,10 +69,8 @@ pub(crate) struct Args {
     #[command(flatten)]
     images: DataArgs,
     /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
-    /// half of their
-    /// pixels. All methods treat it as measured. The model must be of the same place, in the same world frame. --refine
-    /// then
-    /// estimates parameters jointly with the scene
+    /// half of their pixels. All methods treat it as measured. The model must be of the same place, in the same world
+    /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
     /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]

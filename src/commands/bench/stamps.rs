@@ -106,8 +106,7 @@ fn check(args: &Args) -> Result<(), BadArgument> {
 }
 
 /// For each image after the settling time, the time of the pose that the join assigns to it minus the time of its
-/// shutter. The
-/// fixed latency is included.
+/// shutter. The fixed latency is included.
 #[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
 fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = seed;
