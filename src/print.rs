@@ -1,9 +1,10 @@
 //! Terminal output: results on stdout, log and progress on stderr.
 //!
-//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if stdout fails.
-//! A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and [`report_json`], which never fail: a
-//! closed terminal or a full disk loses lines, not the model. A separate thread writes the lines, so that a terminal that accepts
-//! no output does not block the program. [`has_lost_output`] returns whether any lines were lost.
+//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if
+//! stdout fails. A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and
+//! [`report_json`], which never fail: a closed terminal or a full disk loses lines, not the model. A separate thread
+//! writes the lines, so that a terminal that accepts no output does not block the program. [`has_lost_output`] returns
+//! whether any lines were lost.
 
 use anyhow::Context;
 use console::Term;
@@ -36,7 +37,7 @@ const MAX_FLUSH: Duration = Duration::from_secs(5);
 enum OutputChunk {
     Out(Vec<u8>),
     Err(Vec<u8>),
-    /// Answered when everything before it has been written.
+    /// Acknowledged once everything before it has been written.
     Flush(SyncSender<()>),
 }
 
@@ -88,8 +89,8 @@ fn target() -> ProgressDrawTarget {
 
 /// A terminal that may disappear or stop accepting output at any time: output goes through the writer thread.
 ///
-/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does with EIO
-/// after a terminal is closed.
+/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does
+/// with EIO after a terminal is closed.
 #[derive(Debug)]
 struct BarTerm {
     term: Term,
@@ -163,7 +164,8 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
-/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged once.
+/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged
+/// once.
 pub(crate) fn report(text: impl Display) {
     let sent = BARS.suspend(|| WRITER.try_send(OutputChunk::Out(format!("{text}\n").into_bytes())));
     if sent.is_err() {

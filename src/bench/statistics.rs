@@ -46,7 +46,8 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of x.
+/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of
+/// x.
 ///
 /// Source: Theil 1950, Sen 1968. A few outliers do not change it.
 pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
@@ -65,7 +66,8 @@ pub(crate) enum Interpolation {
     Log,
 }
 
-/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never does.
+/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never
+/// does.
 pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Interpolation) -> Option<f64> {
     let floor = curve.first()?.1 - drop_db;
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;

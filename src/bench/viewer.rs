@@ -243,7 +243,7 @@ mod tests {
             };
             if n_drawn == 0 {
                 // The viewer repeats the request.
-                pending.fail("nothing was seen yet");
+                pending.fail("no image yet");
             } else {
                 let size_px = pending.request.size_px;
                 let n = (size_px[0] * size_px[1]) as usize;
@@ -251,7 +251,7 @@ mod tests {
             }
             n_drawn += 1;
         }
-        assert!(n_drawn >= 4, "one failed request and three pictures, of one stage each if the server draws fast");
+        assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
         drop(viewer);
         while hub.n_clients() > 0 {
             assert!(started.elapsed() < Duration::from_secs(60));

@@ -135,12 +135,12 @@ fn to_f32(value: f64) -> f32 {
     value as f32
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of u8")]
+#[expect(clippy::cast_possible_truncation, reason = "casts of floats saturate")]
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of i64")]
+#[expect(clippy::cast_possible_truncation, reason = "casts of floats saturate")]
 fn pixel(units: f64) -> i64 {
     (units * f64::from(PIXELS_PER_UNIT)).round() as i64
 }

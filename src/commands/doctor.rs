@@ -346,7 +346,7 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     for camera in realsense_of(rig) {
         let is_connected = found.iter().any(|device| camera.device.is_empty() || device.serial == camera.device);
         if !is_connected {
-            let message = format!("camera {:?}: no RealSense camera {:?} is plugged in", camera.name, camera.device);
+            let message = format!("camera {:?}: no RealSense camera {:?} is connected", camera.name, camera.device);
             findings.push(Finding::fail(CHECK, message, "list the connected cameras with fieldrig devices"));
         }
     }

@@ -107,7 +107,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_no_overwrite(&args.out, requests.len())?;
     partial::remove_on_signals()?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
@@ -125,7 +125,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     bar.finish_and_clear();
     warn_if_hardly_covered(&covered_fracs);
     if !args.json {
-        let n_pictures = print::counted(requests.len() as u64, "picture");
+        let n_pictures = print::counted(requests.len() as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)

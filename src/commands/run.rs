@@ -182,7 +182,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         return Err(error);
     }
     if live.has_exhausted_input() {
-        log::info!("the devices ended and all their data is in the model: no training steps are left");
+        log::info!("the devices have ended and all their data is in the model");
     }
     stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
@@ -536,7 +536,9 @@ impl Args {
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         if let (Some(file), None) = (flag(RECORD), &self.record) {
-            log::warn!("the first part was recorded in {file}; this part is not, unless --record names another file");
+            log::warn!(
+                "the first part was recorded to {file}; this part is not recorded unless --record names another file"
+            );
         }
         Self {
             seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),

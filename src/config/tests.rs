@@ -251,7 +251,7 @@ fn every_key_takes_effect_and_rejects_invalid_values() {
                 invalid.push(format!("{key} = {good} changes nothing"))
             }
             Ok(_) => {}
-            Err(e) => invalid.push(format!("{key} = {good} is refused: {e}")),
+            Err(e) => invalid.push(format!("{key} = {good} is rejected: {e}")),
         }
         match with(key, bad) {
             Ok(_) => invalid.push(format!("{key} = {bad} is accepted")),
@@ -418,7 +418,7 @@ fn pinhole_with_nonzero_coefficients_is_rejected() {
 fn tag_ids_are_limited_by_family() {
     let numbered = |id: u32| parse(&RIG.replace("[base.tag.7]", &format!("[base.tag.{id}]")), &[]);
     assert!(numbered(586).is_ok());
-    let refused = numbered(587).expect_err("tag36h11 ends before").to_string();
+    let refused = numbered(587).expect_err("outside tag36h11").to_string();
     assert!(refused.contains("base.tag.587") && refused.contains("0 to 586"), "{refused}");
 }
 

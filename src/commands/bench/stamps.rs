@@ -118,7 +118,7 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
         let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
         let position = vec![SPEED_RAD_S * stamp.secs_since(Stamp(0))];
         let state = JointState { stamp, position, velocity: vec![SPEED_RAD_S], effort: Vec::new() };
-        joints.push(state).expect("in order, and numbers");
+        joints.push(state).expect("the states are ordered and finite");
     }
     let mut errors = Vec::new();
     for ix in 0..(args.seconds * rate_hz) as i64 {
@@ -147,7 +147,7 @@ fn uniform(state: &mut u64) -> f64 {
 }
 
 impl StampErrors {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped into the bars")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bins")]
     fn of(rate_hz: f64, is_calibrated: bool, errors: &[f64]) -> Self {
         let n_bars = (2.0 * HISTOGRAM_RANGE_MILLIS / BIN_MILLIS).round() as usize;
         let mut bars = vec![0.0; n_bars];
