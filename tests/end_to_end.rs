@@ -8,6 +8,7 @@ use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
+use trainer::gpu::{Gpu, GpuOptions};
 
 /// Images the simulated camera delivers.
 const N_IMAGES: i64 = 40;
@@ -161,24 +162,28 @@ fn tsdf_runs_live_replays_and_resumes() {
     assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "two halves give another model");
 }
 
-/// Steps of a neural field: few, since software takes its time over each.
-const N_RAY_STEPS: &str = "120";
-/// Measured 16.5 dB: keyframes come in while it learns.
-const MIN_PSNR_OF_RAYS: f64 = 14.0;
+/// Steps that train a NeRF: few on a software adapter, where each is slow. On a GPU the model is larger and needs more.
+fn n_nerf_steps() -> &'static str {
+    let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
+    if gpu.is_software() { "120" } else { "300" }
+}
+/// Measured 16.5 dB on a software adapter, 22.6 dB on an H100: keyframes arrive during training.
+const MIN_NERF_PSNR: f64 = 14.0;
 
 #[test]
 fn nerf_runs_live_replays_and_resumes() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     rig_file(folder);
-    let common = ["--method", "nerf", "--json", "--steps", N_RAY_STEPS];
+    let n_steps = n_nerf_steps();
+    let common = ["--method", "nerf", "--json", "--steps", n_steps];
     let run = [&["--steps-per-keyframe", "8", "--listen", "127.0.0.1:0"], &common[..]].concat();
     let live = ["run", "rig.toml", "--sim", "--record", "scan.mcap", "--out", "live"];
     let printed = events(folder, &[&live[..], &run].concat());
     let done = printed.last().expect("events");
     let psnr = number(done, "psnr");
-    assert!(psnr >= MIN_PSNR_OF_RAYS, "test PSNR {psnr:.2} dB");
-    assert_eq!(done["steps"].as_u64(), N_RAY_STEPS.parse().ok());
+    assert!(psnr >= MIN_NERF_PSNR, "test PSNR {psnr:.2} dB");
+    assert_eq!(done["steps"].as_u64(), n_steps.parse().ok());
 
     let replay = ["run", "rig.toml", "--from", "scan.mcap", "--out", "replay"];
     let replayed = events(folder, &[&replay[..], &run].concat());

@@ -79,6 +79,6 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     if image < rule.n_images && is_learned && begin < end && abs(gradient) < MAX_ABS {
         let at = image * IMAGE_PARAM_STRIDE + lane;
         let rate = step_scale.rate_frac * vec3f(rule.rotation_rate, rule.translation_rate, rule.embedding_rate)[part];
-        image_params[at] = stepped(image_params[at], gradient, rate, rule.weight_decay * step_scale.rate_frac);
+        image_params[at] = adam_step(image_params[at], gradient, rate, rule.weight_decay * step_scale.rate_frac);
     }
 }

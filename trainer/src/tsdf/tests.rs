@@ -391,7 +391,7 @@ fn resume_is_bit_exact() {
         refused(&other, &keyframes)
     };
     assert!(broken(&|other| other.method = "splat".into()).contains("\"splat\""));
-    assert!(broken(&|other| other.state["n_blocks"] = 1.into()).contains("\"places\" has"));
+    assert!(broken(&|other| other.state["n_blocks"] = 1.into()).contains("\"block_coords\" has"));
     assert!(broken(&|other| other.state["voxel_grid"]["voxel_m"] = (-1.0).into()).contains("no field"));
     assert!(broken(&|other| other.state["future"] = 1.into()).contains("unknown field"));
 }
