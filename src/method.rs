@@ -137,13 +137,13 @@ pub(crate) struct LoadedModel {
     pub(crate) bounds: Option<Bounds>,
 }
 
-/// Loads a saved model as [`load`] does, with its bounds if `wants_bounds`.
-pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) -> anyhow::Result<LoadedModel> {
+/// Loads a saved model as [`load`] does, with its bounds if `needs_bounds`.
+pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, needs_bounds: bool) -> anyhow::Result<LoadedModel> {
     expect_model(model)?;
     match kind_in(model)? {
         Some(ModelKind::Tsdf) => {
             let mut tsdf = TsdfModel::load(gpu, model)?;
-            let voxel_grid = tsdf.voxel_grid().filter(|_| wants_bounds).cloned();
+            let voxel_grid = tsdf.voxel_grid().filter(|_| needs_bounds).cloned();
             let bounds = match voxel_grid {
                 Some(voxel_grid) => Bounds::of_blocks(tsdf.blocks()?.keys(), &voxel_grid),
                 None => None,
@@ -152,14 +152,14 @@ pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) 
         }
         Some(ModelKind::Nerf) => {
             let nerf = NerfModel::load(gpu, model)?;
-            let extent = nerf.extent().filter(|_| wants_bounds);
+            let extent = nerf.extent().filter(|_| needs_bounds);
             let bounds = extent.map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m });
             return Ok(LoadedModel { kind: ModelKind::Nerf, method: Box::new(Aligned::load(nerf, model)?), bounds });
         }
         Some(ModelKind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;
-    let bounds = if wants_bounds { Bounds::of_splats(&splats) } else { None };
+    let bounds = if needs_bounds { Bounds::of_splats(&splats) } else { None };
     let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;
     let method: Box<dyn Method> =
         Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer });

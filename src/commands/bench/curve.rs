@@ -182,11 +182,11 @@ impl CurveResult {
     }
 
     fn line(&self) -> Line {
-        let point = |point_of: &CurvePoint| Point {
-            x: point_of.seconds,
-            y: point_of.psnr,
-            low: point_of.min_psnr,
-            high: point_of.max_psnr,
+        let point = |evaluation: &CurvePoint| Point {
+            x: evaluation.seconds,
+            y: evaluation.psnr,
+            low: evaluation.min_psnr,
+            high: evaluation.max_psnr,
         };
         Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_peer: self.is_peer }
     }
@@ -208,8 +208,8 @@ fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
     for curve in curves {
         let mut taken = HashSet::new();
         for &(seconds, psnr) in curve {
-            let point_of = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
-            groups.entry((point_of, !taken.insert(point_of))).or_default().push((seconds, psnr));
+            let scheduled_bits = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
+            groups.entry((scheduled_bits, !taken.insert(scheduled_bits))).or_default().push((seconds, psnr));
         }
     }
     let mut evaluations: Vec<CurvePoint> = groups
@@ -380,7 +380,7 @@ mod tests {
         ];
         let evaluations = median_curve(&curves);
         let points: Vec<(f64, f64, usize)> =
-            evaluations.iter().map(|point_of| (point_of.seconds, point_of.psnr, point_of.n_runs)).collect();
+            evaluations.iter().map(|point| (point.seconds, point.psnr, point.n_runs)).collect();
         assert_eq!(points, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "a single run at 0.5 s gives no point");
         assert_eq!((evaluations[1].min_psnr, evaluations[1].max_psnr), (20.0, 25.0));
     }
@@ -388,7 +388,7 @@ mod tests {
     #[test]
     fn end_between_evaluations_is_a_separate_point() {
         let evaluations = median_curve(&[vec![(1.0, 20.0), (1.9, 21.0)], vec![(1.0, 22.0), (1.9, 23.0)]]);
-        assert_eq!(evaluations.iter().map(|point_of| point_of.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
+        assert_eq!(evaluations.iter().map(|point| point.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
     }
 
     #[test]
