@@ -1,28 +1,28 @@
-//! Exit codes, and which error means which.
+//! Exit codes and the errors that lead to them.
 
 use crate::config::ConfigError;
 use crate::print;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
-/// How a command ended; the number is the exit code.
+/// How a command ended. The discriminant is the exit code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum Exit {
-    /// All done.
+    /// Success.
     Done = 0,
     /// Something failed.
     Failed = 1,
-    /// The arguments, or the rig file they name, make no sense.
+    /// The arguments, or the rig file they name, are invalid.
     BadArguments = 2,
-    /// Done, but something was lost on the way.
+    /// Done, but some data is missing from the result.
     Loss = 3,
-    /// Not done: what came in does not suffice.
+    /// Not done: the input is not sufficient for a result.
     Refused = 4,
 }
 
 impl Exit {
-    /// A command that succeeded but could not print all of its output ends with a loss.
+    /// Turns success into a loss if some of the output could not be printed.
     pub(crate) fn or_output_loss(self) -> Self {
         if self == Self::Done && print::has_lost_output() { Self::Loss } else { self }
     }
@@ -34,12 +34,12 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// An error that is the caller's: wrong arguments, or a rig file that does not check.
+/// A user error: invalid arguments, or an invalid rig file.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct BadArgument(pub(crate) String);
 
-/// What came in does not suffice for a result.
+/// The input is not sufficient for a result.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct InsufficientData(pub(crate) String);
@@ -58,10 +58,10 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
     }
 }
 
-/// The exit code of a command that did what it could: each loss of data that was to be kept is told on stderr.
+/// Logs each loss of data as a warning and returns the exit code.
 pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
     for loss in data_losses {
-        log::warn!("lost: {loss}");
+        log::warn!("data loss: {loss}");
     }
     if data_losses.is_empty() { Exit::Done } else { Exit::Loss }
 }

@@ -72,12 +72,12 @@ fn main() -> ExitCode {
     }
 }
 
-/// Without a desktop, software Vulkan looks for a Wayland display all the same, and its library prints an error that is
-/// none; it does not when the display it is to look for has a full path.
-#[expect(unsafe_code, reason = "the environment is the only way to tell that library")]
+/// Keeps software Vulkan from printing an irrelevant error on machines without a desktop: it looks for a Wayland
+/// display there, and its library complains if there is none, unless the display is given as an absolute path.
+#[expect(unsafe_code, reason = "that library can only be configured through the environment")]
 fn keep_wayland_quiet() {
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() && std::env::var_os("WAYLAND_DISPLAY").is_none() {
-        // SAFETY: this is the first thing the program does; no other thread exists that could read the environment.
+        // SAFETY: this runs before anything else, so no other thread can read the environment.
         unsafe { std::env::set_var("WAYLAND_DISPLAY", "/nowhere") };
     }
 }

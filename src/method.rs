@@ -1,4 +1,4 @@
-//! Which scene model: by its name on the command line, new or out of a folder.
+//! Creates, resumes and loads scene models of any kind.
 
 mod failed_model;
 mod kind;
@@ -21,7 +21,7 @@ use trainer::splat::{CameraRefinement, SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
 use trainer::{Aligned, Keyframe, Method, Restartable};
 
-/// Names of kinds for people: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
+/// Names of kinds as prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub(crate) fn describe(kinds: &[ModelKind]) -> String {
     let names: Vec<&str> = kinds.iter().map(|kind| kind.name()).collect();
     match names.split_last() {
@@ -30,7 +30,7 @@ pub(crate) fn describe(kinds: &[ModelKind]) -> String {
     }
 }
 
-/// A scene model to be made.
+/// Kind and options of a model to create.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ModelSpec {
     pub(crate) kind: ModelKind,
@@ -38,8 +38,9 @@ pub(crate) struct ModelSpec {
 }
 
 impl ModelSpec {
-    /// A model that has seen nothing yet. Of the options a distance field has the memory it may take, a neural field also
-    /// seed, planned steps and whether poses of images are learned, and both alignment; what else they want to know they find in the keyframes.
+    /// Creates an untrained model. A distance field uses only the memory limit of the options and the alignment; a
+    /// neural field also uses the seed, the planned steps and the camera refinement. Everything else comes from the
+    /// keyframes.
     pub(crate) fn start(self, gpu: Arc<Gpu>) -> anyhow::Result<Box<dyn Method>> {
         let Self { kind, options } = self;
         Ok(match kind {
@@ -50,7 +51,7 @@ impl ModelSpec {
     }
 }
 
-/// The model, with its cameras aligned where that is asked for.
+/// The model, with camera alignment if the options request it.
 fn aligned(model: impl Restartable + 'static, gpu: &Gpu, options: SplatOptions) -> Box<dyn Method> {
     if options.align == CameraRefinement::default() {
         return Box::new(model);
@@ -67,16 +68,16 @@ fn nerf_options(options: &SplatOptions) -> NerfOptions {
     NerfOptions { seed, max_bytes, n_planned_steps, cameras: options.cameras.clone(), ..NerfOptions::default() }
 }
 
-/// A model that goes on from a checkpoint.
+/// A model restored from a checkpoint.
 pub(crate) struct Resumed {
-    /// Seed and planned steps are those that training began with.
+    /// Seed and planned steps are those of the original training.
     pub(crate) model_spec: ModelSpec,
     pub(crate) method: Box<dyn Method>,
-    /// What it had not learned from: test keyframes, and new ones.
+    /// Keyframes it was not trained on: test keyframes and new ones.
     pub(crate) untrained: Vec<Arc<Keyframe>>,
 }
 
-/// Goes on from a checkpoint; what was learned from must be among the keyframes.
+/// Restores a model from a checkpoint. `keyframes` must contain those it was trained on.
 pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<Resumed> {
     if checkpoint.method == ModelKind::Tsdf.name() {
         let TsdfOptions { max_bytes, .. } = saved_options(checkpoint)?;
@@ -97,14 +98,16 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
     Ok(Resumed { model_spec, method: Box::new(model), untrained })
 }
 
-/// The options of the model that a checkpoint is of.
+/// The options of the model in a checkpoint.
 fn saved_options<T: serde::de::DeserializeOwned>(checkpoint: &Checkpoint) -> anyhow::Result<T> {
     let options = checkpoint.state.get("options").cloned().unwrap_or_default();
-    serde_json::from_value(options).context("the checkpoint does not say how its model was made")
+    serde_json::from_value(options).context("the checkpoint has no valid model options")
 }
 
-/// The kind of model that a folder holds: what its `model.json` names, else what its files are; `None` where there is neither.
-/// A folder that holds several models is refused.
+/// The kind of model in a folder, from the method in `model.json` or else from the files; `None` if neither identifies
+/// one.
+///
+/// # Errors If the folder contains several models, or `model.json` is invalid.
 pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<ModelKind>> {
     expect_one_model(folder)?;
     #[derive(serde::Deserialize)]
@@ -121,7 +124,7 @@ pub(crate) fn kind_in(folder: &Path) -> anyhow::Result<Option<ModelKind>> {
     Ok(metadata.method.as_deref().and_then(ModelKind::from_name).or_else(detected_kind))
 }
 
-/// A saved model: its folder, of any kind, or a file of splats.
+/// Loads a saved model of any kind from its folder, or splats from a file.
 pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method>> {
     Ok(load_with_bounds(gpu, model, false)?.method)
 }
@@ -130,17 +133,17 @@ pub(crate) fn load(gpu: Arc<Gpu>, model: &Path) -> anyhow::Result<Box<dyn Method
 pub(crate) struct LoadedModel {
     pub(crate) kind: ModelKind,
     pub(crate) method: Box<dyn Method>,
-    /// Where most of it is; `None` if the model is empty or the bounds were not requested.
+    /// Region that contains most of the model; `None` if the model is empty or the bounds were not requested.
     pub(crate) bounds: Option<Bounds>,
 }
 
-/// Loads a saved model as [`load`] does; with bounds if `wants_bounds`.
-pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) -> anyhow::Result<LoadedModel> {
+/// Loads a saved model as [`load`] does, with its bounds if `needs_bounds`.
+pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, needs_bounds: bool) -> anyhow::Result<LoadedModel> {
     expect_model(model)?;
     match kind_in(model)? {
         Some(ModelKind::Tsdf) => {
             let mut tsdf = TsdfModel::load(gpu, model)?;
-            let voxel_grid = tsdf.voxel_grid().filter(|_| wants_bounds).cloned();
+            let voxel_grid = tsdf.voxel_grid().filter(|_| needs_bounds).cloned();
             let bounds = match voxel_grid {
                 Some(voxel_grid) => Bounds::of_blocks(tsdf.blocks()?.keys(), &voxel_grid),
                 None => None,
@@ -149,21 +152,21 @@ pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, wants_bounds: bool) 
         }
         Some(ModelKind::Nerf) => {
             let nerf = NerfModel::load(gpu, model)?;
-            let extent = nerf.extent().filter(|_| wants_bounds);
+            let extent = nerf.extent().filter(|_| needs_bounds);
             let bounds = extent.map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m });
             return Ok(LoadedModel { kind: ModelKind::Nerf, method: Box::new(Aligned::load(nerf, model)?), bounds });
         }
         Some(ModelKind::Splat) | None => {}
     }
     let splats = splat_file::read(model)?;
-    let bounds = if wants_bounds { Bounds::of_splats(&splats) } else { None };
+    let bounds = if needs_bounds { Bounds::of_splats(&splats) } else { None };
     let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;
     let method: Box<dyn Method> =
         Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer });
     Ok(LoadedModel { kind: ModelKind::Splat, method, bounds })
 }
 
-/// The options of a rig file as the trainer wants them; `steps` when their number is settled beforehand.
+/// Trainer options from the settings in a rig file. `steps` is the number of steps if it is fixed in advance.
 pub(crate) fn options(train: &Train, steps: Option<u64>) -> Result<SplatOptions, BadArgument> {
     let defaults = SplatOptions::default();
     let max_splats = train.max_splats.unwrap_or(defaults.max_splats.into());

@@ -1,9 +1,10 @@
-//! What people and programs see: results on stdout, log and progress on stderr.
+//! Terminal output: results on stdout, log and progress on stderr.
 //!
-//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if stdout fails.
-//! A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and [`report_json`], which never fail: a
-//! closed terminal or a full disk loses lines, not the model. A separate thread writes the lines, so that a terminal that accepts
-//! no output does not block the program. [`has_lost_output`] returns afterwards whether any lines were lost.
+//! A command whose result is its output (`devices`, `metrics`) prints with [`line()`] and [`json`], which fail if
+//! stdout fails. A command whose result is a file (`train`, `run`, `record`) prints with [`report`] and
+//! [`report_json`], which never fail: a closed terminal or a full disk loses lines, not the model. A separate thread
+//! writes the lines, so that a terminal that accepts no output does not block the program. [`has_lost_output`] returns
+//! whether any lines were lost.
 
 use anyhow::Context;
 use console::Term;
@@ -21,22 +22,22 @@ use std::time::Duration;
 #[error("cannot write to stdout")]
 pub(crate) struct StdoutError(#[source] pub(crate) std::io::Error);
 
-/// The bars on stderr; log lines go above them.
+/// The progress bars on stderr; log lines are printed above them.
 static BARS: LazyLock<MultiProgress> = LazyLock::new(|| MultiProgress::with_draw_target(target()));
 /// Whether a line of [`report`] could not be written.
 static LOST_OUTPUT: AtomicBool = AtomicBool::new(false);
 
-/// Maximum number of pieces of output that wait to be written. Up to this many, a terminal that accepts no output, such as one
-/// behind a broken connection, does not block the program.
+/// Maximum number of output chunks that wait to be written. Up to this many, a terminal that accepts no output, such as
+/// one behind a broken connection, does not block the program.
 const MAX_WAITING: usize = 4096;
 /// At exit, the program waits at most this long for its output to be written.
 const MAX_FLUSH: Duration = Duration::from_secs(5);
 
-/// A piece of output for a stream.
+/// A chunk of output for one stream.
 enum OutputChunk {
     Out(Vec<u8>),
     Err(Vec<u8>),
-    /// Answered when everything before it has been written.
+    /// Acknowledged once everything before it has been written.
     Flush(SyncSender<()>),
 }
 
@@ -55,7 +56,7 @@ fn write(chunk: OutputChunk) {
                 log_lost(&error.to_string());
             }
         }
-        // Lost if the terminal is closed or the disk is full.
+        // The output is lost if the terminal is closed or the disk is full.
         OutputChunk::Err(bytes) => drop(std::io::stderr().write_all(&bytes)),
         OutputChunk::Flush(done) => drop(done.send(())),
     }
@@ -67,7 +68,7 @@ fn log_lost(reason: &str) {
     }
 }
 
-/// Waits until all output is written, but not for long if the stream accepts none.
+/// Waits until all output is written, at most [`MAX_FLUSH`].
 pub(crate) fn flush() {
     let (done, is_done) = sync_channel(1);
     let is_written = WRITER.try_send(OutputChunk::Flush(done)).is_ok() && is_done.recv_timeout(MAX_FLUSH).is_ok();
@@ -86,14 +87,14 @@ fn target() -> ProgressDrawTarget {
     }
 }
 
-/// A terminal that may disappear or stop accepting output at any time: output goes through the writing thread.
+/// A terminal that may disappear or stop accepting output at any time: output goes through the writer thread.
 ///
-/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does with EIO
-/// after a terminal is closed.
+/// indicatif's own target blocks on the terminal, and panics if drawing fails (`MultiProgress::suspend`), as it does
+/// with EIO after a terminal is closed.
 #[derive(Debug)]
 struct BarTerm {
     term: Term,
-    /// Drawn since the last flush.
+    /// Text drawn since the last flush.
     buffered: Mutex<String>,
 }
 
@@ -148,7 +149,7 @@ impl TermLike for BarTerm {
     fn flush(&self) -> std::io::Result<()> {
         let buffered = std::mem::take(&mut *self.buffered.lock().unwrap_or_else(PoisonError::into_inner));
         if !buffered.is_empty() {
-            let _ = WRITER.try_send(OutputChunk::Err(buffered.into_bytes())); // If the bar is lost, it is drawn again later.
+            let _ = WRITER.try_send(OutputChunk::Err(buffered.into_bytes())); // A lost bar is drawn again later.
         }
         Ok(())
     }
@@ -163,7 +164,8 @@ pub(crate) fn line(text: impl Display) -> Result<(), StdoutError> {
     })
 }
 
-/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged once.
+/// Prints one line about a result in a file. If stdout fails or accepts no output, the line is lost, which is logged
+/// once.
 pub(crate) fn report(text: impl Display) {
     let sent = BARS.suspend(|| WRITER.try_send(OutputChunk::Out(format!("{text}\n").into_bytes())));
     if sent.is_err() {
@@ -171,8 +173,8 @@ pub(crate) fn report(text: impl Display) {
     }
 }
 
-/// Prints the error that ends the program to stderr, through the writer thread like the log: a terminal that takes no output cannot keep
-/// the program from ending, and the exit code remains.
+/// Prints the error that ends the program to stderr. Like the log, it goes through the writer thread, so a terminal
+/// that accepts no output does not prevent the program from exiting with the right code.
 pub(crate) fn error(error: &anyhow::Error) {
     let _ = BARS.suspend(|| WRITER.try_send(OutputChunk::Err(format!("error: {error:#}\n").into_bytes())));
 }
@@ -182,7 +184,7 @@ pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
-/// A count with its word: `1 image`, `2 images`.
+/// A count and its noun: `1 image`, `2 images`.
 pub(crate) fn counted(n: u64, noun: &str) -> String {
     match noun.strip_suffix('y') {
         _ if n == 1 => format!("1 {noun}"),
@@ -191,15 +193,14 @@ pub(crate) fn counted(n: u64, noun: &str) -> String {
     }
 }
 
-/// Prints one JSON object on a line of its own.
+/// Prints one JSON object on its own line.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
 }
 
-/// Prints one JSON object on a separate line, as [`report`] does.
+/// Prints one JSON object on its own line, as [`report`] does.
 ///
-/// # Errors
-/// If the value cannot be written as JSON.
+/// # Errors If the value cannot be serialized as JSON.
 pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
     report(json_text(value)?);
     Ok(())
@@ -209,9 +210,9 @@ fn json_text(value: &impl Serialize) -> anyhow::Result<String> {
     serde_json::to_string(value).context("cannot write the result as JSON")
 }
 
-/// A progress bar on stderr; nothing where stderr is no terminal or `hidden` is set.
+/// Returns a progress bar on stderr; it is not drawn if `hidden` is set or stderr is not a terminal.
 ///
-/// `template` is indicatif's.
+/// `template` is an indicatif template.
 pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> ProgressBar {
     let bar = length.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
     bar.set_style(ProgressStyle::with_template(template).expect("templates are constants of this program"));
@@ -222,7 +223,7 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
     BARS.add(bar)
 }
 
-/// Sends log records to stderr. `RUST_LOG` overrules; `verbose` counts the `-v` flags.
+/// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
     let level = match verbose {
         0 => "warn,fieldrig=info,drivers=info,sim=info,trainer=info,viz=info",
@@ -235,7 +236,7 @@ pub(crate) fn start_log(verbose: u8) {
         .init();
 }
 
-/// Stderr, with the bars moved out of the way. Records that cannot be written are lost without an error to the caller.
+/// Writes to stderr above the progress bars. Records that cannot be written are dropped without an error.
 struct LogTarget;
 
 impl Write for LogTarget {

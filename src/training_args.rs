@@ -1,4 +1,4 @@
-//! Flags that every training command has; they override keys of the same name in a rig file.
+//! Flags shared by all commands that train. They override the keys of the same name in a rig file.
 
 use crate::config::{self, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, SEED_RANGE};
 use crate::exit::BadArgument;
@@ -7,39 +7,42 @@ use clap::{ValueEnum, value_parser};
 use trainer::align;
 use trainer::splat::{CameraRefinement, CountPolicy, ParamSet};
 
-/// The key of a rig file that `--refine` stands for.
+/// The rig file key that `--refine` sets.
 pub(crate) const REALIGN: &str = "base.realign";
 
-/// What to train, and how large it may become.
+/// Which models to train, and their limits.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat; nerf, a neural field; or tsdf, a distance field with a mesh; or several, separated by commas: `train`
-    /// and `run` let them learn at once, `bench curve` one after the other [default: the rig file's, else splat]
+    /// Scene model: splat (Gaussian splats), nerf (neural radiance field), tsdf (signed distance field with a mesh), or
+    /// several separated by commas. `train` and `run` train several at once, `bench curve` one after the other
+    /// [default: train.method of the rig file, else splat]
     #[arg(long, value_name = "METHOD", value_parser = methods)]
     pub(crate) method: Option<Methods>,
-    /// Seed of everything random, 0 to 2^63 - 1; trained for the same number of steps, one seed gives one result
+    /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same result
     /// [default: the rig file's, else 1]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(SEED_RANGE))]
     pub(crate) seed: Option<u64>,
-    /// Most GPU bytes the model may take, at least 1000000, and what the smallest model of the method takes [default: the rig file's, else no bound but memory]
+    /// Maximum GPU memory of each model in bytes, at least 1000000 and enough for the smallest model of the method
+    /// [default: the rig file's, else no limit]
     #[arg(long, value_name = "BYTES", value_parser = value_parser!(u64).range(MAX_BYTES_RANGE))]
     pub(crate) max_bytes: Option<u64>,
-    /// Most splats, 1 to 100000000 [default: the rig file's, else 400000]
+    /// Maximum number of splats, 1 to 100000000 [default: the rig file's, else 400000]
     #[arg(long, value_name = "N", value_parser = value_parser!(u64).range(MAX_SPLATS_RANGE))]
     pub(crate) max_splats: Option<u64>,
-    /// What is found about cameras: auto (what pays on held-back images), none, or a list of base, extrinsics, time-offset, joints,
-    /// depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated by commas. Where images have depth they are
-    /// laid over each other at the start, with base at each stand of a base that walks; else it is learned with the scene
-    /// [default: base; for data on disk auto on a GPU]
+    /// Calibration parameters to estimate: auto (those that improve validation images), none, or a list of base,
+    /// extrinsics, time-offset, joints, depth-pose, lens, depth-scale, readout, image-poses and image-gains, separated
+    /// by commas. Images with depth are registered before training; without depth, the parameters are optimized with
+    /// the scene. base estimates the pose of a mobile base at every station [default: base; for data on disk with a
+    /// GPU: auto]
     #[arg(long, value_name = "PARAMS", value_delimiter = ',', hide_possible_values = true)]
     pub(crate) refine: Vec<Refine>,
-    /// How many splats there are in the end: tested (grown up to --max-splats, then halved as long as that costs less than
-    /// 0.1 dB on held-back images) or to-cap (--max-splats) [default: to-cap; for data on disk tested on a GPU]
+    /// How the number of splats is chosen: to-cap (grow to --max-splats) or tested (grow to --max-splats, then halve as
+    /// long as that costs less than 0.1 dB on validation images) [default: to-cap; for data on disk with a GPU: tested]
     #[arg(long, value_name = "HOW", hide_possible_values = true)]
     pub(crate) count: Option<CountArg>,
 }
 
-/// Different scene models, at least one.
+/// Distinct scene models, at least one.
 #[derive(Clone, Debug)]
 pub(crate) struct Methods(Vec<ModelKind>);
 
@@ -47,28 +50,28 @@ fn methods(text: &str) -> Result<Methods, String> {
     let mut kinds = Vec::new();
     for name in text.split(',') {
         let kind = ModelKind::from_name(name)
-            .ok_or_else(|| format!("there is no {name:?}, only {}", method::describe(&ModelKind::ALL)))?;
+            .ok_or_else(|| format!("unknown method {name:?}, expected {}", method::describe(&ModelKind::ALL)))?;
         if kinds.contains(&kind) {
-            return Err(format!("{name} stands there twice"));
+            return Err(format!("{name} is listed twice"));
         }
         kinds.push(kind);
     }
     Ok(Methods(kinds))
 }
 
-/// What `--count` takes.
+/// Values of `--count`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum CountArg {
     Tested,
     ToCap,
 }
 
-/// What `--refine` takes.
+/// Values of `--refine`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum Refine {
     Auto,
     None,
-    /// Not of the cameras: the rig file's `base.realign`.
+    /// The rig file's `base.realign`; not a camera parameter.
     Base,
     Extrinsics,
     TimeOffset,
@@ -82,51 +85,51 @@ pub(crate) enum Refine {
 }
 
 impl Refine {
-    /// As it is written.
+    /// The name on the command line.
     fn name(&self) -> String {
         self.to_possible_value().map_or(String::new(), |name| name.get_name().to_owned())
     }
 }
 
-/// What is found about cameras, and how.
+/// Which calibration parameters are estimated, and how.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct RefineSettings {
-    /// By laying keyframes with depth over each other.
+    /// By registering keyframes with depth.
     pub(crate) align: CameraRefinement,
-    /// Along with the splats.
+    /// Jointly with the scene.
     pub(crate) with_scene: CameraRefinement,
 }
 
-/// What data have that cameras could be refined by.
+/// Properties of the data that limit which calibration parameters can be estimated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct AvailableData {
-    /// Poses come from a recording's joints, which are wrong in what all images share.
+    /// Poses come from the joints of a recording, so their errors are systematic and shared by all images.
     pub(crate) joints: bool,
-    /// Poses come from a SLAM system, or from a base that has one: they drift from image to image.
+    /// Poses come from a SLAM system or a base that uses one, so they drift from image to image.
     pub(crate) drifts: bool,
-    /// Keyframes, known from the start, with depth.
+    /// The keyframes are known before training and have depth.
     pub(crate) depth: bool,
 }
 
 impl TrainingArgs {
-    /// The scene models asked for, if any are.
+    /// The requested scene models; `None` if the flag is not given.
     pub(crate) fn methods(&self) -> Option<&[ModelKind]> {
         self.method.as_ref().map(|Methods(kinds)| kinds.as_slice())
     }
 
-    /// Refuses flags that only splats have where no scene model is splats.
+    /// Rejects flags that need splats if no scene model is splats.
     pub(crate) fn check_for(&self, kinds: &[ModelKind]) -> Result<(), BadArgument> {
         let of_splats = [(self.max_splats.is_some(), "--max-splats"), (self.count.is_some(), "--count")];
         match of_splats.into_iter().find(|(is_given, _)| *is_given && !kinds.contains(&ModelKind::Splat)) {
             Some((_, flag)) => Err(BadArgument(format!(
-                "{flag}: only the method splat has it, and the method is {}",
+                "{flag}: needs the method splat, but the method is {}",
                 method::describe(kinds)
             ))),
             None => Ok(()),
         }
     }
 
-    /// Refuses flags that make no sense whatever the data hold, before those are read.
+    /// Rejects flags that are invalid for any data, before the data is read.
     pub(crate) fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), BadArgument> {
         let all_available = AvailableData { joints, drifts: true, depth: true };
         self.check_for(kinds)?;
@@ -134,7 +137,7 @@ impl TrainingArgs {
         self.check_learned(kinds, all_available)
     }
 
-    /// Refuses terms that were asked for and that no scene model finds, and names those that one does.
+    /// Rejects requested parameters that no scene model can estimate; the error lists the valid ones.
     pub(crate) fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), BadArgument> {
         let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
         let can_learn = |param: &Refine| {
@@ -148,16 +151,16 @@ impl TrainingArgs {
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
         let known: Vec<String> =
             Refine::value_variants().iter().filter(|param| is_known(param)).map(Refine::name).collect();
-        let without = if available.depth { "" } else { " of images without depth, or whose depth comes later" };
+        let without = if available.depth { "" } else { " without depth at the start" };
         Err(BadArgument(format!(
-            "--refine {}: the method {} does not find that{without}, only {}",
+            "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
             method::describe(kinds),
             known.join(", ")
         )))
     }
 
-    /// What is found about cameras; `default_value` where no flag says.
+    /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
     pub(crate) fn refining(
         &self,
         available: AvailableData,
@@ -166,14 +169,14 @@ impl TrainingArgs {
         let requested = if self.refine.is_empty() { std::slice::from_ref(&default_value) } else { &self.refine };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
-            return Err(BadArgument("--refine: auto and none stand alone".into()));
+            return Err(BadArgument("--refine: auto and none cannot be combined with other values".into()));
         }
         if has(Refine::Auto) {
             return Ok(available.auto_settings());
         }
         let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
         if let (Some(param), false) = (needs_depth.into_iter().find(|param| has(*param)), available.depth) {
-            let message = "needs images with depth, and all of them at the start";
+            let message = "needs depth images that are all available before training";
             return Err(BadArgument(format!("--refine {}: {message}", param.name())));
         }
         if has(Refine::Joints) && !available.joints {
@@ -204,7 +207,7 @@ impl TrainingArgs {
         })
     }
 
-    /// How the number of splats is found; `default_value` where no flag says.
+    /// How the number of splats is chosen; `default_value` applies if the flag is not given.
     pub(crate) fn count(&self, default_value: CountArg) -> CountPolicy {
         match self.count.unwrap_or(default_value) {
             CountArg::Tested => CountPolicy::Tested,
@@ -212,7 +215,7 @@ impl TrainingArgs {
         }
     }
 
-    /// The keys of the rig file that the flags stand for.
+    /// The rig file keys that the flags override.
     pub(crate) fn overrides(&self) -> Vec<Override> {
         let mut overrides = Vec::new();
         if let Some(kinds) = self.methods() {
@@ -231,7 +234,7 @@ impl TrainingArgs {
         overrides
     }
 
-    /// Whether a base that walks is found anew at each stand, where `--refine` is given.
+    /// Whether the pose of a mobile base is re-estimated at each station; `None` if `--refine` is not given.
     pub(crate) fn realign(&self) -> Option<bool> {
         let is_on = || self.refine.iter().any(|param| matches!(param, Refine::Auto | Refine::Base));
         (!self.refine.is_empty()).then(is_on)
@@ -239,7 +242,7 @@ impl TrainingArgs {
 }
 
 impl AvailableData {
-    /// Candidates, the likelier first: alignment for what it can do, a trial with the scene for the rest.
+    /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
     fn auto_settings(self) -> RefineSettings {
         let gains = ParamSet { image_gains: true, ..ParamSet::NONE };
         let poses = ParamSet { image_poses: true, ..ParamSet::NONE };
@@ -302,7 +305,8 @@ mod tests {
     #[test]
     fn methods_are_unique_and_splat_flags_need_splats() {
         assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![ModelKind::Tsdf, ModelKind::Splat]));
-        for (text, message) in [("mesh", "\"mesh\""), ("splat,splat", "twice"), ("splat,", "\"\""), ("", "\"\"")] {
+        for (text, message) in [("mesh", "\"mesh\""), ("splat,splat", "listed twice"), ("splat,", "\"\""), ("", "\"\"")]
+        {
             assert!(methods(text).is_err_and(|error| error.contains(message)), "{text}");
         }
         let args = TrainingArgs { max_splats: Some(5), refine: vec![Refine::ImageGains], ..no_flags() };
@@ -314,7 +318,7 @@ mod tests {
         let message = args.check_learned(&[ModelKind::Tsdf], available).unwrap_err().0;
         assert!(
             message.starts_with(
-                "--refine image-gains: the method tsdf does not find that, only auto, none, base, extrinsics,"
+                "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
             ),
             "{message}"
         );
@@ -324,7 +328,7 @@ mod tests {
         assert!(args.check_before_data(&[ModelKind::Nerf], false).is_ok());
         let message =
             args.check_learned(&[ModelKind::Nerf], AvailableData { depth: false, ..available }).unwrap_err().0;
-        assert!(message.ends_with("only auto, none, base, image-poses, image-gains"), "{message}");
+        assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
         let args = TrainingArgs { refine: vec![Refine::Joints], ..no_flags() };
         assert!(args.check_before_data(&[ModelKind::Splat], true).is_ok());
         assert!(args.check_before_data(&[ModelKind::Splat], false).is_err());
@@ -333,9 +337,9 @@ mod tests {
     #[test]
     fn unsupported_refine_params_are_rejected() {
         let message = |requested: &[Refine], joints, depth| refining(requested, joints, depth).unwrap_err();
-        assert!(message(&[Refine::DepthPose], true, false).contains("depth-pose: needs images with depth"));
+        assert!(message(&[Refine::DepthPose], true, false).contains("depth-pose: needs depth images"));
         assert!(message(&[Refine::Readout], false, false).contains("readout: needs"));
         assert!(message(&[Refine::Joints], false, true).contains("needs a recording of an arm"));
-        assert!(message(&[Refine::Auto, Refine::Extrinsics], true, true).contains("stand alone"));
+        assert!(message(&[Refine::Auto, Refine::Extrinsics], true, true).contains("cannot be combined"));
     }
 }

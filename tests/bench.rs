@@ -199,7 +199,7 @@ fn ablation_bench_reports_gains() {
     let printed = events(folder, &[&args[..], &["--json"]].concat());
     let changes = printed.last().expect("events")["findings"]["changes"].as_array().expect("changes").clone();
     let names: Vec<&str> = changes.iter().filter_map(|change| change["name"].as_str()).collect();
-    assert_eq!(names, ["as it is", "no structure loss", "black background"]);
+    assert_eq!(names, ["baseline", "no structure loss", "black background"]);
     let psnrs: Vec<f64> = changes.iter().filter_map(|change| change["psnr"].as_f64()).collect();
     assert!(
         psnrs.len() == 3 && psnrs[1] != psnrs[0] && psnrs[2] != psnrs[0],

@@ -203,7 +203,7 @@ fn nerf_runs_live_replays_and_resumes() {
     let exported = fieldrig(folder, &["export", "live", "--to", "ply", "--out", "splats.ply"]);
     let printed = String::from_utf8_lossy(&exported.stderr);
     assert!(
-        !exported.status.success() && printed.contains("a neural field, which has neither splats nor a mesh"),
+        !exported.status.success() && printed.contains("a neural field has neither splats nor a mesh"),
         "{printed}"
     );
 }
@@ -371,7 +371,7 @@ fn record_reports_losses_and_does_not_overwrite() {
     let done: Value = serde_json::from_slice(&output.stdout).expect("a JSON object");
     assert_eq!((done["images"].as_i64(), done["depth_images"].as_i64()), (Some(N_IMAGES), Some(N_IMAGES)));
     let n_dropped = done["dropped"]["wrist"]["images"].as_u64().expect("a number");
-    assert!(n_dropped > 0 && printed.contains(&format!("camera \"wrist\" lost {n_dropped} color")), "{printed}");
+    assert!(n_dropped > 0 && printed.contains(&format!("camera \"wrist\" dropped {n_dropped} color")), "{printed}");
 
     let before = std::fs::read(folder.join("scan.mcap")).expect("a recording");
     let itself = ["run", "rig.toml", "--from", "scan.mcap", "--record", "scan.mcap", "--listen", "127.0.0.1:0"];
@@ -469,7 +469,7 @@ fn replay_without_training_keyframes_reports_the_reason() {
     std::fs::write(folder.join("once.toml"), once).expect("room on the disk");
     std::fs::write(folder.join("other.toml"), text.replace("camera.wrist", "camera.front")).expect("room on the disk");
     events(folder, &["record", "once.toml", "--sim", "--out", "one.mcap", "--json"]);
-    for (rig, reason) in [("rig.toml", "the only keyframe is held out"), ("other.toml", "are of \"wrist\"")] {
+    for (rig, reason) in [("rig.toml", "the only keyframe is a test image"), ("other.toml", "are from \"wrist\"")] {
         let output = fieldrig(
             folder,
             &["run", rig, "--from", "one.mcap", "--out", &format!("out-{rig}"), "--listen", "127.0.0.1:0"],

@@ -102,9 +102,9 @@ fn invalid_input_gives_one_error_and_no_output() {
         (
             &["--tip", "link1"],
             r#"{"joint_names":["joint_1"],"configurations":[[0.5]]}"#,
-            r#"joint "joint_1" is not in the URDF; the nearest is "joint1""#,
+            r#"joint "joint_1" is not in the URDF; did you mean "joint1"?"#,
         ),
-        (&["--tip", "link1"], r#"{"joint_names":["joint1","joint1"],"configurations":[]}"#, "named twice"),
+        (&["--tip", "link1"], r#"{"joint_names":["joint1","joint1"],"configurations":[]}"#, "listed twice"),
         (
             &["--tip", "link1"],
             r#"{"joint_names":["joint1"],"configurations":[[0.5],[]]}"#,

@@ -89,7 +89,7 @@ fn incomparable_pictures_give_one_error() {
     let (a, b) = (picture(folder.path(), "a.png", 20, 0), picture(folder.path(), "b.png", 30, 0));
     let stderr_text = error_message(&fieldrig(&["metrics", text(&a), text(&b)]), 1);
     assert!(
-        stderr_text.contains("a.png is 20x20 pixels") && stderr_text.contains("pictures must have one size"),
+        stderr_text.contains("a.png is 20x20 pixels") && stderr_text.contains("the images must have the same size"),
         "{stderr_text}"
     );
     std::fs::write(&b, b"not a picture").unwrap();
@@ -112,24 +112,24 @@ fn model_is_exported_as_ply() {
     assert_eq!(ply::read(&out).unwrap(), splats);
 
     let stderr_text = error_message(&fieldrig(&export), 2);
-    assert!(stderr_text.contains("scene.ply: it is there already"), "{stderr_text}");
+    assert!(stderr_text.contains("scene.ply: the file exists"), "{stderr_text}");
     let out = folder.path().join("other.ply");
     let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "spz", "--out", text(&out)]), 2);
-    assert!(stderr_text.contains("ends in .spz"), "{stderr_text}");
+    assert!(stderr_text.contains("must end in .spz"), "{stderr_text}");
     let glb = folder.path().join("mesh.glb");
     let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "glb", "--out", text(&glb)]), 2);
-    assert!(stderr_text.contains("which have no mesh"), "{stderr_text}");
+    assert!(stderr_text.contains("have no mesh"), "{stderr_text}");
     let stderr_text =
         error_message(&fieldrig(&["export", text(&model), "--to", "ply", "--cell-m", "0.1", "--out", text(&out)]), 2);
     assert!(stderr_text.contains("--cell-m") && stderr_text.contains("has no mesh"), "{stderr_text}");
     let stderr_text = error_message(&fieldrig(&["export", text(&model), "--to", "nerfstudio", "--out", text(&out)]), 2);
-    assert!(stderr_text.contains("nerfstudio is written of a recording"), "{stderr_text}");
+    assert!(stderr_text.contains("nerfstudio is exported from a recording"), "{stderr_text}");
     let nothing = folder.path().join("nothing");
     let stderr_text = error_message(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
     assert!(stderr_text.contains("nothing does not exist"), "{stderr_text}");
     let stderr_text = error_message(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
     assert!(
-        stderr_text.contains("neither a folder with a model, nor a file of splats, nor a recording"),
+        stderr_text.contains("not a model folder, a splat file or a recording"),
         "{stderr_text}"
     );
     let other = folder.path().join("other.bin");

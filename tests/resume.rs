@@ -240,5 +240,5 @@ fn killed_live_run_resumes_keyframes_and_clock() {
     };
     assert_fails(&["--resume", "out", "--seed", "5"], "--seed");
     std::fs::remove_dir_all(folder.join("out/keyframes")).unwrap();
-    assert_fails(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no keyframes that can be used");
+    assert_fails(&["--resume", "out", "--seconds", "30", "--out", "x"], "has no usable keyframes");
 }

@@ -93,9 +93,9 @@ fn check_mesh_export(folder: &Path) {
         let coarse = export(to, &["--cell-m", "0.1"], &format!("coarse.{to}"));
         assert!(coarse.len() < saved.len() / 4, "{to}: {} of {} bytes", coarse.len(), saved.len());
     }
-    assert_fails_with(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["which has no splats"]);
-    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["it is there already"]);
-    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["ends in .glb"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["has no splats"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["the file exists"]);
+    assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["must end in .glb"]);
     assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
     assert_fails_with(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
     assert_fails_with(
@@ -139,7 +139,7 @@ fn invalid_methods_give_one_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for (methods, word) in
-        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf stands there twice"), ("", "splat, tsdf and nerf")]
+        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf is listed twice"), ("", "splat, tsdf and nerf")]
     {
         assert_fails_with(folder, &["train", "data", "--method", methods], &["--method", word]);
         assert_fails_with(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);

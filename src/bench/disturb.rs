@@ -1,10 +1,11 @@
 //! Disturbances of keyframes, one size at a time.
 //!
-//! A clock offset and an exposure step befall all images, those for testing too, as they would on a robot. Pose noise befalls
-//! those that are learned from: test images stay at their true poses, so that what is scored is the model.
+//! A clock offset and an exposure step affect all images including test images, as they would on a robot. Pose noise
+//! affects only training images: test images keep their true poses, so that the scores measure the model.
 //!
-//! A disturbance is a function of its size, a seed, and the keyframes: it has no state, and what befalls a keyframe depends
-//! on no other one's order. Sizes of one seed share their random directions, so that a curve over sizes has no noise of its own.
+//! A disturbance is a stateless function of its size, a seed and the keyframes. Its effect on one keyframe does not
+//! depend on the order of the others. All sizes with one seed share their random directions, which keeps curves over
+//! the size free of extra noise.
 
 use crate::bench::statistics::Interpolation;
 use kinematics::{Stamp, Transform, Twist, transform};
@@ -14,27 +15,27 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use trainer::{Keyframe, Split};
 
-/// What is disturbed.
+/// Kinds of disturbances.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Disturbance {
-    /// Every camera is a little elsewhere than its pose says.
+    /// Errors of the camera poses.
     PoseNoise,
-    /// Poses belong to another time than images.
+    /// The clock of the poses is offset from that of the images.
     ClockOffset,
-    /// The light changes in the middle of the capture.
+    /// The exposure changes in the middle of the capture.
     Exposure,
-    /// There are few keyframes.
+    /// Fewer training keyframes.
     Keyframes,
 }
 
-/// Turn that comes with a shift of pose noise, degrees per millimetre: 5 degrees at 50 mm.
+/// Rotation that pose noise adds to a translation, degrees per millimeter: 5 degrees at 50 mm.
 const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
-    /// All there are.
+    /// All disturbances.
     pub(crate) const ALL: [Self; 4] = [Self::PoseNoise, Self::ClockOffset, Self::Exposure, Self::Keyframes];
 
-    /// Its name in files and on the command line.
+    /// Name in files and on the command line.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::PoseNoise => "pose-noise",
@@ -44,17 +45,17 @@ impl Disturbance {
         }
     }
 
-    /// What its size means, with the unit, for an axis.
+    /// Axis label for the size, with its unit.
     pub(crate) fn axis(self) -> &'static str {
         match self {
-            Self::PoseNoise => "pose noise, mm (standard deviation along each axis; 0.1 degrees of turn per mm)",
+            Self::PoseNoise => "pose noise, mm (standard deviation along each axis; 0.1 degrees of rotation per mm)",
             Self::ClockOffset => "clock offset of the poses, ms",
             Self::Exposure => "exposure step in the middle of the capture, EV",
             Self::Keyframes => "training keyframes",
         }
     }
 
-    /// Unit of its size.
+    /// Unit of the size.
     pub(crate) fn unit(self) -> &'static str {
         match self {
             Self::PoseNoise => "mm",
@@ -64,7 +65,7 @@ impl Disturbance {
         }
     }
 
-    /// Sizes that are measured, from none to large; of keyframes, from few to many.
+    /// Default sizes, in ascending order; for keyframes, this is from the largest disturbance to the smallest.
     pub(crate) fn default_levels(self) -> &'static [f64] {
         match self {
             Self::PoseNoise => &[0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0],
@@ -74,7 +75,7 @@ impl Disturbance {
         }
     }
 
-    /// How break points between two sizes are found.
+    /// How break points between two sizes are interpolated.
     pub(crate) fn interpolation(self) -> Interpolation {
         match self {
             Self::Keyframes => Interpolation::Log,
@@ -82,10 +83,10 @@ impl Disturbance {
         }
     }
 
-    /// The keyframes, disturbed.
+    /// Applies the disturbance to keyframes.
     ///
     /// * `level`: size in [`Self::unit`].
-    /// * `nanos_per_sec`: what a second is on the keyframes' stamps; 1e9 unless they only count images.
+    /// * `nanos_per_sec`: a second in units of the keyframes' stamps; 1e9 unless stamps only count images.
     pub(crate) fn apply(
         self,
         keyframes: &[Arc<Keyframe>],
@@ -111,7 +112,7 @@ fn map(keyframes: &[Arc<Keyframe>], mut change: impl FnMut(&mut Keyframe)) -> Ve
     keyframes.iter().map(change_one).collect()
 }
 
-/// Moves a camera; its depth sensor moves along.
+/// Moves a camera together with its depth sensor.
 fn move_to(keyframe: &mut Keyframe, world_from_camera: Transform) {
     let moved_from_original = world_from_camera * keyframe.world_from_camera.inverse();
     if let Some(depth) = &mut keyframe.depth {
@@ -136,9 +137,9 @@ fn pose_noise(keyframes: &[Arc<Keyframe>], sigma_mm: f64, seed: u64) -> Vec<Arc<
     })
 }
 
-/// Six independent numbers of mean 0 and standard deviation 1, always the same for a keyframe and a seed.
+/// Six independent samples of a standard normal distribution, determined by seed, camera and stamp.
 ///
-/// Source: Box and Muller 1958, on uniform numbers cut from a hash.
+/// Source: Box and Muller 1958, applied to uniform numbers from a hash.
 fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
     let block = |ix: u8| {
         let mut hash = Sha256::new();
@@ -148,7 +149,7 @@ fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
         hash.update(camera.as_bytes());
         hash.finalize()
     };
-    // 53 bits fill a f64's fraction; half a unit up keeps the logarithm away from 0.
+    // 53 bits fill the fraction of a f64; the offset of 0.5 keeps the logarithm finite.
     let uniform = |bytes: &[u8]| {
         let bits = u64::from_le_bytes(bytes.try_into().expect("eight bytes")) >> 11;
         (bits as f64 + 0.5) / (1_u64 << 53) as f64
@@ -163,10 +164,10 @@ fn six_normals(seed: u64, camera: &str, stamp: Stamp) -> [f64; 6] {
     normals
 }
 
-/// What a camera did over time, as its keyframes tell.
+/// Poses and velocities of one camera over time, from its keyframes.
 type Trajectory = Vec<(Stamp, Transform, Option<Twist>)>;
 
-/// Gives each keyframe the pose, and the velocity, that its camera had `offset_nanos` later.
+/// Gives each keyframe the pose and velocity of its camera `offset_nanos` later.
 fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyframe>> {
     let mut trajectories: BTreeMap<Arc<str>, Trajectory> = BTreeMap::new();
     for keyframe in keyframes {
@@ -186,7 +187,7 @@ fn clock_offset(keyframes: &[Arc<Keyframe>], offset_nanos: f64) -> Vec<Arc<Keyfr
     })
 }
 
-/// Pose and velocity at a time, between the two neighboring states; past the ends the nearest motion goes on.
+/// Pose and velocity at a time, interpolated between the neighboring states or extrapolated beyond the ends.
 fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)> {
     let next = trajectory.partition_point(|(stamp, ..)| (stamp.0 as f64) < nanos);
     let next = next.clamp(1, trajectory.len().checked_sub(1).filter(|last| *last > 0)?);
@@ -199,7 +200,7 @@ fn at(trajectory: &Trajectory, nanos: f64) -> Option<(Transform, Option<Twist>)>
     Some((transform::interpolate(a, b, frac), twist))
 }
 
-/// Darkens the first half of the capture and brightens the second, half of `step_ev` each, so that the mean stays.
+/// Darkens the first half of the capture and brightens the second, by half of `step_ev` each, which preserves the mean.
 fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>> {
     let mut stamps: Vec<Stamp> =
         keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).map(|keyframe| keyframe.stamp).collect();
@@ -215,9 +216,9 @@ fn exposure_step(keyframes: &[Arc<Keyframe>], step_ev: f64) -> Vec<Arc<Keyframe>
     })
 }
 
-/// What becomes of each sRGB byte when the light is multiplied by `gain`: linear light, clipped, rounded to 8 bits.
+/// Maps each sRGB byte to its value after multiplying the light by `gain`: linear light, clipped, rounded to 8 bits.
 ///
-/// Source: IEC 61966-2-1 for both curves.
+/// Source: IEC 61966-2-1 for both transfer functions.
 fn exposure_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|byte| {
         let srgb = byte as f64 / 255.0;
@@ -230,7 +231,7 @@ fn exposure_table(gain: f64) -> [u8; 256] {
     })
 }
 
-/// Keeps `n` training keyframes, spread evenly over all; test keyframes stay.
+/// Keeps `n` evenly spaced training keyframes and all test keyframes.
 fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
     let n_all = keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count() as f64;
     let fraction = (n / n_all).min(1.0);
@@ -239,7 +240,7 @@ fn subsample(keyframes: &[Arc<Keyframe>], n: f64) -> Vec<Arc<Keyframe>> {
         if keyframe.split == Split::Test {
             return true;
         }
-        // The one in the middle of each of n equal stretches.
+        // Keeps the middle one of each of n equal segments.
         let before = (n_visited * fraction + 0.5).floor();
         n_visited += 1.0;
         (n_visited * fraction + 0.5).floor() > before
@@ -253,7 +254,8 @@ mod tests {
 
     const TOLERANCE: f64 = 1e-9; // Rounding of products of poses near 1.
 
-    /// A camera on a line, turning: 0.1 m and 0.02 rad a keyframe, 10 keyframes a second, gray images.
+    /// A camera that moves along a line and rotates: 0.1 m and 0.02 rad per keyframe, 10 keyframes per second, gray
+    /// images.
     fn capture(n: i64) -> Vec<Arc<Keyframe>> {
         let keyframe = |ix: i64| {
             let along = ix as f64;
@@ -323,7 +325,7 @@ mod tests {
 
     #[test]
     fn pose_noise_has_the_requested_std() {
-        /// Four standard errors of a standard deviation over three axes of 3500 keyframes.
+        /// Four standard errors of the standard deviation over three axes of 3500 keyframes.
         const REL_TOLERANCE: f64 = 0.03;
         let capture = capture(4000);
         let noisy = pose_noise(&capture, 20.0, 7);
@@ -368,7 +370,7 @@ mod tests {
     #[test]
     fn clock_offset_uses_poses_of_a_later_time() {
         let capture = capture(20);
-        // 50 ms are half of the way to the next keyframe, 250 ms go past the end.
+        // 50 ms is half the time to the next keyframe; 250 ms is beyond the end.
         for (millis, n_keyframes) in [(50.0, 0.5), (200.0, 2.0), (250.0, 2.5), (-50.0, -0.5)] {
             let moved = Disturbance::ClockOffset.apply(&capture, millis, 1, 1e9);
             for (before, after) in trained(&capture).zip(trained(&moved)) {
@@ -381,25 +383,25 @@ mod tests {
                 );
             }
         }
-        // Where stamps count images, a second is what the rate says it is: 100 ms at 1 image a second of 0.1 s stamps.
+        // If stamps count images, the rate defines a second: 100 ms at 1 image per second with stamps 0.1 s apart.
         let counted = Disturbance::ClockOffset.apply(&capture, 100.0, 1, 1e8);
         assert!((counted[1].world_from_camera.translation.x - 0.11).abs() < TOLERANCE);
         let alone = clock_offset(&capture[1..2], 1e8);
-        assert_eq!(alone[0].world_from_camera, capture[1].world_from_camera, "one keyframe tells no motion");
+        assert_eq!(alone[0].world_from_camera, capture[1].world_from_camera, "a single keyframe defines no motion");
     }
 
     #[test]
     fn exposure_is_multiplied_in_linear_light() {
         assert!(exposure_table(1.0).iter().enumerate().all(|(byte, after)| byte == *after as usize));
         let doubled = exposure_table(2.0);
-        // 128 is 0.2159 of the light; 0.4317 is 175.6. 188 is just above half of the light.
+        // 128 is 0.2159 in linear light; twice that is 175.6. 188 is just above 0.5.
         assert_eq!((doubled[0], doubled[128], doubled[188], doubled[255]), (0, 176, 255, 255));
         let capture = capture(20);
         let stepped = exposure_step(&capture, 2.0);
         assert_eq!(stepped[1].rgba_srgb[1], exposure_table(0.5)[128]);
         assert_eq!(stepped[19].rgba_srgb[1], 176);
-        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposure_table(2.0)[10]], "alpha stays");
-        assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha stays");
+        assert_eq!(&stepped[19].rgba_srgb[3..5], &[255, exposure_table(2.0)[10]], "alpha is unchanged");
+        assert_eq!(stepped[19].rgba_srgb[7], 0, "alpha is unchanged");
     }
 
     #[test]

@@ -12,40 +12,40 @@ const MIN_SPAN_SECS: f64 = 60.0;
 const MAX_GROUPS: usize = 400;
 const SECS_PER_HOUR: f64 = 3600.0;
 
-/// Memory at one moment, bytes.
+/// Memory use at one time, bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub(crate) struct Sample {
-    /// Since the first image.
+    /// Time since the first image.
     pub(crate) seconds: f64,
-    /// Of the process; on a software adapter this includes the GPU's memory.
+    /// Resident memory of the process; on a software adapter this includes GPU memory.
     pub(crate) resident_bytes: u64,
     /// GPU buffers in use.
     pub(crate) gpu_bytes: u64,
-    /// Memory that the GPU's allocator holds for them, if the backend reports it.
+    /// Memory that the GPU allocator reserves for them, if the backend reports it.
     pub(crate) gpu_reserved_bytes: Option<u64>,
-    /// Of the models, a part of `gpu_bytes`.
+    /// Models, a part of `gpu_bytes`.
     pub(crate) model_bytes: u64,
     /// Images of keyframes on the GPU, a part of `gpu_bytes`.
     pub(crate) gpu_image_bytes: u64,
-    /// Host memory of the keyframes held.
+    /// Host memory of the keyframes.
     pub(crate) keyframe_bytes: u64,
     pub(crate) keyframes: usize,
     /// Keyframes evicted so far.
     pub(crate) evicted: u64,
     pub(crate) step: u64,
-    /// Connected viewers, and the pictures they received.
+    /// Number of connected viewers, and of the images they received.
     pub(crate) viewers: usize,
     pub(crate) pictures: u64,
 }
 
-/// Which part of resident memory is measured.
+/// Which part of the resident memory is not counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Excluded {
-    /// All of it: GPU buffers are in other memory.
+    /// Nothing; GPU buffers are in separate memory.
     Nothing,
-    /// All but the models.
+    /// The models.
     Model,
-    /// All but the models and the working memory of training, whose size grows with the models.
+    /// The models and the working memory of training, whose size grows with the models.
     Training,
 }
 
@@ -72,12 +72,12 @@ pub(crate) struct Growth {
     pub(crate) resident_bytes: f64,
     /// Theil-Sen slope: the median of the slopes between all pairs of samples.
     pub(crate) bytes_per_hour: f64,
-    /// The same as a share of `resident_bytes`.
+    /// The slope as a percentage of `resident_bytes`.
     pub(crate) percent_per_hour: f64,
 }
 
 impl Growth {
-    /// `None` if less than a minute of samples counts.
+    /// Returns `None` if less than a minute of samples can be used.
     pub(crate) fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
         let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
         let last = samples.last()?;
@@ -123,7 +123,7 @@ fn kilobytes(status: &str, name: &str) -> Option<u64> {
 mod tests {
     use super::*;
 
-    /// Samples of a store that is full after 100 s, with `bytes` as a function of the seconds.
+    /// Samples of a run whose store is full after 100 s, with `bytes` as a function of the seconds.
     fn samples(n: u32, bytes: impl Fn(f64) -> f64) -> Vec<Sample> {
         let sample = |ix: u32| {
             let seconds = f64::from(ix);
@@ -179,7 +179,7 @@ mod tests {
     #[test]
     fn resident_memory_is_read() {
         let (before, _) = resident_bytes().expect("Linux");
-        // Far more than concurrent tests free in the meantime.
+        // Far more than concurrent tests free at the same time.
         let held = vec![1u8; 512 << 20];
         let (now, peak) = resident_bytes().expect("Linux");
         assert!(now >= before + (384 << 20) && peak >= now, "{before} {now} {peak} {}", held.len());

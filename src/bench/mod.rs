@@ -1,4 +1,4 @@
-//! Many trainings under one question: each is kept in a file of its own as soon as it ends, and all are told in charts.
+//! Benchmarks that train many models: each run is saved to a file when it ends, and the results are drawn as charts.
 
 pub(crate) mod disturb;
 pub(crate) mod memory;

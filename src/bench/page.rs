@@ -1,4 +1,4 @@
-//! What a bench found, as files: JSON with every number, charts as SVG and PNG, one page that shows all of it.
+//! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
 use crate::chart::drawing::escaped;
 use crate::chart::{Chart, raster};
@@ -8,21 +8,21 @@ use serde_json::Value;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-/// What a bench found so far.
+/// Results of a bench so far.
 pub(crate) struct Findings {
-    /// Of the files: `curve`, `budget`, `stability`.
+    /// Base name of the files: `curve`, `budget`, `stability`.
     pub(crate) name: &'static str,
     pub(crate) title: String,
-    /// What was done, for the page.
+    /// Description of the measurement, for the page.
     pub(crate) sentences: Vec<String>,
-    /// Each with what follows the name in its files' names.
+    /// Charts, each with the suffix of its file names.
     pub(crate) charts: Vec<(&'static str, Chart)>,
     pub(crate) tables: Vec<Table>,
-    /// Every number.
+    /// All numbers, for the JSON file.
     pub(crate) numbers: Value,
 }
 
-/// A table in words; the first column is the head of its row.
+/// A table of text; the first column contains the row headers.
 pub(crate) struct Table {
     pub(crate) title: String,
     pub(crate) head: Vec<String>,
@@ -30,7 +30,7 @@ pub(crate) struct Table {
 }
 
 impl Findings {
-    /// Writes all files; the page's place comes back.
+    /// Writes all files; returns the path of the page.
     pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<PathBuf> {
         let path_with = |suffix: &str| folder.join(format!("{}{suffix}", self.name));
         run_folder::write_json(&path_with(".json"), &self.numbers)?;
@@ -91,7 +91,7 @@ fn write_file(path_with: &Path, bytes: &[u8]) -> anyhow::Result<()> {
 }
 
 impl Table {
-    /// The table with its title, as HTML for a page.
+    /// The table with its title as HTML.
     pub(crate) fn html(&self) -> String {
         let row = |cells: &[String], tag: &str| {
             let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
@@ -104,7 +104,7 @@ impl Table {
         )
     }
 
-    /// The table for a terminal, columns in line.
+    /// The table with aligned columns, for a terminal.
     fn text(&self) -> String {
         let all = || std::iter::once(&self.head).chain(&self.rows);
         let width = |column: usize| {
@@ -149,7 +149,7 @@ mod tests {
             tables: vec![table()],
             numbers: serde_json::json!({ "lines": [] }),
         };
-        let page = findings.write(folder.path()).expect("room on the disk");
+        let page = findings.write(folder.path()).expect("the folder is writable");
         let text = std::fs::read_to_string(page).expect("a page");
         assert!(text.contains("<p>One &amp; all.</p>") && text.contains("<h2>Sizes</h2>"), "{text}");
         assert!(folder.path().join("curve.json").is_file());

@@ -1,25 +1,25 @@
-//! Curves that other trainers measured: JSON with `rows` of `seconds` and `psnr`.
+//! Curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
 
 use crate::exit::BadArgument;
 use serde::Deserialize;
 use std::path::Path;
 
-/// Another trainer's curve.
+/// Curve of another trainer.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Peer {
-    /// Name of the file.
+    /// Name of the file without its extension.
     pub(crate) label: String,
     pub(crate) rows: Vec<Row>,
 }
 
-/// One time of a curve.
+/// One point of a curve.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub(crate) struct Row {
     pub(crate) seconds: f64,
     pub(crate) psnr: f64,
-    /// Primitives, where told.
+    /// Number of primitives, if given.
     pub(crate) n: Option<u64>,
-    /// Bytes of the model, where told.
+    /// Bytes of the model, if given.
     pub(crate) bytes: Option<u64>,
 }
 
@@ -29,14 +29,16 @@ struct File {
 }
 
 impl Peer {
-    /// Reads a file; one of another form is the caller's mistake.
+    /// Reads a file.
+    ///
+    /// # Errors If the file is unreadable or has another format.
     pub(crate) fn load(path: &Path) -> Result<Self, BadArgument> {
         let invalid = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text)
-            .map_err(|error| invalid(&format!("wants an object with rows of seconds and psnr ({error})")))?;
+            .map_err(|error| invalid(&format!("expected an object with rows of seconds and psnr ({error})")))?;
         if file.rows.is_empty() || file.rows.iter().any(|row| row.seconds <= 0.0) {
-            return Err(invalid("has no row, or one whose seconds are not above 0"));
+            return Err(invalid("expected at least one row, and seconds above 0 in each"));
         }
         let label = path.file_stem().map_or_else(|| "peer".to_owned(), |stem| stem.to_string_lossy().into_owned());
         let mut rows = file.rows;
@@ -44,7 +46,7 @@ impl Peer {
         Ok(Self { label, rows })
     }
 
-    /// `(seconds, dB)`.
+    /// Points `(seconds, dB)`.
     pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
         self.rows.iter().map(|row| (row.seconds, row.psnr)).collect()
     }

@@ -1,4 +1,5 @@
-//! The runs of a bench: trained once, kept in a file each, and not repeated when the bench goes on in the same folder.
+//! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
+//! repeat it.
 
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
@@ -19,26 +20,26 @@ use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 
-/// Folder of the runs, inside the bench's.
+/// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";
 
-/// Flags that every bench of trainings has.
+/// Flags shared by all benches that train.
 #[derive(Debug, clap::Args)]
 pub(crate) struct BenchArgs {
     #[command(flatten)]
     pub(crate) training: TrainingArgs,
     #[command(flatten)]
     pub(crate) images: DataArgs,
-    /// Where runs, charts and the page go; in the folder of an earlier bench what is finished is not repeated
+    /// Folder for runs, charts and the page; finished runs of an earlier bench in this folder are not repeated
     /// [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     pub(crate) out: Option<PathBuf>,
-    /// Print one JSON object a line: each run as it ends, then the findings
+    /// Print JSON, one object per line: each run when it ends, then the findings
     #[arg(long)]
     pub(crate) json: bool,
 }
 
-/// What makes two runs the same.
+/// Settings that identify a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunSettings {
     pub(crate) data: PathBuf,
@@ -51,27 +52,27 @@ pub(crate) struct RunSettings {
     pub(crate) scale: Option<f64>,
     pub(crate) holdout: Option<String>,
     pub(crate) keyframes: Option<PathBuf>,
-    /// Images trained on when nothing is disturbed.
+    /// Number of training images if nothing is disturbed.
     pub(crate) n_train: usize,
     pub(crate) n_test: usize,
     pub(crate) disturbed: Option<Disturbed>,
-    /// What is changed in the trainer.
+    /// Name of the variant of the trainer.
     pub(crate) variant: Option<String>,
     pub(crate) adapter: String,
     pub(crate) version: String,
 }
 
-/// What was done to the training keyframes.
+/// Disturbance of the training keyframes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Disturbed {
     pub(crate) disturbance: String,
     pub(crate) level: f64,
     pub(crate) unit: String,
-    /// Images a second where stamps only count images.
+    /// Images per second, if stamps only count images.
     pub(crate) rate_hz: Option<f64>,
 }
 
-/// Scores and size at one time. What is not known is `None`.
+/// Scores and size at one time; `None` if unknown.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunScores {
     pub(crate) seconds: f64,
@@ -84,7 +85,7 @@ pub(crate) struct RunScores {
     pub(crate) bytes: u64,
 }
 
-/// One finished training.
+/// A finished training run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Run {
     pub(crate) name: String,
@@ -94,15 +95,15 @@ pub(crate) struct Run {
 }
 
 impl Run {
-    /// Test PSNR at the end, dB; a picture without any error, which has none, counts as very good.
+    /// Final test PSNR, dB; 99 for an image without errors, whose PSNR is infinite.
     pub(crate) fn psnr(&self) -> f64 {
         const WITHOUT_ERROR_DB: f64 = 99.0;
         self.end.psnr.unwrap_or(WITHOUT_ERROR_DB)
     }
 
-    /// `(seconds, dB)` at the marks and at the end.
+    /// Points `(seconds, dB)` at the evaluations and at the end.
     pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
-        /// An end this close after a mark is the mark.
+        /// An end this close after the last evaluation is not a separate point.
         const MIN_SECONDS_RATIO: f64 = 1.02;
         let is_new = self.evaluations.last().is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
         let points = self.evaluations.iter().chain(is_new.then_some(&self.end));
@@ -110,16 +111,16 @@ impl Run {
     }
 }
 
-/// A data set under its name in charts.
+/// A data set and its name in charts.
 pub(crate) struct NamedData {
     pub(crate) name: String,
     pub(crate) path: PathBuf,
     pub(crate) data: Data,
-    /// The scene models that the flags and the recording ask for.
+    /// The scene models requested by the flags and the recording.
     pub(crate) model_specs: Vec<ModelSpec>,
 }
 
-/// One training to do.
+/// A training run to do.
 pub(crate) struct Job<'a> {
     pub(crate) name: String,
     pub(crate) data: &'a NamedData,
@@ -127,13 +128,13 @@ pub(crate) struct Job<'a> {
     pub(crate) limits: Limits,
     pub(crate) disturbed: Option<Disturbed>,
     pub(crate) variant: Option<String>,
-    /// The keyframes; asked for only when the run is not there yet.
+    /// Returns the keyframes; called only if the run is not saved yet.
     pub(crate) keyframes: &'a dyn Fn() -> Vec<Arc<Keyframe>>,
-    /// Everything is scored at every mark; else PSNR, and everything at the end.
+    /// Whether every evaluation computes all scores; otherwise only the final one does, and the others compute PSNR.
     pub(crate) is_thorough: bool,
 }
 
-/// Where runs are done and kept.
+/// Trains and saves runs.
 pub(crate) struct Runs<'a> {
     args: &'a BenchArgs,
     out: PathBuf,
@@ -145,23 +146,29 @@ pub(crate) struct Runs<'a> {
 }
 
 impl NamedData {
-    /// The scene model, for a bench of one; several are refused.
+    /// The scene model, for a bench of a single method.
+    ///
+    /// # Errors If there are several.
     pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec, BadArgument> {
         match &self.model_specs[..] {
             [one] => Ok(one),
-            _ => {
-                Err(BadArgument(format!("{}: this bench is of one method, {} are too many", self.name, self.methods())))
-            }
+            _ => Err(BadArgument(format!(
+                "{}: this bench needs a single method, but the methods are {}",
+                self.name,
+                self.methods()
+            ))),
         }
     }
 
-    /// How splats are trained, for a bench of what only those have; other scene models are refused.
+    /// The training options of splats, for a bench of splats.
+    ///
+    /// # Errors If the method is another one.
     pub(crate) fn splats(&self) -> Result<&SplatOptions, BadArgument> {
         match &self.model_specs[..] {
             [ModelSpec { kind: ModelKind::Splat, options }] => Ok(options),
             _ => {
                 let (data, methods) = (&self.name, self.methods());
-                Err(BadArgument(format!("{data}: this bench is of splats, and the method is {methods}")))
+                Err(BadArgument(format!("{data}: this bench needs the method splat, but the method is {methods}")))
             }
         }
     }
@@ -172,7 +179,7 @@ impl NamedData {
     }
 }
 
-/// A bench that ends before its first run leaves nothing behind.
+/// Removes the created folders if the bench ends before its first run.
 impl Drop for Runs<'_> {
     fn drop(&mut self) {
         if std::fs::read_dir(self.out.join(RUNS)).is_ok_and(|mut runs| runs.next().is_none()) {
@@ -182,13 +189,13 @@ impl Drop for Runs<'_> {
 }
 
 impl<'a> Runs<'a> {
-    /// Makes the folder.
+    /// Creates the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
         let stop = Stop::on_ctrl_c()?;
         let mut created = CreatedFolders::default();
         let out = created.make(args.out.as_deref())?;
         let runs = out.join(RUNS);
-        std::fs::create_dir_all(&runs).with_context(|| format!("cannot make the folder {}", runs.display()))?;
+        std::fs::create_dir_all(&runs).with_context(|| format!("cannot create the folder {}", runs.display()))?;
         log::info!("{}", gpu.describe());
         Ok(Self { args, out, created, gpu, stop, n_all: 0, n_done: 0 })
     }
@@ -198,30 +205,30 @@ impl<'a> Runs<'a> {
         &self.out
     }
 
-    /// The graphics card in words.
+    /// Description of the GPU.
     pub(crate) fn adapter(&self) -> String {
         self.gpu.describe()
     }
 
-    /// Says how many runs there will be from now on.
+    /// Sets the number of remaining runs.
     pub(crate) fn expect(&mut self, n_more: usize) {
         self.n_all = self.n_done + n_more;
     }
 
-    /// Loads data, and finds a name for it that none of `used_names` has.
+    /// Loads data and chooses a name that is not in `used_names`.
     pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> anyhow::Result<NamedData> {
         training::check_before_data(&self.args.training, path, &self.args.images)?;
         let overrides = self.args.training.overrides();
         let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
         if data.of_split(Split::Test).is_empty() {
-            let reason = "no image is held out for testing, so nothing can be scored: see --holdout";
+            let reason = "there are no test images, so nothing can be scored; see --holdout";
             return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
         }
         let model_specs = training::model_specs(&self.args.training, &data, None, self.gpu.is_software())?;
         Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
-    /// The run of a job: out of its file, or trained now and written there.
+    /// Returns the run of a job, from its file or trained now and saved.
     pub(crate) fn run(&mut self, job: Job<'_>) -> anyhow::Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
@@ -230,7 +237,7 @@ impl<'a> Runs<'a> {
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
                 return Err(BadArgument(format!(
-                    "--out {}: the run {} in it differs in {difference}; name another folder",
+                    "--out {}: the saved run {} differs in {difference}; choose another folder",
                     self.out.display(),
                     job.name
                 ))
@@ -256,7 +263,7 @@ impl<'a> Runs<'a> {
                 bytes: outcome.bytes,
             },
         };
-        // Beside its place first: a file that is there is whole.
+        // Written to a temporary file first, so that an existing file is complete.
         let unfinished = path.with_extension("part");
         run_folder::write_json(&unfinished, &run)?;
         std::fs::rename(&unfinished, &path).with_context(|| format!("cannot write {}", path.display()))?;
@@ -278,7 +285,7 @@ impl<'a> Runs<'a> {
         let session =
             training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.preparation_time, &self.stop)?;
         if self.stop.requested() && !session.is_over() {
-            bail!("stopped before its end: the same command with --out {} goes on from there", self.out.display());
+            bail!("stopped early; the same command with --out {} continues the bench", self.out.display());
         }
         session.score_without_saving()
     }
@@ -317,7 +324,7 @@ impl<'a> Runs<'a> {
         if self.args.json {
             return print::report_json(&Event { event: "run", cached: is_cached, run });
         }
-        let (end, cached) = (&run.end, if is_cached { ", done before" } else { "" });
+        let (end, cached) = (&run.end, if is_cached { ", done earlier" } else { "" });
         print::report(format_args!(
             "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
             self.n_done,
@@ -347,12 +354,12 @@ fn from_evaluation(evaluation: &Evaluation) -> RunScores {
 }
 
 fn read(path: &Path) -> anyhow::Result<Run> {
-    let message = || format!("{} is no finished run: remove it to have it done again", path.display());
+    let message = || format!("{} is not a finished run; remove it to repeat the run", path.display());
     let text = std::fs::read_to_string(path).with_context(message)?;
     serde_json::from_str(&text).with_context(message)
 }
 
-/// The first setting that differs, in words.
+/// Description of the first setting that differs.
 fn difference(cached: &RunSettings, requested: &RunSettings) -> anyhow::Result<Option<String>> {
     let fields = |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
     let (cached, requested) = (fields(cached)?, fields(requested)?);
@@ -360,10 +367,10 @@ fn difference(cached: &RunSettings, requested: &RunSettings) -> anyhow::Result<O
     Ok(requested
         .iter()
         .find(|(key, value)| cached[key.as_str()] != **value)
-        .map(|(key, value)| format!("{key} ({} there, {value} now)", cached[key.as_str()])))
+        .map(|(key, value)| format!("{key} ({} saved, {value} now)", cached[key.as_str()])))
 }
 
-/// A name for data from its path, with a number where it is taken already.
+/// A name for data from its path, with a number if it is already used.
 fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
     let canonical = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let stem = if canonical.is_dir() { canonical.file_name() } else { canonical.file_stem() };
@@ -377,7 +384,7 @@ fn unique_name(path: &Path, used_names: &mut HashSet<String>) -> String {
     name
 }
 
-/// A name as a file's: nothing but letters, digits, dots and dashes.
+/// Turns a name into a file name of letters, digits, dots and dashes.
 fn file_name(name: &str) -> String {
     name.chars().map(|letter| if letter.is_alphanumeric() || letter == '.' { letter } else { '-' }).collect()
 }
@@ -386,7 +393,7 @@ fn file_name(name: &str) -> String {
 pub(crate) mod tests {
     use super::*;
 
-    /// A run that ended with these figures.
+    /// A run with the given curve and size.
     pub(crate) fn run(name: &str, curve: &[(f64, f64)], n_splats: u64) -> Run {
         let scores_at = |&(seconds, psnr): &(f64, f64)| RunScores {
             seconds,
@@ -428,7 +435,7 @@ pub(crate) mod tests {
         run_folder::write_json(&path, &written).expect("written");
         assert_eq!(read(&path).expect("read"), written);
         std::fs::write(&path, "{").expect("written");
-        assert!(read(&path).expect_err("cut off").to_string().contains("run.json"));
+        assert!(read(&path).expect_err("truncated").to_string().contains("run.json"));
     }
 
     #[test]
@@ -437,7 +444,7 @@ pub(crate) mod tests {
         assert_eq!(difference(&cached, &cached).expect("plain"), None);
         let requested = RunSettings { max_splats: 2000, ..cached.clone() };
         let message = difference(&cached, &requested).expect("plain").expect("one differs");
-        assert_eq!(message, "max_splats (1000 there, 2000 now)");
+        assert_eq!(message, "max_splats (1000 saved, 2000 now)");
     }
 
     #[test]

@@ -1,6 +1,6 @@
-//! What many runs come to: medians, spreads, times to a quality, break points.
+//! Statistics over runs: medians, spreads, times to a PSNR level, break points.
 
-/// The middle value; the mean of the two middle ones of an even number. `None` of nothing.
+/// Median; the mean of the two middle values for an even count. `None` if empty.
 pub(crate) fn median(values: &[f64]) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
@@ -12,7 +12,7 @@ pub(crate) fn median(values: &[f64]) -> Option<f64> {
     }
 }
 
-/// The number that so large a share of sorted ones do not exceed. `None` of nothing.
+/// The value that a share `frac` of the sorted values does not exceed. `None` if empty.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index below the length")]
 pub(crate) fn quantile(sorted: &[f64], frac: f64) -> Option<f64> {
     let ix = (frac * sorted.len() as f64).ceil() as usize;
@@ -25,7 +25,7 @@ pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {
     Some(values.iter().fold([first; 2], |[low, high], value| [low.min(*value), high.max(*value)]))
 }
 
-/// Standard deviation of a sample (divided by n - 1); `None` below two values.
+/// Sample standard deviation (divided by n - 1); `None` for fewer than two values.
 pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     if values.len() < 2 {
         return None;
@@ -35,9 +35,9 @@ pub(crate) fn sample_std(values: &[f64]) -> Option<f64> {
     Some((values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt())
 }
 
-/// When a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
+/// Time at which a curve of `(seconds, dB)` first reaches `target_db`, interpolated over the logarithm of time.
 ///
-/// A curve that starts above reached it by its first point at the latest: that time is the answer.
+/// For a curve that starts above the target, this is the time of its first point.
 pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     let at = curve.iter().position(|(_, psnr)| *psnr >= target_db)?;
     let (secs, psnr) = curve[at];
@@ -46,7 +46,8 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of x.
+/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of
+/// x.
 ///
 /// Source: Theil 1950, Sen 1968. A few outliers do not change it.
 pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
@@ -56,16 +57,17 @@ pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
     median(&slopes)
 }
 
-/// How values between two levels of a disturbance are found.
+/// How values between two levels of a disturbance are interpolated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Interpolation {
-    /// On a straight line over the level.
+    /// Linear in the level.
     Linear,
-    /// On a straight line over the logarithm of the level, which is above 0.
+    /// Linear in the logarithm of the level, which must be above 0.
     Log,
 }
 
-/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never does.
+/// The level at which a curve of `(level, dB)` has first fallen by `drop_db` from its first point; `None` if it never
+/// does.
 pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Interpolation) -> Option<f64> {
     let floor = curve.first()?.1 - drop_db;
     let at = curve.iter().position(|(_, psnr)| *psnr <= floor)?;
@@ -77,10 +79,10 @@ pub(crate) fn break_point(curve: &[(f64, f64)], drop_db: f64, interpolation: Int
     })
 }
 
-/// Growth of a count below which a gain per doubling would divide noise by next to nothing.
+/// Growth of a count below which the gain per doubling would mostly be noise.
 const MIN_GROWTH: f64 = 1.05;
 
-/// What doubling the count gained between two points of `(count, dB)`; `None` where the count hardly grew.
+/// Gain per doubling of the count between two points `(count, dB)`; `None` if the count hardly grew.
 pub(crate) fn db_per_doubling(fewer: (f64, f64), more: (f64, f64)) -> Option<f64> {
     let growth = more.0 / fewer.0;
     (growth >= MIN_GROWTH).then(|| (more.1 - fewer.1) / growth.log2())
@@ -119,7 +121,7 @@ mod tests {
         let curve = [(1.0, 20.0), (4.0, 24.0), (16.0, 23.0), (64.0, 30.0)];
         assert_close(secs_to(&curve, 22.0), 2.0);
         assert_close(secs_to(&curve, 24.0), 4.0);
-        assert_eq!(secs_to(&curve, 19.0), Some(1.0), "by the first point at the latest");
+        assert_eq!(secs_to(&curve, 19.0), Some(1.0), "the time of the first point");
         assert_eq!(secs_to(&curve, 31.0), None);
     }
 
@@ -128,7 +130,7 @@ mod tests {
         let curve = [(0.0, 30.0), (2.0, 29.6), (4.0, 28.6), (8.0, 24.6)];
         assert_close(break_point(&curve, 1.0, Interpolation::Linear), 3.2);
         assert_close(break_point(&curve, 3.0, Interpolation::Linear), 5.6);
-        assert_eq!(break_point(&curve, 6.0, Interpolation::Linear), None, "it never falls so far");
+        assert_eq!(break_point(&curve, 6.0, Interpolation::Linear), None, "it never falls that far");
         assert_eq!(break_point(&[], 1.0, Interpolation::Linear), None);
         let fewer = [(100.0, 30.0), (25.0, 28.0)];
         assert_close(break_point(&fewer, 1.0, Interpolation::Log), 50.0);

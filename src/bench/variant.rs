@@ -1,14 +1,14 @@
-//! Ways to train that are compared with each other.
+//! Variants of the training options that benches compare.
 
 use trainer::splat::{CameraRefinement, SplatOptions};
 
-/// One of them.
+/// A named change of the training options.
 pub(crate) struct Variant {
     pub(crate) name: &'static str,
     pub(crate) change: fn(SplatOptions) -> SplatOptions,
 }
 
-/// Nothing is looked for about cameras.
+/// No camera parameters are refined.
 pub(crate) const CAMERAS_AS_GIVEN: Variant = Variant {
     name: "cameras as given",
     change: |options| SplatOptions {
@@ -19,7 +19,7 @@ pub(crate) const CAMERAS_AS_GIVEN: Variant = Variant {
 };
 
 impl Variant {
-    /// How it trains where `base` is asked for.
+    /// The options `base` with this change.
     pub(crate) fn options(&self, base: &SplatOptions) -> SplatOptions {
         (self.change)(base.clone())
     }

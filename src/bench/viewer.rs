@@ -1,4 +1,4 @@
-//! A viewer for benches: a WebSocket client that requests pictures back to back and discards them.
+//! A viewer for benches: a WebSocket client that requests images back to back and discards them.
 //!
 //! It runs in the measured process, so it reads through one small buffer.
 
@@ -13,9 +13,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Size of the requested pictures, pixels.
+/// Size of the requested images, pixels.
 const SIZE_PX: [u32; 2] = [960, 720];
-/// Angle between two pictures on the circle around the scene, radians.
+/// Angle between two views on the circle around the scene, radians.
 const STEP_RAD: f64 = 0.05;
 /// The connection counts as dead after this long without a byte: the server sends its status several times a second.
 const MAX_SILENCE: Duration = Duration::from_secs(120);
@@ -39,7 +39,7 @@ pub(crate) struct Viewer {
 }
 
 impl Viewer {
-    /// Connects to a server on this machine and starts to request pictures.
+    /// Connects to a server on this machine and starts to request images.
     pub(crate) fn connect(address: SocketAddr) -> anyhow::Result<Self> {
         let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
         stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
@@ -57,12 +57,12 @@ impl Viewer {
         Ok(Self { stream, n_pictures, thread: Some(thread.context("cannot start a thread")?) })
     }
 
-    /// Full pictures received so far.
+    /// Number of complete images received so far.
     pub(crate) fn n_pictures(&self) -> u64 {
         self.n_pictures.load(Ordering::Relaxed)
     }
 
-    /// Whether it is still receiving.
+    /// Whether it still receives.
     pub(crate) fn is_connected(&self) -> bool {
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
     }
@@ -83,7 +83,7 @@ struct Client {
     stream: TcpStream,
     n_pictures: Arc<AtomicU64>,
     n_requested: u64,
-    /// Of the scene, in world.
+    /// Center of the scene in world.
     center_m: Point3<f64>,
     radius_m: f64,
 }
@@ -97,7 +97,7 @@ impl Client {
         )?;
         let mut line = String::new();
         self.reader.read_line(&mut line)?;
-        ensure!(line.starts_with("HTTP/1.1 101"), "the server answered {:?}, expected a WebSocket", line.trim_end());
+        ensure!(line.starts_with("HTTP/1.1 101"), "the server responded {:?}, expected a WebSocket", line.trim_end());
         while line.trim_end() != "" {
             line.clear();
             ensure!(self.reader.read_line(&mut line)? > 0, "the server closed the connection");
@@ -128,12 +128,12 @@ impl Client {
         let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
         match message["type"].as_str() {
             Some("scene") => {
-                let number = |value: &Value| value.as_f64().context("a scene without its numbers");
+                let number = |value: &Value| value.as_f64().context("a scene message lacks a number");
                 let center = &message["center_m"];
                 self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
                 self.radius_m = number(&message["radius_m"])?;
             }
-            // There is no picture yet.
+            // There is no image yet.
             Some("error") => {
                 std::thread::sleep(Duration::from_millis(200));
                 self.request_picture()?;
@@ -157,7 +157,7 @@ impl Client {
         Ok(())
     }
 
-    /// Requests the next picture on a circle around the scene.
+    /// Requests the next image on a circle around the scene.
     fn request_picture(&mut self) -> anyhow::Result<()> {
         let angle = self.n_requested as f64 * STEP_RAD;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
@@ -175,7 +175,7 @@ impl Client {
         self.send(TEXT, request.to_string().as_bytes())
     }
 
-    /// Kind and length of the next frame; the server sends each message as one frame.
+    /// Opcode and length of the next frame; the server sends each message as one frame.
     fn next_frame(&mut self) -> anyhow::Result<(u8, u64)> {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
@@ -242,8 +242,8 @@ mod tests {
                 continue;
             };
             if n_drawn == 0 {
-                // It asks again.
-                pending.fail("nothing was seen yet");
+                // The viewer repeats the request.
+                pending.fail("no image yet");
             } else {
                 let size_px = pending.request.size_px;
                 let n = (size_px[0] * size_px[1]) as usize;
@@ -251,7 +251,7 @@ mod tests {
             }
             n_drawn += 1;
         }
-        assert!(n_drawn >= 4, "one failed request and three pictures, of one stage each if the server draws fast");
+        assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
         drop(viewer);
         while hub.n_clients() > 0 {
             assert!(started.elapsed() < Duration::from_secs(60));

@@ -1,42 +1,42 @@
-//! Axes: what they span, where their ticks are, how numbers are written.
+//! Axes: ranges, ticks and number formats.
 
-/// How values become places.
+/// How values map to positions.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Scale {
     Linear,
     /// Values are above 0.
     Log,
-    /// These values, in rising order, stand at equal distances; between two of them places are linear.
+    /// The values, in ascending order, are spaced evenly; positions between two of them are interpolated linearly.
     Levels(Vec<f64>),
 }
 
 /// One axis.
 #[derive(Clone, Debug)]
 pub(crate) struct Axis {
-    /// What it shows, with the unit.
+    /// Quantity and unit.
     pub(crate) label: String,
     pub(crate) scale: Scale,
-    /// Where ticks are; found by themselves when empty. Those outside the data are left out.
+    /// Tick values; chosen automatically if empty. Ticks outside the data are omitted.
     pub(crate) ticks: Vec<f64>,
 }
 
-/// An axis that knows its data.
+/// An axis with the range of its data.
 #[derive(Clone, Debug)]
 pub(super) struct AxisRange {
     scale: Scale,
     low: f64,
     high: f64,
-    /// Values and their labels.
+    /// Tick values and their labels.
     pub(super) ticks: Vec<(f64, String)>,
 }
 
-/// A linear axis shows at least this much, so that noise does not look like news.
+/// Minimum range of a linear axis, so that noise does not look like a trend.
 const MIN_SPAN: f64 = 1.0;
-/// Ticks an axis has at about.
+/// Approximate number of ticks of an axis.
 const N_TICKS: f64 = 7.0;
 
 impl Axis {
-    /// The axis around `values`.
+    /// Returns the axis with a range that contains `values`.
     pub(super) fn span(&self, values: impl Iterator<Item = f64>) -> AxisRange {
         let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
         for value in values.filter(|value| value.is_finite()) {
@@ -70,20 +70,20 @@ impl Axis {
 }
 
 impl AxisRange {
-    /// Where a value lies: 0 at the low end, 1 at the high end.
+    /// Relative position of a value: 0 at the low end, 1 at the high end.
     pub(super) fn frac(&self, value: f64) -> f64 {
         match &self.scale {
             Scale::Linear => (value - self.low) / (self.high - self.low),
             Scale::Log => (value / self.low).ln() / (self.high / self.low).ln(),
             Scale::Levels(levels) => {
-                // Half a step of room at both ends.
+                // Leaves half a step at both ends.
                 (level_position(levels, value) + 0.5) / levels.len().max(1) as f64
             }
         }
     }
 }
 
-/// A value's place among levels: 0 at the first, 1 at the second and so on.
+/// Position of a value among levels: 0 at the first, 1 at the second and so on.
 fn level_position(levels: &[f64], value: f64) -> f64 {
     if levels.len() < 2 {
         return 0.0;
@@ -107,7 +107,7 @@ fn linear_ticks(low: f64, high: f64) -> Vec<f64> {
     ticks
 }
 
-/// 1, 2 and 5 times powers of ten; powers only where these are many, all whole multiples where they are few.
+/// 1, 2 and 5 times powers of ten; only the powers if there are many, all integer multiples if there are few.
 fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     let mut powers = Vec::new();
     let mut power = 10.0_f64.powf(low.log10().floor());
@@ -124,7 +124,7 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
     if all.len() as f64 <= 2.0 * N_TICKS { all } else { powers.into_iter().filter(|tick| *tick >= low).collect() }
 }
 
-/// A number for an axis: three digits after the point at most, thousands as k, millions as M.
+/// Formats a number for an axis: at most three decimals, thousands as k, millions as M.
 pub(crate) fn compact_number(value: f64) -> String {
     let (value, suffix) = match value.abs() {
         size if size >= 1e6 => (value / 1e6, "M"),

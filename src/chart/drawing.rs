@@ -1,11 +1,11 @@
-//! A drawing as plain data: lines, areas and text in units that are pixels of the SVG file.
+//! A drawing as plain data: lines, areas and text. Its units are pixels of the SVG file.
 
 use std::fmt::Write;
 
 /// `[red, green, blue]`, sRGB.
 pub(crate) type Color = [u8; 3];
 
-/// Sizes of text; each is a height at which the picture's letters exist.
+/// Text sizes, for which the bitmap font has letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum TextSize {
     Normal,
@@ -22,7 +22,7 @@ impl TextSize {
     }
 }
 
-/// Which point of a text lies at its place.
+/// Which point of a text is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Anchor {
     Start,
@@ -30,10 +30,10 @@ pub(crate) enum Anchor {
     End,
 }
 
-/// One thing drawn; y points down.
+/// A shape; y points down.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum VectorShape {
-    /// A line through points; `dash` is the length of dashes and of gaps.
+    /// A line through points; `dash` is the length of dashes and gaps.
     Line { points: Vec<[f64; 2]>, color: Color, width: f64, dash: Option<[f64; 2]> },
     /// A filled polygon.
     Area { points: Vec<[f64; 2]>, color: Color, opacity_frac: f64 },
@@ -41,7 +41,7 @@ pub(crate) enum VectorShape {
     Text { at: [f64; 2], text: String, color: Color, size: TextSize, anchor: Anchor, vertical: bool },
 }
 
-/// Shapes in the order in which they are drawn, on white.
+/// Shapes in drawing order, on a white background.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Drawing {
     pub(crate) size: [f64; 2],
@@ -49,7 +49,7 @@ pub(crate) struct Drawing {
 }
 
 impl Drawing {
-    /// The drawing as an SVG file; text stays text, so that it can be searched and read aloud.
+    /// The drawing as an SVG file. Text is kept as text, so that it can be searched and read aloud.
     pub(crate) fn svg(&self) -> String {
         let [width, height] = self.size;
         let mut svg = format!(
@@ -99,7 +99,7 @@ fn coordinates(points: &[[f64; 2]]) -> String {
     let mut text = String::new();
     for [x, y] in points {
         let space = if text.is_empty() { "" } else { " " };
-        write!(text, "{space}{x:.2},{y:.2}").expect("a string takes all");
+        write!(text, "{space}{x:.2},{y:.2}").expect("writing to a string cannot fail");
     }
     text
 }
@@ -108,7 +108,7 @@ fn hex([red, green, blue]: Color) -> String {
     format!("#{red:02x}{green:02x}{blue:02x}")
 }
 
-/// Text as SVG and HTML want it, inside elements and quoted attributes.
+/// Escapes text for SVG and HTML, inside elements and quoted attributes.
 pub(crate) fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -1,7 +1,7 @@
-//! Charts: lines over one axis each way, drawn once for SVG and PNG.
+//! Line charts, drawn once for both SVG and PNG.
 //!
-//! Colors are those of Okabe and Ito (2008), which color-blind people can tell apart; lines differ by the form of their dots
-//! too, so that a gray print can be read.
+//! The colors are those of Okabe and Ito (2008), which color-blind people can distinguish. The dots of lines also
+//! differ in shape, for grayscale prints.
 
 mod axis;
 pub(crate) mod drawing;
@@ -11,18 +11,18 @@ pub(crate) use axis::{Axis, Scale, compact_number};
 use drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
 use raster::text_width;
 
-/// A chart in words and numbers.
+/// Contents of a chart.
 #[derive(Clone, Debug)]
 pub(crate) struct Chart {
     pub(crate) title: String,
-    /// What the points and bands are.
+    /// Explanation of the points and bands.
     pub(crate) subtitle: String,
     pub(crate) x: Axis,
     pub(crate) y: Axis,
     pub(crate) lines: Vec<Line>,
-    /// Levels on the y axis worth a dashed line, with what they mean.
+    /// Values on the y axis to mark with a dashed line, with their labels.
     pub(crate) thresholds: Vec<(f64, String)>,
-    /// Places on the x axis worth a dashed line.
+    /// Values on the x axis to mark with a dashed line.
     pub(crate) markers: Vec<Marker>,
 }
 
@@ -30,13 +30,13 @@ pub(crate) struct Chart {
 #[derive(Clone, Debug)]
 pub(crate) struct Line {
     pub(crate) label: String,
-    /// In the order of x.
+    /// Points, ordered by x.
     pub(crate) points: Vec<Point>,
-    /// Told apart from our own lines by dashes.
+    /// Whether it is drawn dashed, as the line of another trainer.
     pub(crate) is_peer: bool,
 }
 
-/// A point, and how far the values behind it spread.
+/// A point and the range of the values it summarizes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Point {
     pub(crate) x: f64,
@@ -45,12 +45,12 @@ pub(crate) struct Point {
     pub(crate) high: f64,
 }
 
-/// A place on the x axis, explained above the chart.
+/// A marked value on the x axis, with a label above the plot.
 #[derive(Clone, Debug)]
 pub(crate) struct Marker {
     pub(crate) x: f64,
     pub(crate) label: String,
-    /// The line it belongs to.
+    /// The line to which it belongs.
     pub(crate) line_ix: usize,
 }
 
@@ -64,16 +64,16 @@ const WIDTH: f64 = 960.0;
 const PLOT_HEIGHT: f64 = 380.0;
 const LEFT: f64 = 66.0;
 const MARGIN: f64 = 18.0;
-/// Room below the plot for tick labels and the axis label.
+/// Space below the plot for tick labels and the axis label.
 const MARGIN_BELOW: f64 = 56.0;
 const TITLE_HEIGHT: f64 = 54.0;
 const MARKER_ROW: f64 = 15.0;
 const LEGEND_SWATCH: f64 = 34.0;
 const LEGEND_ROW: f64 = 15.0;
-/// Letters a line of the legend.
+/// Maximum characters per row of the legend.
 const MAX_LEGEND_CHARS: usize = 26;
 
-/// Where the plot lies, and what its axes span.
+/// Position of the plot and the ranges of its axes.
 struct Plot {
     left: f64,
     right: f64,
@@ -98,7 +98,7 @@ impl Plot {
 }
 
 impl Chart {
-    /// The chart drawn; the legend stands beside the data, never over them.
+    /// Draws the chart; the legend is next to the plot and never covers it.
     pub(crate) fn draw(&self) -> Drawing {
         let legend = self.legend();
         let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Normal));
@@ -160,7 +160,7 @@ impl Chart {
         }
     }
 
-    /// Each rule has a row of its own above the plot, so that no two labels meet.
+    /// Each marker has its own row above the plot, so that labels do not overlap.
     fn draw_markers(&self, plot: &Plot, shapes: &mut Vec<VectorShape>) {
         for (row, marker) in self.markers.iter().enumerate() {
             let (x, color) = (plot.x(marker.x), color_of(marker.line_ix));
@@ -258,7 +258,7 @@ fn draw_line(line: &Line, ix: usize, plot: &Plot, shapes: &mut Vec<VectorShape>)
     }
 }
 
-/// A dot whose form tells the line: disc, square, triangle, diamond.
+/// Draws a dot whose shape identifies the line: disc, square, triangle, diamond.
 fn draw_dot([x, y]: [f64; 2], line_ix: usize, shapes: &mut Vec<VectorShape>) {
     let (n_corners, first_angle_frac, radius) =
         [(24, 0.0, 3.6), (4, 0.125, 4.6), (3, 0.75, 5.2), (4, 0.0, 5.0)][line_ix % 4];
@@ -278,7 +278,7 @@ fn text(at: [f64; 2], text: &str, color: Color, anchor: Anchor) -> VectorShape {
     VectorShape::Text { at, text: text.to_owned(), color, size: TextSize::Normal, anchor, vertical: false }
 }
 
-/// Text in rows of at most `max_chars`, broken after spaces and, where a word is longer, anywhere.
+/// Wraps text into rows of at most `max_chars`, after spaces or, for longer words, anywhere.
 fn wrap(text: &str, max_chars: usize) -> Vec<String> {
     let mut rows = vec![String::new()];
     for word in text.split_inclusive(' ') {

@@ -1,4 +1,4 @@
-//! A drawing as a PNG picture, on machines without fonts: letters come as pictures with the program.
+//! Draws a drawing as a PNG image. The bitmap font is part of the program, so no system fonts are needed.
 
 use super::drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
 use anyhow::Context;
@@ -6,7 +6,7 @@ use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
-/// Pixels a unit of the drawing; the letters' heights are made for it.
+/// Pixels per unit of the drawing; the font heights match it.
 const PIXELS_PER_UNIT: u32 = 2;
 
 fn raster_height(size: TextSize) -> RasterHeight {
@@ -16,13 +16,13 @@ fn raster_height(size: TextSize) -> RasterHeight {
     }
 }
 
-/// Width of a text in the picture, in units of the drawing; all letters are equally wide.
+/// Width of a text in units of the drawing; the font is monospaced.
 pub(crate) fn text_width(text: &str, size: TextSize) -> f64 {
     let width = get_raster_width(FontWeight::Regular, raster_height(size)) as f64;
     text.chars().count() as f64 * width / f64::from(PIXELS_PER_UNIT)
 }
 
-/// The picture as the bytes of a PNG file.
+/// The drawing as the bytes of a PNG file.
 pub(crate) fn png(drawing: &Drawing) -> anyhow::Result<Vec<u8>> {
     #[expect(clippy::cast_possible_truncation, reason = "a chart is a few thousand pixels wide")]
     let [width, height] = drawing.size.map(|units| (units.ceil() as u32) * PIXELS_PER_UNIT);
@@ -85,10 +85,10 @@ fn to_pixels() -> Transform {
     Transform::from_scale(scale, scale)
 }
 
-/// One line of text in the making.
+/// One line of text to draw.
 struct TextRun {
     at: [f64; 2],
-    /// Where the text starts, from `at` along its direction.
+    /// Offset of the start of the text from `at`, along the text.
     start: f64,
     color: Color,
     size: TextSize,
@@ -114,7 +114,7 @@ impl TextRun {
         }
     }
 
-    /// Mixes the color into one pixel; `right` and `down` are from `at`, as the text runs.
+    /// Blends the color into one pixel; `right` and `down` are relative to `at`, in the direction of the text.
     fn blend(&self, picture: &mut Pixmap, right: i64, down: i64, opacity: u8) {
         let [x, y] = self.at.map(pixel);
         let [x, y] = if self.vertical { [x + down, y - right] } else { [x + right, y + down] };
@@ -135,12 +135,12 @@ fn to_f32(value: f64) -> f32 {
     value as f32
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of u8")]
+#[expect(clippy::cast_possible_truncation, reason = "casts of floats saturate")]
 fn byte(value: f64) -> u8 {
     value.round() as u8
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of i64")]
+#[expect(clippy::cast_possible_truncation, reason = "casts of floats saturate")]
 fn pixel(units: f64) -> i64 {
     (units * f64::from(PIXELS_PER_UNIT)).round() as i64
 }
@@ -169,7 +169,7 @@ mod tests {
         assert_eq!(picture.dimensions(), (80, 80));
         assert_eq!(picture.get_pixel(40, 4).0, color);
         let half = picture.get_pixel(5, 70).0;
-        // Half way to white, rounded either way.
+        // Halfway to white, rounded either way.
         assert!(half.iter().zip([234, 175, 128]).all(|(got, expected)| got.abs_diff(expected) <= 1), "{half:?}");
         assert_eq!(picture.get_pixel(60, 70).0, [255; 3]);
         let inked = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
@@ -178,6 +178,6 @@ mod tests {
                 .count()
         };
         assert!(inked(33..47, 18..42) > 40, "no letter");
-        assert_eq!(inked(50..80, 8..80), 0, "ink beside the letter");
+        assert_eq!(inked(50..80, 8..80), 0, "ink outside the letter");
     }
 }

@@ -1,4 +1,4 @@
-//! `fieldrig devices`: what is plugged in, as far as the kernel tells, and what of it a rig file can name.
+//! `fieldrig devices`: lists connected devices, as reported by the kernel, with the values to use in a rig file.
 
 use crate::exit::Exit;
 use crate::print;
@@ -7,34 +7,34 @@ use drivers::v4l2;
 use serde::Serialize;
 use std::path::Path;
 
-/// Intel's USB vendor number; RealSense cameras carry it.
+/// Intel's USB vendor ID, used by RealSense cameras.
 #[cfg(any(not(feature = "realsense"), test))]
 const INTEL_USB_VENDOR: &str = "8086";
 
 /// Flags of `devices`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// One thing found.
+/// A device that was found.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 struct DeviceInfo {
     /// `gpu`, `camera`, `can` or `simulation`.
     kind: &'static str,
-    /// What to write into a rig file or to show.
+    /// Value for a rig file, or text for display.
     address: String,
-    /// What it calls itself.
+    /// Name that the device reports.
     name: String,
     /// Whether this build can use it.
     usable: bool,
-    /// Why not, or how.
+    /// How to use it, or why it is not usable.
     note: String,
 }
 
-/// Lists the devices.
+/// Prints the devices.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut found = vec![gpu(), simulation()];
     let sys = Path::new("/sys");
@@ -53,7 +53,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if !args.json {
         print::line(
-            "Arms on the network (Franka's FCI) are not looked for: `fieldrig doctor RIG.toml` checks the one of a rig file.",
+            "Arms on the network (Franka's FCI) are not listed: `fieldrig doctor RIG.toml` checks the arm of a rig file.",
         )?;
     }
     Ok(Exit::Done)
@@ -61,7 +61,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn gpu() -> DeviceInfo {
     let (name, usable, note) = match super::open_gpu() {
-        Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "in software: works, slowly".to_owned()),
+        Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "software adapter: works, but slowly".to_owned()),
         Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
         Err(error) => ("none".to_owned(), false, error.to_string()),
     };
@@ -71,14 +71,14 @@ fn gpu() -> DeviceInfo {
 fn simulation() -> DeviceInfo {
     let usable = cfg!(feature = "sim");
     let note = if usable {
-        "`--sim` puts simulated twins in the place of a rig's devices"
+        "`--sim` simulates all devices of a rig"
     } else {
         "built without simulation: `make deps`, then `cargo build --release --features sim`"
     };
     DeviceInfo { kind: "simulation", address: "--sim".into(), name: "MuJoCo".into(), usable, note: note.into() }
 }
 
-/// V4L2 devices that give images, with all that they offer.
+/// V4L2 capture devices with their image modes.
 #[cfg(target_os = "linux")]
 fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<DeviceInfo> {
     let describe = |camera: v4l2::FoundCamera| {
@@ -103,7 +103,7 @@ fn video_devices(cameras: Vec<Result<v4l2::FoundCamera, v4l2::Problem>>) -> Vec<
     cameras.into_iter().map(|camera| camera.map_or_else(unavailable, describe)).collect()
 }
 
-/// RealSense cameras by their maker's library.
+/// RealSense cameras found by librealsense.
 #[cfg(feature = "realsense")]
 fn realsense_cameras(_sys: &Path) -> Vec<DeviceInfo> {
     let found = |address, name, usable, note| DeviceInfo { kind: "camera", address, name, usable, note };
@@ -120,7 +120,7 @@ fn realsense_cameras(_sys: &Path) -> Vec<DeviceInfo> {
     }
 }
 
-/// RealSense cameras on USB, as the kernel tells.
+/// RealSense cameras on USB, found in sysfs.
 #[cfg(any(not(feature = "realsense"), test))]
 fn realsense_on_usb(sys: &Path) -> Vec<DeviceInfo> {
     let usb = sys.join("bus/usb/devices");
@@ -130,8 +130,7 @@ fn realsense_on_usb(sys: &Path) -> Vec<DeviceInfo> {
         .filter_map(|device| {
             let name = attribute(&usb.join(&device).join("product")).filter(|name| name.contains("RealSense"))?;
             let note =
-                "also driver realsense, in a program that was built with `cargo build --release --features realsense`"
-                    .into();
+                "to use driver realsense as well, build with `cargo build --release --features realsense`".into();
             Some(DeviceInfo { kind: "camera", address: format!("usb {device}"), name, usable: false, note })
         })
         .collect()
@@ -149,14 +148,14 @@ fn can_interfaces(sys: &Path) -> Vec<DeviceInfo> {
         .map(|interface| {
             let state = attribute(&sys.join("class/net").join(&interface).join("operstate"))
                 .unwrap_or_else(|| "unknown".into());
-            let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` tells how it is set up");
+            let note = format!("driver can, [arm.bus.{interface}]; `fieldrig doctor` checks its settings");
             let usable = cfg!(target_os = "linux");
             DeviceInfo { kind: "can", address: interface, name: format!("CAN interface, {state}"), usable, note }
         })
         .collect()
 }
 
-/// Names in a folder of sysfs, sorted; none where it is absent.
+/// Names in a sysfs folder, sorted; empty if the folder is absent.
 #[cfg(any(not(feature = "realsense"), test))]
 fn children(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(folder)
@@ -168,7 +167,7 @@ fn children(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A sysfs attribute, trimmed.
+/// Value of a sysfs attribute, trimmed.
 fn attribute(path: &Path) -> Option<String> {
     Some(std::fs::read_to_string(path).ok()?.trim().to_owned())
 }
@@ -217,7 +216,7 @@ mod tests {
         let found = video_devices(vec![Ok(camera), Err(unavailable)]);
         assert_eq!(found[0].address, "/dev/v4l/by-id/usb-A1B2-index0");
         assert!(found[0].note.contains("/dev/video2, at usb-0000:00:14.0-2, serial A1B2, USB at 480 Mbit/s"));
-        assert!(!found[0].usable && !found[1].usable, "the one offers nothing, the other may not be opened");
+        assert!(!found[0].usable && !found[1].usable, "one has no modes, the other cannot be opened");
         assert!(found[1].note.contains("usermod -aG video"), "{}", found[1].note);
     }
 

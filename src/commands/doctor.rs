@@ -1,4 +1,4 @@
-//! `fieldrig doctor`: what this machine lacks for a rig, each with the line that mends it.
+//! `fieldrig doctor`: checks this computer for a rig and names a remedy for each problem.
 
 mod franka;
 mod listen;
@@ -17,22 +17,22 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 
-/// A model of a million splats with its keyframes and the optimiser's state fits into this.
+/// Enough for a model of a million splats with its keyframes and the optimizer state.
 const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
-/// Where `run` serves unless told otherwise.
+/// Default address of the page that `run` serves.
 const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
-/// Stamps are compared with the time an image row takes, tens of microseconds.
+/// Stamps are compared with the readout time of an image row, tens of microseconds.
 const MAX_CLOCK_STEP: Duration = Duration::from_micros(1);
 
 /// Flags of `doctor`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rig file: what it names is checked against what it wants
+    /// Rig file; its devices are checked, too
     rig: Option<PathBuf>,
-    /// Then read the rig's devices for S seconds and tell rates, latencies and losses; nothing is moved
+    /// Then read the rig's devices for S seconds and print rates, latencies and losses; nothing is moved
     #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
     listen: Option<f64>,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
@@ -45,7 +45,7 @@ enum Verdict {
     Fail,
 }
 
-/// One thing looked at.
+/// Result of one check.
 #[derive(Debug, PartialEq, Eq, Serialize)]
 struct Finding {
     check: &'static str,
@@ -69,7 +69,7 @@ impl Finding {
     }
 }
 
-/// Checks everything; fails when a finding does.
+/// Runs all checks; the exit code is 1 if one fails.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
     let mut findings = gpu();
@@ -132,29 +132,29 @@ fn gpu() -> Vec<Finding> {
         Err(error) => {
             let adapters = Gpu::adapters();
             let remedy = if adapters.is_empty() {
-                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (in software; a GPU needs its own driver)"
+                "sudo apt-get install -y libvulkan1 mesa-vulkan-drivers   (a software adapter; a GPU needs its own driver)"
                     .to_owned()
             } else {
-                format!("unset FIELDRIG_GPU, or let it name one of: {}", numbered(&adapters))
+                format!("unset FIELDRIG_GPU, or set it to one of: {}", numbered(&adapters))
             };
             return vec![Finding::fail("gpu", error.to_string(), remedy)];
         }
     };
     let adapter = if gpu.is_software() {
-        let remedy = "install the Vulkan driver of the GPU, if there is one: training is slow in software";
+        let remedy = "training is slow on a software adapter: install the Vulkan driver of the GPU, if there is one";
         Finding::warn("gpu", gpu.describe(), remedy)
     } else {
         Finding::ok("gpu", gpu.describe())
     };
     let optional = gpu.optional();
     let lanes = optional.subgroup_lanes.map_or("none".to_owned(), |lanes| lanes.to_string());
-    let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are not known" };
+    let timestamps = if optional.timestamps { "yes" } else { "no: times per pass are unavailable" };
     let mib = gpu.max_binding_bytes() >> 20;
     let message = format!("largest buffer {mib} MiB, subgroup lanes {lanes}, timestamps {timestamps}");
     let mut findings = vec![adapter, Finding::ok("gpu limits", message)];
     let adapters = Gpu::adapters();
     if adapters.len() > 1 {
-        findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N picks one", numbered(&adapters))));
+        findings.push(Finding::ok("gpus", format!("{}; FIELDRIG_GPU=N selects one", numbered(&adapters))));
     }
     findings
 }
@@ -169,11 +169,11 @@ fn simulation() -> Finding {
         Finding::ok("simulation", "MuJoCo is built in")
     } else {
         let remedy = "make deps && cargo build --release --features sim";
-        Finding::warn("simulation", "built without MuJoCo: `--sim` is not there", remedy)
+        Finding::warn("simulation", "built without MuJoCo: `--sim` is not available", remedy)
     }
 }
 
-/// The smallest step the monotonic clock shows.
+/// Measures the smallest step of the monotonic clock.
 fn clock() -> Finding {
     let mut min_step = Duration::MAX;
     for _ in 0..1000 {
@@ -190,14 +190,14 @@ fn clock() -> Finding {
     if min_step <= MAX_CLOCK_STEP {
         Finding::ok("clock", message)
     } else {
-        Finding::warn("clock", message, "stamps are this coarse: look for another clock source below")
+        Finding::warn("clock", message, "stamps are equally coarse: use another clock source, see below")
     }
 }
 
 fn clock_source(sys: &Path) -> Finding {
     let folder = sys.join("devices/system/clocksource/clocksource0");
     let Ok(current) = std::fs::read_to_string(folder.join("current_clocksource")) else {
-        return Finding::ok("clock source", "the kernel does not tell");
+        return Finding::ok("clock source", "not reported by the kernel");
     };
     let current = current.trim();
     if matches!(current, "hpet" | "acpi_pm" | "pit" | "jiffies") {
@@ -207,22 +207,24 @@ fn clock_source(sys: &Path) -> Finding {
     Finding::ok("clock source", current)
 }
 
-/// The frequency governor, where the machine has one.
+/// The CPU frequency governor, if the machine has one.
 fn governor(sys: &Path) -> Option<Finding> {
     let governor = std::fs::read_to_string(sys.join("devices/system/cpu/cpu0/cpufreq/scaling_governor")).ok()?;
     let governor = governor.trim();
     Some(match governor {
         "performance" => Finding::ok("governor", governor),
-        _ => {
-            Finding::warn("governor", format!("{governor}: delays vary"), "sudo cpupower frequency-set -g performance")
-        }
+        _ => Finding::warn(
+            "governor",
+            format!("{governor}: latencies vary"),
+            "sudo cpupower frequency-set -g performance",
+        ),
     })
 }
 
 fn memory(proc: &Path) -> Finding {
     let Some(available_kib) = field(&proc.join("meminfo"), "MemAvailable:").and_then(|kib| kib.parse::<u64>().ok())
     else {
-        return Finding::ok("memory", "the kernel does not tell");
+        return Finding::ok("memory", "not reported by the kernel");
     };
     let message = format!("{} MiB available", available_kib >> 10);
     if available_kib >= SUFFICIENT_MEMORY_KIB {
@@ -232,11 +234,11 @@ fn memory(proc: &Path) -> Finding {
     }
 }
 
-/// The real-time priority this user may ask for, which arms at 1 kHz need.
+/// The real-time priority that this user may request; arms at 1 kHz need it.
 fn realtime(proc: &Path) -> Finding {
     let limit = field(&proc.join("self/limits"), "Max realtime priority");
     match limit.as_deref() {
-        None => Finding::ok("real time", "the kernel does not tell"),
+        None => Finding::ok("real time", "not reported by the kernel"),
         Some("0") => {
             let message = "real-time priority is not allowed; only arms controlled at 1 kHz need it";
             let remedy = r#"echo "$USER - rtprio 99" | sudo tee -a /etc/security/limits.conf, then log in again"#;
@@ -253,7 +255,7 @@ fn field(file: &Path, key: &str) -> Option<String> {
     rest.split_whitespace().next().map(str::to_owned)
 }
 
-/// Whether the video devices may be opened.
+/// Whether the video devices can be opened.
 fn cameras(dev: &Path) -> Finding {
     let mut nodes: Vec<PathBuf> = std::fs::read_dir(dev)
         .into_iter()
@@ -271,30 +273,27 @@ fn cameras(dev: &Path) -> Finding {
         .map(|node| node.display().to_string())
         .collect();
     if denied.is_empty() {
-        return Finding::ok("cameras", format!("{} video devices, none refused", nodes.len()));
+        return Finding::ok("cameras", format!("{} video devices, all accessible", nodes.len()));
     }
     let message = format!("no permission to open {}", denied.join(", "));
     Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
 }
 
-/// What a camera on USB offers and its port cannot carry.
+/// Whether the USB port has enough bandwidth for all modes of a camera.
 #[cfg(target_os = "linux")]
 fn usb(camera: &v4l2::FoundCamera) -> Option<Finding> {
     let bandwidth = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
     let name = format!("{} ({})", camera.name, camera.node.display());
     let unsupported = camera.modes_exceeding_usb();
     if unsupported.is_empty() {
-        return Some(Finding::ok(
-            "usb",
-            format!("{name}: its port carries {bandwidth}, enough for all that it offers"),
-        ));
+        return Some(Finding::ok("usb", format!("{name}: its port carries {bandwidth}, enough for all modes")));
     }
-    let message = format!("{name}: its port carries {bandwidth} at most, too little for {}", unsupported.join(", "));
-    let remedy = "choose v4l2.format = \"mjpeg\", a smaller size or a lower rate, or a USB 3 port; `lsusb -t` shows who shares one";
+    let message = format!("{name}: its port carries at most {bandwidth}, too little for {}", unsupported.join(", "));
+    let remedy = "use v4l2.format = \"mjpeg\", a smaller size, a lower rate, or a USB 3 port; `lsusb -t` shows which devices share a port";
     Some(Finding::warn("usb", message, remedy))
 }
 
-/// V4L2 cameras of a rig that are not plugged in.
+/// V4L2 cameras of a rig that are not connected.
 #[cfg(target_os = "linux")]
 fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
     let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
@@ -304,12 +303,16 @@ fn missing_v4l2(rig: &Rig) -> Vec<Finding> {
     });
     let missing = devices.filter_map(|(name, device)| {
         let problem = v4l2::check_connected(device).err()?;
-        Some(Finding::fail("cameras", format!("camera {name:?}: {problem}"), "plug it in, or name another one"))
+        Some(Finding::fail(
+            "cameras",
+            format!("camera {name:?}: {problem}"),
+            "connect it, or change the device in the rig file",
+        ))
     });
     missing.collect()
 }
 
-/// RealSense cameras that are plugged in, and whether those of the rig are.
+/// Checks connected RealSense cameras, and whether those of the rig are connected.
 #[cfg(feature = "realsense")]
 fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     const CHECK: &str = "realsense";
@@ -323,7 +326,7 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     for camera in &found {
         let name = format!("{} {}", camera.name, camera.serial);
         if camera.is_on_usb2() {
-            let remedy = "a USB 3 port and the cable that came with it; turn the plug over once";
+            let remedy = "use a USB 3 port and the original cable; turn the plug over";
             findings.push(Finding::warn(
                 CHECK,
                 format!("{name}: runs at USB 2, which carries few of its modes"),
@@ -333,8 +336,8 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
         if camera.has_old_firmware() {
             let recommended = camera.recommended_firmware.as_deref().unwrap_or_default();
             let message =
-                format!("{name}: firmware {} is older than the library wants ({recommended})", camera.firmware);
-            findings.push(Finding::warn(CHECK, message, "rs-fw-update of the RealSense SDK"));
+                format!("{name}: firmware {} is older than the library recommends ({recommended})", camera.firmware);
+            findings.push(Finding::warn(CHECK, message, "update it with rs-fw-update of the RealSense SDK"));
         }
         if !camera.is_on_usb2() && !camera.has_old_firmware() {
             findings.push(Finding::ok(CHECK, format!("{name}, firmware {}", camera.firmware)));
@@ -343,8 +346,8 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     for camera in realsense_of(rig) {
         let is_connected = found.iter().any(|device| camera.device.is_empty() || device.serial == camera.device);
         if !is_connected {
-            let message = format!("camera {:?}: no RealSense camera {:?} is plugged in", camera.name, camera.device);
-            findings.push(Finding::fail(CHECK, message, "fieldrig devices lists those that there are"));
+            let message = format!("camera {:?}: no RealSense camera {:?} is connected", camera.name, camera.device);
+            findings.push(Finding::fail(CHECK, message, "list the connected cameras with fieldrig devices"));
         }
     }
     findings
@@ -353,20 +356,20 @@ fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
 #[cfg(not(feature = "realsense"))]
 fn realsense(rig: Option<&Rig>) -> Vec<Finding> {
     let missing = realsense_of(rig).map(|camera| {
-        let message = format!("camera {:?}: this program was built without RealSense cameras", camera.name);
+        let message = format!("camera {:?}: this program was built without RealSense support", camera.name);
         let remedy = "install the RealSense SDK (librealsense2), then cargo build --release --features realsense";
         Finding::fail("realsense", message, remedy)
     });
     missing.collect()
 }
 
-/// RealSense cameras of a rig that are no files.
+/// RealSense cameras of a rig, without those that play back a file.
 fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
     let cameras = rig.map_or(&[][..], |rig| &rig.cameras).iter();
     cameras.filter(|camera| camera.driver == CameraDriver::Realsense && camera.realsense.file.as_os_str().is_empty())
 }
 
-/// How CAN interfaces are set up: those that the rig names as it wants them, the others in themselves.
+/// Checks the settings of CAN interfaces: those in the rig against the rig file, the others in general.
 #[cfg(target_os = "linux")]
 fn can(rig: Option<&Rig>) -> Vec<Finding> {
     use drivers::can::{BusConfig, Link, interfaces};
@@ -380,7 +383,7 @@ fn can(rig: Option<&Rig>) -> Vec<Finding> {
         let link = match Link::read(&interface) {
             Ok(link) => link,
             Err(error) => {
-                findings.push(Finding::fail("can", error.to_string(), "fieldrig devices lists those that there are"));
+                findings.push(Finding::fail("can", error.to_string(), "list the CAN interfaces with fieldrig devices"));
                 continue;
             }
         };
@@ -414,13 +417,13 @@ fn port(address: &str) -> Finding {
     match TcpListener::bind(address) {
         Ok(_) => Finding::ok("network", format!("{address} is free for the page")),
         Err(error) => {
-            let remedy = "name another address: fieldrig run ... --listen 127.0.0.1:7008";
+            let remedy = "choose another address: fieldrig run ... --listen 127.0.0.1:7008";
             Finding::warn("network", format!("{address}: {error}"), remedy)
         }
     }
 }
 
-/// Whether what sends datagrams can be listened to.
+/// Whether the UDP addresses of the rig are free to listen on.
 fn senders(rig: &Rig) -> Vec<Finding> {
     let base = (rig.base.driver == BaseDriver::Udp).then(|| ("base".to_owned(), rig.base.address));
     let scanners = rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp);
@@ -442,7 +445,7 @@ fn senders(rig: &Rig) -> Vec<Finding> {
                 Finding::fail(
                     "udp",
                     message,
-                    "another program listens there, a fieldrig perhaps: end it, or name another address",
+                    "another program listens there, perhaps another fieldrig: stop it, or choose another address",
                 )
             }
         })
@@ -450,11 +453,11 @@ fn senders(rig: &Rig) -> Vec<Finding> {
     findings.collect()
 }
 
-/// Whether the arm can be moved as the rig file wants it, as far as that is known without it.
+/// Whether this kind of arm supports the settings in [arm.motion], as far as can be checked without the arm.
 fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref().filter(|_| matches!(rig.arm.driver, ArmDriver::Can | ArmDriver::Franka))?;
     Some(match open::check_motion(rig) {
-        Ok(()) => Finding::ok("motion", "[arm.motion] asks for what this kind of arm can do"),
+        Ok(()) => Finding::ok("motion", "the driver of the arm supports the settings in [arm.motion]"),
         Err(error) => Finding::fail(
             "motion",
             format!("{error:#}"),
@@ -463,17 +466,17 @@ fn motion(rig: &Rig) -> Option<Finding> {
     })
 }
 
-/// Whether the files that cameras play are there.
+/// Whether the files that RealSense cameras play back exist.
 fn files(rig: &Rig) -> Vec<Finding> {
     let missing = |camera: &&Camera| {
         let file = &camera.realsense.file;
         camera.driver == CameraDriver::Realsense && !file.as_os_str().is_empty() && !file.is_file()
     };
-    let print_findings = |camera: &Camera| {
-        let message = format!("camera {:?}: there is no file {}", camera.name, camera.realsense.file.display());
-        Finding::fail("realsense", message, "camera.NAME.realsense.file is a path from the rig file's folder")
+    let missing_file = |camera: &Camera| {
+        let message = format!("camera {:?}: the file {} does not exist", camera.name, camera.realsense.file.display());
+        Finding::fail("realsense", message, "camera.NAME.realsense.file is relative to the folder of the rig file")
     };
-    rig.cameras.iter().filter(missing).map(print_findings).collect()
+    rig.cameras.iter().filter(missing).map(missing_file).collect()
 }
 
 #[cfg(test)]
@@ -554,7 +557,7 @@ mod tests {
             crate::config::Override::new("camera.wrist.realsense.file", "nowhere.bag"),
         ];
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
-        let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+        let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
         assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Fail]);
         drop(occupied);
         assert_eq!(senders(&rig).iter().map(|finding| finding.verdict).collect::<Vec<_>>(), [Verdict::Ok]);
@@ -569,7 +572,7 @@ mod tests {
             let overrides: Vec<_> =
                 overrides.iter().map(|(key, value)| crate::config::Override::new(key, *value)).collect();
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
-            Rig::load(&path, &overrides).expect("a rig file that comes along")
+            Rig::load(&path, &overrides).expect("a bundled rig file")
         };
         let absent =
             rig("static-arm.toml", &[("camera.wrist.driver", "v4l2"), ("camera.wrist.device", "no such serial")]);
@@ -577,10 +580,10 @@ mod tests {
         assert!(findings.iter().any(|finding| finding.message.contains("\"no such serial\"")), "{findings:?}");
         let findings = senders(&rig("static-arm.toml", &[("arm.driver", "udp"), ("arm.address", "localhost")]));
         assert!(findings.len() == 1 && findings[0].message.contains("arm.address is \"localhost\""), "{findings:?}");
-        assert_eq!(motion(&rig("static-arm.toml", &[])), None, "nothing is moved");
+        assert_eq!(motion(&rig("static-arm.toml", &[])), None, "the arm is only read");
         for (on_loss, verdict) in [("hold", Verdict::Ok), ("release", Verdict::Fail)] {
             let findings =
-                motion(&rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)])).expect("it is moved");
+                motion(&rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)])).expect("the arm can be moved");
             assert_eq!(findings.verdict, verdict, "{findings:?}");
         }
     }

@@ -1,4 +1,4 @@
-//! `fieldrig eval`: how good a saved model is on the test images of some data.
+//! `fieldrig eval`: scores a saved model on test images.
 
 use crate::config::{Override, Rig};
 use crate::data::{self, Data, DataArgs, Purpose};
@@ -14,13 +14,13 @@ use trainer::{Keyframe, Split};
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model, or a file of splats (.ply, .spz)
+    /// Folder of a saved model, or a splat file (.ply, .spz)
     model: PathBuf,
-    /// The data it was trained on, or other data of the same scene in the same frame
+    /// The data it was trained on, or other data of the same scene in the same world frame
     data: PathBuf,
     #[command(flatten)]
     images: DataArgs,
-    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
     /// Print one JSON object
@@ -28,7 +28,7 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// What is printed with `--json`.
+/// JSON output of the command.
 #[derive(Debug, Serialize)]
 struct EvalResult {
     #[serde(flatten)]
@@ -43,10 +43,10 @@ struct NamedScores {
     scores: ImageScores,
 }
 
-/// Draws and scores every test image.
+/// Renders and scores every test image.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
-    // All before the data, which take long to read.
+    // Checked before the data, which takes long to read.
     args.images.holdout()?;
     data::expect(&args.data)?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
@@ -59,7 +59,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     }
     if data.rig.as_ref().is_some_and(|rig| differs_from_training_rig(rig, &args.model)) {
         log::warn!(
-            "the model was trained with another rig file: what it knows about cameras corrects that one; see --rig"
+            "the model was trained with another rig file, and its camera corrections apply to that one; see --rig"
         );
     }
     let images = evaluator.score_all(model.as_mut(), tests.iter())?;
@@ -79,21 +79,23 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// Whether the base was realigned when the model was trained: else its scene is not where the images' poses have it.
+/// Reads from the model's rig file whether base poses were realigned in training. Otherwise the poses would not match
+/// the scene.
 fn training_overrides(model: &Path) -> Vec<Override> {
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
     training_rig.iter().map(|rig| Override::new("base.realign", rig.base.realign)).collect()
 }
 
-/// Whether the cameras of a rig are not those that the model was trained with, as the rig file in its folder has them.
+/// Whether the calibration of a rig differs from the one in the model's folder.
 fn differs_from_training_rig(rig: &Rig, model: &Path) -> bool {
     let training_rig = Rig::load(&model.join(drivers::recording::RIG_FILE), &[]);
     training_rig.is_ok_and(|training_rig| !rig.has_same_calibration(&training_rig))
 }
 
-/// How many of the images to score the model was trained on, as the list in its folder says; 0 where there is none.
+/// How many of the test images the model was trained on, according to the list in its folder; 0 if there is no list.
 ///
-/// The images of a folder have no names that hold for all folders, so there the list counts only for the one it was made of.
+/// Image names of a dataset folder are not unique across folders, so for these the list counts only if it is of the
+/// same folder.
 fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usize {
     let Ok(list) = KeyframeList::load(&args.model.join("keyframes.txt")) else { return 0 };
     if !is_recording && trained_folder(&args.model) != args.data.canonicalize().ok() {
@@ -103,7 +105,7 @@ fn n_trained_on(args: &Args, tests: &[Arc<Keyframe>], is_recording: bool) -> usi
     tests.iter().filter(is_trained).count()
 }
 
-/// The data that a model was trained on, as its report says.
+/// The data that a model was trained on, according to its report.
 fn trained_folder(model: &Path) -> Option<PathBuf> {
     let report = std::fs::read_to_string(model.join("report.json")).ok()?;
     let report: serde_json::Value = serde_json::from_str(&report).ok()?;

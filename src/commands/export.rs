@@ -1,4 +1,4 @@
-//! `fieldrig export`: models and recordings in the formats of other programs.
+//! `fieldrig export`: converts models and recordings to formats of other programs.
 
 use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
@@ -19,38 +19,39 @@ use trainer::tsdf::mesh::{Mesh, write_glb, write_ply};
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// A model's folder, a file of splats (.ply, .spz), or a recording (MCAP)
+    /// A model folder, a splat file (.ply, .spz), or a recording (MCAP)
     #[arg(value_name = "MODEL|REC")]
     from: PathBuf,
-    /// What to write
+    /// Output format
     #[arg(long, value_enum)]
     to: Format,
-    /// File (ply, spz, glb) or folder (nerfstudio) to write; what is there already is refused
+    /// File (ply, spz, glb) or folder (nerfstudio) to write; must not exist
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
-    /// Of a distance field, make the mesh coarser: one vertex per cell of this width, metres
+    /// Simplify the mesh of a distance field to one vertex per cell of this width, meters
     #[arg(long, value_name = "M", value_parser = parse_cell_width)]
     cell_m: Option<f64>,
-    /// Of a recording, export exactly the keyframes this `keyframes.txt` lists [default: those a run would accept]
+    /// Export exactly the keyframes of a recording that this `keyframes.txt` lists [default: those that a run would
+    /// accept]
     #[arg(long, value_name = "FILE")]
     keyframes: Option<PathBuf>,
 }
 
-/// Formats there are.
+/// Output formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Format {
-    /// Of a model: its splats, or the mesh of a distance field, as a .ply that other programs open
+    /// From a model: its splats, or the mesh of a distance field, as .ply
     Ply,
-    /// Of a model: its splats as a .spz, a tenth as large; values are rounded
+    /// From a model: its splats as .spz, a tenth of the size of .ply; values are rounded
     Spz,
-    /// Of a distance field: its mesh as a .glb, y up
+    /// From a distance field: its mesh as .glb, y up
     Glb,
-    /// Of a recording: a folder with PNG photos, 16-bit depth, transforms.json with poses and split lists
+    /// From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists
     Nerfstudio,
 }
 
 impl Format {
-    /// The ending of its files; a folder has none.
+    /// The file extension; `None` for a folder.
     fn extension(self) -> Option<&'static str> {
         match self {
             Self::Ply => Some("ply"),
@@ -66,7 +67,7 @@ fn parse_cell_width(text: &str) -> Result<f64, String> {
     width_m.ok_or_else(|| "expected a number above 0".to_owned())
 }
 
-/// What is there to be exported.
+/// What the input contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Contents {
     Splats,
@@ -75,7 +76,7 @@ enum Contents {
     Recording,
 }
 
-/// Writes the model or recording and says what was written; a recording that ends early is a loss.
+/// Converts the model or recording and prints what was written. A truncated recording is a loss.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let contents = contents(&args.from)?;
     if args.cell_m.is_some() && contents != Contents::DistanceField {
@@ -88,17 +89,15 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         (Format::Spz, Contents::Splats) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
         (Format::Ply | Format::Glb, Contents::DistanceField) => export_mesh(args),
         (Format::Nerfstudio, Contents::Recording) => export_recording(args),
-        (Format::Glb, Contents::Splats) => {
-            Err(unsupported("splats, which have no mesh: glb is of a distance field", args))
-        }
+        (Format::Glb, Contents::Splats) => Err(unsupported("splats have no mesh; glb needs a distance field", args)),
         (Format::Spz, Contents::DistanceField) => {
-            Err(unsupported("a distance field, which has no splats but a mesh: ply or glb", args))
+            Err(unsupported("a distance field has no splats; export its mesh as ply or glb", args))
         }
-        (_, Contents::NeuralField) => Err(unsupported("a neural field, which has neither splats nor a mesh", args)),
+        (_, Contents::NeuralField) => Err(unsupported("a neural field has neither splats nor a mesh", args)),
         (Format::Ply | Format::Spz | Format::Glb, Contents::Recording) => {
-            Err(unsupported("splats and meshes are written of a model, this is a recording", args))
+            Err(unsupported("this is a recording; splats and meshes are exported from a model", args))
         }
-        (Format::Nerfstudio, _) => Err(unsupported("nerfstudio is written of a recording, this is a model", args)),
+        (Format::Nerfstudio, _) => Err(unsupported("this is a model; nerfstudio is exported from a recording", args)),
     }
 }
 
@@ -113,20 +112,20 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
         run_folder::expect_model(path)?;
         return Ok(Contents::Splats);
     }
-    let sentence = "neither a folder with a model, nor a file of splats, nor a recording";
+    let sentence = "not a model folder, a splat file or a recording";
     ensure!(path.is_file(), BadArgument(format!("{}: {sentence}", path.display())));
     Ok(Contents::Recording)
 }
 
-/// Refuses a file that is there already, or whose name says another format.
+/// Rejects an output file that exists or has the wrong extension.
 fn check_file(args: &Args) -> Result<(), BadArgument> {
     let Some(extension) = args.to.extension() else { return Ok(()) };
     let out = args.out.display();
     if !args.out.extension().is_some_and(|actual| actual.eq_ignore_ascii_case(extension)) {
-        return Err(BadArgument(format!("--out {out}: the name of such a file ends in .{extension}")));
+        return Err(BadArgument(format!("--out {out}: the file name must end in .{extension}")));
     }
     if args.out.exists() {
-        return Err(BadArgument(format!("--out {out}: it is there already, name another file")));
+        return Err(BadArgument(format!("--out {out}: the file exists; choose another name")));
     }
     Ok(())
 }
@@ -135,7 +134,7 @@ fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
     BadArgument(format!("{}: {sentence}", args.from.display())).into()
 }
 
-/// Checks the splats by reading them before they go out.
+/// Exports the splats after validating them.
 fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow::Result<Exit> {
     let splats = splat_file::read(model)?;
     let partial = Partial::file(out);
@@ -146,7 +145,7 @@ fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow
     Ok(Exit::Done)
 }
 
-/// Makes the mesh anew from the voxels.
+/// Exports the mesh, extracted from the voxels.
 fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
     let mesh = TsdfModel::load(super::open_gpu()?, &args.from)?.mesh()?;
     let coarser = args.cell_m.map(|cell_m| mesh.clustered(cell_m));
@@ -155,7 +154,7 @@ fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
         && written.triangles.is_empty()
     {
         return Err(BadArgument(format!(
-            "--cell-m {cell_m}: nothing is left of a mesh so coarse, name a smaller width"
+            "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
         ))
         .into());
     }
@@ -166,7 +165,7 @@ fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
     }
     partial.keep();
     let triangles = |mesh: &Mesh| counted(mesh.triangles.len() as u64, "triangle");
-    let replaced = if coarser.is_some() { format!(" in place of {}", triangles(&mesh)) } else { String::new() };
+    let replaced = if coarser.is_some() { format!(" instead of {}", triangles(&mesh)) } else { String::new() };
     print::report(format!("{}{replaced} -> {}", triangles(written), args.out.display()));
     Ok(Exit::Done)
 }
@@ -203,7 +202,7 @@ fn sentence(written: Written) -> String {
     let Written { n_images, n_depth, n_depth_skipped } = written;
     let skipped = match n_depth_skipped as u64 {
         0 => String::new(),
-        n => format!(", {} left out: their lens is not that of their photo", counted(n, "depth image")),
+        n => format!(", {} skipped: their lens differs from that of their photo", counted(n, "depth image")),
     };
     format!("{}, {n_depth} of them with depth{skipped}", counted(n_images as u64, "photo"))
 }

@@ -1,4 +1,4 @@
-//! `fieldrig fk`: where a robot's tip is when its joints are so.
+//! `fieldrig fk`: forward kinematics of a robot.
 
 use crate::print;
 use anyhow::{Context, bail, ensure};
@@ -10,30 +10,30 @@ use std::path::{Path, PathBuf};
 /// Flags of `fk`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Robot description (URDF, expanded from xacro; meshes are not read)
+    /// Robot description (URDF, already expanded from xacro; meshes are not read)
     urdf: PathBuf,
     /// Link whose pose is computed
     #[arg(long, value_name = "LINK")]
     tip: String,
-    /// Link the poses are told in [default: the link above all others]
+    /// Link in whose frame the poses are given [default: the root link]
     #[arg(long, value_name = "LINK")]
     base: Option<String>,
     /// Joint values as JSON, `{"joint_names": ["j1", ...], "configurations": [[0.1, ...], ...]}`
     ///
-    /// Radians for turning joints, metres for sliding ones. Names may come in any order. Joints of the robot that do not
-    /// move the tip may be there and change nothing, and so may joints that mimic others: they follow those.
+    /// Radians for revolute joints, meters for prismatic ones, in any order of names. Joints that do not move the tip
+    /// and joints that mimic others may be included; they have no effect.
     #[arg(long, value_name = "FILE.json")]
     joints: PathBuf,
 }
 
-/// What the joints file holds.
+/// Contents of the joints file.
 #[derive(Debug, Deserialize)]
 struct JointsFile {
     joint_names: Vec<String>,
     configurations: Vec<Vec<f64>>,
 }
 
-/// What is printed.
+/// The printed result.
 #[derive(Debug, Serialize)]
 struct Poses<'a> {
     tip: &'a str,
@@ -41,7 +41,7 @@ struct Poses<'a> {
     poses: Vec<[f64; 16]>,
 }
 
-/// Prints one pose for every configuration, as one JSON object.
+/// Prints the poses of all configurations as one JSON object.
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     let urdf = read(&args.urdf)?;
     let robot = Robot::parse(&urdf).with_context(|| args.urdf.display().to_string())?;
@@ -82,13 +82,13 @@ fn poses(robot: &Robot, chain: &Chain, joints: &str) -> anyhow::Result<Vec<[f64;
 
 fn check_names(robot: &Robot, names: &[String]) -> anyhow::Result<()> {
     for (at, name) in names.iter().enumerate() {
-        ensure!(!names[..at].contains(name), "joint {name:?} is named twice in joint_names");
+        ensure!(!names[..at].contains(name), "joint {name:?} is listed twice in joint_names");
         if robot.joint(name).is_none() {
             let nearest = robot.joints().iter().max_by(|a, b| {
                 let similarity = |joint: &str| strsim::jaro_winkler(joint, name);
                 similarity(&a.name).total_cmp(&similarity(&b.name))
             });
-            let hint = nearest.map(|joint| format!("; the nearest is {:?}", joint.name)).unwrap_or_default();
+            let hint = nearest.map(|joint| format!("; did you mean {:?}?", joint.name)).unwrap_or_default();
             bail!("joint {name:?} is not in the URDF{hint}");
         }
     }

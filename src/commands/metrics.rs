@@ -1,4 +1,4 @@
-//! `fieldrig metrics`: how near one picture comes to another.
+//! `fieldrig metrics`: compares two images.
 
 use crate::print;
 use anyhow::{Context, bail};
@@ -7,25 +7,25 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
 
-/// Names the weights of LPIPS where the flag does not.
+/// Environment variable with the path of the LPIPS weights; the flag takes precedence.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
 
 /// Flags of `metrics`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The picture to judge (PNG or JPEG)
+    /// Image to score (PNG or JPEG)
     #[arg(value_name = "A")]
     rendered: PathBuf,
-    /// What it should look like; where this one is transparent, nothing is compared
+    /// Ground truth; its transparent pixels are ignored
     #[arg(value_name = "B")]
     truth: PathBuf,
-    /// Print one JSON object instead of a line for people; null is what is not known, or for PSNR infinite
+    /// Print one JSON object; null means unavailable or, for PSNR, infinite
     #[arg(long)]
     json: bool,
-    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Metres per count, when both pictures are 16-bit depth
+    /// Meters per count, if both images are 16-bit depth
     #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = positive)]
     meters_per_count: f64,
 }
@@ -35,7 +35,7 @@ fn positive(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| "must be a number above 0".to_owned())
 }
 
-/// What is printed; `None` is not known.
+/// The printed scores; `None` if unavailable.
 #[derive(Debug, Default, Serialize)]
 struct Scores {
     psnr: Option<f64>,
@@ -44,13 +44,13 @@ struct Scores {
     depth_rmse_m: Option<f64>,
 }
 
-/// Prints PSNR, SSIM and LPIPS of two pictures, or the error of two depth images.
+/// Prints PSNR, SSIM and LPIPS of two images, or the error of two depth images.
 pub(crate) fn run(args: Args) -> anyhow::Result<()> {
     let (rendered, truth) = (open(&args.rendered)?, open(&args.truth)?);
     let [size_px, truth_px] = [&rendered, &truth].map(|picture| [picture.width(), picture.height()]);
     if size_px != truth_px {
         bail!(
-            "{} is {}x{} pixels, {} is {}x{}: pictures must have one size",
+            "{} is {}x{} pixels, {} is {}x{}: the images must have the same size",
             args.rendered.display(),
             size_px[0],
             size_px[1],
@@ -73,7 +73,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
 
 fn open(path: &Path) -> anyhow::Result<DynamicImage> {
     let read = || anyhow::Ok(image::ImageReader::open(path)?.with_guessed_format()?.decode()?);
-    read().with_context(|| format!("cannot read the picture {}", path.display()))
+    read().with_context(|| format!("cannot read the image {}", path.display()))
 }
 
 fn lpips_weights(args: &Args) -> Option<PathBuf> {

@@ -1,4 +1,4 @@
-//! One file a subcommand.
+//! The subcommands, one file each.
 
 pub(crate) mod bench;
 pub(crate) mod devices;
@@ -23,11 +23,11 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use trainer::gpu::{Gpu, GpuOptions};
 
-/// Reads a number of a flag, which has to lie within a range.
+/// Returns a parser for a numeric flag that accepts values in the given range.
 fn number_in_range(range: RangeInclusive<f64>) -> impl Fn(&str) -> Result<f64, String> + Clone + Send + Sync {
     move |text| {
         let number = text.parse().ok().filter(|number| range.contains(number));
-        number.ok_or_else(|| format!("allowed are {} to {}", range.start(), range.end()))
+        number.ok_or_else(|| format!("must be {} to {}", range.start(), range.end()))
     }
 }
 
@@ -51,8 +51,8 @@ pub(crate) fn run(command: Command) -> anyhow::Result<Exit> {
     }
 }
 
-/// Opens the GPU; `FIELDRIG_GPU` says which one of several, `FIELDRIG_GPU_FEATURES=none` does without everything
-/// optional, and `no-matrices` without cooperative matrices.
+/// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
+/// and `no-matrices` only cooperative matrices.
 pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
     open_gpu_with(GpuOptions::default())
 }
@@ -70,7 +70,7 @@ fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     };
     recovery::hide_caught_panics();
     recovery::check_open_for_tests()?;
-    // Lets tests run out of GPU memory.
+    // Lets tests exhaust GPU memory.
     let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
     let gpu = Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..options })?;
     if gpu.is_software() {

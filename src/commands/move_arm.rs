@@ -1,4 +1,4 @@
-//! `fieldrig move`: takes an arm to given joint positions, within its limits, with a person watching.
+//! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
 use crate::config::Rig;
 use crate::exit::{BadArgument, Exit};
@@ -14,58 +14,60 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Targets this near to the end of a range are in it, rad or m.
+/// A target this close to a joint limit counts as within the range, rad or m.
 const TOLERANCE_RAD: f64 = 1e-4;
-/// How soon Ctrl-C is noticed.
+/// How often Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(50);
-/// A movable arm that says nothing for so long is lost, whatever it was asked for.
+/// A movable arm that reports nothing for this long counts as lost.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 
 /// Flags of `move`.
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("what").required(true).multiple(true).args(["to", "by", "recover"]))]
 pub(crate) struct Args {
-    /// The arm (TOML); its table [arm.motion] says how it may be moved
+    /// Rig file with the arm (TOML); its table [arm.motion] defines how the arm may be moved
     rig_file: PathBuf,
-    /// Positions of all joints in the order of arm.joints, rad or m: 0,-0.5,0,-2.0,0,1.8,0.7
+    /// Target positions of all joints in the order of arm.joints, rad or m: 0,-0.5,0,-2.0,0,1.8,0.7
     #[arg(long, value_name = "Q,Q,...", value_delimiter = ',', allow_hyphen_values = true, conflicts_with = "by")]
     to: Option<Vec<f64>>,
-    /// Move this joint by so much from where it is, rad or m; may be given for several joints
+    /// Move this joint by this much from its current position, rad or m; can be repeated for other joints
     #[arg(long, value_name = "JOINT=DELTA", value_parser = delta)]
     by: Vec<(String, f64)>,
-    /// First switch an arm that stopped on again; look at it before
+    /// First recover an arm that has stopped; inspect it before
     #[arg(long)]
     recover: bool,
-    /// Yes, move it: nobody is in its reach, and a hand is on the emergency stop
+    /// Confirm the motion: nobody is within reach of the arm, and a hand is on the emergency stop
     #[arg(long, required = true)]
     enable_motion: bool,
-    /// End as soon as it has arrived, also where its motors let go of it then
+    /// Exit as soon as the arm has arrived, even if its motors then release it
     #[arg(long)]
     exit_on_arrival: bool,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
 fn delta(text: &str) -> Result<(String, f64), String> {
     let parsed = text.split_once('=').and_then(|(joint, delta)| Some((joint.to_owned(), delta.parse().ok()?)));
-    parsed.filter(|(_, delta): &(String, f64)| delta.is_finite()).ok_or_else(|| "write it as JOINT=0.1".to_owned())
+    parsed
+        .filter(|(_, delta): &(String, f64)| delta.is_finite())
+        .ok_or_else(|| "expected JOINT=DELTA, such as joint1=0.1".to_owned())
 }
 
-/// What is told at the end of a way.
+/// Report of an arrival.
 #[derive(Debug, Serialize)]
 struct ArrivedEvent<'a> {
     event: &'static str,
     joints: &'a [String],
-    /// Where it was headed for, and where the joints say they are, rad or m.
+    /// Target, and the position that the joints report, rad or m.
     target: &'a [f64],
     position: &'a [f64],
-    /// The largest difference of these.
+    /// Largest absolute difference between the two.
     error: f64,
     seconds: f64,
 }
 
-/// Moves the arm, and holds it where it would let go.
+/// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let rig = Rig::load(&args.rig_file, &[])?;
@@ -82,7 +84,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut mover = Mover { arm, offsets, stop, bar: print::bar(None, "{spinner} {elapsed} {msg}", args.json) };
     if args.recover {
         mover.arm.recover()?;
-        log::info!("the arm is switched on again");
+        log::info!("the arm has recovered");
     }
     let initial = mover.read()?;
     if args.to.is_some() || !args.by.is_empty() {
@@ -92,29 +94,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         for (joint, (requested, accepted)) in rig.arm.joints.iter().zip(requested.position.iter().zip(&target.position))
         {
             if (requested - accepted).abs() > TOLERANCE_RAD {
-                log::warn!(
-                    "joint {joint:?} is sent to {accepted:.4}, the end of its range, rather than {requested:.4}"
-                );
+                log::warn!("joint {joint:?} moves to {accepted:.4}, the limit of its range, instead of {requested:.4}");
             }
         }
         let began = clock::now();
         let last = mover.follow(&target).inspect_err(|error| {
             if args.json {
-                // What stdout does with it changes nothing.
+                // Output errors are ignored: the arm's error is returned.
                 let _ = print::report_json(&serde_json::json!({ "event": "stopped", "reason": format!("{error:#}") }));
             }
         })?;
         report_arrival(args, &rig.arm.joints, &target, &last, began)?;
     }
     if motion.on_loss != OnLoss::Hold && !args.exit_on_arrival {
-        log::info!("the arm is held until Ctrl-C; its motors let go of it then: support it first");
+        log::info!("holding the arm until Ctrl-C; its motors release it then, so support it first");
         mover.hold()?;
     }
     mover.bar.finish_and_clear();
     Ok(Exit::Done)
 }
 
-/// What can be seen to be wrong before anything is opened.
+/// Checks the arguments against the rig file, before any device is opened.
 fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     let joints = &rig.arm.joints;
     if let Some(to) = args.to.as_ref().filter(|to| to.len() != joints.len()) {
@@ -123,13 +123,13 @@ fn check(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     }
     if let Some((joint, _)) = args.by.iter().find(|(joint, _)| !joints.contains(joint)) {
         let available = if joints.is_empty() { "none".to_owned() } else { joints.join(", ") };
-        return Err(BadArgument(format!("--by: there is no joint {joint:?}; there are: {available}")));
+        return Err(BadArgument(format!("--by: unknown joint {joint:?}; joints of the arm: {available}")));
     }
     Ok(())
 }
 
-/// Refuses a target outside the ranges of the arm's description: a slip of the pen is not to swing an arm to the end of its range. A
-/// joint that is outside already may stay.
+/// Rejects a target outside the joint ranges of the URDF, so that a typing error does not move an arm to its limits. A
+/// joint that is already outside may stay there.
 fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::Result<()> {
     let chain = open::chain_of(rig)?;
     for (ix, joint) in rig.arm.joints.iter().enumerate() {
@@ -140,7 +140,7 @@ fn check_range(rig: &Rig, requested: &JointTarget, now: &JointState) -> anyhow::
             && !(lower - TOLERANCE_RAD..=upper + TOLERANCE_RAD).contains(&requested)
         {
             return Err(BadArgument(format!(
-                "joint {joint:?} would go to {requested:.4}, outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
+                "joint {joint:?}: target {requested:.4} is outside its range of {lower:.4} to {upper:.4}; it is at {now:.4}, and nothing was moved"
             ))
             .into());
         }
@@ -183,23 +183,23 @@ fn format_positions(position: &[f64]) -> String {
     position.iter().map(|position| format!("{position:.4}")).collect::<Vec<_>>().join(", ")
 }
 
-/// The arm and who watches it.
+/// The arm and the state for supervising it.
 struct Mover {
     arm: Box<dyn MovableArm>,
-    /// What is added to what the joints tell, as wherever else they are read.
+    /// Joint offsets, added to the reported positions as in all other commands.
     offsets: Vec<f64>,
     stop: Stop,
     bar: ProgressBar,
 }
 
 impl Mover {
-    /// The next joint state; an arm that stopped by itself, or says nothing, is an error.
+    /// Reads the next joint state; an arm that has stopped on its own, or reports nothing, is an error.
     fn read(&mut self) -> anyhow::Result<JointState> {
         let deadline = clock::now().plus_secs(MAX_SILENCE.as_secs_f64());
         loop {
             let state = self.arm.read(POLL);
             if let Motion::Stopped { reason } = self.arm.motion() {
-                bail!("the arm stopped: {reason}. Look at it, then switch it on again with --recover");
+                bail!("the arm stopped: {reason}. Inspect it, then recover it with --recover");
             }
             match state {
                 Err(Error::NoJoints { .. }) if clock::now() < deadline => {}
@@ -212,7 +212,7 @@ impl Mover {
         }
     }
 
-    /// Heads for a target; what is truly headed for comes back.
+    /// Sends a target; returns the one that was accepted after limits.
     fn command(&mut self, requested: &JointTarget) -> Result<JointTarget, Error> {
         let with_offsets = |target: &JointTarget, sign: f64| JointTarget {
             position: target
@@ -226,7 +226,7 @@ impl Mover {
         Ok(with_offsets(&accepted, 1.0))
     }
 
-    /// Waits until it has arrived; Ctrl-C brings it to rest on the way, which is an error.
+    /// Waits until the arm arrives. Ctrl-C stops it, which is an error.
     fn follow(&mut self, target: &JointTarget) -> anyhow::Result<JointState> {
         loop {
             let state = self.read()?;
@@ -239,16 +239,16 @@ impl Mover {
                 format_positions(&target.position)
             ));
             if self.stop.requested() {
-                self.arm.stop().context("the arm could not be stopped")?;
+                self.arm.stop().context("cannot stop the arm")?;
                 while self.arm.motion() == Motion::Moving {
                     self.read()?;
                 }
-                bail!("stopped on the way, at {}", format_positions(&self.read()?.position));
+                bail!("stopped before the target, at {}", format_positions(&self.read()?.position));
             }
         }
     }
 
-    /// Keeps it where it is until Ctrl-C.
+    /// Holds the arm in place until Ctrl-C.
     fn hold(&mut self) -> anyhow::Result<()> {
         while !self.stop.requested() {
             let state = self.read()?;

@@ -1,4 +1,4 @@
-//! `fieldrig record`: what the devices say, into a file, and nothing else.
+//! `fieldrig record`: writes everything that the devices send to a recording.
 
 use super::number_in_range;
 use crate::config::{ArmDriver, BaseDriver, Override, Rig};
@@ -16,35 +16,35 @@ use std::path::PathBuf;
 /// Flags of `record`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Cameras and arm (TOML)
+    /// Rig file: cameras and arm (TOML)
     rig_file: PathBuf,
-    /// The recording, an MCAP file that Foxglove and Lichtblick open too
+    /// MCAP file to write; Foxglove and Lichtblick can open it
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Put a simulated twin in the place of every device of the rig file
+    /// Simulate all devices of the rig file
     #[arg(long)]
     sim: bool,
-    /// Simulate as fast as the machine can, without losing anything; else in real time
+    /// Simulate as fast as possible, without loss [default: real time]
     #[arg(long, requires = "sim")]
     lockstep: bool,
-    /// Stop after S seconds of the devices' time [default: until Ctrl-C or the devices' end; needed with --lockstep, unless
-    /// the rig file says when the simulation ends]
+    /// Stop after S seconds of device time [default: until Ctrl-C or until the devices end; required with --lockstep,
+    /// unless the rig file ends the simulation]
     #[arg(long, value_name = "S", value_parser = number_in_range(0.1..=1e7))]
     seconds: Option<f64>,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// What was recorded.
+/// Counts of what was recorded.
 #[derive(Debug, Default, Serialize)]
 struct Recorded {
     event: &'static str,
     seconds: f64,
-    /// Colour images.
+    /// Color images.
     images: u64,
     depth_images: u64,
-    /// Colour images that the devices lost, or that a slow disk made them lose; then by camera.
+    /// Color images dropped by the devices, or because the disk was too slow; below, the counts per camera.
     images_dropped_by_devices: u64,
     dropped: BTreeMap<String, DroppedImages>,
     joint_states: u64,
@@ -54,7 +54,7 @@ struct Recorded {
     out: PathBuf,
 }
 
-/// Images of one camera that did not come.
+/// Number of dropped images of one camera.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 struct DroppedImages {
     images: u64,
@@ -73,7 +73,7 @@ impl Recorded {
             Sample::Base(_) => self.base_poses += 1,
             Sample::Range(_) => self.range_scans += 1,
             Sample::Truth(_) => self.truths += 1,
-            // Comes with every base pose.
+            // Arrives with every base pose.
             Sample::BaseTruth(_) => {}
         }
     }
@@ -91,7 +91,7 @@ impl Recorded {
         }
     }
 
-    /// Counts what can be read from the file after writing failed; images that devices lost stay counted.
+    /// Recounts from the file after a write error. The counts of dropped images are kept.
     fn recount_from_file(self) -> Self {
         let mut found = Self { event: self.event, out: self.out, ..Self::default() };
         let mut first: Option<Stamp> = None;
@@ -116,7 +116,7 @@ impl Recorded {
         message
     }
 
-    /// Devices of the rig that told nothing at all.
+    /// Devices of the rig from which nothing was recorded.
     fn missing_devices(&self, rig: &Rig) -> Vec<String> {
         let arm = (rig.arm.driver != ArmDriver::None && self.joint_states == 0).then_some("joint state of the arm");
         let base = (rig.base.driver != BaseDriver::Fixed && self.base_poses == 0).then_some("pose of the base");
@@ -124,35 +124,35 @@ impl Recorded {
         [arm, base, images].into_iter().flatten().map(|what| format!("no {what} was recorded")).collect()
     }
 
-    /// What did not come, a sentence a camera.
+    /// Dropped images, one message per camera.
     fn data_losses(&self) -> Vec<String> {
         let sentence = |(camera, dropped): (&String, &DroppedImages)| {
-            format!("camera {camera:?} lost {} color and {} depth images", dropped.images, dropped.depth_images)
+            format!("camera {camera:?} dropped {} color and {} depth images", dropped.images, dropped.depth_images)
         };
         self.dropped.iter().map(sentence).collect()
     }
 }
 
-/// Refuses a simulation that nothing holds back and nothing ends: it would fill the disk.
+/// Rejects a lockstep simulation without an end, because it would fill the disk.
 fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
     let is_endless = args.seconds.is_none() && rig.sim.duration_secs.is_none() && rig.sim.n_images.is_none();
     let is_simulated = args.sim || rig.arm.driver == ArmDriver::Sim;
     if is_simulated && rig.sim.lockstep && is_endless {
         return Err(BadArgument(
-            "a simulation in lockstep would go on until the disk is full: say with --seconds when it ends".into(),
+            "a lockstep simulation without an end would fill the disk: limit it with --seconds".into(),
         ));
     }
     Ok(())
 }
 
-/// Records until the time is over, the devices end, or Ctrl-C.
+/// Records until the time limit, the end of the devices, or Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let stop = Stop::on_ctrl_c()?;
     let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
     let rig = Rig::load(&args.rig_file, &overrides)?;
     check_end(args, &rig)?;
     if args.out.exists() {
-        return Err(drivers::Error::Exists { path: args.out.clone() }.into()); // Not after all devices are open.
+        return Err(drivers::Error::Exists { path: args.out.clone() }.into()); // Checked before the devices are opened.
     }
     let Opened { rig, mut source, .. } = open::rig(rig, if args.sim { Devices::Sim } else { Devices::Real })?;
     let mut recorder = open::recorder(&args.out, &rig)?;
@@ -195,11 +195,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         None => None,
     };
     if let Some(error) = input_error {
-        let finished = format!("the devices broke off; {} keeps what came before", args.out.display());
+        let finished = format!("a device failed; {} contains the data up to then", args.out.display());
         return Err(anyhow::Error::new(error).context(finished));
     }
     if n_written == Some(0) {
-        return Err(InsufficientData(format!("no sample came, so {} was not written", args.out.display())).into());
+        return Err(
+            InsufficientData(format!("no device sent any data, so {} was not written", args.out.display())).into()
+        );
     }
     if args.json {
         print::report_json(&recorded)?;
@@ -210,8 +212,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     data_losses.extend(recorded.missing_devices(&rig));
     let n_dropped = source.n_other_samples_dropped();
     if n_dropped > 0 {
-        data_losses
-            .push(format!("{n_dropped} joint states, base poses and range scans, because the disk was too slow"));
+        data_losses.push(format!(
+            "{n_dropped} joint states, base poses and range scans were dropped because the disk was too slow"
+        ));
     }
     Ok(exit::from_losses(&data_losses))
 }

@@ -1,4 +1,4 @@
-//! `fieldrig render`: pictures from a saved model.
+//! `fieldrig render`: renders images of a saved model.
 
 use crate::camera_path::{CameraPath, PathCamera};
 use crate::evaluate::{covered_frac, warn_if_hardly_covered};
@@ -12,65 +12,65 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::{Aabb, Picture, Projection, RenderRequest};
 
-/// Size of a picture where nobody says one.
+/// Image size if neither a flag nor the camera path gives one.
 const DEFAULT_SIZE_PX: [u32; 2] = [1280, 720];
-/// Largest side of a picture: 16 k.
+/// Maximum width and height of an image.
 const MAX_SIDE_PX: u32 = 16_384;
 
 /// Flags of `render`.
 #[derive(Debug, clap::Args)]
 #[command(group(clap::ArgGroup::new("where").required(true)))]
 pub(crate) struct Args {
-    /// Folder of a saved model, or a file of splats (.ply, .spz)
+    /// Folder of a saved model, or a splat file (.ply, .spz)
     model: PathBuf,
-    /// Camera path as nerfstudio writes it (JSON)
+    /// Camera path in nerfstudio's format (JSON)
     #[arg(long, value_name = "FILE", group = "where")]
     camera_path: Option<PathBuf>,
-    /// `world_from_camera`, 16 numbers row major, separated by spaces or commas; camera: x right, y down, z forward
+    /// `world_from_camera`: 16 numbers, row major, separated by spaces or commas; camera: x right, y down, z forward
     #[arg(long, value_name = "NUMBERS", group = "where", allow_hyphen_values = true, value_parser = numbers::<16>)]
     pose: Option<Numbers<16>>,
-    /// Size of the pictures [default: the camera path's, else 1280x720]
+    /// Size of the images [default: the camera path's, else 1280x720]
     #[arg(long, value_name = "WIDTHxHEIGHT", value_parser = size)]
     size: Option<[u32; 2]>,
-    /// Angle from the top to the bottom of the picture, degrees [default: the camera path's, else 60]
+    /// Vertical field of view, degrees [default: the camera path's, else 60]
     #[arg(long, value_name = "DEGREES")]
     fov: Option<f64>,
-    /// Draw all directions (360 degrees) instead of a pinhole view
+    /// Render a 360-degree equirectangular image instead of a pinhole view
     #[arg(long, conflicts_with = "fov")]
     equirect: bool,
-    /// Draw only what lies in a box in the world: x y z of the lowest corner, then of the highest, metres
+    /// Render only what lies in a box in the world: x y z of the lower corner, then of the upper corner, meters
     #[arg(long, value_name = "NUMBERS", allow_hyphen_values = true, value_parser = corners)]
     crop: Option<Numbers<6>>,
-    /// Write depth too, metres along the camera's z axis (distance with --equirect), as .npy
+    /// Also write depth as .npy: meters along the camera's z axis (distance with --equirect)
     #[arg(long)]
     depth: bool,
-    /// Folder for the pictures; one that holds such pictures is refused
+    /// Folder for the images; existing images are not overwritten
     #[arg(long, value_name = "FOLDER", default_value = "renders")]
     out: PathBuf,
-    /// Print one JSON object a picture
+    /// Print JSON, one object per image
     #[arg(long)]
     json: bool,
 }
 
-/// A fixed number of numbers from one argument.
+/// A fixed number of numbers in one argument.
 #[derive(Clone, Copy, Debug)]
 struct Numbers<const N: usize>([f64; N]);
 
 fn numbers<const N: usize>(text: &str) -> Result<Numbers<N>, String> {
     let words = text.split([' ', ',']).filter(|word| !word.is_empty());
     let values: Vec<f64> =
-        words.map(|word| word.parse().map_err(|_| format!("{word:?} is no number"))).collect::<Result<_, _>>()?;
+        words.map(|word| word.parse().map_err(|_| format!("{word:?} is not a number"))).collect::<Result<_, _>>()?;
     let n = values.len();
     <[f64; N]>::try_from(values).map(Numbers).map_err(|_| format!("got {n} numbers, expected {N}"))
 }
 
-/// Two opposite corners of a box, the lowest first.
+/// Two opposite corners of a box, the lower one first.
 fn corners(text: &str) -> Result<Numbers<6>, String> {
     let corners = numbers::<6>(text)?;
     let Numbers([x, y, z, to_x, to_y, to_z]) = corners;
     for (axis, from, to) in [("x", x, to_x), ("y", y, to_y), ("z", z, to_z)] {
         if !(from.is_finite() && to.is_finite() && from < to) {
-            return Err(format!("{axis} goes from {from} to {to}, must be finite and go up"));
+            return Err(format!("{axis} ranges from {from} to {to}; both must be finite and increasing"));
         }
     }
     Ok(corners)
@@ -83,18 +83,18 @@ fn size(text: &str) -> Result<[u32; 2], String> {
         .ok_or_else(|| format!("expected WIDTHxHEIGHT, such as 1280x720, each side at most {MAX_SIDE_PX}"))
 }
 
-/// What was drawn.
+/// A rendered image.
 #[derive(Debug, Serialize)]
 struct RenderedPicture {
     picture: PathBuf,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth: Option<PathBuf>,
     size_px: [u32; 2],
-    /// Wall time from the request to the pixels.
+    /// Wall time from the request to the pixels, milliseconds.
     draw_ms: f64,
 }
 
-/// Draws every stand of the path.
+/// Renders every camera of the path.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let path = match (&args.camera_path, &args.pose) {
         (Some(file), _) => CameraPath::load(file)?,
@@ -107,7 +107,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_no_overwrite(&args.out, requests.len())?;
     partial::remove_on_signals()?;
     let mut model = method::load(super::open_gpu()?, &args.model)?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make the folder {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
@@ -125,7 +125,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     bar.finish_and_clear();
     warn_if_hardly_covered(&covered_fracs);
     if !args.json {
-        let n_pictures = print::counted(requests.len() as u64, "picture");
+        let n_pictures = print::counted(requests.len() as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)
@@ -163,20 +163,20 @@ impl Args {
     }
 }
 
-/// Files of a picture and of its depth.
+/// File names of an image and its depth.
 fn files(folder: &Path, ix: usize) -> [PathBuf; 2] {
     [folder.join(format!("{ix:05}.png")), folder.join(format!("{ix:05}_depth.npy"))]
 }
 
-/// Refuses a folder that holds any of so many pictures: none is replaced.
+/// Rejects a folder that already holds any of the `n` images or their depth.
 fn check_no_overwrite(folder: &Path, n: usize) -> Result<(), BadArgument> {
     match (0..n).flat_map(|ix| files(folder, ix)).find(|file| file.exists()) {
-        Some(file) => Err(BadArgument(format!("--out: {} is there already, name another folder", file.display()))),
+        Some(file) => Err(BadArgument(format!("--out: {} exists; choose another folder", file.display()))),
         None => Ok(()),
     }
 }
 
-/// The picture's file, and the depth's.
+/// Writes an image and optionally its depth; returns their files.
 fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyhow::Result<(PathBuf, Option<PathBuf>)> {
     let [width, height] = picture.size_px;
     let [file, depth] = files(folder, ix);
@@ -193,7 +193,7 @@ fn write(folder: &Path, ix: usize, picture: &Picture, with_depth: bool) -> anyho
     Ok((file, depth))
 }
 
-/// Depth as `[height, width]` of 32-bit floats.
+/// Writes depth as a `[height, width]` array of 32-bit floats.
 fn write_npy(file: &Path, picture: &Picture) -> std::io::Result<()> {
     use npyz::WriterBuilder;
     let [width, height] = picture.size_px.map(u64::from);
@@ -228,13 +228,13 @@ mod tests {
         let picture =
             Picture { size_px: [2, 3], rgba_srgb: vec![255; 24], depth_m: vec![0.0, 1.0, 2.0, 3.0, 4.0, 5.5] };
         let (file, depth) = write(folder.path(), 7, &picture, true).expect("written");
-        let bytes = std::fs::read(depth.expect("asked for")).expect("a file");
+        let bytes = std::fs::read(depth.expect("requested")).expect("a file");
         let read = npyz::NpyFile::new(&bytes[..]).expect("npy");
         assert_eq!(read.shape(), [3, 2]);
         assert_eq!(read.into_vec::<f32>().expect("floats"), picture.depth_m);
         assert!(file.ends_with("00007.png"));
-        check_no_overwrite(folder.path(), 7).expect("the eighth is not among them");
-        let message = check_no_overwrite(folder.path(), 8).expect_err("it is there").0;
-        assert!(message.contains("00007.png is there already"), "{message}");
+        check_no_overwrite(folder.path(), 7).expect("the eighth image is not requested");
+        let message = check_no_overwrite(folder.path(), 8).expect_err("the file exists").0;
+        assert!(message.contains("00007.png exists"), "{message}");
     }
 }

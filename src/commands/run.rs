@@ -1,4 +1,4 @@
-//! `fieldrig run`: devices, join, trainer, picture.
+//! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
@@ -40,55 +40,55 @@ use viz::{Hub, RunResult, Server, ServerConfig};
 /// Flags of `run`.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Cameras, arm and training settings (TOML)
+    /// Rig file: cameras, arm and training settings (TOML)
     rig_file: PathBuf,
-    /// Put a simulated twin in the place of every device of the rig file
+    /// Simulate all devices of the rig file
     #[arg(long, conflicts_with = "from")]
     sim: bool,
-    /// Wait with the simulation for the trainer, so that a seed gives one result; else it runs in real time
+    /// Make the simulation wait for the trainer, so that with --steps a seed gives one result [default: real time]
     #[arg(long, requires = "sim", conflicts_with = "from")]
     lockstep: bool,
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
-    /// Write everything that comes in to an MCAP file; what devices lose then is a loss (exit code 3), else the next image does
+    /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
+    /// code 3)
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags. New
-    /// keyframes are added; --record and --listen are given anew
+    /// Continue a run that crashed or was stopped, from the checkpoint and keyframes in its folder and with its flags.
+    /// New keyframes are added; --record and --listen are not restored
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
-    /// Stop S seconds after the first image, including the time before --resume [default: run until Ctrl-C]
+    /// Stop S seconds after the first image; time before --resume counts [default: run until Ctrl-C]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps, or when the devices ended and there is nothing left to fuse; in lockstep one seed gives one
-    /// result then
+    /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
+    /// With --lockstep, a seed then gives one result
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// With a lockstep simulation or a recording only: steps between two keyframes [default: 10]
+    /// Optimizer steps between two keyframes; needs --lockstep or --from [default: 10]
     #[arg(long, value_name = "N")]
     steps_per_keyframe: Option<u64>,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Address of the page, as numbers
+    /// Address of the page: numeric IP address and port
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:7007", value_parser = address)]
     listen: SocketAddr,
-    /// Where the results and the settled rig file go, of several methods in a folder each inside; a folder that holds a model is
-    /// refused [default: a new folder in runs]
+    /// Folder for the results and the effective rig file; several methods get a subfolder each. A folder that contains
+    /// a model is refused [default: a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
-    /// When the run has reached its limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without --json,
-    /// else exit]
+    /// At a limit, keep serving the page until Ctrl-C, or exit [default: stay on a terminal without --json, else exit]
     #[arg(long, value_name = "WHAT")]
     when_done: Option<WhenDone>,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// What happens when a run has reached its limit.
+/// What to do when a run reaches its limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum WhenDone {
     /// Show the model on the page until Ctrl-C.
@@ -97,7 +97,7 @@ enum WhenDone {
     Exit,
 }
 
-/// Parses an address of the page.
+/// Parses the address of the page.
 pub(super) fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "expected an address and a port, such as 127.0.0.1:7007".to_owned())
 }
@@ -110,14 +110,14 @@ const SIM: &str = "sim";
 const LOCKSTEP: &str = "lockstep";
 const RECORD: &str = "record";
 
-/// Time in which connected clients receive the last status.
+/// How long the server stays up so that connected clients receive the last status.
 const FINAL_STATUS_TIME: Duration = Duration::from_millis(400);
-/// Steps between two keyframes where no flag says.
+/// Steps between two keyframes if the flag is not given.
 const DEFAULT_STEPS_PER_KEYFRAME: u64 = 10;
-/// People look on while a mark is scored: it must not take long.
+/// Evaluation interrupts a live run, so it must be short.
 const MAX_IMAGES_SCORED_LIVE: usize = 12;
 
-/// What the report says beside scores.
+/// The entries of the report besides scores.
 #[derive(Debug, Serialize)]
 struct RunDetails {
     method: &'static str,
@@ -126,18 +126,18 @@ struct RunDetails {
     evicted: u64,
     refused: BTreeMap<&'static str, u64>,
     device_skipped: u64,
-    /// Turns of range scanners in the list beside the keyframes, and their points.
+    /// Number of range scans, which are stored in addition to the keyframes, and of their points.
     range_scans: usize,
     range_points: usize,
     data_losses: Vec<String>,
-    /// What was found of the base's pose at each stand after the first.
+    /// Estimated base pose at each station after the first.
     stations: Vec<StationReport>,
-    /// Largest distance of a keyframe's camera from its true place, metres; in simulation only.
+    /// Largest camera position error of a keyframe, meters; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     max_position_error_m: Option<f64>,
 }
 
-/// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the settled rig file.
+/// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
     let ended = drive(args, &mut created);
@@ -175,26 +175,26 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         if recovery::is_gpu_error(&error) || error.is::<GpuUnrecoverable>() {
             return Err(keep_input(live, &folders, error));
         }
-        log::error!("training broke off, saving what was learned: {error:#}");
+        log::error!("training failed; saving the model so far: {error:#}");
         if let Err(error) = save(live, args, &rig, folders, &damage) {
             log::error!("{error:#}");
         }
         return Err(error);
     }
     if live.has_exhausted_input() {
-        log::info!("the devices ended and all their data is in the model: no training steps are left");
+        log::info!("the devices have ended and all their data is in the model");
     }
     stop.request();
     let (exit, models) = save(live, args, &rig, folders, &damage)?;
     if args.keeps_serving() && !models.is_empty() && !stop.signaled() {
-        print::report(format_args!("the page remains at {} until Ctrl-C", server.url()));
+        print::report(format_args!("serving the page at {} until Ctrl-C", server.url()));
         let shown = |FinishedModel { kind, method, .. }| ServedModel { kind, method };
         ModelViewer::new(models.into_iter().map(shown).collect(), hub).serve(&stop);
     }
     Ok(exit)
 }
 
-/// Reports the end of a run to its page.
+/// Publishes the result of a run to its page.
 fn publish_end(hub: &Hub, models: &[FinishedModel]) {
     let name = |model: &FinishedModel| match models.len() {
         1 => model.scores.to_string(),
@@ -214,7 +214,7 @@ fn publish_end(hub: &Hub, models: &[FinishedModel]) {
         seconds: models.iter().map(|model| model.seconds).fold(0.0, f64::max),
     });
     if hub.n_clients() > 0 {
-        std::thread::sleep(FINAL_STATUS_TIME); // Clients keep showing it after the server has stopped.
+        std::thread::sleep(FINAL_STATUS_TIME); // Clients show it even after the server has stopped.
     }
 }
 
@@ -230,7 +230,8 @@ pub(super) struct Running {
 }
 
 impl Running {
-    /// Takes keyframes, trains a slice, draws and publishes the status; returns `false` when the run is over or interrupted.
+    /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false` when the run is over or
+    /// interrupted.
     pub(super) fn run_time_slice(&mut self) -> anyhow::Result<bool> {
         if self.stop.requested() || self.live.is_over() {
             return Ok(false);
@@ -239,7 +240,7 @@ impl Running {
         Ok(true)
     }
 
-    /// Closes the devices without saving anything; returns why they ended too early, if they did.
+    /// Closes the devices without saving anything; returns the error that ended them early, if any.
     pub(super) fn discard(self) -> anyhow::Result<Option<drivers::Error>> {
         self.stop.request();
         let (mut sessions, input_result) = self.live.finish();
@@ -249,7 +250,7 @@ impl Running {
     }
 }
 
-/// Opens the devices, the GPU and the page; with `previous`, to continue that run.
+/// Opens the devices, the GPU and the page; continues the `previous` run if there is one.
 pub(super) fn start(
     args: &Args,
     previous: Option<&PreviousRun>,
@@ -267,7 +268,7 @@ pub(super) fn start(
     let rig = Rig::load(&args.rig_file, &overrides)?;
     let kinds = rig.train.methods.clone();
     args.training.check_for(&kinds)?;
-    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth comes, but not at the start.
+    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
     args.training.check_learned(&kinds, available)?;
     let cameras = args.training.refining(available, Refine::None)?.with_scene;
     let count = args.training.count(CountArg::ToCap);
@@ -326,7 +327,7 @@ pub(super) fn start(
             model_spec: ModelSpec { kind, options },
             folder: folder.clone(),
             resumed: previous.map(|previous| previous.folder.clone()),
-            known: Vec::new(), // The session holds all of them.
+            known: Vec::new(), // The session holds all keyframes.
             settings,
             resume_command: args.resume_command(folder),
         };
@@ -360,7 +361,8 @@ pub(super) fn start(
     Ok(Running { live, gpu, server, stop, rig, folders, damage })
 }
 
-/// Closes the recording and writes the lists of keyframes when training cannot continue; the error names what was saved.
+/// Closes the recording and writes the keyframe lists after a GPU failure; returns the error, extended by what was
+/// saved.
 fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
@@ -373,7 +375,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
         Ok(input_result) => {
             log::info!("{}", input_result.join.counts());
             if let Some(error) = input_result.recording_error {
-                log::error!("the recording is cut off: {error:#}");
+                log::error!("the recording is incomplete: {error:#}");
             }
         }
         Err(error) => log::error!("{error:#}"),
@@ -382,7 +384,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
     if is_already_reported { error } else { error.context(format!("the run stopped early; {recoverable}")) }
 }
 
-/// Saves what there is, then tells what went wrong on the way.
+/// Saves the models, then reports errors of the input.
 fn save(
     mut live: Live,
     args: &Args,
@@ -399,7 +401,7 @@ fn save(
     let input_result = match input_result {
         Ok(input_result) => input_result,
         Err(error) => {
-            // A bug of the input does not cost the models.
+            // An error in the input must not cost the models.
             let details = || serde_json::json!({ "data_losses": [error.to_string()] });
             let ending = |(session, out): (Session, PathBuf)| EndingSession { details: details(), session, out };
             if n_train > 0 {
@@ -408,7 +410,7 @@ fn save(
             return Err(error);
         }
     };
-    // A disk that has no room for these may have some for the models.
+    // A disk that is too full for the lists may still have space for the models.
     let list = |(session, folder): (&Session, &PathBuf)| {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), session.keyframes())
     };
@@ -420,9 +422,9 @@ fn save(
     } else {
         SampleUse::Watched
     });
-    // Keyframes that the recording does not hold cannot be scored on it again.
+    // Keyframes that are missing from the recording cannot be scored on it later.
     let is_recorded = input_result.recording_error.is_none();
-    data_losses.extend(input_result.recording_error.map(|error| format!("the recording is cut off: {error:#}")));
+    data_losses.extend(input_result.recording_error.map(|error| format!("the recording is incomplete: {error:#}")));
     data_losses.extend(damage.get().cloned());
     let stations = input_result.stations.as_ref().map_or(Vec::new(), |stations| stations.reports().to_vec());
     let ending = |(session, out): (Session, PathBuf)| EndingSession {
@@ -450,7 +452,7 @@ fn save(
     publish_end(&hub, &models);
     listed?;
     if let Some(error) = input_result.input_error {
-        return Err(anyhow::Error::new(error).context("the devices broke off"));
+        return Err(anyhow::Error::new(error).context("a device failed"));
     }
     if n_train == 0 {
         return Err(InsufficientData(no_model_reason(n_keyframes, counts, rig)).into());
@@ -458,14 +460,14 @@ fn save(
     Ok((exit::from_losses(&data_losses), models))
 }
 
-/// Camera and stamp of a keyframe for which there was no room.
+/// Camera and stamp of a keyframe that was evicted for lack of memory.
 type Evicted = (Arc<str>, Stamp);
 
-/// A run to be continued.
+/// A run to continue.
 pub(super) struct PreviousRun {
     folder: PathBuf,
     checkpoint: Checkpoint,
-    /// The keyframes it held, ordered by stamp.
+    /// Its keyframes, ordered by stamp.
     keyframes: Vec<Arc<Keyframe>>,
 }
 
@@ -475,7 +477,7 @@ impl PreviousRun {
         let stored = StoredKeyframes::of_run(folder).read();
         let keyframes = stored.with_context(|| {
             format!(
-                "the run in {} has no keyframes that can be used; `train` continues from a recording",
+                "the run in {} has no usable keyframes; to continue from a recording, use `fieldrig train`",
                 folder.display()
             )
         })?;
@@ -488,7 +490,7 @@ impl PreviousRun {
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
     }
 
-    /// The rig file settings that the flags of that run set.
+    /// The rig file settings that were set by flags of that run.
     fn overrides(&self) -> Vec<Override> {
         let realign = self.checkpoint.flags.get(REALIGN).map(|is_on| Override::new(REALIGN, is_on == "true"));
         let method =
@@ -506,7 +508,7 @@ impl Args {
         overrides
     }
 
-    /// Whether the page stays after the run.
+    /// Whether to keep serving the page after the run.
     fn keeps_serving(&self) -> bool {
         let is_watched = !self.json && std::io::stdout().is_terminal();
         self.when_done.map_or(is_watched, |when_done| when_done == WhenDone::Stay)
@@ -528,13 +530,15 @@ impl Args {
         flags.chain(self.checkpoints.flag()).collect()
     }
 
-    /// These flags, completed by those of the earlier run.
+    /// These flags, with missing ones taken from the previous run.
     fn with_flags_of(&self, previous: &PreviousRun) -> Self {
         let flag = |name: &str| previous.checkpoint.flags.get(name);
         let has_limit = self.seconds.is_some() || self.steps.is_some();
         let limit = |name: &str| flag(name).filter(|_| !has_limit);
         if let (Some(file), None) = (flag(RECORD), &self.record) {
-            log::warn!("the first part was recorded in {file}; this part is not, unless --record names another file");
+            log::warn!(
+                "the first part was recorded to {file}; this part is not recorded unless --record names another file"
+            );
         }
         Self {
             seconds: self.seconds.or_else(|| limit(SECONDS)?.parse().ok()),
@@ -547,7 +551,7 @@ impl Args {
         }
     }
 
-    /// Whether the earlier run reached its limit and saved its model, and no flag asks for more.
+    /// Whether the previous run reached its limit and saved its model, and no flag raises the limit.
     fn is_finished(&self, previous: &PreviousRun) -> bool {
         let asks_for_more = self.seconds.is_some() || self.steps.is_some();
         let has_model = || run_folder::check_no_model(&previous.folder).is_err();
@@ -568,13 +572,13 @@ impl Args {
         Ok(Exit::Done)
     }
 
-    /// The given folder; an unfinished run continues in its own folder.
+    /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
     }
 
-    /// The command that continues the run in a folder.
+    /// The command that resumes the run in a folder.
     fn resume_command(&self, folder: &Path) -> String {
         let [rig, folder] = [&*self.rig_file, folder].map(|path| quoted(&path.to_string_lossy()));
         format!("fieldrig run {rig} --resume {folder}")
@@ -582,7 +586,7 @@ impl Args {
 
     /// The data and flags with which `eval` scores the model in `folder` on the images of this run.
     fn data_source(&self, folder: &Path) -> DataSource {
-        // A recording that began with --resume lacks the images before it.
+        // A recording that was started with --resume lacks the earlier images.
         let path = self.record.as_ref().or(self.from.as_ref()).filter(|_| self.resume.is_none()).cloned();
         let rig = folder.join(drivers::recording::RIG_FILE).display().to_string();
         DataSource { path, flags: vec!["--rig".to_owned(), rig], ..DataSource::default() }
@@ -603,7 +607,8 @@ impl Args {
         }
     }
 
-    /// The input, after the keyframes of an earlier run; and those of its keyframes for which there is no room.
+    /// The input, initialized with the keyframes of the previous run, and those of its keyframes that exceed the memory
+    /// limit.
     fn input(
         &self,
         rig: &Rig,
@@ -626,7 +631,7 @@ impl Args {
         Ok((input, evicted))
     }
 
-    /// A recording has no clock of its own, a lockstep simulation waits; everything else goes on without us.
+    /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
         let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
         if self.from.is_some() || (simulated && rig.sim.lockstep) {
@@ -635,7 +640,7 @@ impl Args {
         }
         match self.steps_per_keyframe {
             Some(_) => Err(BadArgument(
-                "--steps-per-keyframe: this run is in real time and takes keyframes as they come, it needs --lockstep or --from"
+                "--steps-per-keyframe: this run uses keyframes in real time, as they arrive; the flag needs --lockstep or --from"
                     .into(),
             )),
             None => Ok(Pace::RealTime),
@@ -650,18 +655,18 @@ fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
     let n_unknown = counts.refused.get(&Refusal::UnknownCamera).copied().unwrap_or_default();
     match (n_keyframes, counts.accepted) {
-        (1, _) => format!("nothing to train on: the only keyframe is held out for testing ({counts})"),
-        (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are held out ({counts})"),
-        (0, 1..) => format!("the run ended before the trainer took its first keyframe ({counts})"),
-        (0, 0) if counts.images == 0 => format!("no image came: the rig file names the cameras {expected}"),
+        (1, _) => format!("nothing to train on: the only keyframe is a test image ({counts})"),
+        (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are test images ({counts})"),
+        (0, 1..) => format!("the run ended before the trainer received a keyframe ({counts})"),
+        (0, 0) if counts.images == 0 => format!("no image was received; the rig file has the cameras {expected}"),
         (0, 0) if n_unknown == counts.images => {
-            format!("no image of the cameras in the rig file ({expected}): all {n_unknown} are of {unknown}")
+            format!("no image is from a camera in the rig file ({expected}): all {n_unknown} are from {unknown}")
         }
         (0, 0) => format!("no image became a keyframe: {counts}"),
     }
 }
 
-/// How far off the worst pose is, where a simulator tells the true ones.
+/// Largest position error of the keyframes; `None` if no true poses are known (only simulators report them).
 fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
     let error_m = |keyframe: &Arc<Keyframe>| {
         let truth = keyframe.truth.as_ref()?.world_from_camera.translation.vector;
@@ -670,9 +675,9 @@ fn max_position_error_m(keyframes: &[Arc<Keyframe>]) -> Option<f64> {
     keyframes.iter().filter_map(error_m).reduce(f64::max)
 }
 
-/// What people at the page should know.
+/// Notes that the page shows to its viewers.
 pub(super) fn notes(gpu: &Gpu) -> Vec<String> {
-    if gpu.is_software() { vec!["no GPU: kernels run on the CPU, slowly".to_owned()] } else { Vec::new() }
+    if gpu.is_software() { vec!["no GPU: kernels run on the CPU, which is slow".to_owned()] } else { Vec::new() }
 }
 
 #[cfg(test)]
@@ -691,10 +696,10 @@ mod tests {
             ..Counts::default()
         };
         for (n_keyframes, counts, expected) in [
-            (1, counts(1, 1, &[]), "the only keyframe is held out for testing (1 keyframe of 1 image)"),
-            (0, counts(1, 1, &[]), "ended before the trainer took its first keyframe"),
-            (0, counts(0, 0, &[]), "no image came"),
-            (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are of \"front\""),
+            (1, counts(1, 1, &[]), "the only keyframe is a test image (1 keyframe of 1 image)"),
+            (0, counts(1, 1, &[]), "ended before the trainer received a keyframe"),
+            (0, counts(0, 0, &[]), "no image was received"),
+            (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
             (
                 0,
                 counts(7, 0, &[(Refusal::NoPose, 7)]),

@@ -1,4 +1,4 @@
-//! `fieldrig train`: a model of a dataset folder or a recording.
+//! `fieldrig train`: trains models on a dataset folder or a recording.
 
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
@@ -30,7 +30,7 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
-/// Length of a training where no flag says.
+/// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
 /// Names of the flags in checkpoints.
 const SECONDS: &str = "seconds";
@@ -47,49 +47,54 @@ pub(crate) struct Args {
     data: PathBuf,
     #[command(flatten)]
     training: TrainingArgs,
-    /// Continue from the checkpoint that an earlier run left in this folder, on the same data and with its flags; no other flag is
-    /// needed. A larger --steps or --seconds continues a finished run; settings of the model stay as they were
+    /// Continue from the checkpoint in this folder, on the same data and with its flags; no other flag is needed. A
+    /// larger --steps or --seconds continues a finished run; model settings cannot be changed
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps"])]
     resume: Option<PathBuf>,
-    /// Repeat what the clock decided in an earlier run, and get the same model: with the settings of the log that it left
-    /// (decisions.jsonl) and on the recording or data it had
+    /// Repeat the timing-dependent decisions of an earlier run and get the same model. Takes the run's decisions.jsonl
+    /// and needs its data
     #[arg(long, value_name = "FILE", conflicts_with_all = ["method", "seed", "max_bytes", "max_splats", "refine", "count", "plan_steps", "seconds", "steps", "holdout", "keyframes", "scale"])]
     replay_decisions: Option<PathBuf>,
-    /// Stop after S seconds of training, those before --resume included; loading and scoring do not count [default: 120, unless --steps is given]
+    /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
+    /// [default: 120, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Stop after N optimiser steps, those before --resume included; no decision reads the clock then, and one seed gives one result
+    /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, so
+    /// one seed gives one result
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// Steps over which learning slows down and the model grows [default: --steps, else 7000]
+    /// Steps over which the learning rate decays and the model grows [default: --steps, else 7000]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     plan_steps: Option<u64>,
     #[command(flatten)]
     images: DataArgs,
-    /// Where images have no depth, or on less than half of them, draw it from this saved model (a folder, or a file of splats)
-    /// of the same place in the same world frame: all methods take it for measured. What --refine finds is learned with the scene then
+    /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
+    /// half of their pixels. All methods treat it as measured. The model must be of the same place, in the same world
+    /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
-    /// Weights of LPIPS for `SqueezeNet` (safetensors) [default: what `FIELDRIG_LPIPS_WEIGHTS` names; none: no LPIPS]
+    /// `SqueezeNet` weights for LPIPS (safetensors) [default: `FIELDRIG_LPIPS_WEIGHTS`, else no LPIPS]
     #[arg(long, value_name = "FILE")]
     lpips_weights: Option<PathBuf>,
-    /// Where the results go, of several methods in a folder each inside; a folder that holds a model is refused [default: the folder of --resume if it holds none, else a new one in runs]
+    /// Folder for the results; several methods get a subfolder each. A folder that contains a model is refused
+    /// [default: the folder of --resume if it contains no model, else a new folder in runs]
     #[arg(long, value_name = "FOLDER")]
     out: Option<PathBuf>,
-    /// Write the recording's rig file here with what was found about its cameras, and the robot's description (robot.urdf) beside it
+    /// Write the recording's rig file here with the estimated calibration, and the robot description (robot.urdf) next
+    /// to it
     #[arg(long, value_name = "FILE")]
     write_rig: Option<PathBuf>,
     #[command(flatten)]
     checkpoints: CheckpointArgs,
-    /// Tell at the end what each kernel of a step takes on the GPU
+    /// Print the GPU time of each kernel at the end
     #[arg(long)]
     profile: bool,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// What the report says beside scores.
+/// The entries of the report besides scores.
 #[derive(Debug, Serialize)]
 struct TrainDetails<'a> {
     method: &'static str,
@@ -100,16 +105,16 @@ struct TrainDetails<'a> {
     n_selection: usize,
     n_test: usize,
     data_losses: &'a [String],
-    /// What was found of the base's pose at each stand after the first.
+    /// Estimated base pose at each station after the first.
     stations: &'a [StationReport],
-    /// How much depth came from a model.
+    /// How much depth was rendered from a model.
     #[serde(skip_serializing_if = "Option::is_none")]
     rendered_depth: Option<&'a RenderedDepth>,
-    /// What was found about cameras by laying images over each other.
+    /// Calibration parameters estimated by registering images.
     alignment: Option<Alignment>,
 }
 
-/// Loads, trains until a limit or Ctrl-C, scores at the marks, saves.
+/// Loads the data, trains until a limit or Ctrl-C, scores on the evaluation schedule, and saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
     let ended = train(args, &mut created);
@@ -179,9 +184,9 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
             let data = args.data.display();
-            return Err(BadArgument(format!("--write-rig: {data} holds no rig file; recordings do")).into());
+            return Err(BadArgument(format!("--write-rig: {data} contains no rig file; use a recording")).into());
         };
-        corrected_rig::check_target_file(rig, file)?; // Not after all the training.
+        corrected_rig::check_target_file(rig, file)?; // Checked before training.
     }
     let gpu = super::open_gpu()?;
     if let Some(source) = &depth_from {
@@ -196,7 +201,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         && steps < from_step
     {
         return Err(
-            BadArgument(format!("--steps {steps}: {subject} is of step {from_step}, name at least that")).into()
+            BadArgument(format!("--steps {steps}: {subject} is at step {from_step}; use at least that many")).into()
         );
     }
     if let Some(replay) = &replay {
@@ -213,7 +218,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         DataSource { path: Some(args.data.clone()), flags: images.flags_of_images(), image_names: data.image_names() };
     let run_flags = RunFlags { depth_from: depth_model_sha256.map(str::to_owned), flags };
 
-    let untrained = models[0].untrained.clone(); // All begin with the same images; only one alone goes on from a checkpoint.
+    let untrained = models[0].untrained.clone(); // All models start with the same images; only a single model resumes from a checkpoint.
     let is_untrained = |keyframe: &Arc<Keyframe>| untrained.iter().any(|other| Arc::ptr_eq(other, keyframe));
     let clock = Clock::default();
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
@@ -249,7 +254,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             .with_profile(args.profile)
             .with_decisions(decisions)
             .with_data(source.clone());
-        // A replay runs on one device: its log counts steps.
+        // A replay runs on one device, because its log counts steps.
         let session = if replay.is_none() { session.with_recovery(recovery) } else { session };
         sessions.push(match (&kinds[..], &checkpoint) {
             ([_], Some(checkpoint)) => session.with_elapsed_secs(checkpoint.seconds),
@@ -257,7 +262,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             _ => session.with_shared_clock(clock.clone()),
         });
     }
-    // What was found of the base's stands and drawn for depth counts once.
+    // Aligning base stations and rendering depth count only once, in the first run.
     let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
@@ -292,12 +297,12 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data_losses))
 }
 
-/// Writes the rig file, and says where nothing changed in it.
+/// Writes the rig file and logs the reason if nothing changed in it.
 fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::Result<()> {
     match alignment {
-        None => log::warn!("images were not laid over each other: the rig file is written as it was"),
+        None => log::warn!("images were not registered: the rig file is written unchanged"),
         Some(alignment) if !alignment.has_enough_validation_images() => {
-            log::warn!("too few images to judge by were held back: the rig file is written as it was");
+            log::warn!("too few validation images: the rig file is written unchanged");
         }
         Some(alignment) if !alignment.has_corrections() => log::info!("the rig file needs no correction"),
         Some(_) => {}
@@ -309,7 +314,7 @@ fn write_rig(rig: &Rig, alignment: Option<&Alignment>, file: &Path) -> anyhow::R
 }
 
 impl Args {
-    /// The models that learn, fresh or out of a checkpoint.
+    /// The models to train, new or restored from a checkpoint.
     fn models(
         &self,
         gpu: &Arc<Gpu>,
@@ -349,7 +354,7 @@ impl Args {
         flags.chain(self.checkpoints.flag()).collect()
     }
 
-    /// These flags, completed by those of the earlier run.
+    /// These flags, with missing ones taken from the previous run.
     fn with_flags_of(&self, checkpoint: &Checkpoint) -> Self {
         let flag = |name: &str| checkpoint.flags.get(name);
         let path = |name: &str| flag(name).map(PathBuf::from);
@@ -367,13 +372,13 @@ impl Args {
         }
     }
 
-    /// The command that continues the training in a folder.
+    /// The command that resumes training in a folder.
     fn resume_command(&self, folder: &Path) -> String {
         let [data, folder] = [&*self.data, folder].map(|path| quoted(&path.to_string_lossy()));
         format!("fieldrig train {data} --resume {folder}")
     }
 
-    /// Whether the earlier run reached its limit and saved its model, and no flag asks for more.
+    /// Whether the previous run reached its limit and saved its model, and no flag asks for more.
     fn is_finished(&self, checkpoint: &Checkpoint) -> bool {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()
@@ -401,22 +406,22 @@ impl Args {
         Ok(Exit::Done)
     }
 
-    /// The folder asked for; a run that was cut off goes on in its own.
+    /// The given folder; an unfinished run continues in its previous folder.
     fn out(&self) -> Option<&Path> {
         let unfinished = || self.resume.as_deref().filter(|folder| run_folder::check_no_model(folder).is_ok());
         self.out.as_deref().or_else(unfinished)
     }
 
-    /// Says what is not as the caller may expect.
+    /// Logs differences from an uninterrupted run.
     fn resumed(&self, resumed: Resumed) -> Resumed {
         let (planned, step) = (resumed.model_spec.options.n_planned_steps, resumed.method.progress().step);
-        log::info!("going on from step {step} of {planned} planned ones");
+        log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
-            log::warn!("learning was planned to slow down over {planned} steps: those past them change little");
+            log::warn!("the learning rate was planned to decay over {planned} steps: later steps change little");
         }
         let n_new = resumed.untrained.iter().filter(|keyframe| keyframe.split != Split::Test).count();
         if n_new > 0 {
-            log::warn!("{} that the checkpoint does not know", print::counted(n_new as u64, "new image"));
+            log::warn!("{} that are not in the checkpoint", print::counted(n_new as u64, "new image"));
         }
         resumed
     }

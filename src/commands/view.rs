@@ -1,4 +1,4 @@
-//! `fieldrig view`: the web page for saved models.
+//! `fieldrig view`: serves saved models on the web page.
 
 use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
@@ -18,15 +18,15 @@ use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Statu
 /// Flags of `view`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Folder of a saved model or of a run of several methods, or a file of splats (.ply, .spz)
+    /// Folder of a saved model or of a run with several methods, or a splat file (.ply, .spz)
     model: PathBuf,
-    /// Address of the page, as numbers [default: 127.0.0.1:7007, or a free port if that one is in use]
+    /// Address of the page: numeric IP address and port [default: 127.0.0.1:7007, or a free port if that one is in use]
     #[arg(long, value_name = "ADDRESS", value_parser = address)]
     listen: Option<SocketAddr>,
-    /// Axis that points up in the model: x, y, z, -x, -y or -z; files from other programs are often -y up
+    /// Axis of the model that points up: x, y, z, -x, -y or -z; files from other programs are often -y up
     #[arg(long, value_name = "AXIS", default_value = "z", allow_hyphen_values = true, value_parser = up_axis)]
     up: Up,
-    /// Print one JSON object per line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
@@ -50,7 +50,7 @@ impl Up {
     /// Rotation from the page, which is z up, to the model.
     fn model_from_page(self) -> Transform {
         let rotation = UnitQuaternion::rotation_between(&Vector3::z(), &self.0);
-        // If the two are opposite: half a turn about any horizontal axis.
+        // If the two are opposite, rotate by 180 degrees about a horizontal axis.
         let rotation = rotation.unwrap_or_else(|| UnitQuaternion::new(std::f64::consts::PI * Vector3::x()));
         Transform::from_parts(Translation3::identity(), rotation)
     }
@@ -120,13 +120,13 @@ fn start_server(listen: Option<SocketAddr>, hub: &Hub) -> Result<Server, viz::Er
     }
 }
 
-/// Refuses paths that are often mistaken for a model, and names the command to use instead.
+/// Rejects paths that are often mistaken for a model, and names the command to use instead.
 fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     let shown = model.display();
     let is_url = |scheme: &str| model.to_str().is_some_and(|text| text.starts_with(scheme));
     if ["http://", "https://", "ws://", "wss://"].into_iter().any(is_url) {
         return Err(BadArgument(format!(
-            "{shown} is the address of a page: open it in a browser; view shows saved models and files of splats"
+            "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
         )));
     }
     if model.is_file() && data::is_recording(model) {
@@ -137,13 +137,13 @@ fn check_is_model(model: &Path) -> Result<(), BadArgument> {
     }
     if drivers::dataset::is_dataset_folder(model) && run_folder::models_at(model).is_err() {
         return Err(BadArgument(format!(
-            "{shown} is a dataset, not a model: train one with `fieldrig train {shown}` and name the folder of that run"
+            "{shown} is a dataset, not a model: train a model with `fieldrig train {shown}` and pass the folder of that run"
         )));
     }
     Ok(())
 }
 
-/// The cameras of the first model whose folder lists them; an unreadable list only causes a warning.
+/// The cameras of the first model whose folder lists them. An unreadable list only causes a warning.
 fn cameras(models: &[PathBuf]) -> Vec<KeyframePose> {
     let read = |folder: &PathBuf| {
         camera_list::read(folder).unwrap_or_else(|error| {
@@ -162,7 +162,7 @@ fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<Keyfr
     cameras.into_iter().map(in_page).collect()
 }
 
-/// The first view: from the first camera, or without cameras from outside the model; `None` for an empty model.
+/// The initial view: from the first camera or, without cameras, from outside the model; `None` for an empty model.
 fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page: &Transform) -> Option<SceneHint> {
     let poses = cameras.iter().map(|camera| camera.world_from_camera).collect();
     scene_hint::from_cameras(poses).or_else(|| {
@@ -178,7 +178,7 @@ fn report(model: &Path) -> Value {
     serde_json::from_str(&text).unwrap_or_default()
 }
 
-/// Size and scores of a model when its training ended.
+/// Size and scores of a model at the end of its training.
 fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus {
     let report = report(model);
     let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
@@ -229,7 +229,7 @@ mod tests {
             "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
-        std::fs::write(folder.path().join("report.json"), text.to_string()).expect("room on the disk");
+        std::fs::write(folder.path().join("report.json"), text.to_string()).expect("the file is writable");
         let status = model_status(folder.path(), "splat", &progress);
         assert_eq!((status.psnr, status.step), (Some(23.5), 700));
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);

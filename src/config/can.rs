@@ -7,7 +7,7 @@ use drivers::wire::can::cia402::Units;
 use drivers::wire::can::{canopen, odrive, robstride, tmotor};
 use toml::{Table, Value};
 
-/// A family without its numbers.
+/// A motor family without its parameters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum FamilyKind {
     Damiao,
@@ -25,7 +25,7 @@ const FAMILIES: [(&str, FamilyKind); 5] = [
     ("cia402", FamilyKind::Cia402),
 ];
 
-/// The models whose counts the driver knows, of both families whose motors do not tell.
+/// Motor models with known scaling, of the two families whose motors do not report it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Model {
     Robstride(robstride::Model),
@@ -47,10 +47,10 @@ const MODELS: [(&str, Model); 13] = [
     ("ak80-9", Model::TMotor(tmotor::Model::Ak80x9)),
     ("ak80-64", Model::TMotor(tmotor::Model::Ak80x64)),
 ];
-/// Gears beyond these are slips of the pen.
+/// Gear ratios outside this range are considered typing errors.
 const GEAR_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
 
-/// Buses and motors, in the order of their names.
+/// Reads buses and motors, ordered by name.
 pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>) {
     let buses: Vec<BusConfig> = keys.named_sections("bus").into_iter().map(|(name, keys)| bus(name, keys)).collect();
     let motors = keys.named_sections("motor").into_iter().filter_map(|(joint, keys)| motor(joint, keys, &buses));
@@ -58,14 +58,14 @@ pub(super) fn read(keys: &mut Section<'_>) -> (Vec<BusConfig>, Vec<MotorConfig>)
     (buses, motors)
 }
 
-/// The system knows no longer names.
+/// Maximum length of an interface name in Linux.
 const MAX_INTERFACE_BYTES: usize = 15;
 
 fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
     let is_name = (1..=MAX_INTERFACE_BYTES).contains(&interface.len())
         && !interface.contains(|letter: char| letter == '/' || letter.is_whitespace());
     if !is_name {
-        let allowed = "the name of an interface, up to 15 letters without blanks and slashes, as the table's name";
+        let allowed = "an interface name of 1 to 15 characters without spaces and slashes, as the name of the table";
         keys.invalid::<()>("interface", &Value::from(interface.as_str()), allowed);
     }
     let rate = |value: Option<u64>| value.and_then(|rate| u32::try_from(rate).ok());
@@ -79,7 +79,7 @@ fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
     bus
 }
 
-/// `None` where something is wrong, which has been told.
+/// Returns `None` if a value is invalid, which has been reported.
 fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<MotorConfig> {
     let kind = keys.choice("family", &FAMILIES);
     if kind.is_none() {
@@ -87,7 +87,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     }
     let bus = keys.text("bus");
     if bus.is_none() {
-        keys.missing("bus", "the interface that it is on, which has a table [arm.bus.NAME]");
+        keys.missing("bus", "interface of the motor, which has a table [arm.bus.NAME]");
     }
     let bus_ix = bus.and_then(|bus| {
         let found = buses.iter().position(|known| known.interface == bus);
@@ -103,9 +103,9 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     };
     let id = keys.whole("id", u64::from(kind == Some(FamilyKind::Cia402))..=max_id);
     if id.is_none() {
-        keys.missing("id", "the number of the motor, axis or node");
+        keys.missing("id", "ID of the motor, axis or node");
     }
-    // Keys of other families are unknown here; where it is not known which it is, all are known.
+    // Keys of other families are unknown; without a valid family, all keys are known.
     let applies = |own: &[FamilyKind]| kind.is_none_or(|kind| own.contains(&kind));
     let feedback = applies(&[FamilyKind::Damiao]).then(|| keys.whole("feedback_id", 0..=0x7FE)).flatten();
     let model = applies(&[FamilyKind::Robstride, FamilyKind::TMotor]).then(|| keys.choice("model", &MODELS)).flatten();
@@ -125,7 +125,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     let family = match (kind, id) {
         (FamilyKind::Damiao, id) => {
             if feedback.is_none() {
-                keys.missing("feedback_id", "the identifier of the motor's answers, its register MST_ID");
+                keys.missing("feedback_id", "CAN ID of the motor's feedback, its register MST_ID");
             }
             let to_u16 = |id: u64| u16::try_from(id).ok();
             id.and_then(to_u16)
@@ -148,7 +148,10 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
             if let (Some(allowed), Some(value)) = (expected_models, model.and_then(|model| name_of(&MODELS, &model))) {
                 keys.invalid::<()>("model", &value, allowed);
             } else if family.is_none() && id.is_some() {
-                keys.missing("model", "what is on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor");
+                keys.missing(
+                    "model",
+                    "model printed on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor",
+                );
             }
             family
         }
@@ -157,7 +160,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
         }
         (FamilyKind::Cia402, id) => {
             if counts_per_turn.is_none() {
-                keys.missing("counts_per_turn", "counts of the drive's position in a turn of what it measures");
+                keys.missing("counts_per_turn", "position counts of the drive per turn of its encoder");
             }
             let node = id.and_then(to_u8).and_then(|id| canopen::Node::new(id).ok());
             let units = counts_per_turn.map(|counts_per_turn| Units { counts_per_turn, rated_torque_nm });
@@ -168,19 +171,19 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     Some(MotorConfig { joint, bus_ix: bus_ix?, family: family?, gear_ratio, is_reversed, offset_rad, gains })
 }
 
-/// Both of them, or none.
+/// Reads both gains; they need each other.
 fn gains(keys: &mut Section<'_>) -> Option<Gains> {
     let stiffness_nm_rad = keys.number("stiffness_nm_rad", 0.0..=1e6);
     let damping_nm_s_rad = keys.number("damping_nm_s_rad", 0.0..=1e5);
     match (stiffness_nm_rad, damping_nm_s_rad) {
-        (Some(_), None) => keys.missing("damping_nm_s_rad", "it goes with stiffness_nm_rad"),
-        (None, Some(_)) => keys.missing("stiffness_nm_rad", "it goes with damping_nm_s_rad"),
+        (Some(_), None) => keys.missing("damping_nm_s_rad", "required with stiffness_nm_rad"),
+        (None, Some(_)) => keys.missing("stiffness_nm_rad", "required with damping_nm_s_rad"),
         _ => {}
     }
     Some(Gains { stiffness_nm_rad: stiffness_nm_rad?, damping_nm_s_rad: damping_nm_s_rad? })
 }
 
-/// The tables of buses and motors; none where there are none.
+/// The tables of buses and motors; `None` if empty.
 pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> [Option<Value>; 2] {
     let bus = |bus: &BusConfig| {
         table([

@@ -1,8 +1,8 @@
-//! What can be wrong with a rig file.
+//! Errors in rig files.
 
 use std::path::PathBuf;
 
-/// Why a rig file was not accepted: one sentence that names the file, the line and the key.
+/// Why a rig file was rejected. The message names the file, the line and the key.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum ConfigError {
@@ -12,16 +12,16 @@ pub(crate) enum ConfigError {
     /// The text is not TOML.
     #[error("{file} line {line}: {message}")]
     Syntax { file: String, line: usize, message: String },
-    /// A key that no rig file has.
+    /// The key does not exist.
     #[error("{at}: unknown key {key:?}{}", .nearest.as_ref().map(|nearest_key| format!(", did you mean {nearest_key:?}?")).unwrap_or_default())]
     UnknownKey { at: SourceLocation, key: String, nearest: Option<String> },
-    /// A key that every rig file needs.
+    /// A required key.
     #[error("{file}: the key {key:?} is missing: {meaning}")]
     Missing { file: String, key: String, meaning: &'static str },
-    /// A value that is not allowed.
+    /// A value outside the allowed ones.
     #[error("{at}: {key} is {got}, allowed: {allowed}")]
     InvalidValue { at: SourceLocation, key: String, got: String, allowed: String },
-    /// The robot's description does not fit the rig.
+    /// The robot description does not match the rig file.
     #[error("{file}: {key}: {reason}")]
     Robot { file: String, key: &'static str, reason: String },
 }

@@ -1,6 +1,6 @@
-//! The rig file: TOML -> checked types, and back to the settled file that repeats a run.
+//! The rig file: TOML -> checked types, and back to the effective rig file that reproduces a run.
 //!
-//! Every key is in `docs/reference/rig.md`. Unknown keys are refused, flags override keys of the same name.
+//! Every key is in `docs/reference/rig.md`. Unknown keys are errors; flags override keys of the same name.
 
 mod can;
 mod error;
@@ -27,13 +27,13 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Most splats, as a key and as a flag.
+/// Range of `max_splats`, as a key and as a flag.
 pub(crate) const MAX_SPLATS_RANGE: RangeInclusive<u64> = 1..=100_000_000;
-/// Most bytes of a model, as a key and as a flag.
+/// Range of `max_bytes`, as a key and as a flag.
 pub(crate) const MAX_BYTES_RANGE: RangeInclusive<u64> = 1_000_000..=1 << 50;
-/// Seeds, as keys and as a flag: TOML has no larger integers.
+/// Range of seeds, as keys and as a flag; TOML integers are at most `i64::MAX`.
 pub(crate) const SEED_RANGE: RangeInclusive<u64> = 0..=i64::MAX.cast_unsigned();
-/// The seed where nothing says one.
+/// Seed if neither a key nor a flag sets one.
 pub(crate) const DEFAULT_SEED: u64 = 1;
 
 /// A checked rig.
@@ -41,37 +41,37 @@ pub(crate) const DEFAULT_SEED: u64 = 1;
 pub(crate) struct Rig {
     pub(crate) arm: Arm,
     pub(crate) base: Base,
-    /// By name.
+    /// Cameras, ordered by name.
     pub(crate) cameras: Vec<Camera>,
-    /// Range scanners, by name.
+    /// Range scanners, ordered by name.
     pub(crate) scanners: Vec<Scanner>,
     pub(crate) join: JoinConfig,
     pub(crate) train: Train,
     pub(crate) sim: Sim,
 }
 
-/// The arm that carries or is seen by the cameras.
+/// The arm that carries the cameras, or that they see.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Arm {
     pub(crate) driver: ArmDriver,
-    /// Network address or bus of the device; empty where the driver needs none.
+    /// Network address of the device; empty if the driver needs none.
     pub(crate) address: String,
-    /// The robot's description, whole.
+    /// The URDF text.
     pub(crate) urdf_text: String,
-    /// Moving joints in the order of the readings.
+    /// Moving joints in the order of the joint states.
     pub(crate) joints: Vec<String>,
-    /// What is added to the readings, in their order, rad or m; empty where nothing is.
+    /// Offsets added to the joint states, in their order, rad or m; empty if there are none.
     pub(crate) joint_offsets: Vec<f64>,
     pub(crate) base_link: String,
     pub(crate) flange_link: String,
     pub(crate) max_speed_rad_s: f64,
-    /// How often motors on CAN buses are asked.
+    /// Rate at which motors on CAN buses are polled, Hz.
     pub(crate) rate_hz: f64,
     /// CAN buses.
     pub(crate) buses: Vec<BusConfig>,
-    /// Motors on them, in the order of `joints`.
+    /// Motors on the buses, in the order of `joints`.
     pub(crate) motors: Vec<MotorConfig>,
-    /// How it may be moved; `None` where it is only read.
+    /// How the arm may be moved; `None` if it is only read.
     pub(crate) motion: Option<ArmMotion>,
 }
 
@@ -85,24 +85,24 @@ pub(crate) enum ArmDriver {
     Sim,
 }
 
-/// Where the base stands.
+/// Pose of the base and its source.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Base {
     pub(crate) driver: BaseDriver,
-    /// Where the driver `udp` listens.
+    /// Address on which the driver `udp` listens.
     pub(crate) address: SocketAddr,
     pub(crate) world_from_base: Transform,
-    /// Poses a second where the base moves.
+    /// Poses per second if the base moves.
     pub(crate) rate_hz: f64,
-    /// Whether its pose is estimated anew at each stand.
+    /// Whether the pose is re-estimated at each station.
     pub(crate) realign: bool,
-    /// Poses that are less sure are passed over, metres and radians.
+    /// Poses with larger standard deviations are skipped, meters and radians.
     pub(crate) max_sigma_m: f64,
     pub(crate) max_sigma_rad: f64,
-    /// The tags that the driver `tags` looks for, by their numbers in the family.
+    /// The tags that the driver `tags` detects, by ID.
     pub(crate) tag_family: Family,
     pub(crate) tags: BTreeMap<u32, TagPlacement>,
-    /// Error of a simulated base's poses at the end of its walk, root mean square, metres and radians.
+    /// Error of a simulated base's poses at the end of its path, root mean square, meters and radians.
     pub(crate) drift_m: f64,
     pub(crate) drift_rad: f64,
 }
@@ -116,18 +116,18 @@ pub(crate) enum BaseDriver {
     Sim,
 }
 
-/// A range scanner that turns about its z axis.
+/// A range scanner that rotates about its z axis.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Scanner {
     pub(crate) name: Arc<str>,
     pub(crate) driver: ScannerDriver,
-    /// Where the driver `udp` listens.
+    /// Address on which the driver `udp` listens.
     pub(crate) address: SocketAddr,
-    /// Turns a second.
+    /// Rotations per second.
     pub(crate) rate_hz: f64,
-    /// Pose on the base: x ahead, z up.
+    /// Pose on the base: x forward, z up.
     pub(crate) base_from_scanner: Transform,
-    /// Echoes outside count as nothing seen.
+    /// Ranges outside these limits are ignored, meters.
     pub(crate) min_m: f64,
     pub(crate) max_m: f64,
     pub(crate) sim: ScannerSim,
@@ -139,7 +139,7 @@ pub(crate) enum ScannerDriver {
     Sim,
 }
 
-/// What a simulated scanner measures, and its flaws.
+/// Scan pattern and errors of a simulated scanner.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ScannerSim {
     pub(crate) rings: u32,
@@ -150,19 +150,19 @@ pub(crate) struct ScannerSim {
     pub(crate) dropped_frac: f64,
 }
 
-/// One camera, colour and, where it has that, depth.
+/// One color camera, optionally with depth.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Camera {
     pub(crate) name: Arc<str>,
     pub(crate) driver: CameraDriver,
-    /// Path or serial number; empty where the driver needs none.
+    /// Path or serial number; empty if the driver needs none.
     pub(crate) device: String,
     pub(crate) rate_hz: f64,
-    /// `None`: the camera chooses and, if it can, tells it with each image.
+    /// `None`: automatic; the camera reports the exposure time with each image if it can.
     pub(crate) exposure_micros: Option<f64>,
-    /// First row to last row; `None` is unknown, 0 a global shutter.
+    /// Time from the first to the last row; `None` if unknown, 0 for a global shutter.
     pub(crate) readout_micros: Option<f64>,
-    /// What is added to a stamp to reach mid-exposure; `None` is unknown.
+    /// Time added to a stamp to get mid-exposure; `None` if unknown.
     pub(crate) stamp_to_mid_exposure: Option<TimeOffset>,
     pub(crate) parent: Parent,
     pub(crate) parent_from_camera: Transform,
@@ -174,7 +174,7 @@ pub(crate) struct Camera {
 }
 
 impl Camera {
-    /// The middle of the exposure of an image that the device gave this stamp.
+    /// Mid-exposure time of an image with this device stamp.
     pub(crate) fn mid_exposure(&self, device_stamp: Stamp) -> Stamp {
         let offset = self.stamp_to_mid_exposure.as_ref();
         offset.map_or(device_stamp, |offset| device_stamp.plus_secs(offset.value_millis * 1e-3))
@@ -189,43 +189,44 @@ pub(crate) enum CameraDriver {
     Sim,
 }
 
-/// How a camera with the driver `v4l2` is set up, beside its exposure.
+/// Settings of a camera with the driver `v4l2`, besides its exposure.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct V4l2 {
-    /// `None` takes the best that is offered.
+    /// `None`: the best available format.
     pub(crate) format: Option<V4l2Format>,
-    /// Counts of the camera; `None` here and below leaves it to the camera.
+    /// Raw value of the camera; `None` here and below leaves the setting unchanged or automatic.
     pub(crate) gain: Option<i32>,
     pub(crate) brightness: Option<i32>,
     pub(crate) white_balance_kelvin: Option<i32>,
     pub(crate) delivery: Delivery,
-    /// How long a camera that was unplugged is looked for.
+    /// How long to search for a disconnected camera, seconds.
     pub(crate) reconnect_secs: f64,
 }
 
-/// How a camera with the driver `realsense` is set up, beside its exposure.
+/// Settings of a camera with the driver `realsense`, besides its exposure.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Realsense {
-    /// A recorded file that is played in the camera's place; empty where a camera is meant.
+    /// Recorded file that is played back instead of a camera; empty for a camera.
     pub(crate) file: PathBuf,
     pub(crate) pace: Pace,
-    /// With the pace `clock`: what is added to the stamps of the file.
+    /// Offset added to the stamps of the file with the pace `clock`.
     pub(crate) clock_offset_nanos: i64,
     pub(crate) stream: Stream,
-    /// `None` here and below leaves it to the camera.
+    /// `None` here and below leaves the setting to the camera.
     pub(crate) gain: Option<i32>,
     pub(crate) brightness: Option<i32>,
     pub(crate) white_balance_kelvin: Option<i32>,
     pub(crate) preset: Option<String>,
     pub(crate) laser_power: Option<f64>,
     pub(crate) filters: Vec<Filter>,
-    /// How long a camera that was unplugged is looked for.
+    /// How long to search for a disconnected camera, seconds.
     pub(crate) reconnect_secs: f64,
-    /// What the rig file leaves to the camera until it is opened.
+    /// Calibration that the camera reports when it is opened.
     pub(crate) unknown: UnknownCalibration,
 }
 
-/// Which numbers of a camera only the camera knows yet; what stands in their place is not to be used.
+/// Which calibration values are missing in the rig file until the camera reports them; their placeholders must not be
+/// used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct UnknownCalibration {
     pub(crate) intrinsics: bool,
@@ -233,7 +234,7 @@ pub(crate) struct UnknownCalibration {
     pub(crate) camera_from_depth: bool,
 }
 
-/// The frame that a camera is fixed to.
+/// The frame to which a camera is attached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Parent {
     Flange,
@@ -241,33 +242,33 @@ pub(crate) enum Parent {
     World,
 }
 
-/// A measured time, milliseconds.
+/// A measured time offset, milliseconds.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct TimeOffset {
     pub(crate) value_millis: f64,
     pub(crate) sigma_millis: f64,
-    /// What measured it.
+    /// How it was measured.
     pub(crate) source: String,
 }
 
 /// Depth images of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Depth {
-    /// Where depth is read with the driver `v4l2`; empty where the driver needs none.
+    /// Device of the depth images with the driver `v4l2`; empty if the driver needs none.
     pub(crate) device: String,
-    /// Metres per count where the device does not tell it.
+    /// Meters per count if the device does not report it.
     pub(crate) meters_per_count: Option<f64>,
     pub(crate) intrinsics: Intrinsics,
-    /// Pose of the depth images' optical frame in that of the colour images.
+    /// Pose of the optical frame of the depth images in that of the color images.
     pub(crate) camera_from_depth: Transform,
-    /// What readings are multiplied by.
+    /// Scale factor for the readings.
     pub(crate) factor: f64,
-    /// Readings outside, after that, count as nothing seen.
+    /// Readings outside these limits, after scaling, are ignored, meters.
     pub(crate) min_m: f64,
     pub(crate) max_m: f64,
 }
 
-/// Flaws of a simulated camera.
+/// Errors of a simulated camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CameraSim {
     pub(crate) noise_sigma: f64,
@@ -306,7 +307,7 @@ pub(crate) struct JoinConfig {
 /// How the model is trained.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Train {
-    /// At least one, all different.
+    /// At least one method, without duplicates.
     pub(crate) methods: Vec<ModelKind>,
     pub(crate) max_splats: Option<u64>,
     pub(crate) max_bytes: Option<u64>,
@@ -315,26 +316,26 @@ pub(crate) struct Train {
     pub(crate) scale: f64,
 }
 
-/// What a simulated rig does; used by `--sim` and by drivers named `sim`.
+/// Settings of the simulation, which is used with `--sim` and by drivers named `sim`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Sim {
     pub(crate) scene: String,
     pub(crate) seed: u64,
     pub(crate) ideal: bool,
-    /// The simulation waits for the trainer, and gives the same samples every time.
+    /// The simulation waits for the trainer and always gives the same samples.
     pub(crate) lockstep: bool,
     pub(crate) speed: f64,
-    /// The camera turns about the vertical axis only.
+    /// The camera rotates only about the vertical axis.
     pub(crate) azimuth_only: bool,
     pub(crate) duration_secs: Option<f64>,
     pub(crate) n_images: Option<u64>,
     pub(crate) truth: bool,
     pub(crate) truth_depth: bool,
-    /// Brightness of the lamps once the arm's camera is inside the cabinet, relative to outside.
+    /// Brightness of the lights once the arm's camera is inside the cabinet, relative to outside.
     pub(crate) light_inside_frac: f64,
 }
 
-/// A value from the command line that replaces a key of the rig file.
+/// A value from the command line that overrides a key of the rig file.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Override {
     key: &'static str,
@@ -342,28 +343,28 @@ pub(crate) struct Override {
 }
 
 impl Override {
-    /// `key` is dotted, as in `docs/reference/rig.md`.
+    /// `key` is a dotted path, as in `docs/reference/rig.md`.
     pub(crate) fn new(key: &'static str, value: impl Into<toml::Value>) -> Self {
         Self { key, value: value.into() }
     }
 }
 
 impl Rig {
-    /// Whether poses of the base come from a device, with its errors.
+    /// Whether base poses come from a device, including its errors.
     pub(crate) fn has_moving_base(&self) -> bool {
         self.base.driver != BaseDriver::Fixed
     }
 
-    /// Reads and checks a rig file and the robot's description that it names.
+    /// Reads and checks a rig file and the robot description that it names.
     pub(crate) fn load(path: &Path, overrides: &[Override]) -> Result<Self, ConfigError> {
         let text = read_file("the rig file", path)?;
         let file =
             path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned());
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
         let mut rig =
-            read::rig(&file, &text, overrides, |urdf| read_file("the robot's description", &folder.join(urdf)))?;
+            read::rig(&file, &text, overrides, |urdf| read_file("the robot description", &folder.join(urdf)))?;
         if let Some(motion) = rig.arm.motion.as_mut().filter(|motion| !motion.odrive_endpoints.is_empty()) {
-            // Wherever the settled file lies, it names the same file.
+            // An absolute path is valid wherever the effective rig file is.
             let path = folder.join(&motion.odrive_endpoints);
             let path = std::path::absolute(&path).map_err(|source| ConfigError::Read {
                 description: "ODrive's endpoints",
@@ -373,26 +374,28 @@ impl Rig {
             motion.odrive_endpoints = path.to_string_lossy().into_owned();
         }
         for camera in rig.cameras.iter_mut().filter(|camera| !camera.realsense.file.as_os_str().is_empty()) {
-            // The settled rig file lies elsewhere.
+            // The effective rig file is in another folder.
             let file = folder.join(&camera.realsense.file);
             camera.realsense.file = std::path::absolute(&file).unwrap_or(file);
         }
         Ok(rig)
     }
 
-    /// Checks the text of a rig file whose robot is described by `urdf_text`; `file` is its name in messages.
+    /// Checks the text of a rig file and the robot description `urdf_text`; `file` is the name used in messages.
     pub(crate) fn parse(file: &str, text: &str, urdf_text: &str, overrides: &[Override]) -> Result<Self, ConfigError> {
         read::rig(file, text, overrides, |_| Ok(urdf_text.to_owned()))
     }
 
-    /// The settled rig file: every key, so that it gives the same rig again. The robot's description lies beside it.
+    /// The effective rig file with every key, from which the same rig can be read. It expects the robot description
+    /// next to it.
     pub(crate) fn to_toml(&self) -> String {
         write::rig(self)
     }
 
-    /// Whether its cameras see the same of the same readings: where they sit, their lenses, delays and depth, and the joints' zeros.
+    /// Whether the calibration is the same: extrinsics, intrinsics, time offsets and depth of the cameras, and joint
+    /// offsets.
     pub(crate) fn has_same_calibration(&self, other: &Self) -> bool {
-        const TOLERANCE: f64 = 1e-9; // Reading a pose back may turn its last bit.
+        const TOLERANCE: f64 = 1e-9; // Reading a pose back may change its last bit.
         let is_same = |one: &Camera, other: &Camera| {
             let difference = one.parent_from_camera.inverse() * other.parent_from_camera;
             one.name == other.name
@@ -409,12 +412,12 @@ impl Rig {
             && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
     }
 
-    /// The same rig for one scene model.
+    /// The same rig with a single scene model.
     pub(crate) fn with_method(&self, method: ModelKind) -> Self {
         Self { train: Train { methods: vec![method], ..self.train.clone() }, ..self.clone() }
     }
 
-    /// Writes the settled rig file and the robot's description into a folder, and says where the rig file is.
+    /// Writes the effective rig file and the robot description into a folder; returns the path of the rig file.
     pub(crate) fn write_resolved(&self, folder: &Path) -> std::io::Result<PathBuf> {
         let path = folder.join(drivers::recording::RIG_FILE);
         std::fs::write(folder.join(drivers::recording::URDF_FILE), &self.arm.urdf_text)?;

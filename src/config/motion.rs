@@ -1,4 +1,4 @@
-//! The keys of how an arm may be moved: `[arm.motion]`.
+//! The keys in `[arm.motion]`, which define how an arm may be moved.
 
 use super::section::Section;
 use super::write::{is, name_of, table};
@@ -8,25 +8,26 @@ use toml::{Table, Value};
 /// How an arm may be moved; an arm without this table is only read.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct ArmMotion {
-    /// What its motors do when this computer falls silent.
+    /// Fail-safe behavior of the motors when communication with this computer is lost.
     pub(crate) on_loss: OnLoss,
-    /// After how long a silence.
+    /// Time without communication until then.
     pub(crate) timeout_millis: f64,
-    /// From rest to `arm.max_speed_rad_s` at full acceleration.
+    /// Time from rest to `arm.max_speed_rad_s` at full acceleration.
     pub(crate) acceleration_secs: f64,
-    /// From rest to full acceleration.
+    /// Time from rest to full acceleration.
     pub(crate) jerk_secs: f64,
-    /// Whether motors that do not notice the silence are moved all the same.
+    /// Whether motors without a watchdog may be moved.
     pub(crate) accept_no_watchdog: bool,
-    /// Torques from outside at which a Franka arm stops, Nm, in the order of its joints; `None` here and below is as its driver has it.
+    /// External torques at which a Franka arm stops, Nm, in the order of its joints; `None` here and below: the
+    /// driver's default.
     pub(crate) contact_torque_nm: Option<[f64; 7]>,
-    /// Forces from outside at its end effector at which it stops, N.
+    /// External forces at the end effector at which it stops, N.
     pub(crate) contact_force_n: Option<[f64; 3]>,
-    /// And moments, Nm.
+    /// External moments at the end effector at which it stops, Nm.
     pub(crate) contact_moment_nm: Option<[f64; 3]>,
-    /// Stiffness of its joints, Nm/rad.
+    /// Joint stiffness, Nm/rad.
     pub(crate) stiffness_nm_rad: Option<[f64; 7]>,
-    /// Path of `ODrive`'s `flat_endpoints.json`; empty where there is none.
+    /// Path of `ODrive`'s `flat_endpoints.json`; empty if not given.
     pub(crate) odrive_endpoints: String,
 }
 
@@ -35,7 +36,7 @@ const ON_LOSS: [(&str, OnLoss); 3] = [("hold", OnLoss::Hold), ("damp", OnLoss::D
 pub(super) fn read(mut keys: Section<'_>) -> Option<ArmMotion> {
     let on_loss = keys.choice("on_loss", &ON_LOSS);
     if on_loss.is_none() {
-        keys.missing("on_loss", "hold, damp or release: what the motors do when this computer falls silent");
+        keys.missing("on_loss", "hold, damp or release: what the motors do when communication is lost");
     }
     let timeout_millis = keys.number("timeout_millis", 5.0..=2000.0).unwrap_or(100.0);
     let acceleration_secs = keys.number("acceleration_secs", 0.01..=10.0).unwrap_or(0.5);

@@ -1,4 +1,4 @@
-//! From the text of a rig file to the checked rig: every key, its default and its range.
+//! Reads the text of a rig file into a checked rig: every key with its default and range.
 
 use super::section::{ParseContext, Section};
 use super::{
@@ -54,19 +54,19 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
-/// Where base poses and range scans are listened for where nothing says otherwise: of this computer only.
+/// Default addresses for base poses and range scans; they accept data from this computer only.
 const DEFAULT_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 const DEFAULT_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
-/// The description of a robot without an arm, where the rig file names none.
+/// Robot description of a rig without an arm, if the rig file names none.
 const EMPTY_URDF: &str = r#"<robot name="none"><link name="base"/></robot>"#;
-/// Poses and lens coefficients beyond this are slips of the pen.
+/// Larger coordinates of poses and lenses are considered typing errors.
 const MAX_COORDINATE: f64 = 1e4;
-/// Offsets of joints beyond this, rad or m, are not offsets.
+/// Maximum joint offset, rad or m.
 const MAX_JOINT_OFFSET: f64 = 1.0;
-/// A quaternion this close to length one is taken as it is, so that a settled file gives the same bits again.
+/// A quaternion this close to unit length is not normalized, so that an effective rig file gives exactly the same rig.
 const UNIT_NORM_TOLERANCE: f64 = 1e-12;
 
-/// Reads a rig; `read_urdf` gives the robot's description for the path in the file.
+/// Reads a rig; `read_urdf` returns the robot description for the path in the file.
 pub(super) fn rig(
     file: &str,
     text: &str,
@@ -82,7 +82,7 @@ pub(super) fn rig(
     Ok(rig)
 }
 
-/// Reads all keys: the rig without its robot, the path of the robot's description, and what is wrong.
+/// Reads all keys: the rig without its robot, the path of the robot description, and the problems found.
 pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Rig, String, ParseContext), ConfigError> {
     let context = ParseContext::new(file, text, overrides.iter().map(|flag| flag.key.to_owned()).collect())?;
     let syntax =
@@ -103,7 +103,7 @@ pub(super) fn keys(file: &str, text: &str, overrides: &[Override]) -> Result<(Ri
     Ok((Rig { arm, base, cameras, scanners, join, train, sim }, urdf_path, context))
 }
 
-/// Replaces the value of a dotted key, making tables on the way.
+/// Sets the value of a dotted key and creates missing tables.
 fn set(table: &mut Table, key: &str, value: Value) {
     match key.split_once('.') {
         None => {
@@ -118,7 +118,7 @@ fn set(table: &mut Table, key: &str, value: Value) {
     }
 }
 
-/// Checks links and joints against the robot's description and fills in the joints that were not named.
+/// Checks links and joints against the robot description and fills in the joints if the rig file lists none.
 fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     let robot = |key, e: kinematics::Error| ConfigError::Robot { file: file.to_owned(), key, reason: e.to_string() };
     if arm.base_link.is_empty() {
@@ -140,7 +140,7 @@ fn resolve_joints(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     Err(ConfigError::Robot { file: file.to_owned(), key: "arm.joint_offsets", reason })
 }
 
-/// Brings the motors into the order of the joints; an arm on CAN buses has one for each, and none besides.
+/// Sorts the motors by joint. An arm on CAN buses needs exactly one motor per joint.
 fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     if arm.driver != ArmDriver::Can {
         return Ok(());
@@ -148,7 +148,7 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
     let problem = |reason| ConfigError::Robot { file: file.to_owned(), key: "arm.motor", reason };
     let index_of = |name: &String| arm.joints.iter().position(|joint| joint == name);
     if let Some(unknown_motor) = arm.motors.iter().find(|motor| index_of(&motor.joint).is_none()) {
-        return Err(problem(format!("{:?} is none of the joints {}", unknown_motor.joint, arm.joints.join(", "))));
+        return Err(problem(format!("{:?} is not one of the joints {}", unknown_motor.joint, arm.joints.join(", "))));
     }
     if let Some(joint) = arm.joints.iter().find(|joint| !arm.motors.iter().any(|motor| motor.joint == **joint)) {
         return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
@@ -157,7 +157,7 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         let is_same = |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.family.conflicts_with(&motor.family);
         if let Some(same) = arm.motors[..ix].iter().find(is_same) {
             let interface = &arm.buses[motor.bus_ix].interface;
-            let message = format!("{:?} and {:?} have the same number on {interface:?}", same.joint, motor.joint);
+            let message = format!("{:?} and {:?} have the same ID on {interface:?}", same.joint, motor.joint);
             return Err(problem(message));
         }
     }
@@ -175,12 +175,12 @@ fn arm(mut keys: Section<'_>) -> (Arm, String) {
     let has_arm = driver != Some(ArmDriver::None);
     let urdf = keys.text("urdf");
     if urdf.is_none() && has_arm {
-        keys.missing("urdf", "path of the robot's description, relative to the rig file");
+        keys.missing("urdf", "path of the robot description, relative to the rig file");
     }
-    // Without an arm and its description there is one link.
+    // Without an arm and a robot description, the robot has a single link.
     let flange_link = keys.text("flange_link").or_else(|| (!has_arm && urdf.is_none()).then(|| "base".to_owned()));
     if flange_link.is_none() {
-        keys.missing("flange_link", "the link that cameras with the parent flange are fixed to");
+        keys.missing("flange_link", "link to which cameras with the parent flange are attached");
     }
     let (buses, motors) = super::can::read(&mut keys);
     let arm = Arm {
@@ -210,7 +210,7 @@ fn base(mut keys: Section<'_>) -> Base {
     sim_keys.end();
     let driver = keys.choice("driver", &BASE_DRIVERS).unwrap_or(BaseDriver::Fixed);
     if driver == BaseDriver::Tags && tags.is_empty() {
-        keys.missing("tag", "a table [base.tag.ID] for each tag: its size_m and world_from_tag");
+        keys.missing("tag", "a table [base.tag.ID] for each tag, with size_m and world_from_tag");
     }
     let base = Base {
         driver,
@@ -229,14 +229,14 @@ fn base(mut keys: Section<'_>) -> Base {
     base
 }
 
-/// A tag with its number; `None` where something is wrong, which has been told.
+/// Reads a tag and its ID; returns `None` if a value is invalid, which has been reported.
 fn tag(id: &str, family: Family, mut keys: Section<'_>) -> Option<(u32, TagPlacement)> {
     let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
-    let allowed = format!("the number of a tag in its family, 0 to {}, as the table's name", family.n_tags() - 1);
+    let allowed = format!("ID of a tag in its family, 0 to {}, as the name of the table", family.n_tags() - 1);
     let id = number.or_else(|| keys.invalid("id", &Value::from(id), &allowed));
     let size_m = keys.number("size_m", 0.001..=10.0);
     if size_m.is_none() {
-        keys.missing("size_m", "the side of the tag's border, where black meets white, m");
+        keys.missing("size_m", "side length of the tag's border, where black meets white, m");
     }
     let world_from_tag = pose(&mut keys, "world_from_tag").unwrap_or_else(Transform::identity);
     keys.end();
@@ -277,7 +277,7 @@ fn scanner(name: &str, mut keys: Section<'_>) -> Scanner {
     scanner
 }
 
-/// Names become names of frames and topics.
+/// Checks a name that is also used for frames and topics.
 fn check_name(name: &str, keys: &Section<'_>) {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if name.is_empty() || !name.chars().all(plain) {
@@ -305,7 +305,7 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     }
     let rate_hz = keys.number("rate_hz", 0.01..=1000.0);
     if rate_hz.is_none() {
-        keys.missing("rate_hz", "images a second");
+        keys.missing("rate_hz", "images per second");
     }
     let parent = keys.choice("parent", &PARENTS);
     if parent.is_none() {
@@ -313,10 +313,10 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     }
     let rectified = keys.flag("rectified").unwrap_or(false);
     let intrinsics = intrinsics(&mut keys, size_px.unwrap_or([1, 1]), rectified);
-    // RealSense cameras know their own.
+    // RealSense cameras report their intrinsics.
     let mut unknown = UnknownCalibration { intrinsics: intrinsics.is_none(), ..UnknownCalibration::default() };
     if unknown.intrinsics && driver != Some(CameraDriver::Realsense) {
-        keys.missing("intrinsics", "focal_px, principal_px and, if the lens distorts, lens and distortion");
+        keys.missing("intrinsics", "focal_px, principal_px and, for a lens with distortion, lens and distortion");
     }
     let intrinsics = intrinsics.unwrap_or(Intrinsics { size_px: size_px.unwrap_or([1, 1]), ..PLACEHOLDER_INTRINSICS });
     let depth = keys.optional_section("depth").map(|keys| depth(keys, &intrinsics, &mut unknown));
@@ -344,7 +344,7 @@ fn camera(name: &str, mut keys: Section<'_>) -> Camera {
     camera
 }
 
-/// Stands in until the missing key is told, or the camera tells its own.
+/// Placeholder until the missing key is reported, or until the camera reports its intrinsics.
 const PLACEHOLDER_INTRINSICS: Intrinsics =
     Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
 
@@ -367,12 +367,12 @@ fn intrinsics(keys: &mut Section<'_>, size_px: [u32; 2], rectified: bool) -> Opt
     }
     let principal_px = keys.numbers::<2>("principal_px", -MAX_COORDINATE..=3.0 * MAX_COORDINATE);
     if principal_px.is_none() {
-        keys.missing("principal_px", "principal point in pixels; the centre of the first pixel is (0.5, 0.5)");
+        keys.missing("principal_px", "principal point in pixels; the center of the first pixel is (0.5, 0.5)");
     }
     let name = keys.choice("lens", &LENSES).unwrap_or("pinhole");
     let distortion = keys.number_list("distortion").unwrap_or_default();
     let lens = match (name, &distortion[..]) {
-        // Drivers print a pinhole as five zeros.
+        // Some drivers print a pinhole as five zeros.
         ("pinhole", coefficients) if coefficients.iter().all(|k| *k == 0.0) => Some(Lens::Pinhole),
         ("pinhole", _) => keys.invalid(
             "distortion",
@@ -408,7 +408,8 @@ fn time_offset(mut keys: Section<'_>) -> TimeOffset {
 fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibration) -> Depth {
     let size_px = size_px(&mut keys).unwrap_or(color.size_px);
     let rectified = keys.flag("rectified").unwrap_or(color.rectified);
-    // Depth of the size of the colour is registered to it; of another size it is taken to show the same field of view.
+    // Depth of the same size as the color image is registered to it; depth of another size is assumed to have the same
+    // field of view.
     let intrinsics = intrinsics(&mut keys, size_px, rectified);
     unknown.depth_intrinsics = intrinsics.is_none();
     let intrinsics = intrinsics.unwrap_or_else(|| Intrinsics {
@@ -431,7 +432,7 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibra
     depth
 }
 
-/// Counts of controls are 32 bits wide; what a camera takes of them it tells when it is opened.
+/// Controls are 32 bits wide; the camera's own limits are checked when it is opened.
 const CONTROL_RANGE: std::ops::RangeInclusive<i64> = -1_000_000..=1_000_000;
 
 fn to_i32(number: i64) -> i32 {

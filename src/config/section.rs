@@ -1,6 +1,6 @@
-//! Reads the keys of a TOML table one by one, checked; what was never asked for is an unknown key.
+//! Reads and checks the keys of a TOML table one by one. Keys that are never read are unknown keys.
 //!
-//! Problems are collected, so that a misspelt key is told as such and not as a missing one.
+//! Problems are collected, so that a misspelled key is reported as such and not as a missing key.
 
 use super::error::{ConfigError, SourceLocation};
 use std::cell::RefCell;
@@ -10,7 +10,7 @@ use std::ops::RangeInclusive;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// What is known about the rig file while it is read.
+/// State while a rig file is read.
 #[derive(Debug)]
 pub(super) struct ParseContext {
     file: String,
@@ -18,12 +18,12 @@ pub(super) struct ParseContext {
     lines: BTreeMap<String, usize>,
     flags: BTreeSet<String>,
     problems: RefCell<Vec<ConfigError>>,
-    /// Every key asked for, by dotted path with `NAME` for a camera's name.
+    /// Every key that was read, by dotted path with `NAME` for free names.
     accessed: RefCell<BTreeSet<String>>,
 }
 
 impl ParseContext {
-    /// Notes the lines of all keys; fails when the text is not TOML.
+    /// Records the lines of all keys; fails if the text is not TOML.
     pub(super) fn new(file: &str, text: &str, flags: BTreeSet<String>) -> Result<Self, ConfigError> {
         let mut lines = BTreeMap::new();
         let table = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
@@ -35,14 +35,14 @@ impl ParseContext {
         Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
     }
 
-    /// The problem to tell, if there is any: unknown keys first, for they explain missing ones.
+    /// The problem to report, if there is one. Unknown keys come first, because they explain missing ones.
     pub(super) fn into_problem(self) -> Option<ConfigError> {
         let mut problems = self.problems.into_inner();
         let first = problems.iter().position(|problem| matches!(problem, ConfigError::UnknownKey { .. })).unwrap_or(0);
         (!problems.is_empty()).then(|| problems.swap_remove(first))
     }
 
-    /// Every key asked for so far.
+    /// Every key read so far.
     #[cfg(test)]
     pub(super) fn accessed(&self) -> BTreeSet<String> {
         self.accessed.borrow().clone()
@@ -53,7 +53,7 @@ impl ParseContext {
     }
 
     fn location(&self, key: &str) -> SourceLocation {
-        // A flag may replace a whole table, and a key inside an inline table is where that table is.
+        // A flag may replace a whole table, and keys inside an inline table are on its line.
         let mut path = key;
         loop {
             if self.flags.contains(path) {
@@ -92,7 +92,7 @@ fn join(path: &str, key: &str) -> String {
 #[derive(Debug)]
 pub(super) struct Section<'a> {
     context: &'a ParseContext,
-    /// Dotted path, as in the file and as in the documentation.
+    /// Dotted paths, as in the file and as in the documentation.
     path: String,
     documented_path: String,
     table: Table,
@@ -105,7 +105,7 @@ impl<'a> Section<'a> {
         Self { context, path: String::new(), documented_path: String::new(), table, known: Vec::new() }
     }
 
-    /// Ends the section: keys that nobody asked for are unknown.
+    /// Ends the section and reports unread keys as unknown.
     pub(super) fn end(self) {
         for key in self.table.keys() {
             let close = |known: &&&str| (strsim::jaro_winkler(key, known) * 1000.0).round();
@@ -125,7 +125,7 @@ impl<'a> Section<'a> {
         self.optional_section(key).unwrap_or_else(|| self.inner(key, key, Table::new()))
     }
 
-    /// A table inside this one, if it is there.
+    /// A table inside this one; `None` if absent.
     pub(super) fn optional_section(&mut self, key: &'static str) -> Option<Self> {
         self.known.push(key);
         match self.table.remove(key)? {
@@ -134,7 +134,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The tables inside this one whose names are free, by name.
+    /// The tables inside this one that have free names, with their names.
     pub(super) fn named_sections(&mut self, key: &'static str) -> Vec<(String, Self)> {
         let Some(mut parent) = self.optional_section(key) else { return Vec::new() };
         let mut sections = Vec::new();
@@ -157,7 +157,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A number within a range, if the key is there.
+    /// A number within a range; `None` if absent or invalid.
     pub(super) fn number(&mut self, key: &'static str, range: RangeInclusive<f64>) -> Option<f64> {
         let value = self.take(key)?;
         match as_number(&value).filter(|number| range.contains(number)) {
@@ -166,7 +166,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A whole number within a range, if the key is there.
+    /// A nonnegative whole number within a range; `None` if absent or invalid.
     pub(super) fn whole(&mut self, key: &'static str, range: RangeInclusive<u64>) -> Option<u64> {
         let value = self.take(key)?;
         match value.as_integer().and_then(|number| u64::try_from(number).ok()).filter(|number| range.contains(number)) {
@@ -175,7 +175,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// A whole number that may be negative, within a range, if the key is there.
+    /// A whole number within a range, which may be negative; `None` if absent or invalid.
     pub(super) fn integer(&mut self, key: &'static str, range: RangeInclusive<i64>) -> Option<i64> {
         let value = self.take(key)?;
         match value.as_integer().filter(|number| range.contains(number)) {
@@ -184,13 +184,13 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// `true` or `false`, if the key is there.
+    /// `true` or `false`; `None` if absent or invalid.
     pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
         let value = self.take(key)?;
         value.as_bool().or_else(|| self.invalid(key, &value, "true or false"))
     }
 
-    /// Text, if the key is there.
+    /// A string; `None` if absent or invalid.
     pub(super) fn text(&mut self, key: &'static str) -> Option<String> {
         match self.take(key)? {
             Value::String(text) => Some(text),
@@ -198,22 +198,22 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// An IP address with a port, if the key is there.
+    /// An IP address with a port; `None` if absent or invalid.
     pub(super) fn address(&mut self, key: &'static str) -> Option<SocketAddr> {
         let text = self.text(key)?;
-        let allowed = "an IP address and a port in quotes, like \"127.0.0.1:7010\"";
+        let allowed = "an IP address and a port in quotes, such as \"127.0.0.1:7010\"";
         text.parse().ok().or_else(|| self.invalid(key, &Value::String(text), allowed))
     }
 
-    /// A list of texts, if the key is there.
+    /// A list of strings; `None` if absent or invalid.
     pub(super) fn texts(&mut self, key: &'static str) -> Option<Vec<String>> {
         let value = self.take(key)?;
         let texts =
             value.as_array().and_then(|list| list.iter().map(|text| text.as_str().map(str::to_owned)).collect());
-        texts.or_else(|| self.invalid(key, &value, "a list of texts in quotes"))
+        texts.or_else(|| self.invalid(key, &value, "a list of strings in quotes"))
     }
 
-    /// Exactly `N` numbers within a range, if the key is there.
+    /// Exactly `N` numbers within a range; `None` if absent or invalid.
     pub(super) fn numbers<const N: usize>(
         &mut self,
         key: &'static str,
@@ -229,14 +229,14 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Any count of numbers, if the key is there.
+    /// A list of numbers of any length; `None` if absent or invalid.
     pub(super) fn number_list(&mut self, key: &'static str) -> Option<Vec<f64>> {
         let value = self.take(key)?;
         let numbers = value.as_array().and_then(|list| list.iter().map(as_number).collect());
         numbers.or_else(|| self.invalid(key, &value, "a list of numbers"))
     }
 
-    /// One of a few words, if the key is there.
+    /// One of the given words; `None` if absent or invalid.
     pub(super) fn choice<T: Copy>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
         let value = self.take(key)?;
         let found = choices.iter().find(|(name, _)| value.as_str() == Some(name));
@@ -247,7 +247,7 @@ impl<'a> Section<'a> {
         found.map(|(_, choice)| *choice)
     }
 
-    /// One of a few words, or a list of different ones, if the key is there.
+    /// One of the given words, or a list of them without duplicates; `None` if absent or invalid.
     pub(super) fn choices<T: Copy + PartialEq>(&mut self, key: &'static str, choices: &[(&str, T)]) -> Option<Vec<T>> {
         let value = self.take(key)?;
         let words = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
@@ -256,12 +256,12 @@ impl<'a> Section<'a> {
         let is_repeated = (1..found.len()).any(|ix| found[..ix].contains(&found[ix]));
         if found.is_empty() || found.len() < words.len() || is_repeated {
             let names: Vec<_> = choices.iter().map(|(name, _)| format!("{name:?}")).collect();
-            return self.invalid(key, &value, &format!("{}, or a list of different ones", names.join(", ")));
+            return self.invalid(key, &value, &format!("{}, or a list of these without duplicates", names.join(", ")));
         }
         Some(found)
     }
 
-    /// A list of different words out of a few, which may be empty, if the key is there.
+    /// A list of the given words without duplicates, which may be empty; `None` if absent or invalid.
     pub(super) fn choices_or_none<T: Copy + PartialEq>(
         &mut self,
         key: &'static str,
@@ -274,7 +274,7 @@ impl<'a> Section<'a> {
         self.choices(key, choices)
     }
 
-    /// Says that a needed key is absent, unless its value was just found wrong.
+    /// Reports a missing key, unless its value was just reported as invalid.
     pub(super) fn missing(&self, key: &str, meaning: &'static str) {
         let key = join(&self.path, key);
         let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: invalid, .. } if *invalid == key);
@@ -283,7 +283,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// Says that the value of a key is not allowed.
+    /// Reports that the value of a key is not allowed.
     pub(super) fn invalid<T>(&self, key: &str, got: &Value, allowed: &str) -> Option<T> {
         let key = join(&self.path, key);
         let at = self.context.location(&key);
@@ -303,7 +303,7 @@ impl<'a> Section<'a> {
     }
 }
 
-/// Whole numbers count as numbers; NaN and infinity do not.
+/// Converts integers and finite floats.
 fn as_number(value: &Value) -> Option<f64> {
     #[expect(clippy::cast_precision_loss, reason = "numbers of a rig file stay far below 2^53")]
     let number = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64))?;

@@ -1,4 +1,4 @@
-//! Every key of the rig file: documented, effective, checked; and the file that comes back gives the same rig.
+//! Every key of the rig file is documented, has an effect and is checked; effective rig files give the same rig.
 
 use super::{ConfigError, Override, Rig, read};
 use std::collections::{BTreeMap, BTreeSet};
@@ -12,7 +12,7 @@ const URDF: &str = r#"<robot name="two"><link name="a"/><link name="b"/><link na
 <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
 <joint name="fix" type="fixed"><parent link="c"/><child link="tool"/></joint></robot>"#;
 
-/// A rig file that has every table, so that each key can be changed by itself.
+/// A rig file with every table, so that each key can be changed separately.
 const RIG: &str = r#"
 [arm]
 driver = "sim"
@@ -72,7 +72,7 @@ fn with(key: &'static str, value: &str) -> Result<Rig, ConfigError> {
     parse(RIG, &[Override::new(key, value["value"].clone())])
 }
 
-/// Key, a good value that differs from the one in force, and a value that is not allowed.
+/// Key, a valid value that differs from the current one, and an invalid value.
 const KEYS: [(&str, &str, &str); 163] = [
     ("arm.rate_hz", "500", "0"),
     ("arm.bus.can0.bitrate_hz", "500_000", "1"),
@@ -231,7 +231,7 @@ const KEYS: [(&str, &str, &str); 163] = [
     ("sim.truth", "false", "0"),
     ("sim.truth_depth", "true", "0"),
     ("sim.light_inside_frac", "0.5", "-1"),
-    // The same keys by the names of whole tables: a flag may replace a table too.
+    // The same settings as whole tables: a flag may also replace a table.
     ("base.world_from_base", "{ xyz_m = [1, 2, 3] }", "3"),
     ("range.lidar.base_from_scanner", "{ xyz_m = [1, 2, 3] }", "3"),
     ("camera.wrist.stamp_to_mid_exposure_millis", "{ value = 2 }", "2"),
@@ -246,12 +246,12 @@ fn every_key_takes_effect_and_rejects_invalid_values() {
     let mut invalid = Vec::new();
     for (key, good, bad) in KEYS {
         match with(key, good) {
-            // The path of the robot's description is read, not kept; another family needs other keys too.
+            // The path of the robot description is not part of the rig, and other motor families need other keys.
             Ok(changed) if changed == rig && !["arm.urdf", "arm.motor.first.family"].contains(&key) => {
                 invalid.push(format!("{key} = {good} changes nothing"))
             }
             Ok(_) => {}
-            Err(e) => invalid.push(format!("{key} = {good} is refused: {e}")),
+            Err(e) => invalid.push(format!("{key} = {good} is rejected: {e}")),
         }
         match with(key, bad) {
             Ok(_) => invalid.push(format!("{key} = {bad} is accepted")),
@@ -264,7 +264,7 @@ fn every_key_takes_effect_and_rejects_invalid_values() {
     assert!(invalid.is_empty(), "{}", invalid.join("\n"));
 }
 
-/// Whether a message names the key; links are told by the key that asked for them.
+/// Whether a message names the key; an invalid base link is reported with the key of the flange link.
 fn names(message: &str, key: &str) -> bool {
     message.contains(key)
         || (key == "arm.base_link" && message.contains("arm.flange_link") && message.contains("nowhere"))
@@ -308,7 +308,7 @@ fn documentation_lists_exactly_the_existing_keys() {
     }
 }
 
-/// A settled file: it has every table.
+/// An effective rig file, which has every table.
 fn full() -> String {
     let measured = Override::new("base.world_from_base.xyz_m", Value::from(vec![0.0; 3]));
     parse(RIG, &[measured]).expect("a good rig file").to_toml()
@@ -396,7 +396,7 @@ fn bundled_rig_files_are_valid_and_round_trip() {
         n_rigs += 1;
         let rig = Rig::load(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
         let resolved = tempfile::tempdir().expect("a folder");
-        let again = Rig::load(&rig.write_resolved(resolved.path()).expect("room on the disk"), &[]);
+        let again = Rig::load(&rig.write_resolved(resolved.path()).expect("the folder is writable"), &[]);
         assert_eq!(again.unwrap_or_else(|e| panic!("{e}")), rig, "{path:?}");
     }
     assert!(n_rigs >= 3, "{n_rigs} rig files");
@@ -418,7 +418,7 @@ fn pinhole_with_nonzero_coefficients_is_rejected() {
 fn tag_ids_are_limited_by_family() {
     let numbered = |id: u32| parse(&RIG.replace("[base.tag.7]", &format!("[base.tag.{id}]")), &[]);
     assert!(numbered(586).is_ok());
-    let refused = numbered(587).expect_err("tag36h11 ends before").to_string();
+    let refused = numbered(587).expect_err("outside tag36h11").to_string();
     assert!(refused.contains("base.tag.587") && refused.contains("0 to 586"), "{refused}");
 }
 
@@ -438,27 +438,27 @@ fn can_arm_needs_one_motor_per_joint() {
     let good = rig(["j1", "j2"]).expect("a motor for each joint");
     assert_eq!(good.arm.motors.iter().map(|motor| motor.joint.as_str()).collect::<Vec<_>>(), ["j2", "j1"]);
     let refused = rig(["j1", "j3"]).expect_err("no such joint").to_string();
-    assert!(refused.contains("\"j3\" is none of the joints j2, j1"), "{refused}");
+    assert!(refused.contains("\"j3\" is not one of the joints j2, j1"), "{refused}");
     let same = parse(&text(["j1", "j2"]).replace("odrive\"", "damiao\"\nfeedback_id = 18"), &[]);
-    let refused = same.expect_err("both answer as 18").to_string();
-    assert!(refused.contains("\"j1\" and \"j2\" have the same number on \"can0\""), "{refused}");
+    let refused = same.expect_err("both send feedback as 18").to_string();
+    assert!(refused.contains("\"j1\" and \"j2\" have the same ID on \"can0\""), "{refused}");
     let answers = parse(&text(["j1", "j2"]).replace("odrive\"", "damiao\"\nfeedback_id = 2"), &[]);
-    let refused = answers.expect_err("the first would take the second one's answers for orders").to_string();
-    assert!(refused.contains("the same number"), "{refused}");
+    let refused = answers.expect_err("the first would take the feedback of the second for commands").to_string();
+    assert!(refused.contains("the same ID"), "{refused}");
     let named = |interface: &str| {
         let text = text(["j1", "j2"]).replace("arm.bus.can0", &format!("arm.bus.{interface:?}"));
         parse(&text.replace("\"can0\"", &format!("{interface:?}")), &[])
     };
     assert!(named("can-first").is_ok());
     for invalid in ["", "can/0", "can 0", "a_name_of_sixteen"] {
-        let refused = named(invalid).expect_err("no such interface can be").to_string();
-        assert!(refused.contains("up to 15 letters"), "{invalid}: {refused}");
+        let refused = named(invalid).expect_err("not an interface name").to_string();
+        assert!(refused.contains("1 to 15 characters"), "{invalid}: {refused}");
     }
     let other = text(["j1", "j2"]).replace("odrive\"", "robstride\"\nmodel = \"ak80-9\"");
-    let refused = parse(&other, &[]).expect_err("of another maker").to_string();
+    let refused = parse(&other, &[]).expect_err("a model of another family").to_string();
     assert!(refused.contains("arm.motor.j2.model") && refused.contains("rs00 to rs06"), "{refused}");
     let refused = with("arm.driver", "'can'").expect_err("no motors for its joints").to_string();
     assert!(refused.contains("arm.motor"), "{refused}");
-    let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors tell it themselves").to_string();
+    let foreign = with("arm.motor.first.model", "'rs01'").expect_err("Damiao motors report their model").to_string();
     assert!(foreign.contains("arm.motor.first.model"), "{foreign}");
 }

@@ -1,4 +1,4 @@
-//! The settled rig file: every key of a checked rig, written so that reading it gives the same rig.
+//! Writes the effective rig file: every key of a checked rig, such that reading it gives the same rig.
 
 use super::read::{
     ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, FILTERS, PACES, PARENTS, SCANNER_DRIVERS, STREAMS,
@@ -39,7 +39,7 @@ pub(super) fn is(value: impl Into<Value>) -> Option<Value> {
 }
 
 pub(super) fn whole(number: u64) -> Option<Value> {
-    // Larger numbers cannot come from a rig file.
+    // Rig files contain no larger numbers.
     is(i64::try_from(number).unwrap_or(i64::MAX))
 }
 
@@ -159,7 +159,7 @@ fn realsense(realsense: &Realsense) -> Table {
     ])
 }
 
-/// What only the camera knows is left out.
+/// Calibration that only the camera reports is omitted.
 fn depth(depth: &Depth, unknown: UnknownCalibration) -> Table {
     table([
         ("device", is(depth.device.as_str())),
@@ -221,7 +221,7 @@ fn train(train: &Train) -> Table {
     ])
 }
 
-/// The value of `train.method`: a word, or a list of words where there are several.
+/// The value of `train.method`: a word, or a list of words if there are several.
 pub(crate) fn methods(methods: &[ModelKind]) -> Value {
     match methods {
         [one] => one.name().into(),

@@ -1,4 +1,4 @@
-//! Takes the place of a model whose GPU failed.
+//! Placeholder for a model whose GPU failed.
 
 use kinematics::Stamp;
 use std::path::Path;
@@ -9,7 +9,7 @@ use trainer::gpu::PassTiming;
 use trainer::splat::CalibratedCamera;
 use trainer::{Error, Keyframe, Method, Picture, Progress, RenderRequest, TrialReport};
 
-/// No model: every operation fails.
+/// Every operation returns [`Error::DeviceLost`].
 pub(crate) struct FailedModel;
 
 impl Method for FailedModel {

@@ -1,26 +1,26 @@
-//! Names of the scene models.
+//! Kinds of scene models and their names.
 
-/// The scene models there are.
+/// The kinds of scene models.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ModelKind {
-    /// 3D Gaussians.
+    /// 3D Gaussian splats.
     Splat,
-    /// A distance field with a mesh, from depth.
+    /// A truncated signed distance field with a mesh, fused from depth.
     Tsdf,
-    /// A neural field.
+    /// A neural radiance field.
     Nerf,
 }
 
 impl ModelKind {
-    /// All there are.
+    /// All kinds.
     pub(crate) const ALL: [Self; 3] = [Self::Splat, Self::Tsdf, Self::Nerf];
 
-    /// The kind of a name.
+    /// The kind with this name.
     pub(crate) fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
 
-    /// Its name in files and on the command line.
+    /// The name in files and on the command line.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::Splat => "splat",

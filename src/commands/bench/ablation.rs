@@ -1,4 +1,4 @@
-//! `fieldrig bench ablation`: what each part of the method brings, by training without it.
+//! `fieldrig bench ablation`: measures the contribution of each part of the method by training without it.
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
@@ -12,28 +12,31 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
 
-/// Length of a run where no flag says.
+/// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 16.0;
-/// Marks that the table tells, seconds.
+/// Times at which the table lists the PSNR, seconds.
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
-/// What all are compared with.
-const BASELINE: Variant = Variant { name: "as it is", change: |options| options };
+/// The unchanged method, with which all variants are compared.
+const BASELINE: Variant = Variant { name: "baseline", change: |options| options };
 
 const VARIANTS: &[Variant] = &[
-    Variant { name: "cloud for seeds", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
+    Variant { name: "no seeds from depth", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
     Variant { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
     Variant { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
     Variant {
-        name: "full size from the start",
+        name: "full resolution from the start",
         change: |options| SplatOptions { coarse_steps: Some([0; 2]), ..options },
     },
     Variant { name: "black background", change: |options| SplatOptions { random_background: 0.0, ..options } },
-    Variant { name: "opacity and size for free", change: |options| SplatOptions { cost_images: 0.0, ..options } },
+    Variant {
+        name: "no opacity and size regularization",
+        change: |options| SplatOptions { cost_images: 0.0, ..options },
+    },
     Variant { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
-    Variant { name: "no wandering", change: |options| SplatOptions { noise: 0.0, ..options } },
-    Variant { name: "one color a splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
-    Variant { name: "filled up to the cap", change: |options| SplatOptions { count: CountPolicy::ToCap, ..options } },
+    Variant { name: "no position noise", change: |options| SplatOptions { noise: 0.0, ..options } },
+    Variant { name: "constant color per splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
+    Variant { name: "grown to the cap", change: |options| SplatOptions { count: CountPolicy::ToCap, ..options } },
     CAMERAS_AS_GIVEN,
 ];
 
@@ -42,13 +45,13 @@ const VARIANTS: &[Variant] = &[
 pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
-    /// Length of a run in seconds of training; loading and scoring do not count [default: 16, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 16, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Length of a run in optimiser steps
+    /// Optimizer steps of each run
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// Runs of each change, 1 to 1000, with seeds counted up from --seed
+    /// Runs of each variant, 1 to 1000, with consecutive seeds from --seed
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     /// Only the rows whose names contain one of these words, separated by commas
@@ -58,7 +61,7 @@ pub(crate) struct Args {
     bench: BenchArgs,
 }
 
-/// The runs of one change.
+/// The runs of one variant.
 #[derive(Debug, Serialize)]
 struct VariantResult {
     name: &'static str,
@@ -68,9 +71,9 @@ struct VariantResult {
     lpips: Option<f64>,
     depth_rmse_m: Option<f64>,
     primitives: f64,
-    /// Median of the gains of whole over changed, seed by seed, dB.
+    /// Median over the seeds of the PSNR gain of the baseline over the variant, dB.
     gain_db: f64,
-    /// Standard deviation of them; `None` of a single seed.
+    /// Standard deviation of these gains; `None` with a single seed.
     gain_std_db: Option<f64>,
     runs: Vec<Run>,
 }
@@ -86,10 +89,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         VARIANTS.iter().filter(|change| is_change(change, base_options)).filter(is_selected).collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(BadArgument(format!("--only: none of the rows is named so: {}", names.join(", "))).into());
+        return Err(BadArgument(format!("--only: no row has such a name; rows: {}", names.join(", "))).into());
     }
     if args.bench.training.count.is_some() {
-        return Err(BadArgument("--count: this bench sets it itself".into()).into());
+        return Err(BadArgument("--count: this bench sets it; remove the flag".into()).into());
     }
     runs.expect((changes.len() + 1) * usize::try_from(args.seeds)?);
     let mut baseline: Vec<Run> = Vec::new();
@@ -124,7 +127,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data.data_losses))
 }
 
-/// Whether it changes anything about how these data are learned.
+/// Whether the variant changes any of these options.
 fn is_change(change: &Variant, options: &SplatOptions) -> bool {
     change.options(options) != *options
 }
@@ -177,7 +180,7 @@ impl VariantResult {
     }
 }
 
-/// Everything known so far, written.
+/// Writes the findings so far.
 fn findings(
     args: &Args,
     runs: &Runs<'_>,
@@ -187,14 +190,14 @@ fn findings(
     let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["trained".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
-    head.extend(["at the end, dB", "bought, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
+    head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
     let findings = Findings {
         name: "ablation",
-        title: format!("What each part brings: {}", data.name),
+        title: format!("Contribution of each part: {}", data.name),
         sentences: vec![
             format!(
-                "Each row is trained for {length} with one part left out or changed, and scored on held-out images; medians of {} seeds. \
-                 Bought: by how much the whole is better, seed by seed.",
+                "Each row is trained for {length} with one part removed or changed, and scored on test images; medians of {} seeds. \
+ Gain: PSNR of the baseline minus that of the row, for the same seed.",
                 args.seeds
             ),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),

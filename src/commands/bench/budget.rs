@@ -1,4 +1,4 @@
-//! `fieldrig bench budget`: accuracy over the number of splats, and the number the trainer takes by itself.
+//! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
@@ -12,11 +12,11 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
 
-/// Length of a run where no flag says.
+/// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
-/// More splats than any rig file may ask for.
+/// Maximum number of splats in a rig file.
 const MAX_CAP: i64 = 100_000_000;
-/// A doubling that gains less than this does not pay, dB.
+/// Gain below which doubling the splats is not worthwhile, dB.
 const MIN_GAIN_DB: f64 = 0.1;
 
 /// Flags of `bench budget`.
@@ -24,7 +24,7 @@ const MIN_GAIN_DB: f64 = 0.1;
 pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
-    /// Caps on the number of splats, 1 to 100000000, separated by commas
+    /// Limits on the number of splats, 1 to 100000000, separated by commas
     #[arg(
         long,
         value_name = "N,...",
@@ -33,33 +33,33 @@ pub(crate) struct Args {
         value_parser = clap::value_parser!(u32).range(1..=MAX_CAP)
     )]
     splats: Vec<u32>,
-    /// Length of a run in seconds of training; loading and scoring do not count [default: 60, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 60, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Length of a run in optimiser steps
+    /// Optimizer steps of each run
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// Runs of each cap, 1 to 1000, with seeds counted up from --seed
+    /// Runs per limit, 1 to 1000, with consecutive seeds from --seed
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// The runs under one cap.
+/// The runs with one limit.
 #[derive(Clone, Debug, Serialize)]
 struct Capped {
-    /// `None`: the trainer's own choice.
+    /// The limit; `None` if the trainer chooses the number.
     cap: Option<u32>,
-    /// Median at the end.
+    /// Median number of splats at the end.
     primitives: f64,
-    /// Median at the end, dB.
+    /// Median PSNR at the end, dB.
     psnr: f64,
     psnr_extent: [f64; 2],
     runs: Vec<Run>,
 }
 
-/// What more splats gained between two caps.
+/// Gain from more splats, between two limits.
 #[derive(Debug, Serialize)]
 struct Gain {
     to_cap: Option<u32>,
@@ -72,13 +72,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
         return Err(
-            BadArgument("--max-splats, --count: this bench sets them itself, name caps with --splats".into()).into()
+            BadArgument("--max-splats, --count: this bench sets them; choose limits with --splats".into()).into()
         );
     }
     let mut caps: Vec<Option<u32>> = args.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();
     caps.dedup();
-    // The trainer's own choice comes first: it is what most people ask for.
+    // The number chosen by the trainer comes first, because most readers want it.
     caps.insert(0, None);
     let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
     runs.expect(caps.len() * usize::try_from(args.seeds)?);
@@ -134,7 +134,7 @@ impl Capped {
     }
 }
 
-/// What doubling gained between neighboring caps, where the number of splats grew.
+/// Gains per doubling between neighboring limits, where the number of splats grew.
 fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     let pairs = by_cap.windows(2);
     let gain = |pair: &[&Capped]| {
@@ -145,16 +145,16 @@ fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
     pairs.filter_map(gain).collect()
 }
 
-/// Everything known so far, written.
+/// Writes the findings so far.
 fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -> anyhow::Result<(Findings, PathBuf)> {
     let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
     let chosen = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
     let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
-        format!("median of {} seeds, band: lowest to highest", args.seeds)
+        format!("median of {} seeds; band: minimum to maximum", args.seeds)
     } else {
-        "one run a cap".to_owned()
+        "one run per cap".to_owned()
     };
     let subtitle = format!("{}, splat, {length}; {spread}", data.name);
     let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
@@ -162,17 +162,17 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     let own_curve_point = chosen.map(Capped::point);
     let own_marker = chosen.map(|chosen| Marker {
         x: chosen.primitives.max(1.0),
-        label: format!("the trainer's own choice: {} splats, {:.2} dB", chosen.primitives, chosen.psnr),
+        label: format!("chosen by the trainer: {} splats, {:.2} dB", chosen.primitives, chosen.psnr),
         line_ix: 1,
     });
     let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
     points.sort_by(|a, b| a.x.total_cmp(&b.x));
     let accuracy = Chart {
-        title: "PSNR of held-out images over the number of splats".into(),
+        title: "PSNR of test images over the number of splats".into(),
         subtitle: subtitle.clone(),
         x: x("splats at the end (log)"),
         y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("with a cap", points), line("no cap given", own_curve_point.into_iter().collect())],
+        lines: vec![line("with a cap", points), line("no cap", own_curve_point.into_iter().collect())],
         thresholds: Vec::new(),
         markers: own_marker.into_iter().collect(),
     };
@@ -181,12 +181,12 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         Point { x, y: gain.db_per_doubling, low: gain.db_per_doubling, high: gain.db_per_doubling }
     };
     let gain_chart = Chart {
-        title: "What doubling the splats gains".into(),
+        title: "Gain from doubling the splats".into(),
         subtitle: format!("{subtitle}; each point between two neighboring caps"),
         x: x("splats (log)"),
-        y: Axis { label: "gain, dB a doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("gain of a doubling", gains.iter().map(gain_point).collect())],
-        thresholds: vec![(MIN_GAIN_DB, format!("{MIN_GAIN_DB} dB: less does not pay"))],
+        y: Axis { label: "gain, dB per doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
+        lines: vec![line("gain per doubling", gains.iter().map(gain_point).collect())],
+        thresholds: vec![(MIN_GAIN_DB, format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"))],
         markers: Vec::new(),
     };
     let row = |capped: &Capped| {
@@ -198,18 +198,18 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
             gain.map_or_else(|| "-".to_owned(), |gain| format!("{:+.2}", gain.db_per_doubling)),
         ]
     };
-    let head = ["cap", "splats", "PSNR, dB", "gain a doubling, dB"].map(str::to_owned).to_vec();
+    let head = ["cap", "splats", "PSNR, dB", "gain per doubling, dB"].map(str::to_owned).to_vec();
     let findings = Findings {
         name: "budget",
         title: format!("Accuracy over size: {}", data.name),
         sentences: vec![
             format!(
-                "Each point is a model trained for {length} under a cap on its splats and scored on held-out images; \
-                 the run without a cap shows what the trainer takes by itself (at most {}): halved as long as \
-                 that costs less than {MIN_GAIN_DB} dB on images held back for it.",
+                "Each point is a model trained for {length} with a cap on its splats and scored on test images. \
+ In the run without a cap, the trainer chooses the number (at most {}): it is halved as long as \
+ that costs less than {MIN_GAIN_DB} dB on validation images.",
                 data.splats()?.max_splats
             ),
-            format!("A doubling of the splats that gains less than {MIN_GAIN_DB} dB does not pay."),
+            format!("Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],
         charts: vec![("", accuracy), ("-gain", gain_chart)],

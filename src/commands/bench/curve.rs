@@ -1,4 +1,4 @@
-//! `fieldrig bench curve`: accuracy over time, several seeds each, peers beside it.
+//! `fieldrig bench curve`: accuracy over time, with several seeds, compared with other trainers.
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::peer::Peer;
@@ -13,49 +13,49 @@ use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::splat::SplatOptions;
 
-/// Qualities whose time is told, dB.
+/// PSNR levels for which the time to reach them is reported, dB.
 const TARGET_DB: [f64; 3] = [25.0, 28.0, 30.0];
-/// Length of a run where no flag says.
+/// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
 
 /// Flags of `bench curve`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each becomes a line a method
+    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each gives one line per method
     #[arg(required = true)]
     data: Vec<PathBuf>,
-    /// Length of a run in seconds of training; loading and scoring do not count
+    /// Training time of each run in seconds; loading and scoring do not count
     #[arg(long, value_name = "S", default_value_t = DEFAULT_SECONDS)]
     seconds: f64,
-    /// Runs of each line, 1 to 1000, with seeds counted up from --seed
+    /// Runs per line, 1 to 1000, with consecutive seeds from --seed
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
-    /// A curve that another trainer measured: JSON with rows of seconds and psnr; may be given several times
+    /// Curve of another trainer: JSON with rows of seconds and psnr; can be repeated
     #[arg(long, value_name = "FILE.json")]
     peer: Vec<PathBuf>,
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// One method on one data set, or one peer.
+/// Result of one method on one data set, or of one peer.
 #[derive(Debug, Serialize)]
 struct CurveResult {
     label: String,
-    /// Of ours.
+    /// `None` for a peer.
     method: Option<&'static str>,
     is_peer: bool,
-    /// PSNR at the marks.
+    /// PSNR on the evaluation schedule.
     points: Vec<CurvePoint>,
     summary: Summary,
     runs: Vec<Run>,
 }
 
-/// The runs at one mark.
+/// The runs at one evaluation.
 #[derive(Debug, PartialEq, Serialize)]
 struct CurvePoint {
-    /// Median.
+    /// Median time.
     seconds: f64,
-    /// Median.
+    /// Median PSNR, dB.
     psnr: f64,
     min_psnr: f64,
     max_psnr: f64,
@@ -65,22 +65,22 @@ struct CurvePoint {
 #[derive(Debug, Serialize)]
 struct Summary {
     n_runs: usize,
-    /// Median at the end.
+    /// Median PSNR at the end, dB.
     psnr: Option<f64>,
-    /// Over the runs, dB.
+    /// Standard deviation over the runs, dB.
     psnr_std: Option<f64>,
-    /// Median at the end: a method that has learned all there is ends before its time is over.
+    /// Median time at the end. A method that is done ends before its time limit.
     seconds: Option<f64>,
     primitives: Option<f64>,
     primitives_extent: Option<[f64; 2]>,
-    /// Standard deviation over mean.
+    /// Standard deviation divided by the mean.
     primitives_spread: Option<f64>,
-    /// Median at the end.
+    /// Median size at the end.
     bytes: Option<f64>,
     seconds_to: Vec<TimeToQuality>,
 }
 
-/// What the runs of a line came to.
+/// Final values of the runs of a line.
 #[derive(Debug, Default)]
 struct FinalValues {
     psnr: Vec<f64>,
@@ -89,7 +89,7 @@ struct FinalValues {
     bytes: Vec<f64>,
 }
 
-/// When a quality was reached.
+/// Time to reach a PSNR level.
 #[derive(Debug, PartialEq, Serialize)]
 struct TimeToQuality {
     psnr: f64,
@@ -130,7 +130,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
                     keyframes: &|| data.data.keyframes.clone(),
                     is_thorough: true,
                 })?);
-                // Written after every run, so that an interrupted bench shows what it has.
+                // Written after every run, so that an interrupted bench leaves results.
                 bench.results.pop();
                 bench.results.push(CurveResult::of_runs(&data, model_spec.kind, finished.clone()));
                 page = Some(bench.findings(&runs)?);
@@ -182,16 +182,16 @@ impl CurveResult {
     }
 
     fn line(&self) -> Line {
-        let point = |point_of: &CurvePoint| Point {
-            x: point_of.seconds,
-            y: point_of.psnr,
-            low: point_of.min_psnr,
-            high: point_of.max_psnr,
+        let point = |evaluation: &CurvePoint| Point {
+            x: evaluation.seconds,
+            y: evaluation.psnr,
+            low: evaluation.min_psnr,
+            high: evaluation.max_psnr,
         };
         Line { label: self.label.clone(), points: self.points.iter().map(point).collect(), is_peer: self.is_peer }
     }
 
-    /// Its end over the size of the model; without a point where that is not known.
+    /// The final PSNR over the size of the model; without a point if either is unknown.
     fn size_line(&self) -> Line {
         let Summary { psnr, bytes, .. } = self.summary;
         let megabytes = bytes.map(|bytes| bytes / 1e6).filter(|megabytes| *megabytes > 0.0);
@@ -200,15 +200,16 @@ impl CurveResult {
     }
 }
 
-/// Median and extent at each mark that at least half of the runs met, in the order of time.
+/// Median and range at each scheduled evaluation that at least half of the runs reached, ordered by time.
 fn median_curve(curves: &[Vec<(f64, f64)>]) -> Vec<CurvePoint> {
-    // Keyed by the mark's bits, which order as the marks do; a last point between two marks stands by itself.
+    // Keyed by the bits of the scheduled time, which sort like the time; a final evaluation between two of them gets
+    // its own key.
     let mut groups: BTreeMap<(u64, bool), Vec<(f64, f64)>> = BTreeMap::new();
     for curve in curves {
         let mut taken = HashSet::new();
         for &(seconds, psnr) in curve {
-            let point_of = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
-            groups.entry((point_of, !taken.insert(point_of))).or_default().push((seconds, psnr));
+            let scheduled_bits = evaluation_schedule::latest(seconds).unwrap_or(0.0).to_bits();
+            groups.entry((scheduled_bits, !taken.insert(scheduled_bits))).or_default().push((seconds, psnr));
         }
     }
     let mut evaluations: Vec<CurvePoint> = groups
@@ -264,17 +265,18 @@ impl Summary {
     }
 }
 
-/// What is known so far.
+/// The results so far.
 struct Bench<'a> {
     args: &'a Args,
     peers: Vec<Peer>,
     results: Vec<CurveResult>,
-    /// Sentences for the page.
+    /// Notes for the page.
     notes: Vec<String>,
 }
 
 impl Bench<'_> {
-    /// The methods that have something to learn from in these data. Where there is but one, it says itself what it lacks.
+    /// The methods that these data support. If there is only one method, it is returned anyway and reports the problem
+    /// itself.
     fn applicable<'a>(&mut self, data: &'a NamedData) -> Vec<&'a ModelSpec> {
         let (applicable, without_depth): (Vec<_>, Vec<_>) =
             data.model_specs.iter().partition(|model_spec| data.data.has_depth() || model_spec.kind != ModelKind::Tsdf);
@@ -283,27 +285,27 @@ impl Bench<'_> {
         }
         for model_spec in without_depth {
             let note =
-                format!("{} has no depth, which {} is made of: it has no such line", data.name, model_spec.kind.name());
+                format!("{} has no depth, which {} needs: there is no such line", data.name, model_spec.kind.name());
             log::warn!("{note}");
             self.notes.push(note + ".");
         }
         applicable
     }
 
-    /// Everything known so far, written.
+    /// Writes the findings so far.
     fn findings(&self, runs: &Runs<'_>) -> anyhow::Result<(Findings, PathBuf)> {
         let peers: Vec<CurveResult> = self.peers.iter().map(CurveResult::of_peer).collect();
         let all = || self.results.iter().chain(&peers);
         let last_secs = all().flat_map(|results| &results.points).map(|point| point.seconds).fold(1.0, f64::max);
         let (n_seeds, seconds) = (self.args.seeds, compact_number(self.args.seconds));
         let subtitle = if n_seeds > 1 {
-            format!("median of {n_seeds} seeds; band: lowest to highest; dashed: peers")
+            format!("median of {n_seeds} seeds; band: minimum to maximum; dashed: peers")
         } else {
-            "one run a line; dashed: peers".to_owned()
+            "one run per line; dashed: peers".to_owned()
         };
         let psnr = || Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() };
         let over_time = Chart {
-            title: "PSNR of held-out images over time".into(),
+            title: "PSNR of test images over time".into(),
             subtitle,
             x: Axis {
                 label: "seconds of training (log)".into(),
@@ -316,7 +318,7 @@ impl Bench<'_> {
             markers: Vec::new(),
         };
         let over_size = Chart {
-            title: "PSNR of held-out images over the size of the model".into(),
+            title: "PSNR of test images over the size of the model".into(),
             subtitle: format!("after {seconds} s; median of the runs"),
             x: Axis { label: "GPU memory of the model, MB (log)".into(), scale: Scale::Log, ticks: Vec::new() },
             y: psnr(),
@@ -324,8 +326,7 @@ impl Bench<'_> {
             thresholds: Vec::new(),
             markers: Vec::new(),
         };
-        let head =
-            ["data, method", "runs", "PSNR, dB", "std, dB", "seconds", "primitives", "extent", "spread, %", "MB"];
+        let head = ["data, method", "runs", "PSNR, dB", "std, dB", "seconds", "primitives", "range", "spread, %", "MB"];
         let head = head.map(str::to_owned).into_iter().chain(TARGET_DB.map(|target_db| format!("to {target_db} dB")));
         let table = Table {
             title: format!("After {seconds} s (peers: after their last row)"),
@@ -335,13 +336,13 @@ impl Bench<'_> {
         let mut sentences = vec![
             format!(
                 "Each line is one method on one data set, trained {n_seeds} times for {seconds} s with different seeds; loading \
-                 and scoring do not count. PSNR is the mean over images that were held out."
+ and scoring do not count. PSNR is the mean over the test images."
             ),
-            "A quality is reached where the line between two marks, over the logarithm of time, crosses it; a curve that starts \
-             above counts by its first mark. Peers' curves come from their files and may stem from another machine."
+            "The time to a PSNR level is interpolated between two evaluations over the logarithm of time; for a curve that starts \
+ above the level, it is the time of the first evaluation. Curves of peers come from their files, possibly from another computer."
                 .into(),
-            "Primitives are splats, voxel blocks (tsdf) or table entries (nerf). A distance field is done when it has taken in \
-             every image once: its line ends there."
+            "Primitives are splats, voxel blocks (tsdf) or table entries (nerf). A distance field is done after fusing \
+ every image once; its line ends there."
                 .into(),
         ];
         sentences.extend(self.notes.iter().cloned());
@@ -379,15 +380,15 @@ mod tests {
         ];
         let evaluations = median_curve(&curves);
         let points: Vec<(f64, f64, usize)> =
-            evaluations.iter().map(|point_of| (point_of.seconds, point_of.psnr, point_of.n_runs)).collect();
-        assert_eq!(points, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "one run alone at 0.5 s makes no point");
+            evaluations.iter().map(|point| (point.seconds, point.psnr, point.n_runs)).collect();
+        assert_eq!(points, [(0.28, 11.0, 2), (1.02, 21.0, 3), (2.5, 23.0, 3)], "a single run at 0.5 s gives no point");
         assert_eq!((evaluations[1].min_psnr, evaluations[1].max_psnr), (20.0, 25.0));
     }
 
     #[test]
     fn end_between_evaluations_is_a_separate_point() {
         let evaluations = median_curve(&[vec![(1.0, 20.0), (1.9, 21.0)], vec![(1.0, 22.0), (1.9, 23.0)]]);
-        assert_eq!(evaluations.iter().map(|point_of| point_of.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
+        assert_eq!(evaluations.iter().map(|point| point.psnr).collect::<Vec<_>>(), [21.0, 22.0]);
     }
 
     #[test]

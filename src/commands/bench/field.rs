@@ -1,31 +1,31 @@
-//! `fieldrig bench field`: how fast a neural field learns.
+//! `fieldrig bench field`: measures the training speed of a neural field.
 
 use crate::print;
 use anyhow::Context;
 use serde::Serialize;
 use trainer::nerf::bench::time_steps;
 
-/// Samples of a step where no flag says: on a GPU, and on the CPU.
+/// Samples of a step if the flag is not given, on a GPU and on the CPU.
 const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
 const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
 
 /// Flags of `bench field`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rays of a step, 1 to 65536
+    /// Rays per step, 1 to 65536
     #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     rays: u32,
-    /// Samples of a step, separated by commas; rounded down to a multiple of the rays, at least one each
+    /// Samples per step, separated by commas; rounded down to a multiple of the rays, with at least one per ray
     /// [default: 131072,262144; without a GPU 16384]
     #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
     samples: Vec<u32>,
-    /// Steps timed, 1 to 10000; the median counts [default: 100; without a GPU 3]
+    /// Number of timed steps, 1 to 10000; the median is reported [default: 100; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
     /// Print the GPU time of each pass of a step
     #[arg(long)]
     profile: bool,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
@@ -36,7 +36,7 @@ struct Row {
     samples: u32,
     step_ms: f64,
     step_wall_ms: f64,
-    /// Of as many samples of a picture.
+    /// Time to render as many samples of an image.
     colors_ms: f64,
     peak_mb: u64,
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -50,7 +50,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (row_ix, n_samples) in
         (if args.samples.is_empty() { default_samples } else { &args.samples }).iter().enumerate()
     {
-        // A fresh device for each row, so that the peak of memory is the row's own.
+        // A new device for each row, so that the memory peak is that of the row.
         let gpu = crate::commands::open_gpu()?;
         if row_ix == 0 {
             log::info!("{}", gpu.describe());
@@ -72,7 +72,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             continue;
         }
         print::line(format_args!(
-            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), as many of a picture {:.3} ms, peak {} MB",
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
             row.rays, row.samples, row.step_ms, row.step_wall_ms, row.colors_ms, row.peak_mb
         ))?;
         for (name, millis) in &row.passes {

@@ -1,4 +1,4 @@
-//! `fieldrig bench kernels`: how fast the kernels are.
+//! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
 use anyhow::Context;
 use serde::Serialize;
@@ -10,48 +10,49 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
-/// More splats than any rig file may ask for.
+/// Maximum number of splats in a rig file.
 const MAX_CLOUD_SPLATS: i64 = 100_000_000;
 
-/// What is measured where no flag says.
+/// Settings if no flag is given.
 struct Defaults {
     size: &'static [Size],
     splats: &'static [u32],
     repeats: u32,
 }
 
-/// On a GPU.
+/// Defaults on a GPU.
 const DEFAULTS: Defaults = Defaults {
     size: &[Size([1024, 1024]), Size([1280, 720]), Size([1920, 1080])],
     splats: &[100_000, 300_000, 1_000_000, 3_000_000],
     repeats: 30,
 };
-/// On the CPU, which takes seconds a step for what a GPU does in a millisecond, and binds smaller buffers.
+/// Defaults on the CPU, which needs seconds for what a GPU does in a millisecond, and supports only smaller buffers.
 const DEFAULTS_ON_CPU: Defaults = Defaults { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
 
 /// Flags of `bench kernels`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Take the cloud from a file of arrays `means`, `quats`, `log_scales`, `opacities_logit` and `sh`, in place of our own
+    /// Use the splats of an .npz file with `means`, `quats`, `log_scales`, `opacities_logit` and `sh` instead of a
+    /// synthetic cloud
     #[arg(long, value_name = "FILE.npz")]
     cloud: Option<PathBuf>,
     /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080; without a GPU 320x240]
     #[arg(long, value_delimiter = ',', value_parser = parse_size)]
     size: Vec<Size>,
-    /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud the file's
+    /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud, that of the file
     /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
     #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
     splats: Vec<u32>,
-    /// Pictures and steps timed, 1 to 10000; the median counts [default: 30; without a GPU 3]
+    /// Number of timed images and steps, 1 to 10000; the median is reported [default: 30; without a GPU 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     repeats: Option<u32>,
-    /// Put the camera into the middle of the cloud, where it sees a part of the splats
+    /// Put the camera into the middle of the cloud, where it sees only some of the splats
     #[arg(long)]
     inside: bool,
     /// Print the GPU time of each pass of a step
     #[arg(long)]
     profile: bool,
-    /// Print one JSON object a line
+    /// Print JSON, one object per line
     #[arg(long)]
     json: bool,
 }
@@ -63,7 +64,7 @@ fn parse_size(text: &str) -> Result<Size, String> {
     let parse = |part: &str| part.parse::<u32>().ok().filter(|size| (1..=16_384).contains(size));
     text.split_once('x')
         .and_then(|(width, height)| Some(Size([parse(width)?, parse(height)?])))
-        .ok_or_else(|| "a size is WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
+        .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
 }
 
 #[derive(Serialize)]
@@ -73,12 +74,12 @@ struct Row {
     n: usize,
     isect: u64,
     render_ms: f64,
-    /// Every splat updated.
+    /// Step that updates every splat.
     step_ms: f64,
-    /// Only those updated that the view shows.
+    /// Step that updates only the visible splats.
     step_touched_ms: f64,
     touched: u64,
-    /// Sums in any order; null where the adapter adds no floats atomically.
+    /// Step with unordered sums; null if the adapter has no atomic float addition.
     step_unordered_ms: Option<f64>,
     render_wall_ms: f64,
     step_wall_ms: f64,
@@ -106,7 +107,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut out = std::io::stdout().lock();
     for (size_ix, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
-            // A fresh device for each row, so that the peak of memory is the row's own.
+            // A new device for each row, so that the memory peak is that of the row.
             let gpu = crate::commands::open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
@@ -150,10 +151,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             }
             let unordered = row
                 .step_unordered_ms
-                .map_or("sums in any order: not offered".into(), |ms| format!("sums in any order {ms:.3} ms"));
+                .map_or("unordered sums: not supported".into(), |ms| format!("unordered sums {ms:.3} ms"));
             writeln!(
                 out,
-                "{}x{} {:>8} splats {:>9} intersections: picture {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} splats seen {:.3} ms; {unordered}), mean {:.5?}, peak {} MB",
+                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms; {unordered}), mean {:.5?}, peak {} MB",
                 row.w,
                 row.h,
                 row.n,

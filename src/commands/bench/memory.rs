@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 const PRINT_PERIOD: Duration = Duration::from_secs(60);
 /// Charts and numbers are written this often, so that an interrupted bench leaves results.
 const WRITE_PERIOD: Duration = Duration::from_secs(60);
-/// Points of a line in the chart.
+/// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
 const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
@@ -32,7 +32,7 @@ const SECS_PER_MINUTE: f64 = 60.0;
 /// Flags of `bench memory`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Cameras, arm and training settings (TOML)
+    /// Rig file: cameras, arm and training settings (TOML)
     rig_file: PathBuf,
     /// Simulate the devices of the rig file, in real time
     #[arg(long, conflicts_with = "from")]
@@ -40,22 +40,22 @@ pub(crate) struct Args {
     /// Replay a recording instead of live devices; training continues after its end
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
-    /// Length of the run, counted from the first image
+    /// Length of the run in seconds, counted from the first image
     #[arg(long, value_name = "S", default_value_t = 900.0)]
     seconds: f64,
-    /// Time between two samples
+    /// Time between two samples, seconds
     #[arg(long, value_name = "S", default_value_t = 1.0)]
     every_secs: f64,
-    /// Number of connected viewers that request pictures back to back, 0 to 32
+    /// Number of connected viewers that request images back to back, 0 to 32
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=32))]
     viewers: u64,
     /// Folder for charts and numbers
     #[arg(long, value_name = "DIR", default_value = "bench-memory")]
     out: PathBuf,
-    /// Print one JSON object per sample
+    /// Print JSON, one object per sample
     #[arg(long)]
     json: bool,
-    /// Further flags of `fieldrig run`
+    /// More flags for `fieldrig run`
     #[arg(last = true, value_name = "RUN FLAGS")]
     run_flags: Vec<OsString>,
 }
@@ -69,8 +69,8 @@ struct RunFlags {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    // Checkpoints are part of a run: they are written, and then removed with their folder.
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    // Checkpoints are part of a run, so they are written, and removed afterwards with their folder.
     let run_folder = args.out.join(format!("run-{}", std::process::id()));
     let measured = args.run_flags(&run_folder).and_then(|flags| measure(args, &flags));
     if run_folder.exists()
@@ -90,12 +90,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 /// The measurements of a run.
 #[derive(Debug, Default)]
 struct MemoryRun {
-    /// Whether the GPU's memory is the host's.
+    /// Whether GPU memory is host memory.
     is_software: bool,
     samples: Vec<Sample>,
     /// GPU buffers at the last sample, bytes by label.
     gpu_buffers: BTreeMap<Arc<str>, u64>,
-    /// Why the devices ended early.
+    /// Error that ended the devices early.
     input_error: Option<drivers::Error>,
 }
 
@@ -313,7 +313,7 @@ fn findings(args: &Args, measured: &MemoryRun) -> anyhow::Result<Findings> {
             },
         )],
         tables: vec![
-            Table { title: "Memory".to_owned(), head: vec!["disturbance".to_owned(), "value".to_owned()], rows },
+            Table { title: "Memory".to_owned(), head: vec!["quantity".to_owned(), "value".to_owned()], rows },
             Table {
                 title: "Largest GPU buffers at the end".to_owned(),
                 head: vec!["label".to_owned(), "size".to_owned()],

@@ -1,4 +1,4 @@
-//! `fieldrig bench`: how fast, how good after how long, how large for how good, and how sturdy.
+//! `fieldrig bench`: measures speed, accuracy over time and model size, memory use and robustness.
 
 mod ablation;
 mod budget;
@@ -13,7 +13,7 @@ use crate::exit::Exit;
 use clap::{Parser, Subcommand};
 use trainer::gpu::PassTiming;
 
-/// What to measure.
+/// Flags of `bench`.
 #[derive(Debug, Parser)]
 pub(crate) struct Args {
     #[command(subcommand)]
@@ -22,25 +22,25 @@ pub(crate) struct Args {
 
 #[derive(Debug, Subcommand)]
 enum BenchCommand {
-    /// Time of a picture and of a training step on a synthetic cloud of splats, by size and count
+    /// Time of an image and of a training step on a synthetic cloud of splats, by image size and number of splats
     Kernels(kernels::Args),
     /// Time of a training step of a neural field on synthetic rays, by number of samples
     Field(field::Args),
-    /// PSNR of held-out images over seconds of training, several seeds each; peers' figures can be drawn in
+    /// Test PSNR over training time with several seeds, optionally compared with other trainers
     Curve(curve::Args),
-    /// PSNR of held-out images over the number of splats, and what the trainer takes by itself
+    /// Test PSNR over the number of splats, and the number that the trainer chooses
     Budget(budget::Args),
-    /// What each part of the method brings, by training without it
+    /// Contribution of each part of the method, by training without it
     Ablation(ablation::Args),
-    /// PSNR of held-out images over the size of a disturbance of the training images, and where it breaks
+    /// Test PSNR over the size of a disturbance of the training images, and its break points
     Stability(stability::Args),
-    /// How far from the shutter the stamps of images are that come late and by another clock, as a histogram
+    /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),
 }
 
-/// Names and milliseconds of passes, where they are asked for.
+/// Names and milliseconds of the passes, if requested.
 fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
     if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
 }

@@ -1,4 +1,4 @@
-//! `fieldrig bench stability`: accuracy over the size of a disturbance, and where it breaks.
+//! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
 
 use crate::bench::disturb::Disturbance;
 use crate::bench::page::{Findings, Table};
@@ -18,38 +18,39 @@ use std::sync::Arc;
 use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 
-/// Length of a run where no flag says.
+/// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of quality whose disturbance is told, dB.
+/// Losses of PSNR whose disturbance level is reported, dB.
 const BREAKS_DB: [f64; 2] = [1.0, 3.0];
 const NANOS_PER_SEC: f64 = 1e9;
-/// Between the stamps of images that are only counted.
+/// Nanoseconds between consecutive images whose stamps only count them.
 const NANOS_PER_COUNT: f64 = 1e6;
 
-/// All meet the same disturbances: one line each in every chart.
-const VARIANTS: &[Variant] = &[Variant { name: "as settled by --refine", change: |options| options }, CAMERAS_AS_GIVEN];
+/// All variants are trained on the same disturbed data; each gives one line per chart.
+const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |options| options }, CAMERAS_AS_GIVEN];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
     data: PathBuf,
-    /// What is disturbed, separated by commas
+    /// What to disturb, separated by commas
     #[arg(long, value_name = "WHAT,...", value_delimiter = ',', default_value = "all")]
     disturb: Vec<DisturbanceArg>,
-    /// Sizes in place of the usual ones (mm, ms, EV or keyframes), separated by commas; for one disturbance
+    /// Sizes of the disturbance instead of the default ones (mm, ms, EV or keyframes), separated by commas; needs a
+    /// single disturbance
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
     levels: Vec<f64>,
-    /// Images a second of a folder without times; clock-offset needs it there
+    /// Images per second of a folder without times; clock-offset needs it then
     #[arg(long, value_name = "HZ")]
     rate_hz: Option<f64>,
-    /// Length of a run in seconds of training; loading and scoring do not count [default: 30, unless --steps is given]
+    /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless --steps is given]
     #[arg(long, value_name = "S")]
     seconds: Option<f64>,
-    /// Length of a run in optimiser steps
+    /// Optimizer steps of each run
     #[arg(long, value_name = "N")]
     steps: Option<u64>,
-    /// Runs of each size, 1 to 1000, with seeds counted up from --seed
+    /// Runs per size, 1 to 1000, with consecutive seeds from --seed
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     #[command(flatten)]
@@ -58,28 +59,28 @@ pub(crate) struct Args {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum DisturbanceArg {
-    /// Training poses off by 0 to 50 mm and 0 to 5 degrees
+    /// Errors of training poses: 0 to 50 mm and 0 to 5 degrees
     PoseNoise,
-    /// Poses of a time 0 to 200 ms later
+    /// Poses of a time that is 0 to 200 ms later
     ClockOffset,
-    /// A step of 0 to 1 EV in the middle of the capture
+    /// Exposure step of 0 to 1 EV in the middle of the capture
     Exposure,
     /// 3 to 300 training keyframes
     Keyframes,
-    /// All of them
+    /// All disturbances
     All,
 }
 
-/// What is measured of one disturbance.
+/// Measurements to make of one disturbance.
 struct DisturbancePlan {
     disturbance: Disturbance,
-    /// From the least disturbed on.
+    /// Sizes, starting with the undisturbed data.
     levels: Vec<f64>,
     nanos_per_sec: f64,
     rate_hz: Option<f64>,
 }
 
-/// Everything measured of one disturbance.
+/// Results of one disturbance.
 #[derive(Debug, Serialize)]
 struct DisturbanceResult {
     name: &'static str,
@@ -89,11 +90,11 @@ struct DisturbanceResult {
     disturbance: Disturbance,
 }
 
-/// One way to train under one disturbance.
+/// Results of one variant under one disturbance.
 #[derive(Clone, Debug, Serialize)]
 struct Curve {
     name: &'static str,
-    /// From the least disturbed on.
+    /// Results by size, starting with the undisturbed data.
     points: Vec<Level>,
     breaks: Vec<Break>,
 }
@@ -101,13 +102,13 @@ struct Curve {
 #[derive(Clone, Debug, Serialize)]
 struct Level {
     level: f64,
-    /// Median, dB.
+    /// Median PSNR, dB.
     psnr: f64,
     psnr_extent: [f64; 2],
     runs: Vec<Run>,
 }
 
-/// Where the PSNR has fallen this far below the undisturbed one; `None` if no size did it.
+/// Size at which the PSNR has fallen by `drop_db` from the undisturbed one; `None` if none of the sizes reaches it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 struct Break {
     drop_db: f64,
@@ -137,7 +138,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             for level in &plan.levels {
                 let finished = measure(args, &mut runs, &data, limits, plan, variant, *level)?;
                 curve.add(plan.disturbance, *level, finished);
-                // Written after every size, so that an interrupted bench shows what it has.
+                // Written after every size, so that an interrupted bench leaves results.
                 let variants = &mut results.last_mut().expect("pushed above").variants;
                 variants.retain(|curve| curve.name != variant.name);
                 variants.push(curve.clone());
@@ -151,7 +152,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(exit::from_losses(&data.data.data_losses))
 }
 
-/// The ways to train that differ for these data: where nothing is looked for about cameras there is one.
+/// The variants that differ for these options. If no camera parameters are refined, there is only one.
 fn distinguished(options: &SplatOptions) -> Vec<&'static Variant> {
     let mut distinguished: Vec<&Variant> = Vec::new();
     for variant in VARIANTS {
@@ -161,12 +162,12 @@ fn distinguished(options: &SplatOptions) -> Vec<&'static Variant> {
         }
     }
     if distinguished.len() < VARIANTS.len() {
-        log::warn!("nothing is looked for about cameras here: see --refine; only one way to train is measured");
+        log::warn!("no camera parameters are refined, so only one variant is measured; see --refine");
     }
     distinguished
 }
 
-/// The runs of one size.
+/// Trains with one size of the disturbance, once per seed.
 fn measure(
     args: &Args,
     runs: &mut Runs<'_>,
@@ -178,7 +179,7 @@ fn measure(
 ) -> anyhow::Result<Vec<Run>> {
     let disturbance = plan.disturbance;
     let is_undisturbed = is_undisturbed(disturbance, level, n_train(data));
-    // The undisturbed run is the same whatever is not disturbed in it: it is done once.
+    // All disturbances share the undisturbed run, so that it is trained only once.
     let size = if is_undisturbed {
         "undisturbed".to_owned()
     } else {
@@ -220,12 +221,12 @@ fn disturb(
     if is_undisturbed { keyframes.to_vec() } else { plan.disturbance.apply(keyframes, level, seed, plan.nanos_per_sec) }
 }
 
-/// Images that are trained on when nothing is disturbed.
+/// Number of training images if nothing is disturbed.
 fn n_train(data: &NamedData) -> usize {
     data.data.keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count()
 }
 
-/// Whether this size of a disturbance is none.
+/// Whether this size leaves the data unchanged.
 fn is_undisturbed(disturbance: Disturbance, level: f64, n_train: usize) -> bool {
     if disturbance == Disturbance::Keyframes { level >= n_train as f64 } else { level == 0.0 }
 }
@@ -247,9 +248,7 @@ impl Args {
     fn check(&self) -> Result<(), BadArgument> {
         let selected = self.disturbances();
         if !self.levels.is_empty() && selected.len() != 1 {
-            return Err(BadArgument(
-                "--levels: name one disturbance with --disturb, its sizes are in units of its own".into(),
-            ));
+            return Err(BadArgument("--levels: needs a single disturbance in --disturb, because units differ".into()));
         }
         let min_level = if selected == [Disturbance::Keyframes] { 1.0 } else { 0.0 };
         if let Some(level) = self.levels.iter().find(|level| !level.is_finite() || **level < min_level) {
@@ -261,26 +260,26 @@ impl Args {
         Ok(())
     }
 
-    /// What is measured; a clock offset without times is refused, or left out of `all`.
+    /// The measurements to make. A clock offset without image times is an error, or is skipped for `all`.
     fn plans(&self, data: &NamedData) -> anyhow::Result<Vec<DisturbancePlan>> {
         let mut selected = self.disturbances();
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
             (true, _) => (NANOS_PER_SEC, None),
             (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),
             (false, None) => {
-                let reason = "the images have no times: tell with --rate-hz how many a second they are";
+                let reason = "the images have no times; give their rate with --rate-hz";
                 let message = format!("clock-offset: {}: {reason}", data.path.display());
                 if self.disturb.contains(&DisturbanceArg::ClockOffset) {
                     return Err(BadArgument(message).into());
                 }
                 if selected.contains(&Disturbance::ClockOffset) {
-                    log::warn!("left out: {message}");
+                    log::warn!("skipped: {message}");
                 }
                 selected.retain(|disturbance| *disturbance != Disturbance::ClockOffset);
                 (NANOS_PER_SEC, None)
             }
         };
-        ensure!(!selected.is_empty(), "nothing is left to disturb");
+        ensure!(!selected.is_empty(), "no disturbance is left to measure");
         let plan = |disturbance: Disturbance| {
             let requested = if self.levels.is_empty() { disturbance.default_levels() } else { &self.levels };
             let rate_hz = rate_hz.filter(|_| disturbance == Disturbance::ClockOffset);
@@ -295,7 +294,7 @@ impl Args {
     }
 }
 
-/// The sizes to measure, from no disturbance to a large one.
+/// The sizes to measure, from none to the largest.
 fn levels(disturbance: Disturbance, requested: &[f64], n_train: usize) -> Vec<f64> {
     let mut levels = requested.to_vec();
     if disturbance == Disturbance::Keyframes {
@@ -332,7 +331,7 @@ impl Curve {
 }
 
 impl DisturbanceResult {
-    /// `of_one` names the line where there is only one variant.
+    /// `of_one` is the label of the line if there is only one variant.
     fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
         let levels = || {
             let mut levels: Vec<f64> =
@@ -355,7 +354,7 @@ impl DisturbanceResult {
         let curves = self.variants.iter().enumerate();
         let label = |curve: &Curve| if self.variants.len() > 1 { curve.name } else { of_one };
         Chart {
-            title: format!("PSNR of held-out images under {}", describe(self.disturbance)),
+            title: format!("PSNR of test images with {}", describe(self.disturbance)),
             subtitle: subtitle.to_owned(),
             x: Axis { label: self.disturbance.axis().to_owned(), scale, ticks },
             y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
@@ -387,7 +386,7 @@ fn describe(disturbance: Disturbance) -> &'static str {
     }
 }
 
-/// Two or three digits that count: more would claim what one curve cannot tell.
+/// Formats a level with two or three significant digits; a single curve does not support more.
 fn significant_digits(level: f64) -> String {
     match level {
         level if level >= 10.0 => format!("{level:.0}"),
@@ -396,7 +395,7 @@ fn significant_digits(level: f64) -> String {
     }
 }
 
-/// Everything known so far, written.
+/// Writes the findings so far.
 fn findings(
     args: &Args,
     runs: &Runs<'_>,
@@ -405,9 +404,9 @@ fn findings(
 ) -> anyhow::Result<(Findings, PathBuf)> {
     let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
-        format!("median of {} seeds, band: lowest to highest", args.seeds)
+        format!("median of {} seeds; band: minimum to maximum", args.seeds)
     } else {
-        "one run a size".to_owned()
+        "one run per size".to_owned()
     };
     let subtitle = format!("after {length}; {spread}");
     let label = format!("{}, {}", data.name, data.single_model_spec()?.kind.name());
@@ -418,7 +417,7 @@ fn findings(
         Disturbance::Keyframes => "-keyframes",
     };
     let charts = results.iter().map(|result| (part(result.disturbance), result.chart(&subtitle, &label)));
-    let head = ["disturbance", "trainer", "undisturbed, dB", "-1 dB at", "-3 dB at"].map(str::to_owned).to_vec();
+    let head = ["disturbance", "variant", "undisturbed, dB", "-1 dB at", "-3 dB at"].map(str::to_owned).to_vec();
     let level_rows = results.iter().flat_map(|result| {
         result.variants.iter().flat_map(|curve| {
             curve.points.iter().map(|point| {
@@ -431,16 +430,15 @@ fn findings(
             })
         })
     });
-    let level_head =
-        ["disturbance, trainer", "size", "PSNR, dB", "against undisturbed, dB"].map(str::to_owned).to_vec();
+    let level_head = ["disturbance, variant", "size", "PSNR, dB", "change, dB"].map(str::to_owned).to_vec();
     let findings = Findings {
         name: "stability",
         title: format!("Stability: {}", data.name),
         sentences: vec![
             format!(
-                "Each point is a model trained for {length} on disturbed images and scored on held-out images that are not disturbed. A break point is where the line has fallen by 1 or 3 dB from its undisturbed end."
+                "Each point is a model trained for {length} on disturbed images and scored on undisturbed test images. A break point is the size at which the PSNR has fallen by 1 or 3 dB from the undisturbed one."
             ),
-            "Pose noise turns each camera too, by 0.1 degrees a millimetre; poses of a clock offset are interpolated between neighboring images; an exposure step darkens the first half of the capture and brightens the second, half each."
+            "Pose noise also rotates each camera, by 0.1 degrees per millimeter. Poses with a clock offset are interpolated between neighboring images. An exposure step darkens the first half of the capture and brightens the second, by half the step each."
                 .into(),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],

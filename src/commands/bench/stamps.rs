@@ -1,4 +1,5 @@
-//! `fieldrig bench stamps`: how well the time of the shutter is found of images whose camera has a clock of its own and a bad cable.
+//! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock and a link with
+//! jitter.
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::statistics::{median, quantile};
@@ -9,38 +10,39 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// Width of a bar, milliseconds.
+/// Width of a histogram bin, milliseconds.
 const BIN_MILLIS: f64 = 0.1;
-/// Bars reach so far to either side, milliseconds; what lies beyond counts in the last ones.
+/// Range of the histogram to either side, milliseconds; errors beyond it count in the outermost bins.
 const HISTOGRAM_RANGE_MILLIS: f64 = 8.0;
-/// Joint readings a second.
+/// Joint states per second.
 const JOINT_RATE_HZ: u32 = 1000;
-/// The joint turns so fast, rad/s: its angle tells the time.
+/// Speed of the joint, rad/s. Its angle encodes the time.
 const SPEED_RAD_S: f64 = 1.0;
-/// What is counted as found.
+/// Error up to which a stamp counts as correct.
 const MAX_ERROR_MILLIS: f64 = 1.0;
 
 /// Flags of `bench stamps`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Rates of cameras, images a second, separated by commas
+    /// Camera rates, images per second, separated by commas
     #[arg(long, value_name = "HZ,...", value_delimiter = ',', default_value = "30,60,200")]
     rates: Vec<f64>,
-    /// Least time from the shutter to the arrival of an image
+    /// Minimum latency from the shutter to the arrival of an image
     #[arg(long, value_name = "MS", default_value_t = 5.0)]
     fixed_millis: f64,
-    /// What may come on top of that, each time anew
+    /// Maximum random latency added to each image
     #[arg(long, value_name = "MS", default_value_t = 75.0)]
     jitter_millis: f64,
-    /// How much faster our clock runs than the camera's, parts in a million
+    /// How much faster this computer's clock runs than the camera's, parts per million
     #[arg(long, value_name = "PPM", default_value_t = 50.0, allow_hyphen_values = true)]
     drift_ppm: f64,
-    /// Length of a run, and what at its beginning does not count
+    /// Length of a run
     #[arg(long, value_name = "S", default_value_t = 120.0)]
     seconds: f64,
+    /// Time at the start of a run that is not counted
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     settle_seconds: f64,
-    /// Runs of each rate
+    /// Runs per rate
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     /// Folder for charts and numbers [default: bench-stamps]
@@ -51,18 +53,18 @@ pub(crate) struct Args {
     json: bool,
 }
 
-/// How far from the shutter the pose was taken, milliseconds, for one rate.
+/// Stamp errors for one camera rate, milliseconds.
 #[derive(Debug, Serialize)]
 struct StampErrors {
     rate_hz: f64,
-    /// Whether the fixed part of the latency is in the rig file.
+    /// Whether the rig file corrects the fixed latency.
     is_calibrated: bool,
     images: usize,
     within_1_ms_frac: f64,
     median_millis: f64,
     p99_abs_millis: f64,
     max_abs_millis: f64,
-    /// Share of the images in each bar, from -8 ms on in steps of 0.1 ms.
+    /// Share of the images in each bin, from -8 ms in steps of 0.1 ms.
     bars: Vec<f64>,
 }
 
@@ -72,14 +74,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     for rate_hz in &args.rates {
         let errors: Vec<f64> = (1..=args.seeds).flat_map(|seed| errors_millis(args, *rate_hz, seed)).collect();
         for is_calibrated in [true, false] {
-            // What the rig file says is taken off every stamp alike.
+            // The rig file's offset is subtracted from every stamp.
             let fixed_latency = if is_calibrated { args.fixed_millis } else { 0.0 };
             let errors: Vec<f64> = errors.iter().map(|error| error - fixed_latency).collect();
             results.push(StampErrors::of(*rate_hz, is_calibrated, &errors));
         }
     }
     std::fs::create_dir_all(&args.out)
-        .map_err(|error| anyhow::Error::new(error).context(format!("cannot make {}", args.out.display())))?;
+        .map_err(|error| anyhow::Error::new(error).context(format!("cannot create {}", args.out.display())))?;
     let findings = findings(args, &results)?;
     findings.print_summary(&findings.write(&args.out)?, args.json)?;
     Ok(Exit::Done)
@@ -97,14 +99,14 @@ fn check(args: &Args) -> Result<(), BadArgument> {
     ];
     match numbers.into_iter().find(|(_, number, allowed)| !allowed.contains(number)) {
         Some((flag, number, allowed)) => {
-            Err(BadArgument(format!("{flag}: {number} is not from {} to {}", allowed.start(), allowed.end())))
+            Err(BadArgument(format!("{flag}: {number} is outside {} to {}", allowed.start(), allowed.end())))
         }
         None => Ok(()),
     }
 }
 
-/// For each image after the beginning, how much later than its shutter the pose is that the join would take for it; the fixed part of
-/// the latency is in it.
+/// For each image after the settling time, the time of the pose that the join assigns to it minus the time of its
+/// shutter. The fixed latency is included.
 #[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
 fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = seed;
@@ -116,7 +118,7 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
         let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
         let position = vec![SPEED_RAD_S * stamp.secs_since(Stamp(0))];
         let state = JointState { stamp, position, velocity: vec![SPEED_RAD_S], effort: Vec::new() };
-        joints.push(state).expect("in order, and numbers");
+        joints.push(state).expect("the states are ordered and finite");
     }
     let mut errors = Vec::new();
     for ix in 0..(args.seconds * rate_hz) as i64 {
@@ -135,7 +137,7 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     errors
 }
 
-/// The next of a series of numbers from 0 to 1. Source: Steele, Lea and Flood 2014, `SplitMix64`.
+/// The next pseudorandom number in [0, 1). Source: Steele, Lea and Flood 2014, `SplitMix64`.
 fn uniform(state: &mut u64) -> f64 {
     *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
     let mut mixed = *state;
@@ -145,7 +147,7 @@ fn uniform(state: &mut u64) -> f64 {
 }
 
 impl StampErrors {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped into the bars")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bins")]
     fn of(rate_hz: f64, is_calibrated: bool, errors: &[f64]) -> Self {
         let n_bars = (2.0 * HISTOGRAM_RANGE_MILLIS / BIN_MILLIS).round() as usize;
         let mut bars = vec![0.0; n_bars];
@@ -170,7 +172,7 @@ impl StampErrors {
     }
 
     fn label(&self) -> String {
-        let suffix = if self.is_calibrated { "" } else { ", fixed part unknown" };
+        let suffix = if self.is_calibrated { "" } else { ", fixed latency unknown" };
         format!("{} Hz{suffix}", self.rate_hz)
     }
 }
@@ -181,7 +183,7 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
         Point { x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS, y, low: y, high: y }
     };
     let line = |results: &StampErrors| {
-        // From the bar before the first that has any to the one behind the last.
+        // Draws one empty bin on either side of the nonempty ones.
         let first = results.bars.iter().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
         let n_empty_after =
             results.bars.iter().rev().position(|fraction| *fraction > 0.0).unwrap_or(0).saturating_sub(1);
@@ -193,7 +195,7 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
         }
     };
     let conditions = format!(
-        "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, the first {} s left out",
+        "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, without the first {} s",
         args.fixed_millis, args.jitter_millis, args.drift_ppm, args.seeds, args.seconds, args.settle_seconds
     );
     let row = |results: &StampErrors| {
@@ -206,23 +208,23 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
             format!("{:.3}", results.max_abs_millis),
         ]
     };
-    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99 % within, ms", "worst, ms"];
+    let head = ["camera", "images", "within 1 ms, %", "median, ms", "99 % within, ms", "maximum, ms"];
     Ok(Findings {
         name: "stamps",
-        title: "When the shutter was open".to_owned(),
+        title: "Errors of image stamps".to_owned(),
         sentences: vec![
             format!("{conditions}."),
-            "A joint turns at 1 rad/s and is read a thousand times a second; the angle at the stamp of an image tells how far that stamp is from its shutter. \
-             The fixed part of a latency cannot be seen in stamps: it stands in the rig file (stamp_to_mid_exposure_millis), or is warned of and stays."
+            "A joint moves at 1 rad/s and is read 1000 times per second; its angle at the stamp of an image gives the error of that stamp. \
+ A fixed latency cannot be detected from stamps: it must be in the rig file (stamp_to_mid_exposure_millis); otherwise it remains, and a warning is logged."
                 .to_owned(),
         ],
         charts: vec![(
             "",
             Chart {
-                title: "From the shutter to the stamp that the pose is taken at".to_owned(),
+                title: "Error of the stamp at which the pose is taken".to_owned(),
                 subtitle: conditions,
                 x: Axis { label: "ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                y: Axis { label: "share of images, % in 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
+                y: Axis { label: "share of images, % per 0.1 ms".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
                 lines: results.iter().map(line).collect(),
                 thresholds: Vec::new(),
                 markers: Vec::new(),

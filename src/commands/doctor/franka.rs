@@ -1,4 +1,5 @@
-//! What a rig with a Franka arm needs of this computer and of the way to the robot; nothing here takes its one place for clients.
+//! Checks of this computer and the network for a rig with a Franka arm. They do not occupy the robot's only client
+//! connection.
 
 use super::{Finding, Verdict, field};
 use crate::config::{ArmDriver, Rig};
@@ -9,20 +10,20 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-/// Franka asks for less between a state and the answer to it.
+/// Franka requires a lower latency between a state and its response.
 const MAX_PING_MILLIS: f64 = 1.0;
-/// A controller in the same network answers at once.
+/// A controller in the same network responds at once.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(1);
-/// Pings, five a second.
+/// Number of pings, five per second.
 const N_PINGS: &str = "10";
 
-/// Checks kernel, limits and network; nothing where the rig has another arm.
+/// Checks kernel, limits and network; empty if the rig has another kind of arm.
 pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     let Some(arm) = rig.map(|rig| &rig.arm).filter(|arm| arm.driver == ArmDriver::Franka) else { return Vec::new() };
     let os_release = std::fs::read_to_string("/etc/os-release").unwrap_or_default();
     let mut findings = vec![kernel(Path::new("/sys"), &os_release), locked_memory(Path::new("/proc"))];
     if arm.address.is_empty() {
-        let remedy = "arm.address = \"172.16.0.2\" in the rig file, or what Desk shows under Settings, Network";
+        let remedy = "set arm.address in the rig file, such as \"172.16.0.2\"; Desk shows it under Settings, Network";
         findings.push(Finding::fail("robot", "arm.address is missing", remedy));
         return findings;
     }
@@ -39,7 +40,7 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
         Some(command_output) => pings(host, &command_output),
         None => {
             let remedy = "sudo apt-get install -y iputils-ping";
-            Finding::warn("robot", format!("whether {host} answers is not known without ping"), remedy)
+            Finding::warn("robot", format!("cannot check whether {host} responds: ping is not installed"), remedy)
         }
     };
     let is_reachable = pinged.verdict != Verdict::Fail;
@@ -48,7 +49,8 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     findings
 }
 
-/// Whether the controller takes clients: a connection is opened, and closed without a word, by which it gives away no place.
+/// Whether the controller accepts clients: opens a connection and closes it without sending, which does not occupy the
+/// robot.
 fn port(address: &str) -> Finding {
     let has_no_port = host_of(address) == address;
     let found = if has_no_port { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
@@ -57,15 +59,15 @@ fn port(address: &str) -> Finding {
         TcpStream::connect_timeout(&address, CONNECT_TIMEOUT)
     });
     match connected {
-        Ok(_) => Finding::ok("FCI", format!("{address} takes clients")),
+        Ok(_) => Finding::ok("FCI", format!("{address} accepts clients")),
         Err(error) => {
-            let remedy = "activate FCI in Desk; unlock the joints; FCI is a feature that the robot has to have";
-            Finding::fail("FCI", format!("{address} takes no client: {error}"), remedy)
+            let remedy = "activate FCI in Desk and unlock the joints; the robot must have the FCI feature";
+            Finding::fail("FCI", format!("{address} accepts no client: {error}"), remedy)
         }
     }
 }
 
-/// An address without its port; addresses of IPv6 with one stand in brackets.
+/// An address without its port; IPv6 addresses with a port are in brackets.
 fn host_of(address: &str) -> &str {
     match address.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
         Some((host, _)) => host,
@@ -83,16 +85,17 @@ fn kernel(sys: &Path, os_release: &str) -> Finding {
         true => "sudo pro enable realtime-kernel, then boot into it",
         false => "sudo apt-get install -y linux-image-rt-amd64, then boot into it",
     };
-    Finding::warn("kernel", "without PREEMPT_RT: an arm's states at 1 kHz are read, now and then some ms late", remedy)
+    Finding::warn("kernel", "without PREEMPT_RT: states at 1 kHz are sometimes read some ms late", remedy)
 }
 
-/// How much memory this user may keep from being swapped out.
+/// How much memory this user may lock.
 fn locked_memory(proc: &Path) -> Finding {
     match field(&proc.join("self/limits"), "Max locked memory").as_deref() {
-        None => Finding::ok("memory lock", "the kernel does not tell"),
+        None => Finding::ok("memory lock", "not reported by the kernel"),
         Some("unlimited") => Finding::ok("memory lock", "unlimited"),
         Some(bytes) => {
-            let message = format!("at most {bytes} bytes may be locked: an arm's thread may wait for the disk");
+            let message =
+                format!("at most {bytes} bytes may be locked: the arm's thread may have to wait for the disk");
             let remedy =
                 r#"echo "$USER - memlock unlimited" | sudo tee -a /etc/security/limits.conf, then log in again"#;
             Finding::warn("memory lock", message, remedy)
@@ -100,41 +103,41 @@ fn locked_memory(proc: &Path) -> Finding {
     }
 }
 
-/// The way to the robot, as `ip -o route get` tells it.
+/// Checks the route to the robot in the output of `ip -o route get`.
 fn route(sys: &Path, host: &str, command_output: &str) -> Finding {
     let after = |word: &str| {
         let mut words = command_output.split_whitespace().skip_while(|found| *found != word);
         words.nth(1)
     };
     let Some(interface) = after("dev") else {
-        let remedy = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the one that the robot's cable is in, another host of its network)";
-        return Finding::fail("route", format!("no way leads to {host}"), remedy);
+        let remedy = "sudo ip addr add 172.16.0.1/24 dev INTERFACE   (the interface with the robot's cable; an unused address in the robot's network)";
+        return Finding::fail("route", format!("no route to {host}"), remedy);
     };
     if sys.join("class/net").join(interface).join("wireless").exists() {
-        let message = format!("{host} is behind {interface}, a wireless network: states come late and get lost");
-        return Finding::warn("route", message, "put the robot's cable into this computer");
+        let message = format!("{host} is reached via {interface}, a wireless network: states arrive late or get lost");
+        return Finding::warn("route", message, "connect the robot's cable to this computer");
     }
     match after("via") {
         Some(router) => {
-            let message = format!("{host} is behind the router {router} ({interface})");
-            Finding::warn("route", message, "put the robot's cable into this computer, in a network of their own")
+            let message = format!("{host} is reached via the router {router} ({interface})");
+            Finding::warn("route", message, "connect the robot's cable to this computer, in a separate network")
         }
         None => Finding::ok("route", format!("{host} is on {interface}")),
     }
 }
 
-/// Whether the robot answers, and how soon, as `ping -q` tells it.
+/// Checks response and latency of the robot in the output of `ping -q`.
 fn pings(host: &str, command_output: &str) -> Finding {
     let loss_percent: Option<f64> = command_output
         .split_once("% packet loss")
         .and_then(|(before, _)| before.split_whitespace().last()?.parse().ok());
     let times = command_output.split_once("mdev = ").and_then(|(_, times)| times.split_whitespace().next());
     let times: Option<Vec<f64>> = times.and_then(|times| times.split('/').map(|time| time.parse().ok()).collect());
-    let latency_remedy = "a cable without a switch; sudo ethtool -C INTERFACE rx-usecs 0; the governor performance";
+    let latency_remedy = "connect without a switch; sudo ethtool -C INTERFACE rx-usecs 0; use the governor performance";
     match (loss_percent, times.as_deref()) {
         (Some(loss_percent), Some([_, average, max_millis, ..])) => {
             let message = format!(
-                "{host} answers after {average} ms, at most {max_millis} ms; {loss_percent} % of pings are lost"
+                "{host} responds after {average} ms, at most {max_millis} ms; {loss_percent} % of pings are lost"
             );
             if loss_percent > 0.0 || *max_millis > MAX_PING_MILLIS {
                 return Finding::warn("robot", message, latency_remedy);
@@ -142,8 +145,8 @@ fn pings(host: &str, command_output: &str) -> Finding {
             Finding::ok("robot", message)
         }
         _ => {
-            let remedy = "look at the cable and the robot's lights; Desk shows its address under Settings, Network";
-            Finding::fail("robot", format!("{host} does not answer"), remedy)
+            let remedy = "check the cable and the robot's lights; Desk shows its address under Settings, Network";
+            Finding::fail("robot", format!("{host} does not respond"), remedy)
         }
     }
 }
@@ -182,8 +185,8 @@ mod tests {
             [("kernel/realtime", "1\n"), ("self/limits", "Max locked memory  8388608  8388608  bytes\n")]
         {
             let path = folder.path().join(name);
-            std::fs::create_dir_all(path.parent().expect("inside the folder")).expect("room on the disk");
-            std::fs::write(path, text).expect("room on the disk");
+            std::fs::create_dir_all(path.parent().expect("inside the folder")).expect("the folder is writable");
+            std::fs::write(path, text).expect("the folder is writable");
         }
         assert_eq!(kernel(folder.path(), "").verdict, Verdict::Ok);
         for (os_release, remedy) in [("ID=ubuntu\n", "pro enable"), ("ID=debian\n", "linux-image-rt")] {
@@ -194,14 +197,14 @@ mod tests {
         let finding = locked_memory(folder.path());
         assert!(finding.message.contains("8388608") && finding.remedy.expect("a remedy").contains("memlock"));
         std::fs::write(folder.path().join("self/limits"), "Max locked memory  unlimited  unlimited  bytes\n")
-            .expect("ours");
+            .expect("the folder is writable");
         assert_eq!(locked_memory(folder.path()).verdict, Verdict::Ok);
     }
 
     #[test]
     fn route_to_the_robot_is_checked() {
         let sys = tempfile::tempdir().expect("a folder");
-        std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless")).expect("room on the disk");
+        std::fs::create_dir_all(sys.path().join("class/net/wlan0/wireless")).expect("the folder is writable");
         let route_finding = |command_output: &str| route(sys.path(), "172.16.0.2", command_output);
         let direct = route_finding("172.16.0.2 dev eth0 src 172.16.0.1 uid 0 \\    cache ");
         assert_eq!((direct.verdict, direct.message.contains("eth0")), (Verdict::Ok, true));

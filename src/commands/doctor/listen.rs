@@ -1,4 +1,4 @@
-//! What a rig's devices truly deliver: each is read for a while with the drivers of `run`, nothing is moved.
+//! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
 use crate::bench::statistics::quantile;
@@ -12,43 +12,43 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// A device that comes this much more slowly than the rig file says is told.
+/// A device slower than this fraction of the rate in the rig file is reported.
 const MIN_RATE_FRAC: f64 = 0.95;
 
-/// Of a device, or of what the join makes of it.
+/// Measurements of one device, or of the keyframes made of its images.
 #[derive(Debug, PartialEq, Serialize)]
 pub(super) struct DeviceStatistics {
     device: String,
     samples: u64,
     rate_hz: f64,
-    /// What the rig file says; `None` where it does not.
+    /// Rate in the rig file; `None` if it has none.
     expected_hz: Option<f64>,
-    /// Images that the device or the driver lost.
+    /// Images dropped by the device or the driver.
     dropped: u64,
-    /// Of devices that are not simulated.
+    /// `None` for simulated devices.
     #[serde(flatten)]
     latency: Option<Latency>,
-    /// 99 of 100 follow within this on the one before.
+    /// 99th percentile of the intervals between samples.
     gap_p99_millis: f64,
 }
 
-/// From mid-exposure, or from the stamp of a state, to when it can be used here.
+/// Time from mid-exposure, or from the stamp of a state, until the sample is available.
 #[derive(Debug, PartialEq, Serialize)]
 struct Latency {
-    /// Half of all, 99 of 100, and all take no longer.
+    /// Median, 99th percentile and maximum.
     latency_p50_millis: f64,
     latency_p99_millis: f64,
     latency_max_millis: f64,
 }
 
-/// The whole of what was heard.
+/// Everything that was measured.
 #[derive(Debug)]
 pub(super) struct ListenResult {
     pub(super) devices: Vec<DeviceStatistics>,
     pub(super) findings: Vec<Finding>,
 }
 
-/// What is noted of each sample.
+/// Raw measurements of one device.
 #[derive(Debug, Default)]
 struct Track {
     stamps: Vec<Stamp>,
@@ -88,7 +88,7 @@ impl Track {
     }
 }
 
-/// Reads the rig's devices for so many seconds, or until Ctrl-C.
+/// Reads the rig's devices for `secs` seconds, or until Ctrl-C.
 pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult> {
     let Opened { rig, mut source, .. } = open::rig(rig.clone(), Devices::Real)?;
     let mut join = Join::new(&rig)?;
@@ -100,7 +100,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
             Ok(Some(sample)) => sample,
             Ok(None) => break,
             Err(error) => {
-                findings.push(Finding::fail("devices", format!("{error}"), "look at the device and its cable"));
+                findings.push(Finding::fail("devices", format!("{error}"), "check the device and its cable"));
                 break;
             }
         };
@@ -126,7 +126,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
     if let (Some(cpu_before), Some(cpu)) = (cpu_before, clock::process_cpu_time()) {
         findings.push(Finding::ok("processor", cpu_message(cpu - cpu_before, began.elapsed())));
     }
-    // A simulation has a clock of its own.
+    // A simulation has its own clock.
     let is_simulated = open::is_any_simulated(&rig);
     let expected = expected(&rig);
     findings.extend(missing(&rig, &expected, &tracks));
@@ -141,9 +141,10 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
     let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
     let n_posed = join.counts().images - join.counts().refused.get(&Refusal::NoPose).copied().unwrap_or(0);
     if !refused.is_empty() {
-        let message = format!("images that became no keyframe: {}", refused.join(", "));
+        let message = format!("images that did not become keyframes: {}", refused.join(", "));
         findings.push(if 2 * n_posed < join.counts().images {
-            let remedy = "joint states, and poses of the base where it moves, have to be there around each image: look at who tells them";
+            let remedy =
+                "each image needs joint states, and base poses if the base moves, around its time: check their source";
             Finding::warn("join", message, remedy)
         } else {
             Finding::ok("join", message)
@@ -152,7 +153,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
     Ok(ListenResult { devices, findings })
 }
 
-/// The devices of a rig, and how often each is to say something where the rig file tells that.
+/// The devices of a rig with their rates, as far as the rig file gives them.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     use crate::config::ArmDriver;
     let mut expected = BTreeMap::new();
@@ -165,7 +166,7 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     match rig.arm.driver {
         ArmDriver::None => {}
         ArmDriver::Franka => drop(expected.insert("arm".to_owned(), Some(1000.0))),
-        // Motors that report by themselves have rates of their own.
+        // Motors that report on their own choose their rates.
         _ => drop(expected.insert("arm".to_owned(), None)),
     }
     if rig.base.driver != BaseDriver::Fixed {
@@ -181,48 +182,48 @@ fn missing(rig: &Rig, expected: &BTreeMap<String, Option<f64>>, tracks: &BTreeMa
     let silent = expected.keys().filter(|device| !tracks.contains_key(*device));
     let remedy = |device: &str| match rig.base.driver {
         BaseDriver::Tags if device == "base" => {
-            "no image told where it is: look at base.tag_family, and at sizes and places of the tags"
+            "no image gave its pose: check base.tag_family, and the sizes and poses of the tags"
         }
-        _ => "look at it and its cable",
+        _ => "check it and its cable",
     };
-    silent.map(|device| Finding::fail("silent", format!("{device} said nothing"), remedy(device))).collect()
+    silent.map(|device| Finding::fail("silent", format!("no data from {device}"), remedy(device))).collect()
 }
 
-/// What is wrong with how a device delivers.
+/// The problem in the measurements of a device, if any.
 fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
     let DeviceStatistics { device, rate_hz, expected_hz, dropped, .. } = statistics;
     let slow = expected_hz.filter(|expected| *rate_hz < MIN_RATE_FRAC * expected);
     let message = match (slow, dropped) {
         (None, 0) => return None,
-        (Some(expected), 0) => format!("{device} comes {rate_hz:.1} times a second, the rig file says {expected:.1}"),
-        (None, dropped) => format!("{device} lost {dropped} images"),
+        (Some(expected), 0) => format!("{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file"),
+        (None, dropped) => format!("{device} dropped {dropped} images"),
         (Some(expected), dropped) => {
             format!(
-                "{device} comes {rate_hz:.1} times a second, the rig file says {expected:.1}; {dropped} images were lost"
+                "{device}: {rate_hz:.1} Hz, expected {expected:.1} Hz by the rig file; {dropped} images were dropped"
             )
         }
     };
     Some(Finding::warn(
         "rate",
         message,
-        "usual causes: bad light with automatic exposure, a slow bus, a busy processor",
+        "usual causes: low light with automatic exposure, a slow bus, a busy processor",
     ))
 }
 
 impl std::fmt::Display for DeviceStatistics {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { device, samples, rate_hz, latency, gap_p99_millis, dropped, .. } = self;
-        write!(f, "{device}: {samples}, {rate_hz:.1} a second, ")?;
+        write!(f, "{device}: {samples} samples, {rate_hz:.1} Hz, ")?;
         if let Some(Latency { latency_p50_millis: p50, latency_p99_millis: p99, .. }) = latency {
-            write!(f, "{p50:.1} ms old (99 %: {p99:.1}) when they are here, ")?;
+            write!(f, "latency {p50:.1} ms (99 %: {p99:.1} ms), ")?;
         }
-        write!(f, "at most {gap_p99_millis:.1} ms apart (99 %), {dropped} lost")
+        write!(f, "interval at most {gap_p99_millis:.1} ms (99 %), {dropped} dropped")
     }
 }
 
 fn cpu_message(busy: Duration, spent: Duration) -> String {
-    let quantile_of = busy.as_secs_f64() / spent.as_secs_f64().max(1e-9);
-    format!("{:.1} % of one core was busy with reading and joining", 100.0 * quantile_of)
+    let busy_frac = busy.as_secs_f64() / spent.as_secs_f64().max(1e-9);
+    format!("{:.1} % of one core was busy with reading and joining", 100.0 * busy_frac)
 }
 
 #[cfg(test)]
@@ -233,7 +234,7 @@ mod tests {
         let mut track = Track { dropped, ..Track::default() };
         for ix in 0..n {
             let stamp = Stamp(ix * period_millis * 1_000_000);
-            // One in a hundred comes late.
+            // One in a hundred arrives late.
             track.note(stamp, stamp.plus_secs(if ix % 100 == 50 { 0.5 } else { 0.01 }));
         }
         track
@@ -243,17 +244,17 @@ mod tests {
     fn doctor_reports_rates_latencies_and_losses() {
         let summarize = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(10.0), false);
         assert!((summarize.rate_hz - 10.0).abs() < 1e-9);
-        let latency = summarize.latency.as_ref().expect("it is no simulation");
+        let latency = summarize.latency.as_ref().expect("not simulated");
         assert!((latency.latency_p50_millis - 10.0).abs() < 1e-6 && (latency.latency_p99_millis - 10.0).abs() < 1e-6);
         assert!((latency.latency_max_millis - 500.0).abs() < 1e-6);
         assert_eq!(problem(&summarize), None);
-        assert!(summarize.to_string().contains("301, 10.0 a second, 10.0 ms old"), "{summarize}");
+        assert!(summarize.to_string().contains("301 samples, 10.0 Hz, latency 10.0 ms"), "{summarize}");
         let slow = track(301, 100, 0).summarize("camera \"wrist\"".into(), Some(15.0), false);
-        assert!(problem(&slow).is_some_and(|finding| finding.message.contains("the rig file says 15.0")));
+        assert!(problem(&slow).is_some_and(|finding| finding.message.contains("expected 15.0 Hz")));
         let lossy = track(301, 100, 4).summarize("camera \"wrist\"".into(), Some(10.0), false);
-        assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("lost 4 images")));
+        assert!(problem(&lossy).is_some_and(|finding| finding.message.contains("dropped 4 images")));
         let nothing = Track::default().summarize("arm".into(), None, true);
         assert_eq!((nothing.rate_hz, &nothing.latency), (0.0, &None));
-        assert!(!nothing.to_string().contains("old"), "{nothing}");
+        assert!(!nothing.to_string().contains("latency"), "{nothing}");
     }
 }

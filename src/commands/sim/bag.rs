@@ -1,4 +1,4 @@
-//! The images of a recording as files of a RealSense camera.
+//! Writes the images of a recording as files of a RealSense camera.
 
 use crate::config::{Camera, CameraDriver, Rig};
 use anyhow::Context;
@@ -8,22 +8,22 @@ use drivers::{Image, PixelFormat};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The files of a rig's cameras, while they are written.
+/// The bag files of a rig's cameras while they are written.
 pub(super) struct CameraFiles {
     camera_files: Vec<CameraFile>,
 }
 
-/// A camera of the rig, and its file once its first images told what they are.
+/// A camera of the rig; its file is created once the first images define its format.
 struct CameraFile {
     camera: Camera,
     path: PathBuf,
-    /// Colour and depth that came before the other was seen.
+    /// Color and depth images received before the file is created.
     pending: Vec<Image>,
     writer: Option<BagWriter>,
 }
 
 impl CameraFiles {
-    /// One for each RealSense camera of the rig.
+    /// Creates an entry for each RealSense camera of the rig.
     pub(super) fn new(rig: &Rig, folder: &Path) -> anyhow::Result<Self> {
         let folder = std::path::absolute(folder).context("the folder of the cameras' files")?;
         let camera_file = |camera: &Camera| CameraFile {
@@ -36,7 +36,7 @@ impl CameraFiles {
         Ok(Self { camera_files: rig.cameras.iter().filter(is_realsense).map(camera_file).collect() })
     }
 
-    /// Takes an image; those of other cameras are not played.
+    /// Adds an image; images of other cameras are ignored.
     pub(super) fn take(&mut self, image: Image) -> anyhow::Result<()> {
         match self.camera_files.iter_mut().find(|camera_file| camera_file.camera.name == image.camera) {
             Some(camera_file) => camera_file.take(image),
@@ -44,7 +44,7 @@ impl CameraFiles {
         }
     }
 
-    /// Ends the files and has the rig play them, by the clock; a sentence for each comes back.
+    /// Finishes the files and sets them in the rig, paced by the clock; returns a description of each.
     pub(super) fn finish(self, rig: &mut Rig) -> anyhow::Result<Vec<String>> {
         let mut descriptions = Vec::new();
         for camera_file in self.camera_files {
@@ -64,7 +64,7 @@ impl CameraFile {
         let image = if image.is_depth() {
             image
         } else {
-            // What a camera sends is never compressed as recordings are.
+            // RealSense cameras send uncompressed images; those of recordings are compressed.
             Image { data: image.decode_rgb()?.into(), format: PixelFormat::Rgb8, ..image }
         };
         match &mut self.writer {
@@ -77,7 +77,7 @@ impl CameraFile {
         Ok(())
     }
 
-    /// Begins the file as soon as an image of each kind has come.
+    /// Creates the file as soon as images of all expected kinds have arrived.
     fn create_writer(&mut self) -> anyhow::Result<()> {
         let Camera { name, rate_hz, intrinsics, depth, .. } = &self.camera;
         let meters_per_depth_count = self.pending.iter().find_map(|image| match image.format {
@@ -115,8 +115,7 @@ impl CameraFile {
 
     fn finish(self) -> anyhow::Result<()> {
         let name = &self.camera.name;
-        let writer =
-            self.writer.with_context(|| format!("the recording holds too few images of the camera {name:?}"))?;
+        let writer = self.writer.with_context(|| format!("the recording has too few images of camera {name:?}"))?;
         Ok(writer.finish()?)
     }
 }

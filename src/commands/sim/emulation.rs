@@ -1,4 +1,4 @@
-//! From a rig file to its devices on the wire.
+//! Emulates the devices of a rig file on the wire.
 
 use super::Args;
 use super::bag::CameraFiles;
@@ -20,12 +20,12 @@ use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// What is simulated, beside the rig file.
+/// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
-/// How soon Ctrl-C is noticed.
+/// How often Ctrl-C is checked.
 const POLL: Duration = Duration::from_millis(50);
 
-/// The scenes that bring a rig file whose devices are on the wire.
+/// Scenes that include a rig file whose devices are on the wire.
 const SCENES: [(&str, &str, &str); 2] = [
     ("static-arm", include_str!("../../../rigs/wire/static-arm.toml"), include_str!("../../../rigs/robots/panda.urdf")),
     (
@@ -35,13 +35,13 @@ const SCENES: [(&str, &str, &str); 2] = [
     ),
 ];
 
-/// What is told once all is ready.
+/// Printed when all devices are ready.
 #[derive(Debug, Serialize)]
 struct ReadyEvent<'a> {
     event: &'static str,
-    /// The rig file to run against.
+    /// The rig file to run against the emulated devices.
     rig: &'a Path,
-    /// Until playing begins, and how long it goes on.
+    /// Seconds until the playback begins, and its length.
     starts_in_secs: f64,
     seconds: f64,
     devices: &'a [String],
@@ -52,12 +52,12 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     let (name, mut rig) = load(&args.rig_or_scene)?;
     check(&rig)?;
     if rig.arm.driver == ArmDriver::Franka {
-        // Not after a minute of simulating.
+        // Checked before simulating for a minute.
         let address = fci_address(&rig.arm.address)?;
-        TcpListener::bind(address).with_context(|| format!("the controller cannot be played at {address}"))?;
+        TcpListener::bind(address).with_context(|| format!("cannot emulate the controller at {address}"))?;
     }
     let folder = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("sim-{name}")));
-    std::fs::create_dir_all(&folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    std::fs::create_dir_all(&folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
     let recording = match &args.from {
         Some(path) => path.clone(),
         None => match simulate(args, &rig, &folder, &stop)? {
@@ -91,7 +91,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
             print::report(device);
         }
         print::report(format_args!(
-            "Playing {:.1} s, which begins in {:.1} s. In another terminal: fieldrig run {}",
+            "Playing back {:.1} s, starting in {:.1} s. In another terminal: fieldrig run {}",
             args.seconds,
             args.start_in,
             rig_file.display()
@@ -101,7 +101,7 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     Ok(Exit::Done)
 }
 
-/// The rig and what it is called.
+/// The rig and its name.
 fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
     if let Some((name, text, urdf)) = SCENES.iter().find(|(name, ..)| *name == rig_or_scene) {
         return Ok(((*name).to_owned(), Rig::parse(name, text, urdf, &[])?));
@@ -115,24 +115,24 @@ fn load(rig_or_scene: &str) -> anyhow::Result<(String, Rig)> {
     Ok((name, Rig::load(path, &[])?))
 }
 
-/// Refuses a rig that cannot be played, before a minute is spent on simulating it.
+/// Rejects a rig that cannot be emulated before it is simulated for a minute.
 fn check(rig: &Rig) -> Result<(), BadArgument> {
     if rig.arm.driver == ArmDriver::Sim {
         return Err(BadArgument(
-            "arm.driver is sim: `fieldrig run` plays such an arm itself; on the wire are franka, can and udp"
+            "arm.driver is sim, which `fieldrig run` simulates itself; drivers that can be emulated: franka, can, udp"
                 .to_owned(),
         ));
     }
     Ok(())
 }
 
-/// Simulates the rig into a recording; `None` where that was interrupted.
+/// Simulates the rig into a recording; `None` if interrupted.
 fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Result<Option<PathBuf>> {
     let mut simulated = rig.clone();
     simulated.sim.lockstep = true;
     let Opened { rig, mut source, .. } = open::rig(simulated, Devices::Sim)?;
     let path = folder.join(SIMULATION_FILE);
-    // Of an earlier time, or of one that was interrupted.
+    // A leftover of an earlier or interrupted simulation.
     match std::fs::remove_file(&path) {
         Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
             return Err(error).with_context(|| format!("cannot replace {}", path.display()));
@@ -158,7 +158,7 @@ fn simulate(args: &Args, rig: &Rig, folder: &Path, stop: &Stop) -> anyhow::Resul
     Ok(Some(path))
 }
 
-/// What the devices of a recording say in its first seconds; images go to the cameras' files. `None` where that was interrupted.
+/// Reads the samples of the first `args.seconds` of a recording; images go to the camera files. `None` if interrupted.
 fn read(
     recording: &Path,
     args: &Args,
@@ -177,7 +177,7 @@ fn read(
         if stop.requested() {
             return Ok(None);
         }
-        bar.set_message(format!("{secs:.1} of {:.1} s made ready", args.seconds));
+        bar.set_message(format!("{secs:.1} of {:.1} s prepared", args.seconds));
         match sample {
             Sample::Image(image) => camera_files.take(image)?,
             other => script.take(other),
@@ -185,12 +185,12 @@ fn read(
     }
     bar.finish_and_clear();
     if let Some(damage) = damage.get() {
-        log::warn!("{damage}; what came before is played");
+        log::warn!("{damage}; the data before that is played back");
     }
     Ok(Some(script))
 }
 
-/// The rig file that runs against what is played, the robot's description beside it.
+/// Writes the rig file to run against the emulated devices, and the robot description next to it.
 fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     let path = folder.join(drivers::recording::RIG_FILE);
     let urdf = folder.join(drivers::recording::URDF_FILE);
@@ -200,18 +200,18 @@ fn write_rig(folder: &Path, rig: &Rig) -> anyhow::Result<PathBuf> {
     Ok(path)
 }
 
-/// Devices that answer until they are dropped.
+/// Devices that respond until they are dropped.
 struct EmulatedDevices {
     _robot: Option<EmulatedRobot>,
     _motors: Option<EmulatedMotors>,
     _senders: EmulatedSenders,
-    /// What they are, a sentence each.
+    /// One description per device.
     descriptions: Vec<String>,
 }
 
 impl EmulatedDevices {
     fn start(rig: &Rig, script: &DeviceScript, playback_clock: PlaybackClock, args: &Args) -> anyhow::Result<Self> {
-        let track = || JointTrack::new(&script.joints, playback_clock).context("the joints' readings");
+        let track = || JointTrack::new(&script.joints, playback_clock).context("the joint states");
         let (mut robot, mut motors) = (None, None);
         let mut datagram_targets = DatagramTargets::default();
         let mut descriptions = Vec::new();
@@ -251,7 +251,7 @@ impl EmulatedDevices {
     }
 }
 
-/// The controller of a rig's arm.
+/// Configuration of the emulated controller of a rig's arm.
 fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     let (version, limits) = match fci {
         "5" => (FciVersion::V5, Limits::panda()),
@@ -262,7 +262,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     Ok(RobotConfig { address, version, chain, flange_from_ee: Transform::identity(), limits })
 }
 
-/// Where a controller listens, which is one of this computer's own addresses.
+/// Address at which a controller listens; it must be one of this computer.
 fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     let found = match text.parse() {
         Ok(address) => Some(address),
@@ -270,25 +270,27 @@ fn fci_address(text: &str) -> anyhow::Result<SocketAddr> {
     };
     match found {
         Some(address) => Ok(address),
-        None => bail!("arm.address is {text:?}: it has to be an address of this computer, like 127.0.0.1"),
+        None => bail!("arm.address is {text:?}, expected an address of this computer, such as 127.0.0.1"),
     }
 }
 
-/// Waits for Ctrl-C; the devices stand still once all was played.
+/// Waits for Ctrl-C. The devices stand still after the playback.
 fn wait(stop: &Stop, starts_at: Stamp, args: &Args) -> anyhow::Result<()> {
     let bar = print::bar(None, "{spinner} {msg}", args.json);
     let mut is_over = false;
     while !stop.requested() {
         let secs = clock::now().secs_since(starts_at);
         bar.set_message(match secs {
-            ..0.0 => format!("begins in {:.1} s", -secs),
-            _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played", args.seconds),
-            _ => "played to the end; everything stands still until Ctrl-C".to_owned(),
+            ..0.0 => format!("starts in {:.1} s", -secs),
+            _ if secs < args.seconds => format!("{secs:.1} of {:.1} s played back", args.seconds),
+            _ => "playback has ended; devices stand still until Ctrl-C".to_owned(),
         });
         if secs >= args.seconds && !std::mem::replace(&mut is_over, true) {
             match args.json {
                 true => print::report_json(&serde_json::json!({ "event": "over" }))?,
-                false => print::report("Playback has ended: emulated devices stand still but answer until Ctrl-C."),
+                false => {
+                    print::report("Playback has ended: the emulated devices stand still but respond until Ctrl-C.")
+                }
             }
         }
         std::thread::sleep(POLL);
@@ -305,14 +307,14 @@ mod tests {
     fn wire_scenes_match_the_simulated_scenes() {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
         for (name, ..) in SCENES {
-            let (_, wire) = load(name).expect("it comes along");
-            let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[]).expect("it comes along");
+            let (_, wire) = load(name).expect("the scene is bundled");
+            let mut plain = Rig::load(&rigs.join(format!("{name}.toml")), &[]).expect("the rig file is bundled");
             plain.arm = wire.arm.clone();
             plain.base.driver = wire.base.driver;
             for (camera, on_wire) in plain.cameras.iter_mut().zip(&wire.cameras) {
                 camera.driver = on_wire.driver;
                 camera.stamp_to_mid_exposure = on_wire.stamp_to_mid_exposure.clone();
-                // What such a camera tells itself the file leaves out.
+                // Wire rig files omit what a RealSense camera reports itself.
                 camera.realsense = on_wire.realsense.clone();
             }
             assert!(plain == wire, "{name}");
@@ -323,7 +325,7 @@ mod tests {
     #[test]
     fn unsupported_rigs_are_rejected_before_simulating() {
         let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
-        let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("it comes along");
+        let plain = Rig::load(&rigs.join("static-arm.toml"), &[]).expect("the rig file is bundled");
         assert!(check(&plain).is_err_and(|error| error.to_string().contains("arm.driver is sim")));
         assert!(load("no-such-rig").is_err_and(|error| error.to_string().contains("scenes: static-arm, mobile-arm")));
         assert_eq!(fci_address("127.0.0.1").expect("an address").port(), FCI_PORT);
