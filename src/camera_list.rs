@@ -1,4 +1,5 @@
-//! The cameras of a run's keyframes, in `cameras.json` beside the model, for viewers to start from and to draw.
+//! The list of camera poses of a run, `cameras.json` next to the model. Viewers draw the cameras and choose their first
+//! view from them.
 
 use crate::{camera_path, run_folder};
 use anyhow::Context;
@@ -7,10 +8,10 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use viz::KeyframePose;
 
-/// Name of the file in the folder of a run.
+/// Name of the file in the run folder.
 pub(crate) const FILE: &str = "cameras.json";
 
-/// Pose and lens of one keyframe.
+/// Pose and intrinsics of one keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct PosedCamera {
     pub(crate) camera: String,
@@ -106,6 +107,6 @@ mod tests {
         let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
         assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
         std::fs::write(folder.path().join(FILE), "{").expect("room on the disk");
-        assert!(format!("{:#}", read(folder.path()).expect_err("cut off")).contains("damaged"));
+        assert!(format!("{:#}", read(folder.path()).expect_err("truncated")).contains("damaged"));
     }
 }
