@@ -88,13 +88,13 @@ mod tests {
     fn camera_list_round_trips() {
         let folder = tempfile::tempdir().expect("a folder");
         assert!(read(folder.path()).expect("no file is no error").is_none());
-        write(folder.path(), &[camera(), camera()]).expect("room on the disk");
+        write(folder.path(), &[camera(), camera()]).expect("disk space");
         let cameras = read(folder.path()).expect("a list").expect("a file");
         assert_eq!((cameras.len(), cameras[0].camera.as_ref(), cameras[1].size_px), (2, "wrist", [64, 48]));
         for (number, expected) in row_major(&cameras[1].world_from_camera).iter().zip(camera().world_from_camera) {
             assert!((number - expected).abs() < 1e-12);
         }
-        write(folder.path(), &[]).expect("room on the disk");
+        write(folder.path(), &[]).expect("disk space");
         assert_eq!(read(folder.path()).expect("a list").map(|cameras| cameras.len()), Some(0));
     }
 
@@ -103,10 +103,10 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let mut skewed = camera();
         skewed.world_from_camera[0] = 3.0;
-        write(folder.path(), &[skewed]).expect("room on the disk");
+        write(folder.path(), &[skewed]).expect("disk space");
         let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
         assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
-        std::fs::write(folder.path().join(FILE), "{").expect("room on the disk");
+        std::fs::write(folder.path().join(FILE), "{").expect("disk space");
         assert!(format!("{:#}", read(folder.path()).expect_err("truncated")).contains("damaged"));
     }
 }

@@ -20,9 +20,9 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
             correct(camera, correction, alignment);
         }
     }
-    let most_offsets =
+    let joint_offsets =
         alignment.corrections.values().map(|correction| &correction.joint_offsets).max_by_key(|offsets| offsets.len());
-    if let Some(by_chain) = most_offsets.filter(|offsets| !offsets.is_empty()) {
+    if let Some(by_chain) = joint_offsets.filter(|offsets| !offsets.is_empty()) {
         let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)?;
         rig.arm.joint_offsets.resize(rig.arm.joints.len(), 0.0);
         for (joint_ix, offset) in chain.order_in(&rig.arm.joints)?.into_iter().zip(by_chain) {

@@ -444,7 +444,7 @@ mod tests {
         log.removed(40, "wrist", Stamp(17));
         log.checkpoint(40);
         log.step_requested();
-        log.end(60).expect("room on the disk");
+        log.end(60).expect("disk space");
         std::fs::read_to_string(folder.join(FILE)).expect("the log")
     }
 
@@ -493,7 +493,7 @@ mod tests {
         let before = written(folder.path());
         let mut log = DecisionLog::create(folder.path(), settings(Some(130))).expect("a log");
         log.restored(130, &keyframe(18, Split::Train));
-        log.end(260).expect("room on the disk");
+        log.end(260).expect("disk space");
         let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
         assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
         assert_eq!(std::fs::read_to_string(folder.path().join(FILE)).expect("the log"), before);

@@ -101,7 +101,7 @@ impl Feed {
     /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
     pub(crate) fn next(&mut self, timeout: Duration) -> Option<Change> {
         match self.changes.recv_timeout(timeout) {
-            Ok(apply) => Some(apply),
+            Ok(change) => Some(change),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => {
                 self.ended = true;
@@ -195,10 +195,10 @@ impl Pump {
         Ok(())
     }
 
-    fn apply(&mut self, apply: Change) -> Result<(), TrainerGone> {
+    fn apply(&mut self, change: Change) -> Result<(), TrainerGone> {
         let forwarded = match &mut self.input.stations {
-            Some(stations) => stations.push(apply),
-            None => vec![apply],
+            Some(stations) => stations.push(change),
+            None => vec![change],
         };
         self.send(forwarded)
     }
@@ -215,7 +215,7 @@ impl Pump {
     }
 
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
-        changes.into_iter().try_for_each(|apply| self.sender.send(apply).map_err(|_| TrainerGone))
+        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| TrainerGone))
     }
 
     /// Publishes a camera image to viewers.

@@ -100,10 +100,10 @@ mod tests {
             let (file, new) = (Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["images"]));
             let existing = Partial::folder(folder.path(), &["images", "test.txt"]);
             for name in ["scene.ply", "scene.ply.part", "other", "test.txt"] {
-                std::fs::write(at(name), b"x").expect("room");
+                std::fs::write(at(name), b"x").expect("disk space");
             }
-            std::fs::create_dir_all(at("new/depth")).expect("room");
-            std::fs::create_dir_all(at("images/a")).expect("room");
+            std::fs::create_dir_all(at("new/depth")).expect("disk space");
+            std::fs::create_dir_all(at("images/a")).expect("disk space");
             if keeps {
                 [file, new, existing].into_iter().for_each(Partial::keep);
             } else {

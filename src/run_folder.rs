@@ -399,9 +399,9 @@ mod tests {
         let out = tempfile::tempdir().expect("a folder");
         check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
         let run = out.path().join(ModelKind::Splat.name());
-        std::fs::create_dir(&run).expect("room");
+        std::fs::create_dir(&run).expect("disk space");
         check_no_unfinished_run(out.path()).expect("no checkpoint");
-        std::fs::write(run.join(CHECKPOINT), b"x").expect("room");
+        std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
         assert!(
             check_no_unfinished_run(out.path())
                 .is_err_and(|error| error.0.contains("splat contains an interrupted run"))
@@ -413,7 +413,7 @@ mod tests {
     fn rejected_run_removes_only_its_own_folders() {
         let folder = tempfile::tempdir().expect("folder");
         let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
-        std::fs::create_dir(&foreign_folder).expect("room on the disk");
+        std::fs::create_dir(&foreign_folder).expect("disk space");
         let refused = || Err::<(), _>(anyhow::Error::new(BadArgument("too small".into())));
         for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
             let mut created = CreatedFolders::default();

@@ -22,8 +22,8 @@ use trainer::{BaseState, Keyframe, Split};
 const MIN_KEYFRAMES: usize = 14;
 /// Maximum time to wait for that many keyframes, seconds.
 const MAX_SCAN_SECS: f64 = 10.0;
-/// Maximum time to wait for a station while the base moves, seconds. After it, the queued keyframes get the correction
-/// of the previous station.
+/// Maximum time to wait for a station while the base moves, seconds. After it, or with [`MAX_HELD`] queued keyframes,
+/// the queued keyframes get the correction of the previous station.
 const MAX_WALK_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
 /// Maximum number of reference keyframes from earlier stations. When it is reached, every other one is removed.
@@ -105,9 +105,9 @@ impl Stations {
     pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
-        if let Some(base_place) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
+        if let Some(base_state) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
             (self.station, self.world_from_base, self.map_from_odom) =
-                (Some(PREVIOUS_RUN), base_place.world_from_base, base_place.map_from_odom);
+                (Some(PREVIOUS_RUN), base_state.world_from_base, base_state.map_from_odom);
         }
         keyframes.iter().for_each(|keyframe| self.add_reference(keyframe));
         self
@@ -223,7 +223,7 @@ impl Stations {
     fn is_at_current_station(&self, keyframe: &Keyframe) -> bool {
         match &keyframe.base {
             None => true,
-            Some(base_place) => self.station.is_none() || base_place.station == self.station,
+            Some(base_state) => self.station.is_none() || base_state.station == self.station,
         }
     }
 
@@ -259,7 +259,7 @@ impl Stations {
     /// correction.
     fn start_search(&mut self, released: &mut Vec<Change>) {
         let guess = self.map_from_odom;
-        let Some(base_place) = self.group().next().and_then(|keyframe| keyframe.base.clone()) else {
+        let Some(base_state) = self.group().next().and_then(|keyframe| keyframe.base.clone()) else {
             for change in std::mem::take(&mut self.held) {
                 released.push(corrected(change, |_| guess));
             }
@@ -271,7 +271,7 @@ impl Stations {
             .map(|keyframe| Arc::new(keyframe.with_base_correction(&guess)))
             .collect();
         let (reference_keyframes, world_from_base) =
-            (self.reference_keyframes.clone(), guess * base_place.world_from_base);
+            (self.reference_keyframes.clone(), guess * base_state.world_from_base);
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
             let found =
@@ -283,25 +283,25 @@ impl Stations {
     /// Passes the queued keyframes with the correction found by registration.
     fn apply_result(&mut self, SearchResult { found, took }: SearchResult, released: &mut Vec<Change>) {
         self.spent += took;
-        let base_place = self.group().next().and_then(|keyframe| keyframe.base.clone());
-        let base_place = base_place.expect("the keyframes of the registered station are queued");
+        let base_state = self.group().next().and_then(|keyframe| keyframe.base.clone());
+        let base_state = base_state.expect("the keyframes of the registered station are queued");
         let (left, before) = (self.world_from_base, self.map_from_odom);
         // Correction at a reported base pose that lies at this fraction of the path between the two stations.
         let correction_at = |reported: &Transform, fraction: f64| {
             let guess = before * reported;
             found.as_ref().map_or(before, |found| found.map_from_odom(&guess, fraction) * before)
         };
-        let now = correction_at(&base_place.world_from_base, 1.0);
+        let now = correction_at(&base_state.world_from_base, 1.0);
         let correction = |at: &BaseState| match at.station {
             Some(_) => now,
             None => {
                 let (from, to) =
-                    (distance(&left, &at.world_from_base), distance(&at.world_from_base, &base_place.world_from_base));
+                    (distance(&left, &at.world_from_base), distance(&at.world_from_base, &base_state.world_from_base));
                 correction_at(&at.world_from_base, if from > 0.0 { from / (from + to) } else { 0.0 })
             }
         };
         let report = StationReport::new(
-            &base_place,
+            &base_state,
             [&before, &now],
             self.group().filter(|of| is_usable(of)).count(),
             found.as_ref(),
@@ -311,7 +311,7 @@ impl Stations {
         let held: Vec<Change> =
             std::mem::take(&mut self.held).into_iter().map(|held| corrected(held, correction)).collect();
         (self.station, self.world_from_base, self.map_from_odom) =
-            (base_place.station, base_place.world_from_base, now);
+            (base_state.station, base_state.world_from_base, now);
         for change in &held {
             if let Change::Accepted(keyframe) = change {
                 self.add_reference(keyframe);
@@ -322,9 +322,9 @@ impl Stations {
 
     /// Corrects a keyframe of the current station.
     fn placed(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
-        let Some(base_place) = &keyframe.base else { return keyframe };
-        if base_place.station.is_some() {
-            (self.station, self.world_from_base) = (base_place.station, base_place.world_from_base);
+        let Some(base_state) = &keyframe.base else { return keyframe };
+        if base_state.station.is_some() {
+            (self.station, self.world_from_base) = (base_state.station, base_state.world_from_base);
         }
         let keyframe = carried(&keyframe, &self.map_from_odom);
         self.add_reference(&keyframe);
@@ -338,9 +338,7 @@ impl Stations {
         self.reference_keyframes.push(Arc::clone(keyframe));
         if self.reference_keyframes.len() > MAX_REFERENCE_KEYFRAMES {
             // Sorted by split first, so that thinning keeps keyframes of both splits.
-            self.reference_keyframes.sort_by_key(|reference_keyframes| {
-                (reference_keyframes.split == Split::Validation, reference_keyframes.stamp)
-            });
+            self.reference_keyframes.sort_by_key(|keyframe| (keyframe.split == Split::Validation, keyframe.stamp));
             let mut ixs = 0..;
             self.reference_keyframes.retain(|_| ixs.next().is_some_and(|ix| ix % 2 == 0));
         }
@@ -373,7 +371,7 @@ fn carried(keyframe: &Arc<Keyframe>, map_from_odom: &Transform) -> Arc<Keyframe>
 fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Change {
     match change {
         Change::Accepted(keyframe) => Change::Accepted(match &keyframe.base {
-            Some(base_place) => carried(&keyframe, &correction(base_place)),
+            Some(base_state) => carried(&keyframe, &correction(base_state)),
             None => keyframe,
         }),
         Change::Evicted { .. } => change,
@@ -382,21 +380,21 @@ fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Ch
 
 impl StationReport {
     fn new(
-        base_place: &BaseState,
-        [before, resume_from]: [&Transform; 2],
+        base_state: &BaseState,
+        [before, after]: [&Transform; 2],
         n_keyframes: usize,
         found: Option<&StationCorrection>,
     ) -> Self {
-        let base_error = base_place.truth.map(|truth| {
-            [before, resume_from].map(|map_from_odom| {
-                let base = map_from_odom * base_place.world_from_base;
+        let base_error = base_state.truth.map(|truth| {
+            [before, after].map(|map_from_odom| {
+                let base = map_from_odom * base_state.world_from_base;
                 PoseDistance {
                     m: (base.translation.vector - truth.translation.vector).norm(),
                     rad: base.rotation.angle_to(&truth.rotation),
                 }
             })
         });
-        Self { station: base_place.station.unwrap_or_default(), n_keyframes, found: found.cloned(), base_error }
+        Self { station: base_state.station.unwrap_or_default(), n_keyframes, found: found.cloned(), base_error }
     }
 }
 
@@ -413,11 +411,11 @@ impl std::fmt::Display for StationReport {
         for unobservable in self.found.iter().flat_map(|found| &found.unobservable) {
             write!(f, "; not observable: {unobservable}")?;
         }
-        if let Some([before, resume_from]) = self.base_error {
-            let reported = |base_error: PoseDistance| {
+        if let Some([before, after]) = self.base_error {
+            let format_error = |base_error: PoseDistance| {
                 format!("{:.1} mm and {:.2} degrees", 1e3 * base_error.m, base_error.rad.to_degrees())
             };
-            write!(f, "; error {} before, {} after", reported(before), reported(resume_from))?;
+            write!(f, "; error {} before, {} after", format_error(before), format_error(after))?;
         }
         Ok(())
     }
@@ -434,7 +432,7 @@ mod tests {
         let (mut rgba, mut depth_m) = (Vec::new(), Vec::new());
         let origin = pose.translation.vector;
         for pixel in 0..SIZE_PX[0] * SIZE_PX[1] {
-            let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|base_place| f64::from(base_place) + 0.5);
+            let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|px| f64::from(px) + 0.5);
             let direction = pose.rotation * Vector3::new((x - 80.0) / FOCAL_PX, (y - 60.0) / FOCAL_PX, 1.0);
             let walls =
                 [(Vector3::x(), 2.0), (Vector3::y(), 1.1), (-Vector3::y(), 1.2), (Vector3::new(0.3, 0.2, -1.0), 0.9)];
@@ -533,9 +531,9 @@ mod tests {
 
     /// Error of a keyframe's base pose, millimeters and degrees.
     fn base_error(keyframe: &Keyframe) -> (f64, f64) {
-        let base_place = keyframe.base.as_ref().unwrap();
-        let base = base_place.map_from_odom * base_place.world_from_base;
-        let left = base_place.truth.unwrap().inverse() * base;
+        let base_state = keyframe.base.as_ref().unwrap();
+        let base = base_state.map_from_odom * base_state.world_from_base;
+        let left = base_state.truth.unwrap().inverse() * base;
         (1e3 * left.translation.vector.norm(), left.rotation.angle().to_degrees())
     }
 
@@ -566,8 +564,8 @@ mod tests {
             assert!((was.to_homogeneous() - is.to_homogeneous()).abs().max() < 1e-9);
         }
         let [report] = stations.reports() else { panic!("{:?}", stations.reports()) };
-        let [before, resume_from] = report.base_error.unwrap();
-        assert!(report.station == 1 && before.m > 0.019 && resume_from.m < 5e-4 && resume_from.rad < 1e-3, "{report}");
+        let [before, after] = report.base_error.unwrap();
+        assert!(report.station == 1 && before.m > 0.019 && after.m < 5e-4 && after.rad < 1e-3, "{report}");
         assert!(report.to_string().starts_with("base at station 1: moved by"), "{report}");
         let camera = Transform::translation(0.1, 0.2, 0.3);
         assert_ne!(stations.corrected_pose("wrist", &camera), camera);

@@ -74,7 +74,7 @@ pub(super) fn depth_map(
 ) -> anyhow::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
-    #[expect(clippy::cast_possible_truncation, reason = "a range in metres needs no more digits")]
+    #[expect(clippy::cast_possible_truncation, reason = "f32 is precise enough for a range in meters")]
     let (factor, min_m, max_m) = (depth.factor as f32, depth.min_m as f32, depth.max_m as f32);
     for depth_m in &mut depth_m {
         *depth_m *= factor;

@@ -149,13 +149,13 @@ impl Motion {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
                 let (world_from_base, twist) = reported.poses.with_twist_at(stamp)?;
-                let base_place = BaseState {
+                let base_state = BaseState {
                     station: reported.station_detector.at(stamp),
                     world_from_base,
                     map_from_odom: Transform::identity(),
                     truth: reported.truth.at(stamp).ok(),
                 };
-                (world_from_base, twist, Some(base_place))
+                (world_from_base, twist, Some(base_state))
             }
             BaseMotion::ReportedPoses(_) => (Transform::identity(), Twist::zero(), None),
         };

@@ -238,11 +238,9 @@ fn replay_reproduces_keyframes_bit_for_bit() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let mut recorder = open::recorder(&path, &rig).expect("a new file");
-    let live = run_join(
-        &mut join(&rig),
-        samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("room on the disk")),
-    );
-    recorder.finish().expect("room on the disk");
+    let live =
+        run_join(&mut join(&rig), samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("disk space")));
+    recorder.finish().expect("disk space");
     for _ in 0..2 {
         let opened = open::recording(&path, None, &[]).expect("a recording");
         let mut source = opened.source;
@@ -397,7 +395,7 @@ fn list_selects_exactly_its_keyframes() {
     let path = folder.path().join("keyframes.txt");
     let mut first = join(&rig(&[]));
     let chosen = run_join(&mut first, samples(6));
-    std::fs::write(&path, keyframe_list(first.keyframes())).expect("room on the disk");
+    std::fs::write(&path, keyframe_list(first.keyframes())).expect("disk space");
     // A rig whose checks would refuse all of them.
     let strict = rig(&[
         Override::new("join.max_shear_px", 0),
@@ -409,7 +407,7 @@ fn list_selects_exactly_its_keyframes() {
     assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
     assert_eq!((listed.refused, listed.evicted), (vec![], vec![]));
     let again = folder.path().join("again.txt");
-    std::fs::write(&again, keyframe_list(second.keyframes())).expect("room on the disk");
+    std::fs::write(&again, keyframe_list(second.keyframes())).expect("disk space");
     assert_eq!(std::fs::read_to_string(&path).expect("a list"), std::fs::read_to_string(&again).expect("a list"));
 }
 

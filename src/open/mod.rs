@@ -343,8 +343,8 @@ mod tests {
             velocity: vec![],
             effort: vec![],
         };
-        recorder.write(&Sample::Joints(joints.clone())).expect("room on the disk");
-        recorder.finish().expect("room on the disk");
+        recorder.write(&Sample::Joints(joints.clone())).expect("disk space");
+        recorder.finish().expect("disk space");
         let mut opened = recording(&path, None, &[]).expect("a recording");
         assert_eq!(opened.rig, rig);
         assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));

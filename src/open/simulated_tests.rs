@@ -61,8 +61,8 @@ fn live_and_replayed_keyframes_are_identical() {
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 24)]);
     let live = super::rig(rig.clone(), Devices::Sim).expect("the simulator");
     let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
-    let (first, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
-    recorder.finish().expect("room on the disk");
+    let (first, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
+    recorder.finish().expect("disk space");
     assert!(first.len() >= 8, "{}", join.counts());
     assert!(first.iter().all(|keyframe| keyframe.depth.is_some() && keyframe.truth.is_some()), "{}", join.counts());
     let (again, _) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
@@ -160,10 +160,10 @@ fn moving_base_keyframes_and_scans_replay_identically() {
         let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
         let mut samples = Vec::new();
         let (first, join) = keyframes(live, |sample| {
-            recorder.write(sample).expect("room on the disk");
+            recorder.write(sample).expect("disk space");
             samples.push(format!("{sample:?}"));
         });
-        recorder.finish().expect("room on the disk");
+        recorder.finish().expect("disk space");
         assert!(first.len() >= 3, "{name}: {}", join.counts());
         let n_scans = join.range_scans().count();
         assert!((n_scans >= 30) == (name == "mobile-base-small.toml"), "{name}: {n_scans} scans, {}", join.counts());
@@ -196,7 +196,7 @@ fn moving_base_poses_and_scans_match_the_simulator() {
                 difference.translation.vector.norm() < TOLERANCE && difference.rotation.angle() < TOLERANCE,
                 "{name}: {difference}"
             );
-            let twist = keyframe.twist.expect("poses come all the time");
+            let twist = keyframe.twist.expect("poses arrive continuously");
             let is_moving = twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 1e-3;
             assert!(is_moving || keyframe.stamp.0 < 1_000_000_000, "{name}: {twist:?} at {:?}", keyframe.stamp);
         }
@@ -257,13 +257,13 @@ fn network_samples_are_registered_recorded_and_replayed() {
         });
         while join.range_scans().count() < 5 || !reported.iter().any(|sample| matches!(sample, Sample::Image(_))) {
             let sample = source.next_sample().expect("the rig works").expect("it has no end");
-            recorder.write(&sample).expect("room on the disk");
+            recorder.write(&sample).expect("disk space");
             join.push(sample.clone());
             reported.push(sample);
         }
         stop.store(true, Ordering::Relaxed);
     });
-    recorder.finish().expect("room on the disk");
+    recorder.finish().expect("disk space");
     // The scanner's position on the base plus the base's position in the world.
     let scan = join.range_scans().next().expect("five of them");
     let [x, y, z] = scan.points_in_world_m[0];
@@ -303,8 +303,8 @@ fn drifting_base_is_corrected_live_and_in_replay() {
     let live = super::rig(rig, Devices::Sim).expect("the simulator");
     let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
     let mut stations = Stations::new(&live.rig).expect("its base moves");
-    let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
-    recorder.finish().expect("room on the disk");
+    let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
+    recorder.finish().expect("disk space");
     let first = stations.corrected(reported.clone());
     let recorded = super::recording(&path, None, &[]).expect("a recording");
     let mut again = Stations::new(&recorded.rig).expect("its base moves");

@@ -487,7 +487,7 @@ mod tests {
         assert_eq!(settings_in(folder.path()), Value::Null);
         let write = |name: &str, step: u64| {
             let lines = format!("{}\n{}\n", json!({ "from_step": step }), json!({ "end": true }));
-            std::fs::write(folder.path().join(name), lines).expect("room on the disk");
+            std::fs::write(folder.path().join(name), lines).expect("disk space");
         };
         write("decisions.jsonl", 0);
         assert_eq!(settings_in(folder.path())["from_step"], 0);
