@@ -24,7 +24,7 @@ const MIN_KEYFRAMES: usize = 14;
 const MAX_SCAN_SECS: f64 = 10.0;
 /// Maximum time to wait for a station while the base moves, seconds. After it, or with [`MAX_HELD`] queued keyframes,
 /// the queued keyframes get the correction of the previous station.
-const MAX_WALK_SECS: f64 = 30.0;
+const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
 /// Maximum number of reference keyframes from earlier stations. When it is reached, every other one is removed.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
@@ -238,7 +238,7 @@ impl Stations {
         let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
         match (waited_secs(self.group().next()), waited_secs(self.held_keyframes().next())) {
             (Some(scan_secs), _) => scan_secs > MAX_SCAN_SECS,
-            (None, Some(walk_secs)) => walk_secs > MAX_WALK_SECS,
+            (None, Some(travel_secs)) => travel_secs > MAX_TRAVEL_SECS,
             (None, None) => false,
         }
     }
@@ -605,7 +605,7 @@ mod tests {
         assert!(stations.push(Change::Accepted(keyframe(25))).is_empty(), "on the way");
         assert!(stations.push(evicted()).is_empty());
         assert!(stations.advance_to(Stamp::from_secs(30.0)).is_empty());
-        let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_WALK_SECS + 1.0));
+        let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_TRAVEL_SECS + 1.0));
         assert!(matches!(&released[..], [Change::Accepted(_), Change::Evicted { .. }]), "{}", released.len());
         // A scan with too few keyframes is registered once it has lasted long enough.
         for ix in 40..44 {

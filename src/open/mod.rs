@@ -122,7 +122,7 @@ pub(crate) fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
     let text = |name| {
-        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} holds no {name}"))?;
+        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} contains no {name}"))?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
     };
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
