@@ -1,18 +1,18 @@
 //! Settings of the C library's allocator.
 //!
-//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed. Freeing such a
-//! block, however, raises the size from which glibc does so, up to 32 MiB. Images then share heaps with everything else, and in a
-//! long run the heaps fragment and grow, although no more memory is in use: keyframes are freed, but blocks between them stay.
-//! A fixed threshold keeps images out of the heaps.
+//! glibc serves large blocks from separate memory mappings, which return to the system when the blocks are freed. Each
+//! such free, however, raises the size above which glibc maps blocks, up to 32 MiB. Images then share heaps with
+//! everything else. In a long run the heaps fragment and grow although no more memory is in use: keyframes are freed,
+//! but smaller blocks between them remain. A fixed threshold keeps images out of the heaps.
 //!
-//! This has a cost: the kernel clears a mapped block page by page when it is first written. Pictures for viewers are such blocks,
-//! and on a GPU that draws one in a millisecond, that takes most of their time (H200, 1024x1024 with depth, 8 clients: 105 ms
-//! from request to picture rather than 45). So the setting is for software adapters, where drawing takes far longer and images take
-//! host memory twice.
+//! The cost: the kernel clears a mapped block page by page when it is first written. Pictures for viewers are such
+//! blocks, and on a GPU that draws a picture in a millisecond, the clearing takes most of the time (H200, 1024x1024
+//! with depth, 8 clients: 105 ms from request to picture instead of 45). The setting is therefore for software
+//! adapters, where drawing takes far longer and images occupy host memory twice.
 
-/// Blocks of at least this size get a separate mapping: an image of 640x480 has 1.2 MB.
+/// Blocks of at least this size get a separate mapping. An image of 640x480 takes 1.2 MB.
 const MMAP_THRESHOLD_BYTES: i32 = 1 << 20;
-/// Free memory at the end of a heap above which it returns to the system: twice the size above, as in glibc.
+/// Free memory at the end of a heap above which it returns to the system: twice [`MMAP_THRESHOLD_BYTES`], as in glibc.
 const TRIM_THRESHOLD_BYTES: i32 = 2 * MMAP_THRESHOLD_BYTES;
 
 /// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
@@ -23,8 +23,8 @@ pub(crate) fn keep_images_out_of_heaps() {
         return;
     }
     #[expect(unsafe_code, reason = "the allocator has no other interface")]
-    // SAFETY: `mallopt` takes the allocator's lock, and both values are within the range it documents. It changes how later
-    // blocks are served and nothing about those handed out.
+    // SAFETY: `mallopt` takes the allocator's lock, and both values are within the documented range. The call affects
+    // future allocations only.
     let results = unsafe {
         [
             libc::mallopt(libc::M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES),
@@ -32,7 +32,7 @@ pub(crate) fn keep_images_out_of_heaps() {
         ]
     };
     if results.contains(&0) {
-        log::debug!("the allocator rejected its settings: a long run will take more memory");
+        log::debug!("the allocator rejected its settings: long runs will use more memory");
     }
 }
 
@@ -61,8 +61,8 @@ mod tests {
         // Without the setting, freeing this block would put the images below into a heap.
         drop(vec![1u8; 24 << 20]);
         let before = mapped_bytes();
-        // Zeroed and never written, so these blocks take addresses and no memory: together far more than other tests, which run at
-        // the same time, may free meanwhile.
+        // These blocks are zeroed and never written, so they take address space but no memory. Together they are far
+        // larger than what other tests running in parallel may free meanwhile.
         let images: Vec<Vec<u8>> = (0..N_BLOCKS).map(|_| vec![0; BLOCK_BYTES]).collect();
         let grown = mapped_bytes().saturating_sub(before);
         assert!(grown >= N_BLOCKS / 2 * BLOCK_BYTES, "{grown} bytes of {} are mapped", images.len() * BLOCK_BYTES);

@@ -1,4 +1,5 @@
-//! The cameras of a run's keyframes, in `cameras.json` beside the model, for viewers to start from and to draw.
+//! The list of camera poses of a run, `cameras.json` next to the model. Viewers draw the cameras and choose their first
+//! view from them.
 
 use crate::{camera_path, run_folder};
 use anyhow::Context;
@@ -7,10 +8,10 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use viz::KeyframePose;
 
-/// Name of the file in the folder of a run.
+/// Name of the file in the run folder.
 pub(crate) const FILE: &str = "cameras.json";
 
-/// Pose and lens of one keyframe.
+/// Pose and intrinsics of one keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct PosedCamera {
     pub(crate) camera: String,
@@ -87,13 +88,13 @@ mod tests {
     fn camera_list_round_trips() {
         let folder = tempfile::tempdir().expect("a folder");
         assert!(read(folder.path()).expect("no file is no error").is_none());
-        write(folder.path(), &[camera(), camera()]).expect("room on the disk");
+        write(folder.path(), &[camera(), camera()]).expect("disk space");
         let cameras = read(folder.path()).expect("a list").expect("a file");
         assert_eq!((cameras.len(), cameras[0].camera.as_ref(), cameras[1].size_px), (2, "wrist", [64, 48]));
         for (number, expected) in row_major(&cameras[1].world_from_camera).iter().zip(camera().world_from_camera) {
             assert!((number - expected).abs() < 1e-12);
         }
-        write(folder.path(), &[]).expect("room on the disk");
+        write(folder.path(), &[]).expect("disk space");
         assert_eq!(read(folder.path()).expect("a list").map(|cameras| cameras.len()), Some(0));
     }
 
@@ -102,10 +103,10 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let mut skewed = camera();
         skewed.world_from_camera[0] = 3.0;
-        write(folder.path(), &[skewed]).expect("room on the disk");
+        write(folder.path(), &[skewed]).expect("disk space");
         let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
         assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
-        std::fs::write(folder.path().join(FILE), "{").expect("room on the disk");
-        assert!(format!("{:#}", read(folder.path()).expect_err("cut off")).contains("damaged"));
+        std::fs::write(folder.path().join(FILE), "{").expect("disk space");
+        assert!(format!("{:#}", read(folder.path()).expect_err("truncated")).contains("damaged"));
     }
 }

@@ -1,4 +1,4 @@
-//! Where pictures are to be drawn from: one pose, or a camera path of nerfstudio's viewer.
+//! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
 use crate::exit::BadArgument;
 use anyhow::{Context, ensure};
@@ -7,11 +7,11 @@ use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use serde::Deserialize;
 use std::path::Path;
 
-/// One place to draw from.
+/// One viewpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct PathCamera {
     pub(crate) world_from_camera: Transform,
-    /// Angle from the top to the bottom of the picture, radians, where the path says it.
+    /// Vertical field of view in radians, if the path specifies it.
     pub(crate) fov_y_rad: Option<f64>,
 }
 
@@ -19,14 +19,14 @@ pub(crate) struct PathCamera {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CameraPath {
     pub(crate) cameras: Vec<PathCamera>,
-    /// Width and height of the pictures, where the path says it.
+    /// Width and height of the pictures in pixels, if the path specifies them.
     pub(crate) size_px: Option<[u32; 2]>,
 }
 
-/// The one type of camera of a path that is drawn.
+/// The only camera type that is supported in a path.
 const PERSPECTIVE: &str = "perspective";
 
-/// As nerfstudio writes it.
+/// The file format of nerfstudio.
 #[derive(Debug, Deserialize)]
 struct PathFile {
     render_height: Option<u32>,
@@ -37,20 +37,20 @@ struct PathFile {
 
 #[derive(Debug, Deserialize)]
 struct PathFileCamera {
-    /// Row major; the camera looks along -z with y up.
+    /// Row major, OpenGL axes: the camera looks along -z, y is up.
     camera_to_world: Vec<f64>,
-    /// From top to bottom, degrees.
+    /// Vertical field of view, degrees.
     fov: Option<f64>,
 }
 
 impl CameraPath {
-    /// Reads a nerfstudio camera path; its cameras are turned to ours.
+    /// Reads a nerfstudio camera path and converts its cameras to the axes of [`kinematics::camera`].
     pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 
-    /// One pose, 16 numbers row major, `world_from_camera` with the axes of [`kinematics::camera`].
+    /// A path with one viewpoint: 16 numbers, row major, `world_from_camera` with the axes of [`kinematics::camera`].
     pub(crate) fn of_pose(numbers: &[f64]) -> Result<Self, BadArgument> {
         let world_from_camera = rigid(numbers).map_err(|error| BadArgument(format!("--pose: {error}")))?;
         Ok(Self { cameras: vec![PathCamera { world_from_camera, fov_y_rad: None }], size_px: None })
@@ -58,11 +58,11 @@ impl CameraPath {
 
     fn parse(text: &str) -> anyhow::Result<Self> {
         let file: PathFile = serde_json::from_str(text)?;
-        ensure!(!file.camera_path.is_empty(), "it has no cameras");
+        ensure!(!file.camera_path.is_empty(), "it contains no cameras");
         let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
         ensure!(
             camera_type == PERSPECTIVE,
-            "camera_type is {camera_type:?}, only {PERSPECTIVE:?} is drawn (and all directions, with --equirect)"
+            "camera_type is {camera_type:?}, but only {PERSPECTIVE:?} is supported (for panoramas, use --equirect)"
         );
         let camera = |(ix, camera): (usize, &PathFileCamera)| {
             let world_from_opengl = rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
@@ -79,16 +79,16 @@ impl CameraPath {
     }
 }
 
-/// The rigid motion of a 4x4 matrix, row major.
+/// The rigid transform of a 4x4 matrix, row major.
 pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
-    /// Files round to six digits or so.
+    /// Files round to about six digits.
     const TOLERANCE: f64 = 1e-3;
     ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
-    ensure!(numbers.iter().all(|number| number.is_finite()), "a number of the pose is not finite");
+    ensure!(numbers.iter().all(|number| number.is_finite()), "the pose has a non-finite number");
     let matrix = Matrix4::from_row_slice(numbers);
     let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
     let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
-    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "its upper left 3x3 is no rotation");
+    ensure!(deviation < TOLERANCE && rotation.determinant() > 0.0, "its upper left 3x3 block is not a rotation");
     ensure!(
         (matrix.row(3) - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() < TOLERANCE,
         "its last row is not 0 0 0 1"

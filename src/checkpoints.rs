@@ -1,4 +1,4 @@
-//! Checkpoints of a model in training: taken every so often, written on a thread of their own.
+//! Checkpoints of a model in training: taken periodically and written on a separate thread.
 
 use crate::exit::BadArgument;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
@@ -12,28 +12,28 @@ use std::time::{Duration, Instant};
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
 use trainer::{Keyframe, Method};
 
-/// Time between two checkpoints unless a flag sets it.
+/// Default time between two checkpoints.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
 /// Time between two writes of new keyframes in a live run.
 const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
-/// Name of the flag in checkpoints.
+/// Name of the flag as stored in checkpoints.
 const CHECKPOINT_SECS: &str = "checkpoint-secs";
 
 /// How often checkpoints are written.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(crate) struct CheckpointArgs {
-    /// Write the state of training every S seconds and at the end, for `--resume`; 0: never [default: 60]
+    /// Write a checkpoint for `--resume` every S seconds and at the end; 0: never [default: 60]
     #[arg(long, value_name = "S", value_parser = secs)]
     checkpoint_secs: Option<Duration>,
 }
 
 impl CheckpointArgs {
-    /// The flag as it is stored in a checkpoint, if it is given.
+    /// The flag as it is stored in a checkpoint, if it was given.
     pub(crate) fn flag(self) -> Option<(String, String)> {
         Some((CHECKPOINT_SECS.to_owned(), self.checkpoint_secs?.as_secs_f64().to_string()))
     }
 
-    /// This flag, or if it is not given, that of the earlier run.
+    /// This flag, or the value of the earlier run if it was not given.
     pub(crate) fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
         let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
         Self { checkpoint_secs: self.checkpoint_secs.or_else(previous) }
@@ -45,13 +45,14 @@ fn secs(text: &str) -> Result<Duration, String> {
     secs.ok_or_else(|| "expected a number of at least 0".to_owned())
 }
 
-/// Reads the checkpoint in the folder of a run.
+/// Reads the checkpoint in a run folder.
 pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
     expect_one_model(folder)?;
-    Checkpoint::read(&folder.join(CHECKPOINT)).with_context(|| format!("nothing to go on from in {}", folder.display()))
+    Checkpoint::read(&folder.join(CHECKPOINT))
+        .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))
 }
 
-/// Refuses a limit in seconds that has already passed when training continues.
+/// Rejects a limit in seconds that earlier training has already reached.
 pub(crate) fn check_limit_not_passed(
     seconds: Option<f64>,
     checkpoint: &Checkpoint,
@@ -59,31 +60,31 @@ pub(crate) fn check_limit_not_passed(
 ) -> Result<(), BadArgument> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(BadArgument(format!(
-            "--seconds {seconds}: {subject} has been trained for {:.1} s, which count too; name more than that",
+            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which count; give a larger limit",
             checkpoint.seconds
         ))),
         None => Ok(()),
     }
 }
 
-/// What every checkpoint of a run holds besides the state of its model.
+/// What every checkpoint of a run contains in addition to the model state.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RunFlags {
-    /// SHA-256 of the model that depth was drawn from.
+    /// SHA-256 of the model from which depth was rendered.
     pub(crate) depth_from: Option<String>,
-    /// Flags of the run: those that affect its keyframes, and its limit.
+    /// Flags of the run that affect its keyframes, and its limits.
     pub(crate) flags: BTreeMap<String, String>,
 }
 
-/// The checkpoints of one run; each replaces the one before.
+/// The checkpoints of one run. Each one replaces the previous one.
 pub(crate) struct Checkpoints {
     path: PathBuf,
     run_flags: RunFlags,
     period: Duration,
-    /// Time after the last one at which the next is due.
+    /// Time after `last` at which the next checkpoint is due.
     due_after: Duration,
     last: Instant,
-    /// Keyframes that are on disk nowhere else.
+    /// Keyframes that exist nowhere else on disk.
     stored_keyframes: Option<StoredKeyframes>,
     last_keyframes: Instant,
     writer: Option<WriterThread>,
@@ -91,26 +92,26 @@ pub(crate) struct Checkpoints {
     has_any: bool,
 }
 
-/// A thread that writes.
+/// A writer thread.
 struct WriterThread {
     thread: JoinHandle<anyhow::Result<()>>,
-    /// Whether it writes a checkpoint, not only keyframes.
+    /// Whether it writes a checkpoint rather than only keyframes.
     is_checkpoint: bool,
 }
 
-/// A model in training and what else goes into its checkpoint.
+/// A model in training, and the other contents of its checkpoint.
 pub(crate) struct Snapshot<'a> {
     pub(crate) method: &'a mut dyn Method,
-    /// All keyframes held, test keyframes included.
+    /// All keyframes in the store, including test keyframes.
     pub(crate) keyframes: &'a [Arc<Keyframe>],
-    /// Seconds of training.
+    /// Training time, seconds.
     pub(crate) seconds: f64,
     /// Whether training has reached its limit.
     pub(crate) is_finished: bool,
 }
 
 impl Checkpoints {
-    /// None where they are not wanted. The first is due after the time between two.
+    /// Returns `None` if checkpoints are disabled. The first one is due after one period.
     pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
         let (period, path) = (args.checkpoint_secs.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
         (!period.is_zero()).then(|| Self {
@@ -131,19 +132,20 @@ impl Checkpoints {
         Self { run_flags, ..self }
     }
 
-    /// Stores the keyframes too: for a live run, whose images are nowhere else. The first checkpoint is written with the first keyframes,
-    /// because resuming needs both.
+    /// Also stores the keyframes, for a live run whose images exist nowhere else. The first checkpoint is due as soon
+    /// as the first keyframes are written, because resuming needs both.
     pub(crate) fn with_keyframes(self, run: &Path) -> Self {
         let due_after = self.period.min(KEYFRAME_PERIOD);
         Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
     }
 
-    /// Whether it keeps them.
+    /// Whether keyframes are stored too.
     pub(crate) fn keeps_keyframes(&self) -> bool {
         self.stored_keyframes.is_some()
     }
 
-    /// Begins one when it is due and the one before is written, and says so. A disk that refuses one does not stop training.
+    /// Starts a checkpoint if one is due and the previous one is complete; returns whether it did. Write errors are
+    /// logged and do not stop training.
     pub(crate) fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
         if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
             return Ok(false);
@@ -164,19 +166,19 @@ impl Checkpoints {
         Ok(false)
     }
 
-    /// Starts a checkpoint of the current state, after the one in progress.
+    /// Starts a checkpoint of the current state once the one in progress is complete.
     pub(crate) fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
         let job = self.take(now)?;
         self.write(job);
         Ok(())
     }
 
-    /// Copies the current state, to be written later.
+    /// Copies the current state for writing later.
     pub(crate) fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
         self.wait_and_warn();
         let started = Instant::now();
         let pending = now.method.checkpoint()?;
-        log::debug!("a checkpoint paused training for {:?}", started.elapsed());
+        log::debug!("taking a checkpoint paused training for {:?}", started.elapsed());
         Ok(CheckpointWrite {
             pending,
             seconds: now.seconds,
@@ -200,7 +202,7 @@ impl Checkpoints {
         match self.wait() {
             Ok(()) => {}
             Err(error) if is_checkpoint => {
-                let previous = if self.path.exists() { ", the previous one stays" } else { "" };
+                let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
                 log::warn!("cannot write a checkpoint{previous}: {error:#}");
             }
             // The next checkpoint stores them too, and warns if that fails.
@@ -208,7 +210,7 @@ impl Checkpoints {
         }
     }
 
-    /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one counts.
+    /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one is used.
     pub(crate) fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
             log::warn!("the checkpoint in progress failed: {error:#}");
@@ -216,7 +218,7 @@ impl Checkpoints {
         self.has_any.then_some(&self.path)
     }
 
-    /// Waits until the one under way is on the disk.
+    /// Waits until the checkpoint in progress is on disk.
     pub(crate) fn wait(&mut self) -> anyhow::Result<()> {
         let Some(WriterThread { thread, is_checkpoint }) = self.writer.take() else { return Ok(()) };
         match thread.join() {
@@ -230,7 +232,7 @@ impl Checkpoints {
     }
 }
 
-/// A checkpoint that is being written.
+/// A checkpoint that is ready to be written.
 pub(crate) struct CheckpointWrite {
     pending: PendingCheckpoint,
     seconds: f64,
@@ -241,7 +243,7 @@ pub(crate) struct CheckpointWrite {
 }
 
 impl CheckpointWrite {
-    /// Writes new keyframes, then the checkpoint, then removes the keyframes that only the previous checkpoint needed.
+    /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous checkpoint needed.
     fn write(self) -> anyhow::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
@@ -253,7 +255,7 @@ impl CheckpointWrite {
         if let Some((stored, keyframes)) = &self.keyframes {
             stored.keep_only(keyframes)?;
         }
-        log::debug!("a checkpoint was written in {:?}", started.elapsed());
+        log::debug!("wrote a checkpoint in {:?}", started.elapsed());
         Ok(())
     }
 }

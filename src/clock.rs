@@ -1,10 +1,10 @@
-//! Seconds of training.
+//! Training time in seconds.
 
 use std::cell::Cell;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
-/// Seconds of training; evaluation does not count. Clones show the same time.
+/// Training time in seconds, excluding evaluation. Clones share the same time.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Clock(Rc<Cell<ClockState>>);
 
@@ -12,28 +12,28 @@ pub(crate) struct Clock(Rc<Cell<ClockState>>);
 struct ClockState {
     started: Option<Instant>,
     excluded: Duration,
-    /// Of the runs that this one goes on from.
+    /// Training time of earlier runs that this one continues.
     previous_secs: f64,
 }
 
 impl Clock {
-    /// A clock that goes on where earlier runs had trained for so long.
+    /// A clock that continues from the training time of earlier runs.
     pub(crate) fn with_elapsed(previous_secs: f64) -> Self {
         Self(Rc::new(Cell::new(ClockState { previous_secs, ..ClockState::default() })))
     }
 
-    /// Starts it, unless it runs.
+    /// Starts the clock unless it is already running.
     pub(crate) fn start(&self, at: Instant) {
         let state = self.0.get();
         self.0.set(ClockState { started: state.started.or(Some(at)), ..state });
     }
 
-    /// When it started, once it runs.
+    /// Time at which the clock was started, if it was.
     pub(crate) fn started(&self) -> Option<Instant> {
         self.0.get().started
     }
 
-    /// Leaves out what was no training.
+    /// Excludes time that was not spent on training.
     pub(crate) fn exclude(&self, spent: Duration) {
         let state = self.0.get();
         self.0.set(ClockState { excluded: state.excluded + spent, ..state });
@@ -56,11 +56,11 @@ mod tests {
         const HOUR: Duration = Duration::from_secs(3600);
         let clock = Clock::with_elapsed(10.0);
         let other = clock.clone();
-        assert_eq!(other.secs(), 10.0, "it stands still");
+        assert_eq!(other.secs(), 10.0, "it is not running");
         let started = Instant::now().checked_sub(HOUR).expect("the machine has run for an hour");
         clock.start(started);
         other.start(Instant::now());
-        assert_eq!(other.started(), Some(started), "it starts once");
+        assert_eq!(other.started(), Some(started), "only the first start counts");
         assert!(other.secs() >= 3610.0);
         other.exclude(HOUR);
         assert!((10.0..3610.0).contains(&clock.secs()), "{}", clock.secs());

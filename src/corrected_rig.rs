@@ -1,4 +1,4 @@
-//! The rig file with what alignment found: the rig calibrates itself.
+//! Writes the rig file with the calibration corrections that alignment found.
 
 use crate::config::{Camera, Rig, TimeOffset};
 use crate::exit::BadArgument;
@@ -9,10 +9,10 @@ use std::path::{Path, PathBuf};
 use trainer::align::{Alignment, Estimate};
 use trainer::splat::CameraCorrection;
 
-/// What a corrected delay says about where it comes from.
+/// Value of `source` for a corrected time offset.
 const SOURCE: &str = "train --write-rig";
 
-/// The rig as it would have been right; poses of single images have no place in it.
+/// The rig with all corrections applied. Per-image pose corrections have no key in a rig file and are left out.
 pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig> {
     let mut rig = rig.clone();
     for camera in &mut rig.cameras {
@@ -20,9 +20,9 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
             correct(camera, correction, alignment);
         }
     }
-    let most_offsets =
+    let joint_offsets =
         alignment.corrections.values().map(|correction| &correction.joint_offsets).max_by_key(|offsets| offsets.len());
-    if let Some(by_chain) = most_offsets.filter(|offsets| !offsets.is_empty()) {
+    if let Some(by_chain) = joint_offsets.filter(|offsets| !offsets.is_empty()) {
         let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)?;
         rig.arm.joint_offsets.resize(rig.arm.joints.len(), 0.0);
         for (joint_ix, offset) in chain.order_in(&rig.arm.joints)?.into_iter().zip(by_chain) {
@@ -32,15 +32,15 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
     Ok(rig)
 }
 
-/// Refuses a place where no file can be written.
+/// Checks that the rig file can be written there.
 pub(crate) fn check_target_file(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
-        return Err(BadArgument(format!("--write-rig {}: must be a file in a folder that exists", file.display())));
+        return Err(BadArgument(format!("--write-rig {}: must be a file in an existing folder", file.display())));
     }
     match other_robot(rig, file) {
         Some(urdf) => Err(BadArgument(format!(
-            "--write-rig {}: {} is another robot's description; the rig file wants a folder of its own",
+            "--write-rig {}: {} is the URDF of another robot; write the rig file to a separate folder",
             file.display(),
             urdf.display()
         ))),
@@ -48,14 +48,14 @@ pub(crate) fn check_target_file(rig: &Rig, file: &Path) -> Result<(), BadArgumen
     }
 }
 
-/// The robot's description beside a rig file, where it is of another robot.
+/// Path of the URDF next to a rig file, if it describes another robot.
 fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let existing = std::fs::read_to_string(&urdf).ok()?;
     (existing != rig.arm.urdf_text).then_some(urdf)
 }
 
-/// Writes a rig file, and the robot's description beside it, where no other one lies.
+/// Writes a rig file and the robot's URDF next to it. Does not overwrite the URDF of another robot.
 pub(crate) fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
     check_target_file(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
@@ -123,7 +123,7 @@ mod tests {
     #[test]
     fn every_correction_is_written_to_its_key() {
         let mut rig = bundled_rig();
-        rig.arm.joints.reverse(); // The device's order is not the chain's.
+        rig.arm.joints.reverse(); // The device orders joints differently from the chain.
         let correction = CameraCorrection {
             rotation_rad: [0.01, -0.02, 0.03],
             translation_m: [0.001, 0.002, -0.003],
@@ -147,7 +147,7 @@ mod tests {
         };
         let calibrated_rig = corrected(&rig, &alignment).unwrap();
         let (before, after) = (&rig.cameras[0], &calibrated_rig.cameras[0]);
-        // A turn and a shift after camera_from_parent.
+        // The correction is applied after camera_from_parent.
         let moved = Transform::new(Vector3::from(correction.translation_m), Vector3::from(correction.rotation_rad));
         let expected = moved * before.parent_from_camera.inverse();
         let max_error = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
@@ -163,12 +163,12 @@ mod tests {
         let moved = [0, 1].map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
         assert!((moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9, "{moved:?}");
         let depth = after.depth.as_ref().unwrap();
-        assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth comes through the same lens");
+        assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth uses the same lens");
         assert!((depth.factor - 0.01f64.exp()).abs() < TOLERANCE);
         assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < TOLERANCE);
         let expected: Vec<f64> = (0..7).rev().map(|joint| 0.001 * f64::from(joint)).collect();
         assert_eq!(calibrated_rig.arm.joint_offsets, expected);
-        // It is a rig file that can be read, and a second rig's description is not overwritten.
+        // The written file can be read back, and the URDF of another robot is not overwritten.
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("rig.toml");
         write(&calibrated_rig, &file).unwrap();
@@ -182,7 +182,7 @@ mod tests {
         assert!(check_target_file(&calibrated_rig, &folder.path().join("none/rig.toml")).is_err());
         assert!(
             check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
-            "before training, too"
+            "the check before training rejects it, too"
         );
     }
 }

@@ -1,4 +1,4 @@
-//! What `train` and `eval` work on: a dataset folder or a recording, as keyframes in host memory.
+//! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
 use crate::config::{Override, Rig};
 use crate::dataset;
@@ -18,33 +18,35 @@ use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
 use trainer::{Keyframe, Split};
 
-/// Ending of a recording.
+/// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
 
-/// Which images of the data are taken, and what for.
+/// Which images are used, and for what.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct DataArgs {
-    /// Hold out every N-th image for testing, or the images that a file names, one a line; with 1, eval scores all [default: 8]
+    /// Use every N-th image for testing, or the images listed in a file, one per line; with 1, eval scores all
+    /// [default: 8]
     #[arg(long, value_name = "N|FILE")]
     pub(crate) holdout: Option<String>,
-    /// Take exactly the keyframes of a list that an earlier run wrote (keyframes.txt)
+    /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
     #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
     pub(crate) keyframes: Option<PathBuf>,
-    /// Read a recording with this rig file instead of the one in it
+    /// Read a recording with this rig file instead of the one stored in it
     #[arg(long, value_name = "FILE")]
     pub(crate) rig: Option<PathBuf>,
-    /// Shrink the images (not their depth) to this share of their width and height, 0.05 to 1 [default: the rig file's, else 1]
+    /// Scale the images (not their depth) to this fraction of their width and height, 0.05 to 1 [default: the rig
+    /// file's, else 1]
     #[arg(long, value_name = "SHARE", value_parser = downscale::parse_scale)]
     pub(crate) scale: Option<f64>,
 }
 
 impl DataArgs {
-    /// What is held out for testing, where a flag says.
+    /// The test images selected by `--holdout`, if it is given.
     pub(crate) fn holdout(&self) -> Result<Option<Holdout>, BadArgument> {
         self.holdout.as_deref().map(Holdout::from_argument).transpose()
     }
 
-    /// What is given of the flags that keyframes are made by: values by names, files by their whole path.
+    /// The given flags that affect keyframes: names and values, with absolute paths for files.
     pub(crate) fn flags(&self) -> BTreeMap<String, String> {
         let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
         let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
@@ -57,30 +59,30 @@ impl DataArgs {
         given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
     }
 
-    /// The flags that affect the pixels of listed keyframes, as words of a command line.
+    /// The flags that affect the pixels of listed keyframes, as command-line arguments.
     pub(crate) fn flags_of_images(&self) -> Vec<String> {
         let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
         let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);
         rig.into_iter().chain(scale).flatten().collect()
     }
 
-    /// These flags, and where they say nothing those that keyframes were made by `before`. A number that says otherwise is refused;
-    /// a file may have moved: what it makes has to be the same, and is compared later.
+    /// Completes these flags with those of an earlier run, `before`. A different number is an error. A different file
+    /// is accepted, because it may have moved; its contents are compared later.
     ///
-    /// `subject`: what was made before.
+    /// `subject`: name of the earlier result for messages.
     pub(crate) fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, BadArgument> {
         let now = self.flags();
         for (name, value) in before {
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(BadArgument(format!("--{name} {now}: {subject} is of images with --{name} {value}")));
+                return Err(BadArgument(format!("--{name} {now}: {subject} was trained with --{name} {value}")));
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
-        // Both say which images there are: one given stands for both.
+        // Both flags select images, so either one replaces both.
         let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
         let scale = unset_flag("scale").map(|scale| scale.parse());
-        let scale = scale.transpose().map_err(|_| BadArgument(format!("{subject}: its scale is no number")))?;
+        let scale = scale.transpose().map_err(|_| BadArgument(format!("{subject}: its scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
             keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
@@ -94,7 +96,7 @@ impl DataArgs {
             .map(|(name, value)| format!("--{name} {value}"))
             .collect();
         if !restored_flags.is_empty() {
-            log::info!("{}, as {subject} was trained with", restored_flags.join(" "));
+            log::info!("using {}, as {subject} was trained with", restored_flags.join(" "));
         }
         Ok(restored)
     }
@@ -104,43 +106,43 @@ fn is_number(text: &str) -> bool {
     text.parse::<f64>().is_ok()
 }
 
-/// Keyframes and what to know of them.
+/// Loaded keyframes and their metadata.
 pub(crate) struct Data {
     /// In the order of the data.
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
     /// Names of the images, in the same order.
     pub(crate) names: Vec<String>,
-    /// The rig that recorded them; a folder has none.
+    /// The rig of the recording; `None` for a folder.
     pub(crate) rig: Option<Rig>,
-    /// Whether the stamps are times; else they only count the images.
+    /// Whether the stamps are times rather than image indices.
     pub(crate) has_times: bool,
-    /// What was lost on the way; anything here makes the exit code 3.
+    /// Data that could not be read. If there are any, the exit code is 3.
     pub(crate) data_losses: Vec<String>,
-    /// What was found of the base's pose at each stand after the first.
+    /// The correction of the base pose at each station after the first.
     pub(crate) stations: Vec<StationReport>,
-    /// What was drawn from a model for images that lack depth.
+    /// Depth that was rendered from a model for images without depth.
     pub(crate) rendered_depth: Option<RenderedDepth>,
-    /// Time that finding the stands and drawing depth took: both come before learning, for the sake of it.
+    /// Time spent on station registration and depth rendering, which precede training but count as training time.
     pub(crate) preparation_time: Duration,
 }
 
-/// What data are for.
+/// What the data are used for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Purpose {
-    /// Something must be left to train on.
+    /// Needs at least one training image.
     Training,
-    /// Test images suffice.
+    /// Needs at least one test image.
     Scoring,
 }
 
-/// Which images are taken.
+/// Which images are used.
 struct DataSelection {
     list: Option<KeyframeList>,
     holdout: Option<Holdout>,
     scale: Option<f64>,
-    /// In place of the one in a recording.
+    /// Replaces the rig stored in a recording.
     rig: Option<PathBuf>,
-    /// Poses are those that the base's source tells, wherever its stands show them to be wrong.
+    /// Uses base poses as reported, without corrections at stations.
     use_reported_poses: bool,
 }
 
@@ -164,8 +166,7 @@ impl Data {
         )
     }
 
-    /// Reads the keyframes of a list, with their images shrunk to a share of their size and their poses as the base's source
-    /// tells them.
+    /// Reads the keyframes of a list, with images scaled to this fraction of their size and base poses as reported.
     pub(crate) fn of_list(
         path: &Path,
         list: KeyframeList,
@@ -195,7 +196,7 @@ impl Data {
             let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
             Self::from_recording(path, rig, list, overrides, quiet)?
         } else if let Some(rig) = rig {
-            return Err(BadArgument(format!("--rig {}: only recordings are read with one", rig.display())).into());
+            return Err(BadArgument(format!("--rig {}: only recordings take a rig file", rig.display())).into());
         } else {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
         };
@@ -206,7 +207,7 @@ impl Data {
             data.realign();
         }
         let (required_split, message) = match purpose {
-            Purpose::Training => (Split::Train, "no image is left to train on"),
+            Purpose::Training => (Split::Train, "no training image"),
             Purpose::Scoring => (Split::Test, "no test image"),
         };
         if data.of_split(required_split).is_empty() {
@@ -216,13 +217,13 @@ impl Data {
         Ok(data)
     }
 
-    /// The rig file that a recording is read with, without what flags override; a folder has none.
+    /// The rig with which a recording is read, before flags override it.
     pub(crate) fn rig_as_given(path: &Path, args: &DataArgs) -> anyhow::Result<Rig> {
         let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
         Ok(open::recording(path, rig, &[])?.rig)
     }
 
-    /// The scene models that data are for where no flag says: a recording's rig file names them, before anything else is read.
+    /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
     pub(crate) fn default_methods(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
         Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![ModelKind::Splat] })
@@ -244,7 +245,7 @@ impl Data {
         self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
     }
 
-    /// Gives images without depth that of a model.
+    /// Renders depth for images without depth from a model.
     pub(crate) fn render_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, quiet: bool) -> anyhow::Result<()> {
         let started = Instant::now();
         self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, quiet)?);
@@ -331,14 +332,14 @@ impl Data {
         })
     }
 
-    /// Corrects the keyframes of a base that walks, as a run does.
+    /// Corrects the base poses at stations, as a live run does.
     fn realign(&mut self) {
         let Some(mut stations) = self.rig.as_ref().and_then(Stations::new) else { return };
         self.keyframes = stations.corrected(std::mem::take(&mut self.keyframes));
         (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
     }
 
-    /// Splits anew, each camera on its own.
+    /// Assigns splits anew, separately for each camera.
     fn hold_out(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
@@ -353,7 +354,7 @@ impl Data {
         Ok(())
     }
 
-    /// Keeps what a list names, as what it names it.
+    /// Keeps only the listed keyframes, with the splits in the list.
     fn take_only(&mut self, list: &KeyframeList) -> Result<(), InsufficientData> {
         let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
         self.data_losses.extend(list.check_found(images(), images().next())?);
@@ -369,13 +370,13 @@ impl Data {
     }
 }
 
-/// Refuses data that are not there.
+/// Returns an error if the path does not exist.
 pub(crate) fn expect(path: &Path) -> anyhow::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
     Ok(())
 }
 
-/// Whether the name is that of a recording.
+/// Whether the file name is that of a recording.
 pub(crate) fn is_recording(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
@@ -394,14 +395,14 @@ mod tests {
         let none = DataArgs { holdout: None, keyframes: None, rig: None, scale: None };
         let first = DataArgs { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
         let again = |args: &DataArgs| args.completed_with("the checkpoint", &first.flags());
-        assert_eq!(again(&none).expect("nothing is said").flags(), first.flags());
+        assert_eq!(again(&none).expect("no flag is given").flags(), first.flags());
         let listed = DataArgs { keyframes: Some("other.txt".into()), ..none.clone() };
-        let names: Vec<String> = again(&listed).expect("a list is compared later").flags().into_keys().collect();
+        let names: Vec<String> = again(&listed).expect("lists are compared later").flags().into_keys().collect();
         assert_eq!(names, ["keyframes", "scale"]);
         let same = DataArgs { scale: Some(0.25), ..none.clone() };
         assert_eq!(again(&same).expect("the same").flags(), first.flags());
         let other = again(&DataArgs { scale: Some(0.5), ..none.clone() }).expect_err("another").0;
-        assert_eq!(other, "--scale 0.5: the checkpoint is of images with --scale 0.25");
+        assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
         assert!(again(&DataArgs { holdout: Some("2".into()), ..none }).is_err());
     }
 }

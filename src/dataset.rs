@@ -1,4 +1,4 @@
-//! Photos of a dataset -> keyframes: decoded, undistorted, scaled, split.
+//! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
 use crate::downscale;
 use crate::holdout::Holdout;
@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 use trainer::{DepthMap, Keyframe, Split};
 
-/// Name of the one camera of a dataset.
+/// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
 
 /// The photos of a dataset as keyframes.
@@ -21,17 +21,20 @@ pub(crate) struct LoadedDataset {
     pub(crate) keyframes: Vec<Arc<Keyframe>>,
     /// Names of the photos, in the same order.
     pub(crate) names: Vec<String>,
-    /// What a user should know.
+    /// Notes for the user.
     pub(crate) notes: Vec<String>,
-    /// What is there but did not decode.
+    /// Files that did not decode.
     pub(crate) data_losses: Vec<String>,
 }
 
-/// Decodes all photos on all cores.
+/// Decodes all photos in parallel.
 ///
-/// `scale_frac` shrinks the undistorted photos (not their depth) by averaging areas; 1 leaves them as they are.
-/// `on_progress` is told how many photos are done. A photo that does not decode is left out and told as a loss; when none is
-/// left, that is an error.
+/// `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1 keeps their size. `on_progress`
+/// receives the number of finished photos. A photo that does not decode is skipped and reported in `data_losses`.
+///
+/// # Errors
+///
+/// If no photo decodes.
 pub(crate) fn load(
     dataset: &Dataset,
     holdout: &Holdout,
@@ -54,7 +57,7 @@ pub(crate) fn load(
         )
     };
 
-    // Photos of one lens follow each other; only their maps are in memory at a time.
+    // Photos with the same lens follow each other, so only one set of maps is in memory at a time.
     let mut results = Vec::with_capacity(names.len());
     let mut start = 0;
     for run in dataset.frames.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
@@ -92,10 +95,10 @@ pub(crate) fn load(
     Ok(loaded)
 }
 
-/// What undoes the distortion of one lens; nothing where there is none.
+/// Undistortion maps of one lens; empty for a lens without distortion.
 struct LensMaps {
     color: Option<Undistortion>,
-    /// For depth images of another size than the photos; made when the first one comes.
+    /// For depth images whose size differs from that of the photos; computed for the first such image.
     depth: OnceLock<Undistortion>,
 }
 
@@ -126,7 +129,7 @@ impl LensMaps {
     }
 }
 
-/// The keyframe of one photo, and why its depth is lost; its camera and split are filled in by the caller.
+/// The keyframe of one photo, and an error message if its depth does not decode. The caller sets camera and split.
 fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::Result<(Keyframe, Option<String>)> {
     let images = frame.load()?;
     let in_frame = || frame.name.clone();

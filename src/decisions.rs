@@ -1,6 +1,7 @@
-//! The log of what a clock decided: which keyframes came and went at which step, and when training ended.
+//! The log of timing-dependent decisions: at which step each keyframe was added or removed, and when training ended.
 //!
-//! One JSON object a line, see `docs/reference/files.md`. There is no time in it: with the same data it gives the same model again.
+//! One JSON object per line, see `docs/reference/files.md`. The log contains no times: replaying it with the same data
+//! gives the same model.
 
 use crate::exit::BadArgument;
 use crate::fingerprint;
@@ -19,9 +20,9 @@ use trainer::splat::SplatOptions;
 use trainer::{Keyframe, Split};
 
 const VERSION: u64 = 2;
-/// Name of the log in the folder of a run.
+/// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
-/// Decisions that may wait for the disk; when so many do, training waits too.
+/// Maximum number of decisions that wait for the disk. When the queue is full, training waits.
 const MAX_WAITING: usize = 4096;
 
 /// The first line: the settings.
@@ -30,21 +31,21 @@ const MAX_WAITING: usize = 4096;
 pub(crate) struct Settings {
     version: u64,
     pub(crate) method: String,
-    /// Name of the dataset folder or recording; none where a run was not recorded.
+    /// Name of the dataset folder or recording; `None` if a live run was not recorded.
     pub(crate) data: Option<String>,
-    /// What it ran on: another adapter rounds otherwise.
+    /// The GPU adapter: others round differently.
     pub(crate) adapter: String,
-    /// Share of the width and height that images were shrunk to.
+    /// Fraction of the width and height to which images were scaled.
     pub(crate) scale: f64,
-    /// SHA-256 of the model that depth was drawn from for images without; none where there was no such model.
+    /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) depth_from: Option<String>,
-    /// Updates made before, where it went on from a checkpoint.
+    /// Number of earlier updates if the run continued from a checkpoint.
     pub(crate) from_step: Option<u64>,
     pub(crate) options: SplatOptions,
 }
 
-/// What settles a training beside its data.
+/// Everything that determines a training result besides its data.
 pub(crate) struct RunDescription<'a> {
     pub(crate) method: &'a str,
     pub(crate) data: Option<&'a Path>,
@@ -78,36 +79,36 @@ impl Settings {
     }
 }
 
-/// One decision, once so many updates had been made.
+/// A decision and the step at which it was made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Entry {
-    /// Updates made before, those included that a trial took back.
+    /// Number of updates before the decision, including those of rejected trials.
     pub(crate) step: u64,
     #[serde(flatten)]
     pub(crate) decision: Decision,
 }
 
-/// What was decided.
+/// The kind of decision.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Decision {
-    /// The checkpoint that this went on from had learned from it.
+    /// A keyframe that the model in the checkpoint was trained on.
     Restored(Pushed),
-    /// A keyframe came.
+    /// A keyframe was added.
     Push(Pushed),
-    /// A keyframe went.
+    /// A keyframe was removed.
     Remove(Removed),
-    /// Somebody looked, so that the keyframes so far were given their splats before the next one came.
+    /// A viewer requested a picture, so splats were created from the keyframes so far before the next one was added.
     Seed(True),
-    /// The keyframes so far were begun to be learned from before the next one came, though no update was made yet.
+    /// Training on the keyframes so far was started before the next one was added, but no update was made yet.
     Begin(True),
-    /// A checkpoint was taken: as far as this it had come.
+    /// A checkpoint was taken at this step.
     Checkpoint(True),
     /// Training ended.
     End(True),
 }
 
-/// A keyframe that came.
+/// A keyframe that was added.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Pushed {
@@ -115,13 +116,13 @@ pub(crate) struct Pushed {
     pub(crate) stamp_nanos: i64,
     split: String,
     fingerprint: String,
-    /// What its poses were multiplied by from the left, where the base's stand was estimated anew: a translation in metres, then
-    /// a quaternion with its real part last.
+    /// Correction of the base pose (`map_from_odom`), if the keyframe's station was re-registered: a translation in
+    /// meters, then a quaternion with its real part last. The keyframe's poses were multiplied by it from the left.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     map_from_odom: Option<[f64; 7]>,
 }
 
-/// A keyframe that went.
+/// A keyframe that was removed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Removed {
@@ -158,20 +159,20 @@ impl Pushed {
         }
     }
 
-    /// The keyframe as it came, from the one that the base's source places.
-    pub(crate) fn corrected(&self, expected_error: &Arc<Keyframe>) -> Arc<Keyframe> {
+    /// The keyframe as it was added, computed from the keyframe with base poses as reported.
+    pub(crate) fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
-            Some(numbers) => Arc::new(expected_error.with_base_correction(&motion(numbers))),
-            None => expected_error.clone(),
+            Some(numbers) => Arc::new(reported.with_base_correction(&motion(numbers))),
+            None => reported.clone(),
         }
     }
 
-    /// What it was for; known from the moment the log is read.
+    /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks it.
     pub(crate) fn split(&self) -> Option<Split> {
         split_from_name(&self.split)
     }
 
-    /// Whether a keyframe has the same pixels, depth, lens, pose and velocity.
+    /// Whether a keyframe has the same pixels, depth, intrinsics, pose and velocity.
     pub(crate) fn matches(&self, keyframe: &Keyframe) -> bool {
         self.fingerprint == fingerprint_of(keyframe)
     }
@@ -187,7 +188,7 @@ fn numbers(motion: Transform) -> [f64; 7] {
     [x, y, z, i, j, k, w]
 }
 
-/// The inverse of [`numbers`], to the last bit.
+/// The bit-exact inverse of [`numbers`].
 fn motion([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
     Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
 }
@@ -196,7 +197,7 @@ fn fingerprint_of(keyframe: &Keyframe) -> String {
     format!("{:016x}", fingerprint::of(keyframe))
 }
 
-/// What training did since the last decision that was written, as far as it matters for the next one.
+/// Activity since the last logged decision that affects the next one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Activity {
     Nothing,
@@ -204,7 +205,7 @@ enum Activity {
     Training,
 }
 
-/// A log being written, on a thread of its own: neither a slow disk nor a large image holds training up.
+/// Writes the log on a separate thread, so that a slow disk or a large image does not delay training.
 pub(crate) struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
@@ -214,14 +215,15 @@ pub(crate) struct DecisionLog {
 
 enum Line {
     Settings(Box<Settings>),
-    /// Its fingerprint takes a while.
+    /// The writer thread computes the fingerprint, which takes time.
     Push(u64, Arc<Keyframe>),
     Restored(u64, Arc<Keyframe>),
     Entry(Entry),
 }
 
 impl DecisionLog {
-    /// Begins a log in the folder of a run; one that goes on from a checkpoint leaves the log up to there alone.
+    /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate file and keeps the
+    /// earlier log.
     pub(crate) fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
         let name = match settings.from_step {
             None => FILE.to_owned(),
@@ -231,7 +233,7 @@ impl DecisionLog {
         let mut file = File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
         let (sender, lines) = sync_channel(MAX_WAITING);
         let thread = std::thread::Builder::new().name("decisions".into()).spawn(move || {
-            // Line by line: what was decided is on the disk when the process is killed.
+            // Written line by line, so that all decisions so far are on disk if the process is killed.
             lines.into_iter().try_for_each(|line: Line| file.write_all(line.text()?.as_bytes()))
         });
         let thread = thread.context("cannot start a thread")?;
@@ -255,14 +257,14 @@ impl DecisionLog {
         self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
     }
 
-    /// Somebody looked at the model.
+    /// Records that a viewer requested a picture.
     pub(crate) fn seeded(&mut self) {
         if self.activity == Activity::Nothing {
             self.activity = Activity::Seeded;
         }
     }
 
-    /// Training was asked for steps.
+    /// Records that training steps were requested.
     pub(crate) fn step_requested(&mut self) {
         self.activity = Activity::Training;
     }
@@ -272,22 +274,27 @@ impl DecisionLog {
         self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
     }
 
-    /// Ends the log; an error says why it is not whole.
+    /// Ends the log.
+    ///
+    /// # Errors
+    ///
+    /// If the log could not be written completely.
     pub(crate) fn end(mut self, step: u64) -> anyhow::Result<()> {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
         drop(self.sender);
-        let written = self.thread.join().map_err(|_| anyhow!("the thread of the log panicked: this is a bug"))?;
-        written.context("the log of decisions is not whole")
+        let written = self.thread.join().map_err(|_| anyhow!("the log thread panicked: this is a bug"))?;
+        written.context("the decision log is incomplete")
     }
 
-    /// Ends the log as that of a run that is killed; all that was decided so far is written when this returns.
+    /// Closes the log without an end, as if the run had been killed. All decisions so far are written when this
+    /// returns.
     pub(crate) fn close_unfinished(self) {
         drop(self.sender);
-        let _ = self.thread.join(); // A log that is not whole is one that was cut off earlier.
+        let _ = self.thread.join(); // An incomplete log counts as truncated at an earlier step.
     }
 
-    /// Writes down what happened between two decisions where no update tells it.
+    /// Logs activity between two decisions if no update in between implies it.
     fn log_activity(&mut self, step: u64) {
         let pending = match std::mem::replace(&mut self.activity, Activity::Nothing) {
             Activity::Seeded => Some(Decision::Seed(True)),
@@ -303,7 +310,7 @@ impl DecisionLog {
     }
 
     fn write(&mut self, line: Line) {
-        // A thread that hung up tells why when it is joined.
+        // If the thread has ended, joining it returns its error.
         let _ = self.sender.send(line);
     }
 }
@@ -334,17 +341,16 @@ pub(crate) struct Decisions {
 
 impl Decisions {
     pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
-        let text =
-            std::fs::read_to_string(path).with_context(|| format!("cannot read the log of decisions {path:?}"))?;
-        Self::parse(&text).with_context(|| format!("the log of decisions {path:?}"))
+        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the decision log {path:?}"))?;
+        Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
     }
 
-    /// Whether it tells how training ended; a run that was killed wrote no end.
+    /// Whether the log contains the end of training. The log of a killed run does not.
     pub(crate) fn is_complete(&self) -> bool {
         self.entries.last().is_some_and(|entry| entry.decision == Decision::End(True))
     }
 
-    /// The keyframes it names, in order.
+    /// The keyframes in the log, in order.
     pub(crate) fn pushed(&self) -> impl Iterator<Item = &Pushed> {
         self.entries.iter().filter_map(|entry| match &entry.decision {
             Decision::Restored(pushed) | Decision::Push(pushed) => Some(pushed),
@@ -360,14 +366,14 @@ impl Decisions {
             serde_json::from_str(first).map_err(|e| invalid(format!("line 1: {e}")))?;
         match description["version"].as_u64() {
             Some(VERSION) => {}
-            Some(other) => return Err(invalid(format!("it is of version {other}, this program reads {VERSION}"))),
-            None => return Err(invalid("line 1 tells no version".to_owned())),
+            Some(other) => return Err(invalid(format!("it has version {other}, expected {VERSION}"))),
+            None => return Err(invalid("line 1 has no version".to_owned())),
         }
         let settings = serde_json::from_value(description).map_err(|e| invalid(format!("line 1: {e}")))?;
         let mut entries: Vec<Entry> = Vec::new();
         for (line, number) in lines {
             if !line.ends_with('\n') {
-                break; // A line that was being written when the run was killed.
+                break; // The run was killed while it wrote this line.
             }
             let entry: Entry = serde_json::from_str(line).map_err(|e| invalid(format!("line {number}: {e}")))?;
             let before = entries.last();
@@ -424,10 +430,10 @@ mod tests {
         })
     }
 
-    /// Two keyframes with a look between them, one that goes, and the end.
+    /// A log with two keyframes, a picture request between them, a removal, and the end.
     fn written(folder: &Path) -> String {
         let mut log = DecisionLog::create(folder, settings(None)).expect("a log");
-        log.seeded(); // Before there is anything to see.
+        log.seeded(); // Before there is any keyframe.
         log.pushed(0, &keyframe(17, Split::Test));
         log.seeded();
         log.pushed(0, &keyframe(18, Split::Train));
@@ -438,7 +444,7 @@ mod tests {
         log.removed(40, "wrist", Stamp(17));
         log.checkpoint(40);
         log.step_requested();
-        log.end(60).expect("room on the disk");
+        log.end(60).expect("disk space");
         std::fs::read_to_string(folder.join(FILE)).expect("the log")
     }
 
@@ -474,7 +480,7 @@ mod tests {
         let pushed: Vec<_> = read.pushed().map(|pushed| (pushed.stamp_nanos, pushed.split())).collect();
         assert_eq!(pushed, [(17, Some(Split::Test)), (18, Some(Split::Train)), (19, Some(Split::Validation))]);
         let first = read.pushed().next().expect("one");
-        assert!(first.matches(&keyframe(17, Split::Train)), "a split is no part of the image");
+        assert!(first.matches(&keyframe(17, Split::Train)), "the split is not part of the image");
         let mut other = keyframe(17, Split::Test).as_ref().clone();
         other.rgba_srgb = vec![1, 2, 4, 255].into();
         assert!(!first.matches(&other));
@@ -487,7 +493,7 @@ mod tests {
         let before = written(folder.path());
         let mut log = DecisionLog::create(folder.path(), settings(Some(130))).expect("a log");
         log.restored(130, &keyframe(18, Split::Train));
-        log.end(260).expect("room on the disk");
+        log.end(260).expect("disk space");
         let read = Decisions::load(&folder.path().join("decisions-from-130.jsonl")).expect("a log");
         assert_eq!((read.settings.from_step, read.pushed().count()), (Some(130), 1));
         assert_eq!(std::fs::read_to_string(folder.path().join(FILE)).expect("the log"), before);
@@ -505,7 +511,7 @@ mod tests {
             assert!(!read.is_complete() && read.entries.len() == lines - 2, "{n_bytes}: {:?}", read.entries);
         }
         assert!(parse_prefix(text.find('\n').expect("a line") + 1).entries.is_empty());
-        assert!(Decisions::parse(&text[..9]).is_err(), "without settings there is nothing");
+        assert!(Decisions::parse(&text[..9]).is_err(), "a log without settings is invalid");
     }
 
     #[test]
@@ -513,8 +519,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":2", "\"version\":9", "version 9, this program reads 2"),
-            ("\"version\"", "\"varsion\"", "line 1 tells no version"),
+            ("\"version\":2", "\"version\":9", "version 9, expected 2"),
+            ("\"version\"", "\"varsion\"", "line 1 has no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
             ("\"seed\":true", "\"sing\":true", "line 3: "),

@@ -1,4 +1,4 @@
-//! Depth for images that have none, drawn from a saved model where they were taken: `--depth-from`.
+//! `--depth-from`: renders depth for images without depth from a saved model.
 
 use crate::evaluate::{CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::exit::{BadArgument, InsufficientData};
@@ -11,27 +11,28 @@ use std::sync::Arc;
 use trainer::gpu::Gpu;
 use trainer::{DepthMap, Keyframe, Method, Picture, Split};
 
-/// A saved model that depth is drawn from.
+/// A saved model from which depth is rendered.
 #[derive(Clone, Debug)]
 pub(crate) struct DepthSource {
     model: PathBuf,
-    /// Of its files.
+    /// SHA-256 of its files.
     pub(crate) sha256: String,
 }
 
-/// How much depth was drawn.
+/// Result of rendering depth.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct RenderedDepth {
     model: PathBuf,
     model_sha256: String,
-    /// Images to learn from that got some: those with depth on less than half of their pixels.
+    /// Number of images for which depth was rendered; only images with depth on less than half of their pixels are
+    /// eligible.
     pub(crate) n_images: usize,
-    /// Share of the pixels without depth of such images that got it.
+    /// Fraction of the missing pixels of such images that were filled.
     rendered_frac: f64,
 }
 
 impl DepthSource {
-    /// The model in a folder, or in a file of splats.
+    /// The model in a folder, or in a single file of splats.
     pub(crate) fn find(model: &Path) -> anyhow::Result<Self> {
         let invalid = |error: anyhow::Error| BadArgument(format!("--depth-from: {error:#}"));
         run_folder::expect_model(model).map_err(invalid)?;
@@ -44,7 +45,8 @@ impl DepthSource {
         Ok(Self { model: model.to_owned(), sha256 })
     }
 
-    /// Gives depth to all keyframes but those for testing where they have none, or next to none. What was measured stays.
+    /// Renders depth for all keyframes except test keyframes that have no depth or only sparse depth. Measured depth is
+    /// kept.
     pub(crate) fn draw(
         &self,
         gpu: Arc<Gpu>,
@@ -69,18 +71,18 @@ impl DepthSource {
         }
         bar.finish_and_clear();
         if totals.n_missing > 0 && totals.n_rendered == 0 {
-            let message = "no image sees anything of that model where it lacks depth";
+            let message = "the model is not visible in any image that lacks depth";
             return Err(InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into());
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = print::counted(n_images as u64, "image");
         let message = format!(
-            "depth of {images} was drawn from {model_name}: {:.1} % of what they lacked",
+            "rendered depth for {images} from {model_name}: {:.1} % of the missing pixels",
             100.0 * rendered_frac
         );
         match (totals.n_missing, rendered_frac) {
             (0, _) => {
-                log::warn!("--depth-from {model_name}: no image to learn from lacks depth, so it changes nothing")
+                log::warn!("--depth-from {model_name} has no effect: no training image lacks depth")
             }
             (_, frac) if frac < MIN_COVERED_FRAC => log::warn!("{message}; {CHECK_SAME_SCENE}"),
             _ => log::info!("{message}"),
@@ -89,30 +91,32 @@ impl DepthSource {
     }
 }
 
-/// Refuses a model that is not the one that depth was drawn from before; `before` and `now` are sums of them.
+/// Returns an error unless both SHA-256 sums, of the model used `before` and of the one given `now`, are the same.
 ///
-/// `subject`: what was made before.
+/// `subject`: name of the earlier result for messages.
 pub(crate) fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), BadArgument> {
     match (before, now) {
         (before, now) if before == now => Ok(()),
-        (None, _) => Err(BadArgument(format!("{subject} had no depth drawn from a model: leave out --depth-from"))),
+        (None, _) => Err(BadArgument(format!("{subject} was made without --depth-from: remove the flag"))),
         (Some(before), None) => Err(BadArgument(format!(
-            "{subject} had depth drawn from the model with the SHA-256 {before}: name it with --depth-from"
+            "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
         ))),
         (Some(before), Some(now)) => Err(BadArgument(format!(
-            "{subject} had depth drawn from the model with the SHA-256 {before}, --depth-from names one with {now}"
+            "{subject} used depth rendered from the model with the SHA-256 {before}, but the model given with \
+             --depth-from has {now}"
         ))),
     }
 }
 
-/// Pixels of one keyframe, or of several.
+/// Pixel counts of one or several keyframes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Filled {
     n_missing: u64,
     n_rendered: u64,
 }
 
-/// Draws what one keyframe lacks: in its own depth image, else in one with the lens of its color image.
+/// Renders the missing depth of one keyframe: in the pixels of its depth image, or of its color image if it has no
+/// depth image.
 fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<Filled> {
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {
@@ -134,7 +138,7 @@ fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<
     Ok(filled)
 }
 
-/// Depth as it was measured, metres, and as it was drawn where it was not; 0 where neither knows any.
+/// Measured depth in meters, filled with rendered depth where it is missing; 0 where neither is known.
 fn merge_depth(own_m: &[f32], rendered: &Picture) -> (Vec<f32>, Filled) {
     let is_known = |z: f32| z > 0.0 && z.is_finite();
     let mut filled = Filled::default();
@@ -172,8 +176,8 @@ mod tests {
     fn different_depth_model_is_rejected() {
         let message = |before, now| check_same("the log", before, now).map_err(|error| error.0);
         assert_eq!((message(None, None), message(Some("5ad1"), Some("5ad1"))), (Ok(()), Ok(())));
-        assert!(message(None, Some("5ad1")).is_err_and(|message| message.contains("leave out --depth-from")));
-        assert!(message(Some("5ad1"), None).is_err_and(|message| message.contains("5ad1: name it with --depth-from")));
+        assert!(message(None, Some("5ad1")).is_err_and(|message| message.contains("remove the flag")));
+        assert!(message(Some("5ad1"), None).is_err_and(|message| message.contains("5ad1: give that model with")));
         let other = message(Some("5ad1"), Some("c0de"));
         assert!(other.is_err_and(|message| message.contains("5ad1") && message.contains("c0de")));
     }

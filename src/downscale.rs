@@ -1,35 +1,36 @@
-//! Smaller training images: their lens, and their pixels by averaging areas.
+//! Downscales training images by averaging areas, together with their intrinsics.
 
 use crate::exit::BadArgument;
 use kinematics::Intrinsics;
 
-/// Images are shrunk at most to this many pixels along a side: below, nothing is left to learn from.
+/// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
 const MIN_SIDE_PX: u32 = 16;
-/// Shares of the width and height that are allowed.
+/// Allowed fractions of the width and height.
 const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
 
-/// The value of `--scale`.
+/// Parses the value of `--scale`.
 pub(crate) fn parse_scale(text: &str) -> Result<f64, String> {
     let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
     share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
 }
 
-/// The lens of images shrunk to `share` of their width and height; refuses what would become too small.
+/// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error if they become too
+/// small.
 pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, BadArgument> {
     let scaled = full.scaled(share);
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
         let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
         return Err(BadArgument(format!(
             "scale {share}: images of {from_width}x{from_height} pixels would have {width}x{height}, \
-             at least {MIN_SIDE_PX} along each side are needed"
+             the minimum is {MIN_SIDE_PX} along each side"
         )));
     }
     Ok(scaled)
 }
 
-/// An image at its new size, `[height, width, 4]`: nothing to do where the size stays.
+/// Scales an image to its new size, `[height, width, 4]`; returns it unchanged if the size is the same.
 ///
-/// What is partly masked is masked: no pixel mixes in what must not be seen.
+/// A new pixel is masked if any pixel it covers is masked, so that no masked content leaks into the result.
 pub(crate) fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     let mut rgba = if from_px == to_px { rgba } else { area_mean(&rgba, from_px, to_px) };
     for alpha in rgba.iter_mut().skip(3).step_by(4) {
@@ -38,7 +39,7 @@ pub(crate) fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8>
     rgba
 }
 
-/// Shrinks `[height, width, 4]`: each new pixel is the mean over the area it covers, fractions of pixels included.
+/// Shrinks `[height, width, 4]`. Each new pixel is the mean over the area it covers, including fractions of pixels.
 fn area_mean(rgba: &[u8], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
     let (columns, rows) = (coverage(from_px[0], to_px[0]), coverage(from_px[1], to_px[1]));
@@ -61,7 +62,7 @@ fn area_mean(rgba: &[u8], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     out
 }
 
-/// For each new pixel of a line, the old ones it covers and their shares, which add up to 1.
+/// For each new pixel of a line, the old pixels it covers and their weights, which add up to 1.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions lie inside the line")]
 fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
     let ratio = f64::from(from) / f64::from(to);
@@ -107,6 +108,6 @@ mod tests {
         let message = intrinsics(&full, 0.1).expect_err("12 rows").to_string();
         assert!(message.contains("160x120") && message.contains("16x12"), "{message}");
         let small = Intrinsics { size_px: [8, 6], ..full };
-        assert_eq!(intrinsics(&small, 1.0).expect("as it is"), small);
+        assert_eq!(intrinsics(&small, 1.0).expect("unchanged"), small);
     }
 }

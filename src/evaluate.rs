@@ -1,6 +1,6 @@
-//! How good a model is: every test keyframe drawn from its own pose at its own size, and scored.
+//! Evaluates a model: renders every test keyframe from its pose at its size, and scores the result.
 //!
-//! The one evaluation of the program: `train`, `run` and `eval` tell the same numbers for the same model.
+//! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
 
 use crate::print;
 use anyhow::Context;
@@ -13,58 +13,58 @@ use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, su
 use trainer::splat::CalibratedCamera;
 use trainer::{DepthMap, Keyframe, Method, Picture, Projection, RenderRequest};
 
-/// Names the weights of LPIPS where no flag does.
+/// Environment variable with the path of the LPIPS weights, used if no flag gives one.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
-/// Nothing nearer than this is drawn, metres.
+/// Near plane of renders, meters.
 const NEAR_M: f64 = 0.01;
-/// Nothing further than this is drawn, metres.
+/// Far plane of renders, meters.
 const FAR_M: f64 = 1000.0;
 
-/// A pixel that a model covers by less shows nothing of it.
+/// Minimum alpha of a pixel that counts as covered by the model.
 pub(crate) const MIN_ALPHA: u8 = 128;
-/// A model that covers less of what is looked at is hardly of that place.
+/// Minimum covered fraction; below it, the model probably does not show the scene of the images.
 pub(crate) const MIN_COVERED_FRAC: f64 = 0.05;
-/// What to ask then.
-pub(crate) const CHECK_SAME_SCENE: &str = "are both of one place, in one world frame?";
+/// Hint for that case.
+pub(crate) const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
 
-/// Which scores are wanted.
+/// Computes scores of test images.
 #[derive(Clone)]
 pub(crate) struct Evaluator {
-    /// Everything there is; else PSNR only.
+    /// Whether to compute all available scores rather than PSNR only.
     is_full: bool,
-    /// Absent without weights.
+    /// `None` without weights.
     lpips: Option<Arc<Lpips>>,
 }
 
-/// Scores of one test image. `None` is not known, never zero.
+/// Scores of one test image. `None` means unknown, never zero.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct ImageScores {
     pub(crate) camera: String,
     pub(crate) stamp_nanos: i64,
-    /// dB against the image as the camera delivered it.
+    /// PSNR against the image as the camera delivered it, dB.
     pub(crate) psnr: f64,
     pub(crate) ssim: Option<f64>,
     pub(crate) lpips: Option<f64>,
-    /// Root mean square along z over pixels where both have depth, metres.
+    /// Root mean square error along z over pixels where both have depth, meters.
     pub(crate) depth_rmse_m: Option<f64>,
-    /// Mean distance of the drawn surface from the measured one along its normal, metres: accuracy.
+    /// Accuracy: mean distance of the rendered surface from the measured one along its normal, meters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) surface_error_m: Option<f64>,
-    /// Share of the measured surface that is drawn within 5 mm: completeness.
+    /// Completeness: fraction of the measured surface that is rendered within 5 mm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) surface_within_5_mm: Option<f64>,
-    /// dB against the noise-free image, drawn at the true pose; in simulation only.
+    /// PSNR against the noise-free image, rendered at the true pose, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_truth: Option<f64>,
-    /// dB of the delivered image against the noise-free one; in simulation only.
+    /// PSNR of the delivered image against the noise-free one, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_ceiling: Option<f64>,
-    /// Share of its pixels that the model covers; `None` if the picture stayed on the GPU.
+    /// Fraction of pixels that the model covers; `None` if the picture stayed on the GPU.
     #[serde(skip)]
     pub(crate) covered_frac: Option<f64>,
 }
 
-/// Means over the test images. `None` is not known, never zero.
+/// Mean scores over the test images. `None` means unknown, never zero.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub(crate) struct Scores {
     pub(crate) psnr: Option<f64>,
@@ -79,20 +79,20 @@ pub(crate) struct Scores {
     pub(crate) psnr_truth: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) psnr_ceiling: Option<f64>,
-    /// PSNR by camera, told when there are several.
+    /// PSNR per camera; empty if there is only one.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub(crate) psnr_per_camera: BTreeMap<String, f64>,
 }
 
 impl Evaluator {
-    /// Scores with PSNR, SSIM, depth and, where the flag or `FIELDRIG_LPIPS_WEIGHTS` names weights, LPIPS.
+    /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights, LPIPS.
     pub(crate) fn thorough(lpips_weights: Option<&Path>) -> anyhow::Result<Self> {
         let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
         let lpips = lpips_weights.or(named.as_deref()).map(Lpips::load).transpose()?;
         Ok(Self { is_full: true, lpips: lpips.map(Arc::new) })
     }
 
-    /// PSNR and no more: one render an image.
+    /// Computes PSNR only, with one render per image.
     pub(crate) fn psnr_only() -> Self {
         Self { is_full: false, lpips: None }
     }
@@ -135,7 +135,7 @@ impl Evaluator {
         })
     }
 
-    /// Scores one test keyframe; an error names the keyframe.
+    /// Scores one test keyframe. Errors name the keyframe.
     pub(crate) fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
         self.score(method, keyframe)
             .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
@@ -152,7 +152,7 @@ impl Evaluator {
 }
 
 impl Scores {
-    /// The means of `images`.
+    /// The means over `images`.
     pub(crate) fn mean(images: &[ImageScores]) -> Self {
         let mut psnr_per_camera = BTreeMap::new();
         for image in images {
@@ -194,14 +194,14 @@ impl Display for Scores {
     }
 }
 
-/// Share of a picture's pixels that the model covers.
+/// Fraction of a picture's pixels that the model covers.
 pub(crate) fn covered_frac(picture: &Picture) -> f64 {
     let pixels = picture.rgba_srgb.as_chunks::<4>().0;
     let n_covered = pixels.iter().filter(|[.., alpha]| *alpha >= MIN_ALPHA).count();
     n_covered as f64 / pixels.len().max(1) as f64
 }
 
-/// Says when a model covers next to nothing of pictures, from the share of each that it covers.
+/// Warns if a model covers almost nothing of these pictures, given the covered fraction of each.
 pub(crate) fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
     if covered_frac < MIN_COVERED_FRAC {
@@ -210,7 +210,7 @@ pub(crate) fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     }
 }
 
-/// Mean of what is known.
+/// Mean of the known values.
 fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0.0);
     for value in values.flatten() {
@@ -220,7 +220,7 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
     (n > 0.0).then(|| sum / n)
 }
 
-/// The picture a model shows where a keyframe was taken, sheared as the keyframe is.
+/// Renders a model from the pose of a keyframe, with the same rolling shutter and the camera's gains.
 pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
@@ -235,15 +235,15 @@ pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) ->
     Ok(picture)
 }
 
-/// PSNR of the picture that [`draw`] draws against the image of the keyframe, without reading the picture back: the same bits.
-/// `None` if the method cannot do that, or if the picture is brightened after it is drawn.
+/// PSNR of the picture that [`draw`] returns against the image of the keyframe, bit-identical, without reading the
+/// picture back. `None` if the method does not support it, or if gains are applied after rendering.
 fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
 }
 
-/// The picture a model shows where a keyframe's depth was taken, of the size and lens of `depth`: the keyframe's, or every so manieth
-/// reading of it. `None` for a keyframe without depth.
+/// Renders a model from the pose of a keyframe's depth image, with the size and intrinsics of `depth`: the full depth
+/// map or a subsampled one. `None` for a keyframe without depth.
 pub(crate) fn render_depth(
     method: &mut dyn Method,
     keyframe: &Keyframe,
@@ -262,7 +262,7 @@ pub(crate) fn render_depth(
     Ok(Some(drawn))
 }
 
-/// What each value of a color becomes when multiplied.
+/// Lookup table for multiplying a color value by `gain`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
 fn gain_table(gain: f64) -> [u8; 256] {
     std::array::from_fn(|value| (gain * value as f64).round().clamp(0.0, 255.0) as u8)
@@ -283,7 +283,7 @@ fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
     }
 }
 
-/// How depth that was drawn differs from depth that was measured.
+/// Error of rendered depth relative to measured depth.
 #[derive(Default)]
 struct DepthError {
     rmse_m: Option<f64>,
@@ -302,7 +302,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<D
     })
 }
 
-/// The noise-free image has no shear, and is seen from the true pose.
+/// PSNR against the noise-free image, which has no rolling shutter and was taken from the true pose.
 fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
     let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
@@ -341,7 +341,7 @@ mod tests {
     fn means_skip_unknown_scores() {
         let scores = Scores::mean(&[image("wrist", 20.0, Some(0.5)), image("wrist", 30.0, None)]);
         assert_eq!((scores.psnr, scores.lpips, scores.ssim), (Some(25.0), Some(0.5), None));
-        assert!(scores.psnr_per_camera.is_empty(), "one camera has no share to tell");
+        assert!(scores.psnr_per_camera.is_empty(), "a single camera is not reported separately");
         assert_eq!(Scores::mean(&[]), Scores::default());
     }
 

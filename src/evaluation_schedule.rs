@@ -1,6 +1,6 @@
-//! The seconds at which scores are told: 0.25, 0.5, 1, 2, 4, 8, 16, 32, 60, 120, 240 and so on.
+//! The evaluation schedule: 0.25, 0.5, 1, 2, 4, 8, 16, 32, 60, 120, 240 seconds of training and so on.
 
-/// The next mark, and those after it.
+/// The evaluation schedule of a session.
 #[derive(Clone, Debug)]
 pub(crate) struct EvaluationSchedule {
     next_secs: f64,
@@ -13,7 +13,7 @@ impl Default for EvaluationSchedule {
 }
 
 impl EvaluationSchedule {
-    /// Whether a mark was reached at `secs`; several passed at once count as one.
+    /// Whether an evaluation time was reached at `secs`. Several reached at once count as one.
     pub(crate) fn reached(&mut self, secs: f64) -> bool {
         let mut reached = false;
         while secs >= self.next_secs {
@@ -24,19 +24,19 @@ impl EvaluationSchedule {
     }
 }
 
-/// The newest mark at `secs`; `None` before the first.
+/// The latest evaluation time at `secs`; `None` before the first.
 pub(crate) fn latest(secs: f64) -> Option<f64> {
     up_to(secs).last()
 }
 
-/// The marks up to `secs`.
+/// The evaluation times up to `secs`.
 pub(crate) fn up_to(secs: f64) -> impl Iterator<Item = f64> {
     let first = EvaluationSchedule::default().next_secs;
     std::iter::successors(Some(first), |evaluation_secs| Some(next_after(*evaluation_secs)))
         .take_while(move |evaluation_secs| *evaluation_secs <= secs)
 }
 
-/// Doubles, and turns from seconds to whole minutes between 32 s and 60 s.
+/// Doubles the time; after 32 s continues with whole minutes, starting at 60 s.
 fn next_after(evaluation_secs: f64) -> f64 {
     if evaluation_secs == 32.0 { 60.0 } else { 2.0 * evaluation_secs }
 }

@@ -1,4 +1,4 @@
-//! Keyframes -> a nerfstudio folder: PNG colour, 16-bit depth, poses, split lists.
+//! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
 
 use crate::partial::Partial;
 use anyhow::{Context, bail, ensure};
@@ -10,13 +10,14 @@ use std::path::Path;
 use std::sync::Arc;
 use trainer::{DepthMap, Keyframe, Split};
 
-/// What readers assume where a file does not say: millimetres.
+/// Depth unit that readers assume if the file does not specify one: millimeters.
 const METERS_PER_COUNT: f64 = 0.001;
-/// Depth may be written as that of a photo when their lenses differ by less than this, in pixels of the depth image.
+/// Maximum difference between the lenses of depth and photo, in pixels of the depth image. Above it, depth cannot be
+/// stored with the photo.
 const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
-/// The test photos, one a line, as `--holdout` takes them.
+/// The test photos, one per line, in the format of `--holdout`.
 const TEST_LIST: &str = "test.txt";
-/// The lists of nerfstudio; its validation photos are our selection.
+/// The split lists of nerfstudio.
 const LISTS: [(&str, Split); 3] =
     [("train_filenames", Split::Train), ("val_filenames", Split::Validation), ("test_filenames", Split::Test)];
 
@@ -26,22 +27,25 @@ const IMAGES: &str = "images";
 const MASKS: &str = "masks";
 const DEPTH: &str = "depth";
 
-/// What was written.
+/// Counts of what was written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Written {
     pub(crate) n_images: usize,
     pub(crate) n_depth: usize,
-    /// Depth images left out because their lens is not that of their photo, which the format cannot say.
+    /// Depth images that were left out because their intrinsics differ from those of the photo, which the format cannot
+    /// express.
     pub(crate) n_depth_skipped: usize,
 }
 
-/// Writes a folder that must not hold a dataset yet; `transforms.json` comes last, so a folder that has it is whole.
+/// Writes a folder, which must not contain a dataset yet. `transforms.json` is written last, so a folder that has it is
+/// complete.
 ///
-/// Depth is rounded to millimetres and ends at 65 m. Velocities, readout times and the truth of simulators have no place in it.
+/// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
+/// not exported.
 pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
     let transforms = out.join(nerfstudio::FILE_NAME);
     if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
-        bail!("{} already exists: name another folder", existing.display());
+        bail!("{} already exists: give another folder", existing.display());
     }
     let partial = Partial::folder(out, &ENTRIES);
     let mut written = Written::default();
@@ -51,7 +55,7 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
         cameras.push(camera_keys(&keyframe));
         splits.push(keyframe.split);
     }
-    ensure!(!frames.is_empty(), "there is no keyframe to export");
+    ensure!(!frames.is_empty(), "no keyframe to export");
 
     let names = |wanted_split: Split| {
         let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted_split);
@@ -62,7 +66,8 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
     document.insert("camera_model".to_owned(), json!("PINHOLE"));
     document.insert("depth_unit_scale_factor".to_owned(), json!(METERS_PER_COUNT));
     document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
-    // One camera stands once, at the top, where every reader looks; several stand with their frames.
+    // A single camera is written once at the top level, which every reader supports; several cameras are written per
+    // frame.
     if cameras.iter().all(|camera| *camera == cameras[0]) {
         document.append(&mut cameras[0]);
     } else {
@@ -74,7 +79,7 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
     Ok(written)
 }
 
-/// Writes the pictures of one keyframe and tells its entry.
+/// Writes the images of one keyframe and returns its entry.
 fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow::Result<Map<String, Value>> {
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
     let mut frame = Map::new();
@@ -106,7 +111,7 @@ fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow
     Ok(frame)
 }
 
-/// Size and lens of a keyframe under nerfstudio's keys.
+/// Size and intrinsics of a keyframe under nerfstudio's keys.
 fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
     let [[fl_x, fl_y], [cx, cy]] = [keyframe.focal_px, keyframe.principal_px];
     let keys =
@@ -118,12 +123,12 @@ fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
 
 /// The pose as four rows, for a camera that looks along -z with y up.
 fn opengl_rows(world_from_camera: &Transform) -> Value {
-    // Half a turn is its own inverse.
+    // A rotation by half a turn is its own inverse.
     let rows = transform::to_rows(&(world_from_camera * nerfstudio::opengl_from_camera()));
     json!(rows.as_chunks::<4>().0)
 }
 
-/// Whether the depth image is seen through the photo's lens, at its own size.
+/// Whether the depth image has the photo's lens, scaled to its size.
 fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
     (0..2).all(|axis| {
         let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
@@ -133,7 +138,7 @@ fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
     })
 }
 
-/// Millimetres in the byte order of this machine, as the encoder wants them; 0 where unknown or too far.
+/// Depth in millimeters, in native byte order as the encoder expects; 0 where unknown or too far.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked first")]
 fn depth_counts(depth: &DepthMap) -> Vec<u8> {
     let count = |depth_m: &f32| {
@@ -217,7 +222,7 @@ mod tests {
                 (got.size_px, got.focal_px, got.principal_px),
                 (expected.size_px, expected.focal_px, expected.principal_px)
             );
-            assert!(got.rgba_srgb == expected.rgba_srgb, "colours differ");
+            assert!(got.rgba_srgb == expected.rgba_srgb, "colors differ");
             assert_eq!(got.split == Split::Test, expected.split == Split::Test);
             assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
             let (got, expected) = (got.depth.as_ref().unwrap(), expected.depth.as_ref().unwrap());

@@ -1,4 +1,5 @@
-//! The input side of a run: source, recorder, join and the stands of the base on a thread of their own, keyframes out of a bounded queue.
+//! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
+//! come out of a bounded queue.
 
 use crate::join::{Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
@@ -16,10 +17,11 @@ use std::time::{Duration, Instant};
 use trainer::Keyframe;
 use viz::{Hub, LiveImage, LivePixels};
 
-/// Keyframes that may wait for the trainer. When they do, the source waits too, and live devices drop (and count) images.
+/// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live
+/// devices drop (and count) images.
 const MAX_WAITING: usize = 8;
 
-/// A live image that seems older than this was stamped by another clock, such as a simulator's.
+/// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// A change of the set of keyframes.
@@ -27,7 +29,7 @@ const MAX_LIVE_AGE_SECS: f64 = 60.0;
 pub(crate) enum Change {
     /// A new keyframe.
     Accepted(Arc<Keyframe>),
-    /// A keyframe made room for others.
+    /// A keyframe was evicted from the full store.
     Evicted {
         /// Name of its camera.
         camera: Arc<str>,
@@ -36,7 +38,7 @@ pub(crate) enum Change {
     },
 }
 
-/// What the run can see of the input while it runs.
+/// State of the input that the run reads while it runs.
 #[derive(Debug, Default)]
 struct Shared {
     first_image: OnceLock<Instant>,
@@ -44,26 +46,26 @@ struct Shared {
     source_failed: AtomicBool,
 }
 
-/// What goes in.
+/// The parts of the input.
 pub(crate) struct Input {
     pub(crate) source: Box<dyn Source>,
     pub(crate) join: Join,
-    /// Where the base walks.
+    /// Corrects base poses at stations, if the base moves.
     pub(crate) stations: Option<Stations>,
     pub(crate) recorder: Option<Recorder>,
-    /// Whether devices are read in real time; the stamps of a recording are from another time.
+    /// Whether devices are read in real time. The stamps of a recording are from another time.
     pub(crate) is_live: bool,
     /// Focal length and principal point of every camera, pixels.
     pub(crate) camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
 
-/// What is left when the input ended.
+/// The input after it ended.
 pub(crate) struct InputResult {
     pub(crate) join: Join,
     pub(crate) stations: Option<Stations>,
-    /// Why the input broke off, if it did.
+    /// Error that ended the input early.
     pub(crate) input_error: Option<drivers::Error>,
-    /// Why the recording broke off, if it did.
+    /// Error that ended the recording early.
     pub(crate) recording_error: Option<anyhow::Error>,
 }
 
@@ -76,7 +78,7 @@ pub(crate) struct Feed {
 }
 
 impl Feed {
-    /// Starts to read `input`; ends at its end, at `stop`, or at an error of the source.
+    /// Starts to read `input`. The feed ends when the input ends, at `stop`, or at an error of the source.
     pub(crate) fn start(input: Input, hub: Hub, stop: Stop) -> anyhow::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
@@ -86,20 +88,20 @@ impl Feed {
         Ok(Self { changes, shared, thread, ended: false })
     }
 
-    /// When the first image came.
+    /// Time at which the first image arrived.
     pub(crate) fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
     }
 
-    /// Images refused so far, by reason.
+    /// Number of refused images so far, by reason.
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
         lock(&self.shared.refused).clone()
     }
 
-    /// The next change, waiting for at most `timeout`; `None` when there is none yet or none will come any more.
+    /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
     pub(crate) fn next(&mut self, timeout: Duration) -> Option<Change> {
         match self.changes.recv_timeout(timeout) {
-            Ok(apply) => Some(apply),
+            Ok(change) => Some(change),
             Err(RecvTimeoutError::Timeout) => None,
             Err(RecvTimeoutError::Disconnected) => {
                 self.ended = true;
@@ -120,7 +122,7 @@ impl Feed {
 
     /// Ends the input and waits for its thread, which closes the recording.
     pub(crate) fn finish(self) -> anyhow::Result<InputResult> {
-        // A pump that waits to send is woken by this.
+        // Wakes an input thread that is waiting to send.
         drop(self.changes);
         self.thread.join().map_err(|_| anyhow!("the input thread panicked: this is a bug"))
     }
@@ -134,7 +136,7 @@ struct Pump {
     shared: Arc<Shared>,
 }
 
-/// The trainer takes no more.
+/// The trainer accepts no more keyframes.
 struct TrainerGone;
 
 impl Pump {
@@ -155,7 +157,7 @@ impl Pump {
                 && let Err(error) = recorder.write(&sample)
             {
                 let error = anyhow!(error);
-                log::error!("the recording ends here, the run goes on: {error:#}");
+                log::error!("the recording ends here, the run continues: {error:#}");
                 recording_error = Some(error);
             }
             if matches!(sample, Sample::Image(_)) {
@@ -169,7 +171,7 @@ impl Pump {
             }
         }
         let events = self.input.join.finish();
-        // A trainer that hung up needs no more keyframes.
+        // If the trainer has ended, it needs no more keyframes.
         let _ = self.forward(events).and_then(|()| self.release_held());
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
@@ -193,10 +195,10 @@ impl Pump {
         Ok(())
     }
 
-    fn apply(&mut self, apply: Change) -> Result<(), TrainerGone> {
+    fn apply(&mut self, change: Change) -> Result<(), TrainerGone> {
         let forwarded = match &mut self.input.stations {
-            Some(stations) => stations.push(apply),
-            None => vec![apply],
+            Some(stations) => stations.push(change),
+            None => vec![change],
         };
         self.send(forwarded)
     }
@@ -206,17 +208,17 @@ impl Pump {
         self.send(forwarded.unwrap_or_default())
     }
 
-    /// Nothing more comes: what was held back goes on.
+    /// Releases the keyframes that wait for a station, because no more will come.
     fn release_held(&mut self) -> Result<(), TrainerGone> {
         let forwarded = self.input.stations.as_mut().map(Stations::finish);
         self.send(forwarded.unwrap_or_default())
     }
 
     fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
-        changes.into_iter().try_for_each(|apply| self.sender.send(apply).map_err(|_| TrainerGone))
+        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| TrainerGone))
     }
 
-    /// Shows what a camera sees to whoever looks.
+    /// Publishes a camera image to viewers.
     fn publish_image(&self, posed_image: &PosedImage) {
         if self.hub.n_clients() == 0 {
             return;
@@ -224,7 +226,7 @@ impl Pump {
         let image = &posed_image.image;
         let pixels = match image.format {
             PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
-            // Browsers show no JPEG that a camera sent without its tables.
+            // Some cameras send JPEG without tables, which browsers cannot show.
             PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
                 Ok(jpeg) => LivePixels::Jpeg(jpeg.as_ref().into()),
                 Err(_) => return,
@@ -252,7 +254,7 @@ impl Pump {
         });
     }
 
-    /// When an image was captured; now, if its stamp is on another clock (recordings, simulations).
+    /// Time at which an image was captured, or now if its stamp is on another clock (recordings, simulations).
     fn captured_at(&self, stamp: Stamp) -> Instant {
         let now = Instant::now();
         let age_secs = clock::now().secs_since(stamp);
@@ -264,7 +266,7 @@ impl Pump {
     }
 }
 
-/// Locks, also after a panic elsewhere: a count cannot be half written.
+/// Locks the mutex even if another thread panicked, because the data cannot be inconsistent.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,9 +1,10 @@
-//! What of a keyframe reaches a model, as one number: data that give another one give another model.
+//! Fingerprint of the keyframe data that affect a model: a different fingerprint means a different model.
 
 use kinematics::Twist;
 use trainer::{DepthMap, Keyframe};
 
-/// A fingerprint of pixels, depth, lens, pose, velocity and how joints move it; the split and what only a simulator knows are left out.
+/// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists. The split and ground truth of a simulator
+/// are excluded.
 pub(crate) fn of(keyframe: &Keyframe) -> u64 {
     let mut hash = Hash::default();
     hash.sizes(keyframe.size_px, keyframe.focal_px, keyframe.principal_px);
@@ -19,7 +20,7 @@ pub(crate) fn of(keyframe: &Keyframe) -> u64 {
     hash.0
 }
 
-/// Eight bytes at a time: a fingerprint must not take as long as the image took to come.
+/// Hashes eight bytes at a time, so that it is faster than the rate of images.
 struct Hash(u64);
 
 impl Default for Hash {

@@ -1,4 +1,4 @@
-//! Which photos of a dataset are kept from training, and what for.
+//! Selects which photos of a dataset are excluded from training, and for what.
 
 use crate::exit::BadArgument;
 use anyhow::ensure;
@@ -8,9 +8,9 @@ use trainer::Split;
 /// How test photos are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Holdout {
-    /// Every n-th photo there is, from the first; n is at least 1.
+    /// Every n-th photo, starting with the first; n is at least 1.
     Every(usize),
-    /// The photos of these names.
+    /// The photos with these names.
     Named(Vec<String>),
 }
 
@@ -21,7 +21,7 @@ impl Default for Holdout {
 }
 
 impl Holdout {
-    /// From the value of `--holdout`: a number, or a file with one name a line.
+    /// Parses the value of `--holdout`: a number, or a file with one name per line.
     pub(crate) fn from_argument(argument: &str) -> Result<Self, BadArgument> {
         let invalid = |reason: &str| BadArgument(format!("--holdout {argument}: {reason}"));
         if let Ok(every) = argument.parse::<i64>() {
@@ -29,18 +29,18 @@ impl Holdout {
                 .ok()
                 .filter(|every| *every >= 1)
                 .map(Self::Every)
-                .ok_or_else(|| invalid("must be at least 1, or a file that names photos"));
+                .ok_or_else(|| invalid("must be at least 1, or a file that lists photos"));
         }
         let text = std::fs::read_to_string(Path::new(argument))
-            .map_err(|error| invalid(&format!("neither a whole number nor a file that can be read ({error})")))?;
+            .map_err(|error| invalid(&format!("neither a whole number nor a readable file ({error})")))?;
         let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
-        if names.is_empty() { Err(invalid("the file names no photo")) } else { Ok(Self::Named(names)) }
+        if names.is_empty() { Err(invalid("the file lists no photo")) } else { Ok(Self::Named(names)) }
     }
 
-    /// What each photo is for, in the order of `names`.
+    /// The split of each photo, in the order of `names`.
     ///
-    /// Selection photos lie halfway between test photos; with named test photos they are every 8th of the others, from the 5th.
-    /// A name matches with its folder and extension or without; one that matches nothing is an error.
+    /// Validation photos lie halfway between test photos; with named test photos, they are every 8th of the others,
+    /// from the 5th. Names match with or without folder and extension. A name without a match is an error.
     pub(crate) fn splits(&self, names: &[&str]) -> anyhow::Result<Vec<Split>> {
         match self {
             Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),
@@ -59,7 +59,7 @@ fn every_nth(ix: usize, every: usize) -> Split {
 
 fn splits_by_name(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<Split>> {
     for test_name in test_names {
-        ensure!(names.iter().any(|name| matches_name(name, test_name)), "--holdout: no photo is called {test_name:?}");
+        ensure!(names.iter().any(|name| matches_name(name, test_name)), "--holdout: no photo is named {test_name:?}");
     }
     let mut n_remaining = 0;
     let split = |name: &&str| {
@@ -72,7 +72,7 @@ fn splits_by_name(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<S
     Ok(names.iter().map(split).collect())
 }
 
-/// Whether a photo is meant: by its path in the folder, its file name, or its file name without extension.
+/// Whether `requested` matches a photo by its path in the folder, its file name, or its file name without extension.
 fn matches_name(name: &str, requested: &str) -> bool {
     let path = Path::new(name);
     let parts = [path.file_name(), path.file_stem()];
@@ -99,8 +99,8 @@ mod tests {
         let splits_by_name =
             |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
         assert_eq!(splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
-        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("no photo is called \"e\""));
-        assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all may be scored");
+        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("no photo is named \"e\""));
+        assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all photos may be scored");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Models growing while keyframes come in and people look.
+//! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
 use crate::feed::{Change, Feed, InputResult};
 use crate::recovery::{self, Recoveries};
@@ -11,32 +11,32 @@ use std::time::{Duration, Instant};
 use trainer::{Keyframe, Split};
 use viz::{Hub, KeyframePose, ModelStatus, Status};
 
-/// The status is told this often.
+/// Period of status messages.
 const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
-/// Where there is nothing to do, this long is waited for something.
+/// Maximum wait for a keyframe when there is nothing to do.
 const IDLE: Duration = Duration::from_millis(10);
-/// Share of the time that goes into scores between the marks.
+/// Fraction of the time spent on scores between scheduled evaluations.
 const SCORE_FRAC: f64 = 0.03;
 /// How often to check for keyframes while waiting for a keyframe or a picture request.
 const POLL_PERIOD: Duration = Duration::from_millis(2);
 /// Pictures are drawn for at most this long before other work continues.
 const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
-/// What sets the pace.
+/// What determines when keyframes are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Pace {
-    /// The devices' clock: keyframes are taken as they come.
+    /// Real time: keyframes are taken as they arrive.
     RealTime,
-    /// The trainer: a keyframe is taken every so many steps, so that a seed gives one result.
+    /// Lockstep with the trainer: a keyframe is taken every given number of steps, so that a seed gives one result.
     Lockstep {
         /// Steps between two keyframes.
         steps_per_keyframe: u64,
     },
 }
 
-/// The moving parts of a run.
+/// The parts of a live run.
 pub(crate) struct Live {
-    /// The first is what people see who do not say which.
+    /// The first one is drawn for viewers that name no method.
     sessions: Vec<Session>,
     feed: Feed,
     hub: Hub,
@@ -56,7 +56,7 @@ pub(crate) struct Live {
 }
 
 impl Live {
-    /// Puts the parts together; nothing happens yet.
+    /// Combines the parts; does not start anything yet.
     pub(crate) fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         Self {
             next_keyframe_at: vec![0; sessions.len()],
@@ -90,19 +90,20 @@ impl Live {
         self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
     }
 
-    /// Whether a limit was reached or cannot be, the devices failed, or they ended and left nothing to train on.
+    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
+    /// without training data.
     pub(crate) fn is_over(&self) -> bool {
         if self.is_scoring() {
             return false; // Scores at the limit are still reported.
         }
-        // Where one reached its limit, the others are waited for as long as they can reach theirs.
+        // If one session has reached its limit, the run waits for the others as long as they can reach theirs.
         let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
         let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
         reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
     }
 
-    /// Whether the devices ended, and steps were asked for that no model can make without them. Where none were asked for
-    /// there is no end: what is known is shown.
+    /// Whether the input ended and a step limit was set that no model can reach without more keyframes. Without a step
+    /// limit the run does not end; the result stays visible.
     pub(crate) fn has_exhausted_input(&self) -> bool {
         self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
     }
@@ -112,12 +113,12 @@ impl Live {
         self.hub.clone()
     }
 
-    /// Keyframes held, in order of acceptance.
+    /// Keyframes in the store, in order of acceptance.
     pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
         &self.keyframes
     }
 
-    /// Keyframes evicted so far: 0 until the store is full.
+    /// Number of keyframes evicted so far.
     pub(crate) fn n_evicted(&self) -> u64 {
         self.n_evicted
     }
@@ -147,7 +148,8 @@ impl Live {
         recovery::describe_recoverable(&mut self.sessions)
     }
 
-    /// Pushes new keyframes to the model: all that wait in real time, the one that is due in lockstep. None during an evaluation.
+    /// Pushes new keyframes to the models: all that wait in real time, the one that is due in lockstep. Does nothing
+    /// during an evaluation.
     fn take_keyframes(&mut self) -> anyhow::Result<()> {
         if self.is_scoring() {
             return Ok(());
@@ -190,8 +192,8 @@ impl Live {
         Ok(())
     }
 
-    /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens for
-    /// [`IDLE`].
+    /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens
+    /// for [`IDLE`].
     fn wait_for_change(&mut self) -> Option<Change> {
         if self.hub.n_clients() == 0 {
             return self.feed.next(IDLE);
@@ -211,8 +213,8 @@ impl Live {
         }
     }
 
-    /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does nothing if a
-    /// requested picture may be drawn at once.
+    /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does
+    /// nothing if a requested picture may be drawn at once.
     fn step(&mut self) -> anyhow::Result<()> {
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
@@ -262,14 +264,14 @@ impl Live {
         while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
             let Some(pending) = self.hub.next_request() else { break };
             if self.keyframes.is_empty() {
-                pending.fail("nothing was seen yet");
+                pending.fail("no keyframe yet");
                 continue;
             }
             let Some(session) = session_for_method(&mut self.sessions, pending.method()) else {
                 let available_methods =
                     self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
                 let requested = pending.method().unwrap_or_default().to_owned();
-                pending.fail(&format!("no model of the method {requested:?} learns here, but {available_methods}"));
+                pending.fail(&format!("no model with the method {requested:?}, only {available_methods}"));
                 continue;
             };
             // Work queued before the picture counts as training time.
@@ -286,7 +288,7 @@ impl Live {
         Ok(())
     }
 
-    /// Tells whoever looks where the run stands, a few times a second.
+    /// Publishes the status of the run to viewers, a few times per second.
     fn publish(&mut self) -> anyhow::Result<()> {
         if self.published.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
             return Ok(());
@@ -295,7 +297,7 @@ impl Live {
         let clock_secs = self.sessions[0].secs();
         if self.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
             let before = Instant::now();
-            // One image at a time, because viewers wait meanwhile.
+            // Only one image at a time, because viewers are waiting.
             self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
             let session = &mut self.sessions[self.next_refreshed];
             if session.progress().step > 0 {
@@ -319,9 +321,9 @@ impl Live {
         Ok(())
     }
 
-    /// Ends the input; the sessions and what is left of the input come back.
+    /// Ends the input; returns the sessions and the remaining input.
     pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<InputResult>) {
-        // The numbers stay, because viewers wait for the scores.
+        // The status stays visible, because viewers wait for the scores.
         self.hub.set_state("saving");
         (self.sessions, self.feed.finish())
     }
@@ -334,17 +336,17 @@ impl Live {
         self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
     }
 
-    /// Several cameras begin with a test keyframe each: their number alone says nothing.
+    /// Counting keyframes is not enough: with several cameras, each camera starts with a test keyframe.
     fn can_train(&self) -> bool {
         self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
     }
 
-    /// Whether no model can learn before a keyframe comes.
+    /// Whether no model can train before the next keyframe arrives.
     fn is_idle(&self) -> bool {
         self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
     }
 
-    /// Whether each model came to the step at which the next keyframe is due, or can do nothing without it.
+    /// Whether each model has reached the step at which the next keyframe is due, or cannot train without it.
     fn is_keyframe_due(&self) -> bool {
         let is_due = |(session, at): (&Session, &u64)| {
             session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
@@ -352,7 +354,7 @@ impl Live {
         self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
     }
 
-    /// Whether the models know all there is to know; they are shown until somebody ends the run.
+    /// Whether the input ended and all training is done; the models stay visible until the user ends the run.
     fn is_finished(&self) -> bool {
         self.feed.ended() && self.is_idle()
     }
@@ -372,11 +374,11 @@ impl Live {
     fn apply(&mut self, change: Change) -> anyhow::Result<()> {
         match change {
             Change::Accepted(keyframe) => {
-                // Nothing comes to a model that has made all its steps: it is as it would be alone.
+                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
                 self.keyframes.push(keyframe.clone());
                 let mut pushed = Ok(());
                 for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
-                    // Every session holds the keyframe, even after a GPU failure, so that a restored model has it.
+                    // Every session holds the keyframe, even after a GPU failure, so that a restored model gets it.
                     pushed = pushed.and(session.push(&keyframe));
                 }
                 pushed
@@ -394,17 +396,17 @@ impl Live {
     }
 }
 
-/// How a run goes.
+/// Options of a live run.
 pub(crate) struct LiveOptions {
-    /// What sets the pace.
+    /// What determines when keyframes are taken.
     pub(crate) pace: Pace,
-    /// Keyframes with which training starts.
+    /// Number of keyframes with which training starts.
     pub(crate) start_keyframes: usize,
-    /// Sentences for the page.
+    /// Notes shown on the page.
     pub(crate) notes: Vec<String>,
 }
 
-/// The session of a method; the first where none is named.
+/// The session of a method; the first one if no method is given.
 fn session_for_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
     sessions.iter_mut().find(|session| method.is_none_or(|name| session.kind().name() == name))
 }

@@ -4,11 +4,11 @@ use trainer::splat::arrays::SplatArrays;
 use trainer::tsdf::VoxelGrid;
 use trainer::tsdf::block::{BLOCK_EDGE, GridCoord};
 
-/// Share of the points inside the radius, so that stray points and far backgrounds stay outside.
+/// Fraction of the points inside the radius, so that stray points and distant backgrounds stay outside.
 const INSIDE_FRAC: f64 = 0.8;
 /// Minimum radius, meters: even a model of one point needs some size.
 const MIN_RADIUS_M: f64 = 0.01;
-/// If a smaller share of the splats is opaque, all splats count.
+/// If a smaller fraction of the splats is opaque, all splats count.
 const MIN_OPAQUE_FRAC: f64 = 0.02;
 
 /// A sphere that contains most of a model.
@@ -52,9 +52,9 @@ impl Bounds {
     }
 }
 
-/// The value that this fraction of all values does not exceed; `values` is not empty.
+/// The value that the fraction `frac` of all values does not exceed; `values` must not be empty.
 fn quantile(mut values: Vec<f64>, frac: f64) -> f64 {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of a length")]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
     let rank = (frac * (values.len() - 1) as f64).round() as usize;
     *values.select_nth_unstable_by(rank, f64::total_cmp).1
 }

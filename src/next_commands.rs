@@ -1,4 +1,4 @@
-//! Commands to run after training; they work as printed, in the folder in which the training was started.
+//! Commands to run after training. They work as printed, in the folder in which training was started.
 
 use crate::method::ModelKind;
 use std::collections::BTreeMap;
@@ -92,7 +92,7 @@ fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
     }
 }
 
-/// Base name of files made from a model: that of its folder, which in a run of several methods is the method.
+/// Base name of files exported from a model: that of its folder, which is the method name in a run of several methods.
 fn model_name(folder: &Path) -> String {
     folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
 }

@@ -11,7 +11,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
-/// For a process ended by a signal, shells report this plus the signal number.
+/// Shells report this plus the signal number for a process ended by a signal.
 const SIGNAL_EXIT_BASE: i32 = 128;
 
 /// Files or folders being written; removed on drop unless they are kept.
@@ -100,10 +100,10 @@ mod tests {
             let (file, new) = (Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["images"]));
             let existing = Partial::folder(folder.path(), &["images", "test.txt"]);
             for name in ["scene.ply", "scene.ply.part", "other", "test.txt"] {
-                std::fs::write(at(name), b"x").expect("room");
+                std::fs::write(at(name), b"x").expect("disk space");
             }
-            std::fs::create_dir_all(at("new/depth")).expect("room");
-            std::fs::create_dir_all(at("images/a")).expect("room");
+            std::fs::create_dir_all(at("new/depth")).expect("disk space");
+            std::fs::create_dir_all(at("images/a")).expect("disk space");
             if keeps {
                 [file, new, existing].into_iter().for_each(Partial::keep);
             } else {
@@ -114,6 +114,6 @@ mod tests {
             assert!(at("other").exists());
         }
         drop([Partial::file(&at("scene.ply")), Partial::folder(&at("new"), &["depth"])]);
-        assert!(at("scene.ply").exists() && at("new/depth").exists(), "they were there before");
+        assert!(at("scene.ply").exists() && at("new/depth").exists(), "they existed before");
     }
 }

@@ -6,14 +6,15 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::Keyframe;
 
-/// Time limit for scoring: if drawing is slow, fewer images are scored. A neural field takes seconds per image on a processor.
+/// Time limit for scoring: if drawing is slow, fewer images are scored. On a CPU, a neural field takes seconds per
+/// image.
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
 /// An evaluation in progress.
 pub(crate) struct PendingEvaluation {
-    /// Seconds of training when it was due.
+    /// Training time when the evaluation was due, seconds.
     pub(crate) seconds: f64,
-    /// Ordered so that the images scored first are already spread evenly over all.
+    /// Ordered so that the first images scored are already spread evenly over all.
     remaining: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
     spent: Duration,

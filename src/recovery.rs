@@ -15,7 +15,7 @@ use trainer::gpu::Gpu;
 
 /// How many times a run tries to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
-/// After this time without a failure the count starts again: a run that lasts for days may fail now and then.
+/// After this time without a failure the count restarts: a run of several days may fail occasionally.
 const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
 /// Pause between attempts: a driver reset takes a moment.
 const RETRY_DELAY: Duration = Duration::from_secs(1);
@@ -29,7 +29,7 @@ pub(crate) struct Recovery {
     pub(crate) resumed: Option<PathBuf>,
     /// Keyframes that the resumed model was trained on.
     pub(crate) known: Vec<Arc<Keyframe>>,
-    /// Settings for the log of decisions.
+    /// Settings for the decision log.
     pub(crate) settings: Settings,
     /// The command that continues from the newest checkpoint.
     pub(crate) resume_command: String,
@@ -55,7 +55,7 @@ fn in_folder(folder: &Path) -> String {
     folder.join(CHECKPOINT).display().to_string()
 }
 
-/// The GPU failed and the run could not continue on another device; the text names what is saved on disk.
+/// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct GpuUnrecoverable(String);
@@ -91,8 +91,8 @@ pub(crate) struct Recoveries {
 }
 
 impl Recoveries {
-    /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail, returns the
-    /// error.
+    /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail,
+    /// returns the error.
     pub(crate) fn recover(&mut self, sessions: &mut [Session], error: anyhow::Error) -> anyhow::Result<()> {
         if !is_gpu_error(&error) || sessions.iter().any(|session| session.recovery().is_none()) {
             return Err(error);

@@ -1,11 +1,12 @@
 //! Limits the share of time that pictures take from training.
 //!
-//! Time spent on training is credited to pictures one for one. A picture is drawn at once while credit is left, so training
-//! keeps at least half of the time however many pictures are requested.
+//! Time spent on training is credited to pictures one for one. A picture is drawn at once while credit is left, so
+//! training keeps at least half of the time however many pictures are requested.
 
 use std::time::Duration;
 
-/// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this length.
+/// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this
+/// length.
 const MAX_CREDIT_SECS: f64 = 0.1;
 /// Maximum debt, seconds: after a picture that takes longer, training catches up on this much only.
 const MAX_DEBT_SECS: f64 = 1.0;
@@ -67,7 +68,7 @@ mod tests {
             let frac = render_frac(Duration::from_millis(millis), STEP);
             assert!((0.49..0.51).contains(&frac), "{millis} ms per picture: {frac}");
         }
-        // On a processor a picture may take so long that its debt is capped.
+        // On a CPU a picture may take so long that its debt is capped.
         assert!(render_frac(Duration::from_secs(10), STEP) > 0.8);
     }
 
@@ -82,7 +83,7 @@ mod tests {
         assert_eq!(n_drawn, 34);
         budget.add_training(STEP);
         assert!(budget.may_render());
-        // On a processor a step takes seconds, so all stages of a picture are drawn between two steps.
+        // On a CPU a step takes seconds, so all stages of a picture are drawn between two steps.
         budget.add_training(Duration::from_secs(2));
         for stage_millis in [100, 500, 1300] {
             assert!(budget.may_render());

@@ -1,4 +1,4 @@
-//! A training whose decisions are those of a log: `train --replay-decisions`.
+//! `train --replay-decisions`: trains with the decisions of a log.
 
 use crate::config::Override;
 use crate::data::Data;
@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::time::Instant;
 use trainer::Keyframe;
 
-/// A log of decisions, to be repeated.
+/// A decision log to replay.
 pub(crate) struct Replay {
     path: PathBuf,
     pub(crate) decisions: Decisions,
@@ -28,18 +28,16 @@ impl Replay {
     pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
         let decisions = Decisions::load(path)?;
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
-            BadArgument(format!("{}: there is no method {:?}", path.display(), decisions.settings.method))
+            BadArgument(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
         })?;
         let replay = Self { path: path.to_owned(), decisions, kind };
         if replay.decisions.pushed().next().is_none() {
-            return Err(
-                InsufficientData(format!("{} names no keyframe: nothing is to be repeated", replay.name())).into()
-            );
+            return Err(InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into());
         }
         Ok(replay)
     }
 
-    /// Loads exactly the keyframes that the log names; [`Self::check_data`] checks that they are the same.
+    /// Loads exactly the keyframes in the log; [`Self::check_data`] checks that they are the same.
     pub(crate) fn load_data(&self, path: &Path, rig: Option<PathBuf>, quiet: bool) -> anyhow::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
@@ -56,13 +54,12 @@ impl Replay {
         if !self.decisions.is_complete() {
             let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
             let name = self.name();
-            data.data_losses
-                .push(format!("{name} is cut off: its run is repeated up to step {last}, the last it tells of"));
+            data.data_losses.push(format!("{name} is truncated: replaying up to step {last}, its last one"));
         }
         Ok(data)
     }
 
-    /// Refuses data that lack a keyframe of the log, or have another one in its place.
+    /// Returns an error if a keyframe of the log is missing from the data or differs.
     pub(crate) fn check_data(&self, path: &Path, data: &Data) -> Result<(), InsufficientData> {
         let by_key = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
@@ -70,52 +67,54 @@ impl Replay {
             let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
             let Some(keyframe) = by_key.get(&(camera, stamp)) else {
                 return Err(InsufficientData(format!(
-                    "{name} names image {stamp} of camera {camera:?}, which {shown} does not have"
+                    "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
                 )));
             };
             if !pushed.matches(keyframe) {
                 return Err(InsufficientData(format!(
-                    "image {stamp} of camera {camera:?} has other pixels, depth, lens or pose in {shown} than {name} was written with"
+                    "image {stamp} of camera {camera:?} has other pixels, depth, intrinsics or pose in {shown} than in \
+                     {name}"
                 )));
             }
         }
         Ok(())
     }
 
-    /// Refuses to repeat a run whose images had depth drawn from another model than this one, known by its SHA-256.
+    /// Checks that depth was rendered from the same model as in the logged run, identified by its SHA-256.
     pub(crate) fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), BadArgument> {
         depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
     }
 
-    /// Refuses a model that is not where the log begins; `from_step`: updates made before, where it goes on from a checkpoint.
+    /// Checks that training starts where the log does. `from_step`: the step of the checkpoint that training continues
+    /// from.
     pub(crate) fn check_start(&self, from_step: Option<u64>) -> Result<(), BadArgument> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
-            (None, _) => Err(BadArgument(format!("{name} begins at the first step: leave out --resume"))),
+            (None, _) => Err(BadArgument(format!("{name} starts at the first step: remove --resume"))),
             (Some(log), None) => Err(BadArgument(format!(
-                "{name} is of a run that went on at step {log}: name the folder of that checkpoint with --resume"
+                "{name} continues from step {log}: give the folder of that checkpoint with --resume"
             ))),
             (Some(log), Some(here)) => {
-                Err(BadArgument(format!("{name} goes on at step {log}, the checkpoint is of step {here}")))
+                Err(BadArgument(format!("{name} continues from step {log}, but the checkpoint is at step {here}")))
             }
         }
     }
 
-    /// The scene model that it is of.
+    /// The method and options of the logged run.
     pub(crate) fn model_spec(&self) -> ModelSpec {
         ModelSpec { kind: self.kind, options: self.decisions.settings.options.clone() }
     }
 
-    /// Says where the bits may differ.
+    /// Warns if the GPU adapter differs from that of the log.
     pub(crate) fn check_adapter(&self, adapter: &str) {
         let logged_adapter = &self.decisions.settings.adapter;
         if logged_adapter != adapter {
-            log::warn!("{} was written on {logged_adapter:?}: another adapter rounds otherwise", self.name());
+            log::warn!("{} was written on {logged_adapter:?}: this adapter rounds differently", self.name());
         }
     }
 
-    /// Repeats the decisions, each at its step.
+    /// Replays the decisions, each at its step.
     pub(crate) fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
         let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
@@ -127,7 +126,7 @@ impl Replay {
                 }
                 if session.step(entry.step - n_total_steps)? == 0 {
                     return Err(InsufficientData(format!(
-                        "{} asks for step {} where there is nothing to learn from",
+                        "{} requires step {}, but there is nothing to train on",
                         self.name(),
                         entry.step
                     ))
@@ -152,7 +151,7 @@ impl Replay {
         Ok(())
     }
 
-    /// The settings as keys of a rig file, so that the settled one that is written tells the truth.
+    /// The settings as keys of a rig file, so that the resolved rig file that is written is correct.
     fn overrides(&self) -> Vec<Override> {
         let options = &self.decisions.settings.options;
         let mut overrides = vec![

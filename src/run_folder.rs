@@ -1,4 +1,4 @@
-//! Where the results of a run go, and what its report says.
+//! The folder of a run, and the files in it.
 
 use crate::config::Rig;
 use crate::data::is_recording;
@@ -14,27 +14,27 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use trainer::{Keyframe, Method};
 
-/// The files of a saved model: what `checkpoint_sha256` covers, in this order.
+/// The files of a saved model, in the order in which `checkpoint_sha256` covers them.
 const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", SPLATS];
-/// The one of them that is a model by itself.
+/// The only one of them that is a complete model on its own.
 const SPLATS: &str = "splats.ply";
-/// Where the folders of runs lie unasked.
+/// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
-/// Where a model lies until it is whole.
+/// Folder in which a model is saved until it is complete.
 const PARTIAL_MODEL: &str = "model.part";
-/// What training needs to go on, in the folder of a run.
+/// The checkpoint in the folder of a run.
 pub(crate) const CHECKPOINT: &str = "training.ckpt";
-/// Held while a run writes into a folder.
+/// Lock file, held while a run writes into a folder.
 const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
-/// Refuses a folder that holds a model, or several: results of two runs never mix, and none is replaced.
+/// Returns an error if a folder contains one or several models, so that results are never mixed or overwritten.
 pub(crate) fn check_no_model(folder: &Path) -> Result<(), BadArgument> {
     let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.map(|kind| PathBuf::from(kind.name())));
     let mut files = subfolders.flat_map(|path| MODEL_FILES.map(|name| path.join(name)));
     match files.find(|file| folder.join(file).exists()) {
         Some(file) => Err(BadArgument(format!(
-            "--out {}: the folder holds a model already ({}), name another one",
+            "--out {}: the folder already contains a model ({}); give another folder",
             folder.display(),
             file.display()
         ))),
@@ -42,12 +42,13 @@ pub(crate) fn check_no_model(folder: &Path) -> Result<(), BadArgument> {
     }
 }
 
-/// Refuses the folder of a run that was cut off, or of several: another run would replace the checkpoint.
+/// Returns an error if a folder contains one or several interrupted runs, because a new run would replace their
+/// checkpoints.
 pub(crate) fn check_no_unfinished_run(out: &Path) -> Result<(), BadArgument> {
     let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.into_iter().map(|kind| out.join(kind.name())));
     match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
         Some(folder) => Err(BadArgument(format!(
-            "--out {}: {} holds a run that was cut off: --resume continues it, --out names another folder",
+            "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
             out.display(),
             folder.display()
         ))),
@@ -55,18 +56,18 @@ pub(crate) fn check_no_unfinished_run(out: &Path) -> Result<(), BadArgument> {
     }
 }
 
-/// Refuses to write results into the folder of the data.
+/// Returns an error if results would be written into the folder of the data.
 pub(crate) fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), BadArgument> {
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => {
-            Err(BadArgument(format!("--out {}: this is the folder of the data, name another folder", out.display())))
+            Err(BadArgument(format!("--out {}: this is the folder of the data; give another folder", out.display())))
         }
         _ => Ok(()),
     }
 }
 
-/// Refuses the folder of a run of several methods where one model is meant, and names theirs.
+/// Returns an error that names the subfolders if a folder contains models of several methods where one model is needed.
 pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
     let inside: Vec<String> = ModelKind::ALL
@@ -78,10 +79,10 @@ pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     if inside.is_empty() || holds_one(folder) {
         return Ok(());
     }
-    Err(BadArgument(format!("{}: a folder for each method lies in it, name {}", folder.display(), inside.join(" or "))))
+    Err(BadArgument(format!("{}: the folder contains several methods; give {}", folder.display(), inside.join(" or "))))
 }
 
-/// Refuses what holds no model: what is not there, a folder without one or with several, and a file that is but a part of one.
+/// Returns an error unless the path is a model: an existing folder with exactly one model, or a file of splats.
 pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
     let shown = model.display();
     ensure!(model.exists(), "{shown} does not exist");
@@ -91,20 +92,20 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
             return Ok(());
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
-        let hint = if has_checkpoint { " but a checkpoint: train --resume goes on from it to one" } else { "" };
-        bail!("{shown} holds no model{hint}");
+        let hint = if has_checkpoint { " but has a checkpoint: train --resume continues from it" } else { "" };
+        bail!("{shown} contains no model{hint}");
     }
     let is_model_part =
         model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
     if is_model_part || splat_file::Format::of(model).is_none() {
-        let message = format!("{shown} is no file of splats (.ply, .spz); of a saved model name its folder");
+        let message = format!("{shown} is not a file of splats (.ply, .spz); for a saved model, give its folder");
         return Err(BadArgument(message).into());
     }
     Ok(())
 }
 
-/// The models at a path: the path itself, or the models in the folder of a run of several methods. Refuses the same paths as
-/// [`expect_model`]. Methods without a model are left out, unless none has one.
+/// The models at a path: the path itself, or the models in the folder of a run of several methods. Returns the same
+/// errors as [`expect_model`]. Methods without a model are left out, unless none has one.
 pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
     let inside = ModelKind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
@@ -116,18 +117,18 @@ pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
     Ok(vec![path.to_owned()])
 }
 
-/// Folders that this run made; a refused run takes them back.
+/// Folders created by this run. They are removed if the run is rejected.
 #[derive(Debug, Default)]
 pub(crate) struct CreatedFolders {
-    /// Each before the one it lies in.
+    /// Folders of the run, each before its parent.
     leaves: Vec<PathBuf>,
-    /// What leads to them, each before the one it lies in.
+    /// Their parents, each before its own parent.
     parents: Vec<PathBuf>,
 }
 
 impl CreatedFolders {
-    /// Makes the folder of each model of a run: the one asked for where there is one model, else one inside it by the name of its
-    /// method. The settled rig file, where there is one, is written into each: beside a model the one that makes it alone.
+    /// Creates the folder of each model of a run: the requested folder for a single model, else a subfolder per method.
+    /// Writes the resolved rig file, if any, into each of them, with only the method of that model.
     pub(crate) fn make_each(
         &mut self,
         requested: Option<&Path>,
@@ -153,7 +154,7 @@ impl CreatedFolders {
         Ok(folders)
     }
 
-    /// Makes the folder asked for, or `runs/<UTC time>`; one that holds a model is refused.
+    /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model is an error.
     pub(crate) fn make(&mut self, requested: Option<&Path>) -> anyhow::Result<PathBuf> {
         let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
         let missing = |folder: &Path| folder.ancestors().take_while(is_missing).map(Path::to_owned).collect::<Vec<_>>();
@@ -169,12 +170,12 @@ impl CreatedFolders {
                 self.leaves.insert(0, leaf.clone());
                 self.parents.splice(0..0, parents.iter().cloned());
             }
-            (Some(_), None) => {} // Somebody else's.
+            (Some(_), None) => {} // It existed before.
         }
         Ok(created)
     }
 
-    /// Removes what was made and all in it, but not where a model, a checkpoint or a recording is: somebody will want that.
+    /// Removes the created folders with their contents, unless they contain a model, a checkpoint or a recording.
     pub(crate) fn remove_created(self) {
         let holds_recording = |folder: &PathBuf| {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -187,14 +188,14 @@ impl CreatedFolders {
             return;
         }
         let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
-        // What others put something into meanwhile is not empty, and stays.
+        // A folder into which another program wrote meanwhile is not empty, so it is kept.
         let removed = removed.and_then(|()| self.parents.iter().try_for_each(std::fs::remove_dir));
         if let Err(error) = removed {
-            log::debug!("what a refused run leaves behind: {error}");
+            log::debug!("cannot remove a folder of the rejected run: {error}");
         }
     }
 
-    /// Takes back what was made where a command was refused: bad arguments, or nothing to work on.
+    /// Removes the created folders if the command was rejected because of bad arguments or insufficient data.
     pub(crate) fn keep_or_remove<T>(self, ended: anyhow::Result<T>) -> anyhow::Result<T> {
         if ended.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::Refused)) {
             self.remove_created();
@@ -206,28 +207,26 @@ impl CreatedFolders {
 fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
     if let Some(folder) = requested {
         if folder.to_str().is_none() {
-            return Err(
-                BadArgument(format!("--out {}: the name must be UTF-8, reports hold it", folder.display())).into()
-            );
+            return Err(BadArgument(format!("--out {}: the name must be valid UTF-8", folder.display())).into());
         }
         check_no_model(folder)?;
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
         lock(folder)?;
         return Ok(folder.to_owned());
     }
     make_in(Path::new(RUNS), "")
 }
 
-/// Makes a folder in the system's folder for temporary files, for a model that cannot be saved in the folder of its run.
+/// Creates a folder in the system's temporary folder, for a model that cannot be saved in the folder of its run.
 pub(crate) fn make_fallback_folder() -> anyhow::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
-/// Makes a new folder named after the current time.
+/// Creates a new folder named after the current time.
 fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
-    #[expect(clippy::disallowed_methods, reason = "a name for people; nothing is measured by it")]
+    #[expect(clippy::disallowed_methods, reason = "only a readable name; no time is measured")]
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    std::fs::create_dir_all(parent).with_context(|| format!("cannot make the folder {}", parent.display()))?;
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot create the folder {}", parent.display()))?;
     let name = format!("{prefix}{}", name_from_time(since_epoch));
     for attempt in 1..100 {
         let folder = match attempt {
@@ -240,50 +239,50 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
                 return Ok(folder);
             }
             Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
-            Err(error) => return Err(error).with_context(|| format!("cannot make the folder {}", folder.display())),
+            Err(error) => return Err(error).with_context(|| format!("cannot create the folder {}", folder.display())),
         }
     }
-    bail!("{} and 98 numbered variants already exist: name a folder with --out", parent.join(name).display())
+    bail!("{} and 98 numbered variants already exist: give a folder with --out", parent.join(name).display())
 }
 
-/// Keeps other runs out of a folder as long as this process lives.
+/// Locks a folder against other runs for the lifetime of this process.
 fn lock(folder: &Path) -> anyhow::Result<()> {
     let path = folder.join(LOCK);
     let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
     match file.try_lock() {
-        Ok(()) => std::mem::forget(file), // The system lets go of it when the process ends, however it ends.
+        Ok(()) => std::mem::forget(file), // The system releases it when the process ends in any way.
         Err(std::fs::TryLockError::WouldBlock) => {
-            let message = format!("--out {}: another run writes into this folder, name another one", folder.display());
+            let message = format!("--out {}: another run uses this folder; give another one", folder.display());
             return Err(BadArgument(message).into());
         }
-        Err(std::fs::TryLockError::Error(error)) => log::debug!("{}: no lock: {error}", path.display()),
+        Err(std::fs::TryLockError::Error(error)) => log::debug!("cannot lock {}: {error}", path.display()),
     }
     Ok(())
 }
 
-/// Saves a model beside its place first and moves it there when it is whole.
+/// Saves a model in a temporary subfolder and moves its files into place once it is complete.
 pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
     let partial_folder = folder.join(PARTIAL_MODEL);
     if partial_folder.exists() {
-        // Of a run that was killed while it saved.
+        // Left by a run that was killed while saving.
         std::fs::remove_dir_all(&partial_folder)
             .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
     }
     if let Err(error) = method.save(&partial_folder) {
-        let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and it takes space.
+        let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and wastes space.
         return Err(error.into());
     }
-    // Splats and blocks come last: a folder that holds them holds the whole model.
+    // Splats and blocks come last: a folder that contains them contains the complete model.
     for name in MODEL_FILES.iter().filter(|name| partial_folder.join(name).exists()) {
         let path = folder.join(name);
         std::fs::rename(partial_folder.join(name), &path)
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
-    // A file that is not listed above would be lost: the folder has to be empty now.
+    // Fails if the folder is not empty, so that a file missing from the list above is not lost.
     std::fs::remove_dir(&partial_folder).with_context(|| format!("cannot remove {}", partial_folder.display()))
 }
 
-/// Writes a report as readable JSON.
+/// Writes a report as indented JSON.
 pub(crate) fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
@@ -295,7 +294,7 @@ pub(crate) fn write_atomic(path: &Path, text: &str) -> anyhow::Result<()> {
     Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
 }
 
-/// Writes which keyframes were used, and what for, for `--keyframes`.
+/// Writes the keyframes of a run and their splits, for `--keyframes`.
 pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
     write_atomic(path, &crate::join::keyframe_list(keyframes.iter()))
 }
@@ -314,11 +313,11 @@ pub(crate) fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
         hash.update(&bytes);
         n_files += 1;
     }
-    ensure!(n_files > 0, "{} holds no model", folder.display());
+    ensure!(n_files > 0, "{} contains no model", folder.display());
     Ok(hex(&hash.finalize()))
 }
 
-/// Bytes as people write them.
+/// Lower-case hexadecimal digits.
 pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
@@ -400,10 +399,13 @@ mod tests {
         let out = tempfile::tempdir().expect("a folder");
         check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
         let run = out.path().join(ModelKind::Splat.name());
-        std::fs::create_dir(&run).expect("room");
-        check_no_unfinished_run(out.path()).expect("without a checkpoint there is nothing to continue from");
-        std::fs::write(run.join(CHECKPOINT), b"x").expect("room");
-        assert!(check_no_unfinished_run(out.path()).is_err_and(|error| error.0.contains("splat holds a run")));
+        std::fs::create_dir(&run).expect("disk space");
+        check_no_unfinished_run(out.path()).expect("no checkpoint");
+        std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
+        assert!(
+            check_no_unfinished_run(out.path())
+                .is_err_and(|error| error.0.contains("splat contains an interrupted run"))
+        );
         assert!(check_no_unfinished_run(&run).is_err());
     }
 
@@ -411,7 +413,7 @@ mod tests {
     fn rejected_run_removes_only_its_own_folders() {
         let folder = tempfile::tempdir().expect("folder");
         let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
-        std::fs::create_dir(&foreign_folder).expect("room on the disk");
+        std::fs::create_dir(&foreign_folder).expect("disk space");
         let refused = || Err::<(), _>(anyhow::Error::new(BadArgument("too small".into())));
         for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
             let mut created = CreatedFolders::default();
@@ -436,10 +438,10 @@ mod tests {
         let at = |name: &str| folder.path().join(name);
         let message = |name: &str| expect_model(&at(name)).expect_err("no model").to_string();
         assert!(message("absent").ends_with("absent does not exist"));
-        assert!(message("").ends_with("holds no model"));
+        assert!(message("").ends_with("contains no model"));
         for name in [CHECKPOINT, "report.json", "scan.mcap", "mesh.ply"] {
             std::fs::write(at(name), b"x").expect("file");
-            assert!(message(name).contains("name its folder"), "{name}");
+            assert!(message(name).contains("give its folder"), "{name}");
             if name == CHECKPOINT {
                 assert!(message("").contains("--resume"));
             }
@@ -454,7 +456,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         make(Some(folder.path())).expect("the first");
         let message = make(Some(folder.path())).expect_err("the second").to_string();
-        assert!(message.contains("another run writes into this folder"), "{message}");
+        assert!(message.contains("another run uses this folder"), "{message}");
     }
 
     #[test]

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use trainer::Keyframe;
 use viz::SceneHint;
 
-/// How far ahead of the cameras the scene is believed to be when their axes do not say, metres.
+/// Assumed distance of the scene ahead of the cameras where their axes do not determine it, meters.
 const PRIOR_DISTANCE_M: f64 = 0.5;
-/// Weight of that belief against one camera's axis: it decides only along directions that no axis decides.
+/// Weight of that assumption relative to one camera's axis, so small that it only matters in directions that no axis
+/// determines.
 const PRIOR_WEIGHT: f64 = 0.01;
 
 /// Distance of a view from outside, in radii of the model: most of the model fits into a view of 50 degrees.
@@ -76,7 +77,7 @@ mod tests {
 
     #[test]
     fn cameras_around_an_object_converge_on_it() {
-        /// The belief pulls by about its weight times how wrong it is, 0.5 m here.
+        /// The prior pulls by about its weight times its error, 0.5 m here.
         const TOLERANCE_M: f64 = 0.01;
         let target = Point3::new(0.5, 0.1, 0.05);
         let positions = [[1.5, 0.1, 0.05], [0.5, 1.1, 0.1], [0.4, 0.1, 1.05], [0.5, -0.9, 0.3]];

@@ -1,4 +1,4 @@
-//! One model in training: its keyframes, its clock, and what is told of it.
+//! A training session: one model with its keyframes, clock, evaluation schedule and reports.
 
 use crate::bench::statistics::median;
 use crate::checkpoints::{Checkpoints, Snapshot};
@@ -27,24 +27,24 @@ use trainer::gpu::{Gpu, PassTiming};
 use trainer::splat::CalibratedCamera;
 use trainer::{DepthMap, Keyframe, Method, Picture, Progress, RenderRequest, Split, TrialReport};
 
-/// Steps that a profile is the median of.
+/// Number of steps in a profile, which reports medians.
 const N_PROFILED: usize = 21;
-/// After large buffers were let go of, drivers are slow for a while.
+/// Drivers are slow for a while after large buffers have been freed.
 const PROFILE_WARM_UP: Duration = Duration::from_millis(700);
-/// Points of the PSNR curve that are kept; past them every second one goes.
+/// Maximum number of points of the PSNR curve. When it is reached, every other point is removed.
 const MAX_HISTORY: usize = 512;
 
-/// When to stop.
+/// When to stop training.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Limits {
     /// Seconds on the session's clock.
     pub(crate) seconds: Option<f64>,
-    /// Optimiser updates.
+    /// Number of optimizer updates.
     pub(crate) steps: Option<u64>,
 }
 
 impl Limits {
-    /// How long that is, for people: `8 s`, `500 steps`.
+    /// The limits as text, such as `8 s` or `500 steps`.
     pub(crate) fn describe(self) -> String {
         let parts =
             [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
@@ -52,32 +52,32 @@ impl Limits {
     }
 }
 
-/// How a session is judged.
+/// How a session is evaluated.
 #[derive(Clone)]
 pub(crate) struct Evaluators {
-    /// At the marks: thorough where nobody waits, quick in a live run.
+    /// Evaluator for scheduled evaluations: thorough in `train`, quick in a live run.
     pub(crate) during_training: Evaluator,
-    /// Test keyframes scored at a mark, spread evenly over all; the others are scored at the end only.
+    /// Maximum number of test keyframes in a scheduled evaluation, spread evenly over all. All are scored at the end.
     pub(crate) max_images_during_training: usize,
-    /// At the end.
+    /// Evaluator for the end of training.
     pub(crate) at_end: Evaluator,
 }
 
 /// What a session prints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum OutputMode {
-    /// A line a mark, and a bar where stderr is a terminal.
+    /// A line per evaluation, and a progress bar if stderr is a terminal.
     Lines,
-    /// One JSON object a mark.
+    /// A JSON object per evaluation.
     Json,
-    /// Nothing but the bar: the caller tells what came of it.
+    /// Only the progress bar; the caller reports the result.
     Bar,
     /// Nothing at all.
     Nothing,
 }
 
 impl OutputMode {
-    /// What a command prints of its one session.
+    /// The output mode of a command with one session.
     pub(crate) fn of_command(json: bool) -> Self {
         if json { Self::Json } else { Self::Lines }
     }
@@ -91,41 +91,42 @@ pub(crate) struct Session {
     decisions: Option<DecisionLog>,
     data: DataSource,
     recovery: Option<Recovery>,
-    /// Evicted keyframes without their pixels, which the newest checkpoint may contain. The first were evicted before the last checkpoint.
+    /// Evicted keyframes, without pixels, that the newest checkpoint may contain. The first `n_evicted_before_last` of
+    /// them were evicted before the last checkpoint.
     evicted: Vec<Arc<Keyframe>>,
     n_evicted_before_last: usize,
     gpu: Arc<Gpu>,
-    /// At the marks.
+    /// For scheduled evaluations.
     evaluator: Evaluator,
     max_images_during_training: usize,
-    /// At the end.
+    /// For the end of training.
     final_evaluator: Evaluator,
-    /// Held, in the order they came.
+    /// Keyframes in the store, in order of arrival.
     keyframes: Vec<Arc<Keyframe>>,
     tests: VecDeque<Arc<Keyframe>>,
     limits: Limits,
     clock: Clock,
-    /// Time it had on a device that it shares.
+    /// Time that this session has used a shared device.
     device_time: Duration,
-    /// When it was done though others were not, seconds.
+    /// Training time at which this session was finished while others continued, seconds.
     finished_secs: Option<f64>,
     schedule: EvaluationSchedule,
-    /// Due and not completely scored yet.
+    /// An evaluation that is due or in progress.
     pending_evaluation: Option<PendingEvaluation>,
-    /// Whether the caller scores an open evaluation image by image.
+    /// Whether the caller scores an evaluation image by image.
     scores_stepwise: bool,
     reported: Vec<Evaluation>,
     history: Vec<(f64, f64)>,
-    /// Newest PSNR of each test keyframe, by camera and stamp.
+    /// Latest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
     output: OutputMode,
-    /// Whether somebody wants an end: a mark is not worth waiting for then.
+    /// Whether a stop was requested; an evaluation is then aborted.
     stop: Stop,
     profiles: bool,
     bar: ProgressBar,
 }
 
-/// What is told at a mark.
+/// Report of a scheduled evaluation.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Evaluation {
     event: &'static str,
@@ -134,26 +135,26 @@ pub(crate) struct Evaluation {
     pub(crate) step: u64,
     #[serde(flatten)]
     pub(crate) scores: Scores,
-    /// Test images that the scores are means over.
+    /// Number of test images in the mean scores.
     n_images: usize,
     pub(crate) primitives: u64,
     pub(crate) bytes: u64,
     step_millis: Option<f64>,
 }
 
-/// What came of a training.
+/// Result of training.
 pub(crate) struct TrainingOutcome {
     pub(crate) seconds: f64,
     pub(crate) steps: u64,
     pub(crate) scores: Scores,
     pub(crate) primitives: u64,
     pub(crate) bytes: u64,
-    /// What was told at the marks.
+    /// The scheduled evaluations.
     pub(crate) evaluations: Vec<Evaluation>,
     per_image: Vec<ImageScores>,
 }
 
-/// What is told at the end.
+/// Report at the end of training.
 #[derive(Clone, Debug, Serialize)]
 struct DoneEvent<'a> {
     event: &'static str,
@@ -176,22 +177,22 @@ struct ProfileEvent<'a> {
     passes: &'a [(&'static str, f64)],
 }
 
-/// What `report.json` holds.
+/// The content of `report.json`.
 #[derive(Debug, Serialize)]
 struct Report<'a, T: Serialize> {
     done: &'a DoneEvent<'a>,
     adapter: String,
     #[serde(flatten)]
     details: &'a T,
-    /// What the parts of the model that were tried bought.
+    /// Results of the trials of model parts.
     parts: Vec<TrialReport>,
-    /// GPU time of each pass of a step, milliseconds, where it was asked for.
+    /// GPU time of each pass of a step in milliseconds, if profiling was requested.
     passes: Vec<(&'static str, f64)>,
     evaluations: &'a [Evaluation],
     per_image: Vec<NamedScores<'a>>,
 }
 
-/// Scores of one test image, with its name.
+/// Scores of one test image with its name.
 #[derive(Debug, Serialize)]
 struct NamedScores<'a> {
     name: String,
@@ -199,14 +200,14 @@ struct NamedScores<'a> {
     scores: &'a ImageScores,
 }
 
-/// A trained model that is saved and scored, still in GPU memory.
+/// A trained model that has been saved and scored and is still in GPU memory.
 pub(crate) struct FinishedModel {
     pub(crate) kind: ModelKind,
     pub(crate) method: Box<dyn Method>,
     pub(crate) folder: PathBuf,
-    /// Seconds of training.
+    /// Training time, seconds.
     pub(crate) seconds: f64,
-    /// Of the saved model, on the test images.
+    /// Scores of the saved model on the test images.
     pub(crate) scores: Scores,
     data: DataSource,
     n_tests: usize,
@@ -219,20 +220,21 @@ impl FinishedModel {
     }
 }
 
-/// One of the sessions that end together: where its results go, and what only its kind of run knows of it.
+/// One of several sessions that end together, with its output folder and the report details specific to the command.
 pub(crate) struct EndingSession<P> {
     pub(crate) session: Session,
     pub(crate) out: PathBuf,
     pub(crate) details: P,
 }
 
-/// Saves the models, then scores each a last time, writes its report, and reports the end. Returns the models so that they can be shown.
+/// Saves the models, then scores each one, writes its report, and reports the end. Returns the models so that they can
+/// be shown.
 pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow::Result<Vec<FinishedModel>> {
-    // Saved before any is scored: a second Ctrl-C during the scoring loses nothing.
+    // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let ended_secs: Vec<f64> =
         endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<anyhow::Result<_>>()?;
     let mut saved = Vec::new();
-    // The first error ends the command, the others are logged.
+    // The first error is returned, the others are logged.
     let mut failed = Ok(());
     let mut record_error = |error: anyhow::Error| match failed {
         Ok(()) => failed = Err(error),
@@ -253,12 +255,12 @@ pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow:
     for (ending, ..) in &mut saved {
         if let Some(Err(error)) = ending.session.checkpoints.as_mut().map(Checkpoints::wait) {
             record_error(
-                error.context(format!("the model was saved in {}, but not its last checkpoint", ending.out.display())),
+                error.context(format!("the model was saved in {}, but not the last checkpoint", ending.out.display())),
             );
         }
     }
     if saved.iter().any(|(ending, ..)| ending.session.stop.requested()) {
-        log::info!("saved; scoring the test images, Ctrl-C again leaves that out");
+        log::info!("saved; scoring the test images, Ctrl-C again skips this");
     }
     let mut finished = Vec::new();
     for (EndingSession { session, out, details }, seconds, sha256) in saved {
@@ -280,12 +282,12 @@ pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow:
 struct Saved {
     folder: PathBuf,
     sha256: String,
-    /// Why it is not in the folder of its run.
+    /// Error of saving in the run folder, if the model was saved elsewhere.
     failed: Option<anyhow::Error>,
 }
 
 impl Session {
-    /// A session around a fresh model; its clock stands still until [`Self::start_clock`].
+    /// A session with a new model. Its clock does not run until [`Self::start_clock`].
     pub(crate) fn new(
         gpu: Arc<Gpu>,
         (kind, method): (ModelKind, Box<dyn Method>),
@@ -327,80 +329,82 @@ impl Session {
         }
     }
 
-    /// Writes checkpoints, if any, from now on.
+    /// Enables checkpoints.
     pub(crate) fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
         Self { checkpoints, ..self }
     }
 
-    /// Cuts the scoring at a mark short where the end is asked for meanwhile; the mark is not told then.
+    /// Aborts an evaluation without a report if a stop is requested.
     pub(crate) fn with_stop(self, stop: &Stop) -> Self {
         Self { stop: stop.clone(), ..self }
     }
 
-    /// Leaves scoring to [`Self::score_next`]: the caller draws pictures in between, and neither trains nor pushes keyframes
-    /// while [`Self::is_scoring`], so that all images of an evaluation are scored on one state of the model.
+    /// Leaves scoring to [`Self::score_next`], so that the caller can draw pictures in between. The caller must neither
+    /// train nor push keyframes while [`Self::is_scoring`], so that all images of an evaluation are scored on the same
+    /// model state.
     pub(crate) fn with_stepwise_scoring(self) -> Self {
         Self { scores_stepwise: true, ..self }
     }
 
-    /// Tells at the end what each pass of a step takes, if asked to.
+    /// Reports the GPU time of each pass at the end, if `profiles` is set.
     pub(crate) fn with_profile(self, profiles: bool) -> Self {
         Self { profiles, ..self }
     }
 
-    /// Writes down from now on what depends on the clock.
+    /// Enables the log of timing-dependent decisions.
     pub(crate) fn with_decisions(self, decisions: DecisionLog) -> Self {
         Self { decisions: Some(decisions), ..self }
     }
 
-    /// Names the data in the report and in the commands to run next.
+    /// Sets the data source for the report and the next commands.
     pub(crate) fn with_data(self, data: DataSource) -> Self {
         Self { data, ..self }
     }
 
-    /// Continues on another device if the GPU fails.
+    /// Enables recovery on another device if the GPU fails.
     pub(crate) fn with_recovery(self, recovery: Recovery) -> Self {
         Self { recovery: Some(recovery), ..self }
     }
 
-    /// Goes on where earlier runs had trained for so long; marks they reached are not told again.
+    /// Continues from the training time of earlier runs, without repeating their evaluations.
     pub(crate) fn with_elapsed_secs(mut self, previous_secs: f64) -> Self {
         self.clock = Clock::with_elapsed(previous_secs);
         self.schedule.reached(previous_secs);
         self
     }
 
-    /// Makes it one of several that learn by one clock; it shows no bar, for those would stand in each other's way.
+    /// Makes this one of several sessions with a common clock. Hides the progress bar, because several bars would
+    /// overwrite each other.
     pub(crate) fn with_shared_clock(self, clock: Clock) -> Self {
         Self { clock, bar: ProgressBar::hidden(), ..self }
     }
 
-    /// The scene model's kind.
+    /// The kind of model.
     pub(crate) fn kind(&self) -> ModelKind {
         self.kind
     }
 
-    /// Starts the clock, unless it runs.
+    /// Starts the clock unless it is already running.
     pub(crate) fn start_clock(&mut self, at: Instant) {
         self.clock.start(at);
     }
 
-    /// When the clock started, once it runs.
+    /// Time at which the clock was started, if it was.
     pub(crate) fn clock_started(&self) -> Option<Instant> {
         self.clock.started()
     }
 
-    /// Keyframes held, in the order they came.
+    /// Keyframes in the store, in order of arrival.
     pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
         &self.keyframes
     }
 
-    /// Seconds of training so far.
+    /// Training time so far, seconds.
     pub(crate) fn secs(&self) -> f64 {
         self.clock.secs()
     }
 
-    /// Gives a keyframe to the model; test keyframes are kept for evaluation too.
+    /// Adds a keyframe to the model. Test keyframes are also kept for evaluation.
     pub(crate) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
@@ -410,20 +414,20 @@ impl Session {
         Ok(())
     }
 
-    /// Holds a keyframe that the model was already trained on in the resumed run.
+    /// Adds a keyframe that the model was already trained on in the resumed run.
     pub(crate) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         if keyframe.split == Split::Test {
             if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
                 self.tests.push_back(keyframe.clone());
             } else {
                 let Keyframe { camera, stamp, .. } = &**keyframe;
-                log::warn!("the test image of {camera} at {} ns is not scored: its mask leaves no pixel", stamp.0);
+                log::warn!("the test image of {camera} at {} ns is not scored: all of its pixels are masked", stamp.0);
             }
         }
         self.keyframes.push(keyframe.clone());
     }
 
-    /// Takes a keyframe back.
+    /// Removes a keyframe.
     pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
         if self.recovery.is_some() {
@@ -440,7 +444,7 @@ impl Session {
         Ok(())
     }
 
-    /// Gives the keyframes so far their splats.
+    /// Creates splats for the keyframes so far.
     pub(crate) fn seed(&mut self) -> anyhow::Result<()> {
         self.note_render();
         Ok(self.method.seed()?)
@@ -452,7 +456,7 @@ impl Session {
         self.method.render(request)
     }
 
-    /// Waits for what is queued, and says how many updates were made in all, those of trials included.
+    /// Waits for queued work and returns the total number of updates, including trials.
     pub(crate) fn n_total_steps(&mut self) -> anyhow::Result<u64> {
         Ok(self.method.n_total_steps()?)
     }
@@ -462,29 +466,29 @@ impl Session {
         self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps()
     }
 
-    /// Steps asked for that it has not made; `None` where no number was asked for.
+    /// Number of steps left until the step limit; `None` without a step limit.
     pub(crate) fn n_steps_remaining(&self) -> Option<u64> {
         Some(self.limits.steps?.saturating_sub(self.method.progress().step))
     }
 
-    /// Whether it made all the steps that were asked for: nothing changes it any more.
+    /// Whether the step limit was reached, so that the model no longer changes.
     pub(crate) fn has_finished_steps(&self) -> bool {
         self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
     }
 
-    /// Whether more steps would do nothing until a keyframe comes.
+    /// Whether the model needs another keyframe before it can train further.
     pub(crate) fn is_idle(&self) -> bool {
         self.method.is_idle()
     }
 
-    /// Trains a slice of at most `max_steps` steps, and evaluates when a mark was reached.
+    /// Trains for at most `max_steps` steps, and evaluates if an evaluation is due.
     pub(crate) fn step(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let n = self.train_steps(max_steps)?;
         self.evaluate_when_due()?;
         Ok(n)
     }
 
-    /// Trains a slice of at most `max_steps` steps.
+    /// Trains for at most `max_steps` steps.
     pub(crate) fn train_steps(&mut self, max_steps: u64) -> anyhow::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
         if let Some(decisions) = &mut self.decisions {
@@ -532,7 +536,7 @@ impl Session {
         self.method = Box::new(FailedModel);
     }
 
-    /// Restores the model on another device, from the newest checkpoint or, without one, from the start.
+    /// Restores the model on another device from the newest checkpoint or, without one, from the start.
     pub(crate) fn restart_on(&mut self, gpu: &Arc<Gpu>) -> anyhow::Result<()> {
         let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
@@ -564,7 +568,7 @@ impl Session {
             method.remove(&keyframe.camera, keyframe.stamp)?;
         }
         let from_step = method.n_total_steps()?;
-        // The log so far is that of a run that ended here; a new log begins, perhaps in the same file.
+        // The current log belongs to a run that ended here. A new log begins, possibly in the same file.
         if let Some(decisions) = self.decisions.take() {
             decisions.close_unfinished();
         }
@@ -582,14 +586,15 @@ impl Session {
             if is_resumed { format!("the checkpoint of step {from_step}") } else { "the start".to_owned() }
         );
         (self.method, self.gpu, self.decisions) = (method, gpu.clone(), Some(decisions));
-        // All images of a mark are scored on one state of the model, and that one is gone.
+        // All images of an evaluation must be scored on the same model state, which is lost.
         (self.finished_secs, self.pending_evaluation) = (None, None);
         Ok(())
     }
 
-    /// Trains for a turn on a device that others use too, at most `max_steps` steps; what was queued is done at its end.
+    /// Trains for one time slice on a shared device, at most `max_steps` steps. Queued work is complete when this
+    /// returns.
     ///
-    /// `is_render_pending`: whether a picture waits for the end of the turn; asked after each submit.
+    /// `is_render_pending`: whether a picture waits for the end of the slice; called after each submit.
     pub(crate) fn run_time_slice(
         &mut self,
         max_steps: impl Fn(&Self) -> u64,
@@ -606,7 +611,7 @@ impl Session {
             }
         }
         self.method.n_total_steps()?;
-        // Who can do nothing does not take each turn because of that.
+        // A session that cannot train is charged a full slice, so that it is not selected every time.
         self.device_time += if n_steps == 0 { TIME_SLICE } else { started.elapsed() };
         if self.has_finished_steps() {
             self.mark_finished();
@@ -614,23 +619,23 @@ impl Session {
         Ok(())
     }
 
-    /// Time it had on a device that it shares.
+    /// Time that this session has used a shared device.
     pub(crate) fn device_time(&self) -> Duration {
         self.device_time
     }
 
-    /// Lets it catch up on no more than what it lacks of this.
+    /// Raises the device time to at least this, so that an idle session does not catch up later.
     pub(crate) fn raise_device_time(&mut self, device_time: Duration) {
         self.device_time = self.device_time.max(device_time);
     }
 
-    /// Takes it for done, at this time of the clock.
+    /// Marks the session as finished at the current training time.
     pub(crate) fn mark_finished(&mut self) {
         let secs = self.secs();
         self.finished_secs.get_or_insert(secs);
     }
 
-    /// Writes the checkpoint that is due, and evaluates when a mark was reached; one that rests has told all.
+    /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.
     pub(crate) fn evaluate_when_due(&mut self) -> anyhow::Result<()> {
         if self.finished_secs.is_some() {
             return Ok(());
@@ -647,7 +652,8 @@ impl Session {
             if let Some(decisions) = &mut self.decisions {
                 decisions.checkpoint(self.method.n_total_steps()?);
             }
-            // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe evicted before it.
+            // Until this checkpoint is written, the previous one is the newest, and it contains no keyframe that was
+            // evicted before it.
             self.evicted.drain(..self.n_evicted_before_last);
             self.n_evicted_before_last = self.evicted.len();
         }
@@ -666,7 +672,7 @@ impl Session {
         self.pending_evaluation.is_some()
     }
 
-    /// Scores one more test image of the open evaluation, and reports the evaluation after its last image.
+    /// Scores one more test image of the evaluation in progress, and reports the evaluation after its last image.
     pub(crate) fn score_next(&mut self) -> anyhow::Result<()> {
         let Some(mut evaluation) = self.pending_evaluation.take() else { return Ok(()) };
         if self.stop.requested() {
@@ -690,7 +696,8 @@ impl Session {
         self.method.set_watched(watched);
     }
 
-    /// Evaluates the test keyframe whose score is oldest, for a curve between the marks; counts as training time.
+    /// Scores the test keyframe whose score is oldest, for the curve between scheduled evaluations; counts as training
+    /// time.
     pub(crate) fn refresh_psnr(&mut self) -> anyhow::Result<()> {
         let Some(oldest) = self.tests.pop_front() else { return Ok(()) };
         self.tests.push_back(oldest.clone());
@@ -702,28 +709,29 @@ impl Session {
         Ok(())
     }
 
-    /// Mean over the test keyframes of their newest PSNR, dB.
+    /// Mean of the latest PSNR of all test keyframes, dB.
     pub(crate) fn psnr(&self) -> Option<f64> {
         let n = self.newest_psnr.len();
         (n > 0).then(|| self.newest_psnr.values().sum::<f64>() / n as f64)
     }
 
-    /// The curve of [`Self::psnr`] over seconds.
+    /// The history of [`Self::psnr`]: training seconds and dB.
     pub(crate) fn psnr_history(&self) -> &[(f64, f64)] {
         &self.history
     }
 
-    /// What alignment of the keyframes found, once that is settled.
+    /// The result of keyframe alignment, once it is decided.
     pub(crate) fn alignment(&self) -> Option<&Alignment> {
         self.method.alignment()
     }
 
-    /// Where training stands.
+    /// The training progress.
     pub(crate) fn progress(&self) -> Progress {
         self.method.progress()
     }
 
-    /// Saves the model after this many seconds of training; if its folder cannot be written, in a folder for temporary files.
+    /// Saves the model after this many seconds of training. If its folder cannot be written, saves it in a temporary
+    /// folder.
     fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_total_steps()?)
@@ -732,10 +740,11 @@ impl Session {
         }
         let progress = self.method.progress();
         if progress.step > 0 && progress.primitives == 0 {
-            log::warn!("the model is empty: nothing that was seen could be used");
+            log::warn!("the model is empty: no observation could be used");
         }
-        // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the trial when it is due.
-        // A live run without new keyframes is not finished: more may come after it is resumed.
+        // Saving ends a trial in progress. The checkpoint holds the state before that, so that a resumed run ends the
+        // trial when it is due. A live run without new keyframes is not finished, because more may come after it is
+        // resumed.
         let is_live = self.checkpoints.as_ref().is_some_and(Checkpoints::keeps_keyframes);
         let is_finished = self.is_over() || (self.is_idle() && !is_live);
         let (method, keyframes) = (self.method.as_mut(), &self.keyframes[..]);
@@ -743,7 +752,7 @@ impl Session {
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                log::warn!("cannot write a checkpoint of the last state: {error:#}"); // The model matters more.
+                log::warn!("cannot write a checkpoint of the last state: {error:#}"); // Still save the model.
                 None
             }
         };
@@ -758,7 +767,7 @@ impl Session {
         }
     }
 
-    /// Saves the model in a folder for temporary files, because that of its run could not be written.
+    /// Saves the model in a temporary folder, because the folder of its run could not be written.
     fn save_elsewhere(&mut self, out: &Path, save_error: anyhow::Error) -> anyhow::Result<Saved> {
         let save = |method: &mut dyn Method| {
             let folder = run_folder::make_fallback_folder()?;
@@ -769,12 +778,12 @@ impl Session {
         match save(self.method.as_mut()) {
             Ok((folder, sha256)) => {
                 let context =
-                    format!("cannot save the model in {}, it was saved in {}", out.display(), folder.display());
+                    format!("cannot save the model in {}; it was saved in {}", out.display(), folder.display());
                 Ok(Saved { folder, sha256, failed: Some(save_error.context(context)) })
             }
             Err(error) => {
                 let error: anyhow::Error = error;
-                log::error!("cannot save the model among the temporary files either: {error:#}");
+                log::error!("cannot save the model in a temporary folder either: {error:#}");
                 Err(save_error.context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
@@ -784,7 +793,7 @@ impl Session {
         }
     }
 
-    /// What to continue from if the model could not be saved, as part of a sentence.
+    /// What to continue from if the model could not be saved, as a clause for an error message.
     fn describe_recoverable(&mut self) -> String {
         let has_checkpoint = self.has_checkpoint();
         let Some(recovery) = &self.recovery else { return "there is no checkpoint either".to_owned() };
@@ -792,7 +801,7 @@ impl Session {
         if has_checkpoint { format!("{left}; use --out to save the model in another folder") } else { left }
     }
 
-    /// Scores the saved model a last time, writes the report, and tells the end.
+    /// Scores the saved model, writes the report, and reports the end.
     fn report_end(
         mut self,
         out: &Path,
@@ -812,7 +821,7 @@ impl Session {
             out,
             checkpoint_sha256,
         };
-        // Before a profile, which takes more steps.
+        // Done before profiling, which takes more steps.
         let comparisons = self.compare(&outcome.per_image);
         let passes = if self.profiles { self.profile()? } else { Vec::new() };
         let report = Report {
@@ -827,7 +836,7 @@ impl Session {
         let written = run_folder::write_json(&out.join("report.json"), &report);
         let page = comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
         if let Err(error) = &page {
-            log::warn!("no {}: {error:#}", report::FILE);
+            log::warn!("{} was not written: {error:#}", report::FILE);
         }
         match self.output {
             OutputMode::Json => {
@@ -867,7 +876,7 @@ impl Session {
         images.iter().map(|scores| NamedScores { name: name(scores), scores }).collect()
     }
 
-    /// Renders test images for the report; `scores` are those of the test images, in the same order.
+    /// Renders test images for the report. `scores` belong to the test images, in the same order.
     fn compare(&mut self, scores: &[ImageScores]) -> anyhow::Result<Vec<report::Comparison>> {
         let name = |scores: &ImageScores| self.data.image_name(&scores.camera, scores.stamp_nanos);
         let scored = self.tests.iter().zip(scores).map(|(keyframe, scores)| report::Scored {
@@ -879,7 +888,7 @@ impl Session {
         report::compare(self.method.as_mut(), &scored.collect::<Vec<_>>())
     }
 
-    /// Writes the page that shows the report.
+    /// Writes the HTML page of the report.
     fn write_page(
         &self,
         out: &Path,
@@ -900,12 +909,13 @@ impl Session {
         page.write()
     }
 
-    /// Writes the list of camera poses with the model's corrections; without it, a viewer starts outside the model.
+    /// Writes the list of camera poses with the model's corrections. Without it, a viewer starts with an outside view
+    /// of the model.
     fn write_cameras(&mut self, out: &Path) {
         let mut cameras = Vec::new();
         for keyframe in &self.keyframes {
             let lens = self.method.calibrated_camera(keyframe).unwrap_or_else(|error| {
-                log::debug!("a camera is listed without the learned correction: {error}");
+                log::debug!("listing a camera without its learned correction: {error}");
                 CalibratedCamera::of(keyframe)
             });
             cameras.push(camera_list::PosedCamera {
@@ -919,11 +929,12 @@ impl Session {
             });
         }
         if let Err(error) = camera_list::write(out, &cameras) {
-            log::warn!("no {}: {error:#}", camera_list::FILE);
+            log::warn!("{} was not written: {error:#}", camera_list::FILE);
         }
     }
 
-    /// GPU time of each kernel in a step, milliseconds: medians over [`N_PROFILED`] steps, in the order of the first.
+    /// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order of first
+    /// execution.
     fn profile(&mut self) -> anyhow::Result<Vec<(&'static str, f64)>> {
         let mut names: Vec<&'static str> = Vec::new();
         let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
@@ -944,13 +955,13 @@ impl Session {
         Ok(names.into_iter().filter_map(|name| Some((name, median(by_name.get(name)?)?))).collect())
     }
 
-    /// Scores the model a last time, and saves nothing.
+    /// Scores the final model without saving it.
     pub(crate) fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
         let seconds = self.stop_training()?;
         self.score_at_end(seconds)
     }
 
-    /// Waits for what is queued; the seconds of training come back.
+    /// Waits for queued work and returns the training time in seconds.
     fn stop_training(&mut self) -> anyhow::Result<f64> {
         self.gpu.wait()?;
         let seconds = self.finished_secs.unwrap_or_else(|| self.secs());
@@ -979,7 +990,7 @@ impl Session {
         self.evaluator.score_all(self.method.as_mut(), tests.iter())
     }
 
-    /// Does what is not training: time stands still meanwhile.
+    /// Runs work that does not count as training time.
     fn without_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
         self.gpu.wait()?;
         self.note_render();
@@ -990,7 +1001,7 @@ impl Session {
         Ok(done)
     }
 
-    /// Opens the evaluation that is due; it scores the model after all steps queued so far.
+    /// Begins the evaluation that is due. It scores the model after all steps queued so far.
     fn begin_evaluation(&mut self) -> anyhow::Result<()> {
         self.method.n_total_steps()?;
         self.pending_evaluation =
@@ -1021,7 +1032,7 @@ impl Session {
         match self.output {
             OutputMode::Json => print::report_json(&eval)?,
             OutputMode::Lines => print::report(format_args!(
-                "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms a step  {}",
+                "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
                 eval.step,
                 print::counted(eval.primitives, self.method.primitive()),
                 progress.step_millis,
@@ -1033,7 +1044,7 @@ impl Session {
         Ok(())
     }
 
-    /// What is drawn makes splats of keyframes that wait for theirs.
+    /// Logs that a picture is drawn, because drawing creates splats for new keyframes.
     fn note_render(&mut self) {
         if let Some(decisions) = &mut self.decisions {
             decisions.seeded();
@@ -1062,14 +1073,14 @@ impl Session {
     }
 }
 
-/// The parts of a keyframe by which a checkpoint recognizes it.
+/// A keyframe without pixels, with all the data by which a checkpoint identifies it.
 fn without_pixels(keyframe: &Keyframe) -> Keyframe {
     let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
     Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }
 }
 
-/// For bars and such.
-#[expect(clippy::cast_possible_truncation, reason = "a cast of floats stops at the ends of u64")]
+/// Whole seconds for the progress bar.
+#[expect(clippy::cast_possible_truncation, reason = "float casts saturate")]
 fn whole_secs(secs: f64) -> u64 {
     secs as u64
 }

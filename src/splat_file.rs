@@ -1,24 +1,24 @@
-//! Splats on disk: the folder of a saved model, a `.ply` or a `.spz`.
+//! Files of splats: a `.ply`, a `.spz`, or the folder of a saved model.
 
 use anyhow::Context;
 use std::path::{Path, PathBuf};
 use trainer::splat::arrays::SplatArrays;
 use trainer::{ply, spz};
 
-/// The splats in a model's folder.
+/// The file of splats in the folder of a model.
 const IN_FOLDER: &str = "splats.ply";
 
-/// Formats of a file of splats.
+/// Format of a file of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Format {
-    /// Every value as it was learned.
+    /// All values at full precision.
     Ply,
-    /// Values rounded to few bits, packed.
+    /// Values quantized and compressed.
     Spz,
 }
 
 impl Format {
-    /// The format that the ending of a name stands for.
+    /// The format for a file name extension.
     pub(crate) fn of(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
@@ -29,12 +29,12 @@ impl Format {
     }
 }
 
-/// Whether this is a folder that holds splats, or a file whose name ends as one of splats.
+/// Whether this is a folder with splats, or a file with the extension of a splat format.
 pub(crate) fn is_splat_file(path: &Path) -> bool {
     path.join(IN_FOLDER).is_file() || (path.is_file() && Format::of(path).is_some())
 }
 
-/// Reads the splats of a model's folder or of a file.
+/// Reads splats from the folder of a model or from a file.
 pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
     let is_file = model.is_file();
     let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };
@@ -42,7 +42,7 @@ pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
         Some(Format::Spz) => spz::read(&path),
         Some(Format::Ply) | None => ply::read(&path),
     };
-    let hint = if is_file { "; of a saved model name its folder" } else { "" };
+    let hint = if is_file { "; for a saved model, give its folder" } else { "" };
     splats.with_context(|| format!("no splats in {}{hint}", model.display()))
 }
 

@@ -1,9 +1,10 @@
-//! The pose of a base that walks, estimated anew at each stand from what its cameras see there and saw before.
+//! Corrects the pose of a moving base at each station by registering its images there with those of earlier stations.
 //!
-//! Keyframes pass through on their way from join to trainer. Those at the first stand pass as they are; from there on the ones
-//! taken while the base walks and the first ones of the next stand are held back, until the stand's can be laid over earlier ones
-//! ([`trainer::align::register_station`]). Then they pass corrected, and so does what comes later. What is decided follows from the keyframes
-//! and their order alone, so that a run, its recording and the replay of that agree; only when keyframes pass depends on a clock.
+//! Keyframes pass through on their way from the join to the trainer. Those of the first station pass unchanged. After
+//! that, keyframes taken while the base moves and the first ones of the next station are queued until the station can
+//! be registered with earlier ones ([`trainer::align::register_station`]). Then they and all later ones pass with the
+//! correction. The result depends only on the keyframes and their order, so that a run, its recording and the replay of
+//! that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::feed::Change;
@@ -16,55 +17,57 @@ use std::time::{Duration, Instant};
 use trainer::align::{self, StationCorrection};
 use trainer::{BaseState, Keyframe, Split};
 
-/// So many keyframes with depth, test keyframes aside, tell where the base stands; that takes a few seconds of scanning.
+/// Number of keyframes with depth, excluding test keyframes, for registering a station. A few seconds of scanning give
+/// them.
 const MIN_KEYFRAMES: usize = 14;
-/// A scan that brings fewer is not waited for longer, seconds.
+/// Maximum time to wait for that many keyframes, seconds.
 const MAX_SCAN_SECS: f64 = 10.0;
-/// A walk as long as this, or with as many keyframes, is not waited for: what is held is corrected as the stand before it.
-const MAX_WALK_SECS: f64 = 30.0;
+/// Maximum time to wait for a station while the base moves, seconds. After it, or with [`MAX_HELD`] queued keyframes,
+/// the queued keyframes get the correction of the previous station.
+const MAX_TRAVEL_SECS: f64 = 30.0;
 const MAX_HELD: usize = 128;
-/// Keyframes of earlier stands that later ones are laid over; past these every other one is forgotten.
+/// Maximum number of reference keyframes from earlier stations. When it is reached, every other one is removed.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
-/// Corrects keyframes for the errors of the base's poses.
+/// Corrects keyframes for errors of the reported base poses.
 pub(crate) struct Stations {
-    /// Cameras that the base carries.
+    /// Cameras on the base or the arm.
     carried: BTreeSet<Arc<str>>,
     max_wait_secs: f64,
-    /// The stand of the keyframes that passed last; none before the first.
+    /// The station of the last keyframe that passed; `None` before the first.
     station: Option<usize>,
-    /// Where its base was told to be.
+    /// The reported base pose at that station.
     world_from_base: Transform,
-    /// What the base's poses are corrected by since that stand.
+    /// The correction of base poses since that station.
     map_from_odom: Transform,
-    /// Keyframes with depth of the stands so far, corrected.
+    /// Corrected keyframes with depth from all stations so far.
     reference_keyframes: Vec<Arc<Keyframe>>,
-    /// On the way to the next stand and at it, in order.
+    /// Queued keyframes on the way to the next station and at it, in order.
     held: Vec<Change>,
-    /// What came since the next stand began to be looked for.
+    /// Changes received since registration of the next station started.
     queue: VecDeque<Change>,
     search: Option<JoinHandle<SearchResult>>,
     reported: Vec<StationReport>,
-    /// Time that looking took.
+    /// Total time spent on registration.
     spent: Duration,
 }
 
-/// What came of looking for a stand.
+/// Result of registering a station.
 struct SearchResult {
     found: Option<StationCorrection>,
     took: Duration,
 }
 
-/// A stand after the first, for people.
+/// Report on a station after the first.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub(crate) struct StationReport {
-    /// Counted from 0.
+    /// Index of the station, counted from 0.
     station: usize,
-    /// Keyframes that it was looked for with.
+    /// Number of keyframes used for registration.
     n_keyframes: usize,
-    /// What was found since the stand before; null where its images show nothing of earlier ones.
+    /// The correction since the previous station; null if the images do not overlap with those of earlier stations.
     found: Option<StationCorrection>,
-    /// How far the base is from where it truly is, before and after; simulators know that.
+    /// Error of the base pose before and after the correction; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     base_error: Option<[PoseDistance; 2]>,
 }
@@ -77,7 +80,7 @@ struct PoseDistance {
 }
 
 impl Stations {
-    /// For a rig whose base moves and is to be realigned; `None` for others.
+    /// Returns `None` unless the base of the rig moves and realignment is enabled.
     pub(crate) fn new(rig: &Rig) -> Option<Self> {
         let carried = || {
             let on_base = rig.cameras.iter().filter(|camera| camera.parent != Parent::World);
@@ -98,19 +101,19 @@ impl Stations {
         })
     }
 
-    /// Continues after the keyframes of an earlier run: the base's first stand is looked for among them.
+    /// Continues after the keyframes of an earlier run; the first station is registered with them.
     pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
-        /// For the earlier run: no stand of this run has this number.
+        /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
-        if let Some(base_place) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
+        if let Some(base_state) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
             (self.station, self.world_from_base, self.map_from_odom) =
-                (Some(PREVIOUS_RUN), base_place.world_from_base, base_place.map_from_odom);
+                (Some(PREVIOUS_RUN), base_state.world_from_base, base_state.map_from_odom);
         }
         keyframes.iter().for_each(|keyframe| self.add_reference(keyframe));
         self
     }
 
-    /// Takes a change of the keyframes; gives those that follow from all so far.
+    /// Processes a change; returns the changes that can be passed on.
     pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
         self.queue.push_back(change);
         let mut released = Vec::new();
@@ -118,11 +121,12 @@ impl Stations {
         released
     }
 
-    /// Takes notice of the time: a stand is not waited for without bound. `newest` is the newest stamp of all samples.
+    /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of all samples. Returns
+    /// the changes that can be passed on.
     pub(crate) fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
-        // An image becomes a keyframe this much later at most.
+        // Images with earlier stamps have already been decided by the join.
         let settled_until = newest.plus_secs(-self.max_wait_secs);
         if self.search.is_none() && self.is_overdue(settled_until) {
             self.start_search(&mut released);
@@ -130,7 +134,7 @@ impl Stations {
         released
     }
 
-    /// Gives what is left when nothing more comes.
+    /// Processes all queued changes at the end of the input; returns them.
     pub(crate) fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
@@ -141,7 +145,7 @@ impl Stations {
         released
     }
 
-    /// All keyframes of a recording.
+    /// Corrects all keyframes of a recording.
     pub(crate) fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
         let mut released: Vec<Change> = Vec::new();
         for keyframe in keyframes {
@@ -155,28 +159,28 @@ impl Stations {
         released.into_iter().filter_map(keyframe).collect()
     }
 
-    /// Where a camera is now, that the base's poses place at `world_from_camera`.
+    /// Corrects the current pose of a camera, given its pose according to the reported base pose.
     pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
 
-    /// What was found at each stand after the first.
+    /// Reports on all stations after the first.
     pub(crate) fn reports(&self) -> &[StationReport] {
         &self.reported
     }
 
-    /// Time spent on finding it.
+    /// Total time spent on registration.
     pub(crate) fn spent(&self) -> Duration {
         self.spent
     }
 
-    /// Works off what waits; `wait_for_search`: however long looking takes.
+    /// Processes queued changes. `wait_for_search`: whether to wait for a registration in progress.
     fn process_queue(&mut self, wait_for_search: bool, released: &mut Vec<Change>) {
         loop {
             if let Some(search) = self.search.take_if(|search| wait_for_search || search.is_finished()) {
-                // A stand that cannot be told costs its correction, not the run.
+                // If registration fails, only the correction of this station is lost.
                 let search_result = search.join().unwrap_or_else(|_| {
-                    log::error!("looking for a stand panicked: this is a bug");
+                    log::error!("registering a station panicked: this is a bug");
                     SearchResult { found: None, took: Duration::ZERO }
                 });
                 self.apply_result(search_result, released);
@@ -215,26 +219,26 @@ impl Stations {
         }
     }
 
-    /// Whether a keyframe is at the stand that was settled last, or has nothing to do with one.
+    /// Whether a keyframe is at the current station or independent of the base.
     fn is_at_current_station(&self, keyframe: &Keyframe) -> bool {
         match &keyframe.base {
             None => true,
-            Some(base_place) => self.station.is_none() || base_place.station == self.station,
+            Some(base_state) => self.station.is_none() || base_state.station == self.station,
         }
     }
 
-    /// Whether a keyframe shows that the base left the stand that is waited for.
+    /// Whether a keyframe shows that the base has left the station that is being collected.
     fn leaves_station(&self, keyframe: &Keyframe) -> bool {
         let next = self.group().next().and_then(station_of);
         keyframe.base.is_some() && next.is_some() && station_of(keyframe) != next
     }
 
-    /// Whether what is held waited for long enough at a time.
+    /// Whether the queued keyframes have waited too long at the time `now`.
     fn is_overdue(&self, now: Stamp) -> bool {
         let waited_secs = |first: Option<&Keyframe>| first.map(|first| now.secs_since(first.stamp));
         match (waited_secs(self.group().next()), waited_secs(self.held_keyframes().next())) {
             (Some(scan_secs), _) => scan_secs > MAX_SCAN_SECS,
-            (None, Some(walk_secs)) => walk_secs > MAX_WALK_SECS,
+            (None, Some(travel_secs)) => travel_secs > MAX_TRAVEL_SECS,
             (None, None) => false,
         }
     }
@@ -246,15 +250,16 @@ impl Stations {
         })
     }
 
-    /// The held keyframes of the next stand.
+    /// The queued keyframes of the next station.
     fn group(&self) -> impl Iterator<Item = &Keyframe> {
         self.held_keyframes().filter(|keyframe| station_of(keyframe).is_some())
     }
 
-    /// Begins to look for the next stand; where there is none in what is held, that passes.
+    /// Starts to register the next station. If no queued keyframe is at a station, passes them with the current
+    /// correction.
     fn start_search(&mut self, released: &mut Vec<Change>) {
         let guess = self.map_from_odom;
-        let Some(base_place) = self.group().next().and_then(|keyframe| keyframe.base.clone()) else {
+        let Some(base_state) = self.group().next().and_then(|keyframe| keyframe.base.clone()) else {
             for change in std::mem::take(&mut self.held) {
                 released.push(corrected(change, |_| guess));
             }
@@ -266,7 +271,7 @@ impl Stations {
             .map(|keyframe| Arc::new(keyframe.with_base_correction(&guess)))
             .collect();
         let (reference_keyframes, world_from_base) =
-            (self.reference_keyframes.clone(), guess * base_place.world_from_base);
+            (self.reference_keyframes.clone(), guess * base_state.world_from_base);
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
             let found =
@@ -275,28 +280,28 @@ impl Stations {
         }));
     }
 
-    /// Passes what was held on, placed by what was found.
+    /// Passes the queued keyframes with the correction found by registration.
     fn apply_result(&mut self, SearchResult { found, took }: SearchResult, released: &mut Vec<Change>) {
         self.spent += took;
-        let base_place = self.group().next().and_then(|keyframe| keyframe.base.clone());
-        let base_place = base_place.expect("what was looked for is held");
+        let base_state = self.group().next().and_then(|keyframe| keyframe.base.clone());
+        let base_state = base_state.expect("the keyframes of the registered station are queued");
         let (left, before) = (self.world_from_base, self.map_from_odom);
-        // The error of the walk, of a base that is told to be somewhere on it, as poses up to the last stand have it.
+        // Correction at a reported base pose that lies at this fraction of the path between the two stations.
         let correction_at = |reported: &Transform, fraction: f64| {
             let guess = before * reported;
             found.as_ref().map_or(before, |found| found.map_from_odom(&guess, fraction) * before)
         };
-        let now = correction_at(&base_place.world_from_base, 1.0);
+        let now = correction_at(&base_state.world_from_base, 1.0);
         let correction = |at: &BaseState| match at.station {
             Some(_) => now,
             None => {
                 let (from, to) =
-                    (distance(&left, &at.world_from_base), distance(&at.world_from_base, &base_place.world_from_base));
+                    (distance(&left, &at.world_from_base), distance(&at.world_from_base, &base_state.world_from_base));
                 correction_at(&at.world_from_base, if from > 0.0 { from / (from + to) } else { 0.0 })
             }
         };
         let report = StationReport::new(
-            &base_place,
+            &base_state,
             [&before, &now],
             self.group().filter(|of| is_usable(of)).count(),
             found.as_ref(),
@@ -306,7 +311,7 @@ impl Stations {
         let held: Vec<Change> =
             std::mem::take(&mut self.held).into_iter().map(|held| corrected(held, correction)).collect();
         (self.station, self.world_from_base, self.map_from_odom) =
-            (base_place.station, base_place.world_from_base, now);
+            (base_state.station, base_state.world_from_base, now);
         for change in &held {
             if let Change::Accepted(keyframe) = change {
                 self.add_reference(keyframe);
@@ -315,11 +320,11 @@ impl Stations {
         released.extend(held);
     }
 
-    /// A keyframe of the stand that was settled last.
+    /// Corrects a keyframe of the current station.
     fn placed(&mut self, keyframe: Arc<Keyframe>) -> Arc<Keyframe> {
-        let Some(base_place) = &keyframe.base else { return keyframe };
-        if base_place.station.is_some() {
-            (self.station, self.world_from_base) = (base_place.station, base_place.world_from_base);
+        let Some(base_state) = &keyframe.base else { return keyframe };
+        if base_state.station.is_some() {
+            (self.station, self.world_from_base) = (base_state.station, base_state.world_from_base);
         }
         let keyframe = carried(&keyframe, &self.map_from_odom);
         self.add_reference(&keyframe);
@@ -332,10 +337,8 @@ impl Stations {
         }
         self.reference_keyframes.push(Arc::clone(keyframe));
         if self.reference_keyframes.len() > MAX_REFERENCE_KEYFRAMES {
-            // Of each split, or selection keyframes could all be forgotten.
-            self.reference_keyframes.sort_by_key(|reference_keyframes| {
-                (reference_keyframes.split == Split::Validation, reference_keyframes.stamp)
-            });
+            // Sorted by split first, so that thinning keeps keyframes of both splits.
+            self.reference_keyframes.sort_by_key(|keyframe| (keyframe.split == Split::Validation, keyframe.stamp));
             let mut ixs = 0..;
             self.reference_keyframes.retain(|_| ixs.next().is_some_and(|ix| ix % 2 == 0));
         }
@@ -346,18 +349,18 @@ fn station_of(keyframe: &Keyframe) -> Option<usize> {
     keyframe.base.as_ref()?.station
 }
 
-/// Whether a keyframe may tell where the base stands.
+/// Whether a keyframe can be used for registration.
 fn is_usable(keyframe: &Keyframe) -> bool {
     keyframe.depth.is_some() && keyframe.split != Split::Test
 }
 
-/// The way between two poses of a base, a radian counting as a metre.
+/// Distance between two poses of a base; one radian counts as one meter.
 fn distance(one: &Transform, other: &Transform) -> f64 {
     (one.translation.vector - other.translation.vector).norm() + one.rotation.angle_to(&other.rotation)
 }
 
 fn carried(keyframe: &Arc<Keyframe>, map_from_odom: &Transform) -> Arc<Keyframe> {
-    // Where nothing is corrected no bit changes.
+    // Without a correction the keyframe stays bit-identical.
     if *map_from_odom == Transform::identity() {
         keyframe.clone()
     } else {
@@ -368,7 +371,7 @@ fn carried(keyframe: &Arc<Keyframe>, map_from_odom: &Transform) -> Arc<Keyframe>
 fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Change {
     match change {
         Change::Accepted(keyframe) => Change::Accepted(match &keyframe.base {
-            Some(base_place) => carried(&keyframe, &correction(base_place)),
+            Some(base_state) => carried(&keyframe, &correction(base_state)),
             None => keyframe,
         }),
         Change::Evicted { .. } => change,
@@ -377,40 +380,42 @@ fn corrected(change: Change, correction: impl Fn(&BaseState) -> Transform) -> Ch
 
 impl StationReport {
     fn new(
-        base_place: &BaseState,
-        [before, resume_from]: [&Transform; 2],
+        base_state: &BaseState,
+        [before, after]: [&Transform; 2],
         n_keyframes: usize,
         found: Option<&StationCorrection>,
     ) -> Self {
-        let base_error = base_place.truth.map(|truth| {
-            [before, resume_from].map(|map_from_odom| {
-                let base = map_from_odom * base_place.world_from_base;
+        let base_error = base_state.truth.map(|truth| {
+            [before, after].map(|map_from_odom| {
+                let base = map_from_odom * base_state.world_from_base;
                 PoseDistance {
                     m: (base.translation.vector - truth.translation.vector).norm(),
                     rad: base.rotation.angle_to(&truth.rotation),
                 }
             })
         });
-        Self { station: base_place.station.unwrap_or_default(), n_keyframes, found: found.cloned(), base_error }
+        Self { station: base_state.station.unwrap_or_default(), n_keyframes, found: found.cloned(), base_error }
     }
 }
 
 impl std::fmt::Display for StationReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "base at stand {}: ", self.station)?;
+        write!(f, "base at station {}: ", self.station)?;
         match &self.found {
-            None => f.write_str("its images show nothing of earlier ones, so it stays where it was told to be")?,
+            None => f.write_str("its images do not overlap with earlier ones, so the reported pose is kept")?,
             Some(found) if found.kept => write!(f, "{found}")?,
-            Some(found) => write!(f, "stays where it was told to be, for this is not sure or does not pay: {found}")?,
+            Some(found) => {
+                write!(f, "the reported pose is kept, as the correction is uncertain or not significant: {found}")?
+            }
         }
         for unobservable in self.found.iter().flat_map(|found| &found.unobservable) {
-            write!(f, "; cannot be seen: {unobservable}")?;
+            write!(f, "; not observable: {unobservable}")?;
         }
-        if let Some([before, resume_from]) = self.base_error {
-            let reported = |base_error: PoseDistance| {
+        if let Some([before, after]) = self.base_error {
+            let format_error = |base_error: PoseDistance| {
                 format!("{:.1} mm and {:.2} degrees", 1e3 * base_error.m, base_error.rad.to_degrees())
             };
-            write!(f, "; off by {} before, by {} now", reported(before), reported(resume_from))?;
+            write!(f, "; error {} before, {} after", format_error(before), format_error(after))?;
         }
         Ok(())
     }
@@ -422,12 +427,12 @@ mod tests {
     use nalgebra::Vector3;
     use trainer::DepthMap;
 
-    /// A room corner with marks on its walls, as a camera at a pose sees it: brightness, and depth.
+    /// A room corner with marks on its walls, rendered from a camera pose: brightness and depth.
     fn render_room(pose: &Transform) -> (Vec<u8>, Vec<f32>) {
         let (mut rgba, mut depth_m) = (Vec::new(), Vec::new());
         let origin = pose.translation.vector;
         for pixel in 0..SIZE_PX[0] * SIZE_PX[1] {
-            let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|base_place| f64::from(base_place) + 0.5);
+            let [x, y] = [pixel % SIZE_PX[0], pixel / SIZE_PX[0]].map(|px| f64::from(px) + 0.5);
             let direction = pose.rotation * Vector3::new((x - 80.0) / FOCAL_PX, (y - 60.0) / FOCAL_PX, 1.0);
             let walls =
                 [(Vector3::x(), 2.0), (Vector3::y(), 1.1), (-Vector3::y(), 1.2), (Vector3::new(0.3, 0.2, -1.0), 0.9)];
@@ -439,10 +444,10 @@ mod tests {
             let at = origin + direction * z;
             let wave = |size: f64, x: f64, y: f64, z: f64| size * (x * at.x + y * at.y + z * at.z).sin();
             let level = 128.0 + wave(30.0, 9.0, 13.0, -8.0) + wave(30.0, -6.0, 7.0, 15.0) + wave(25.0, 4.0, -5.0, 3.0);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a level of a test")]
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a gray level in a test")]
             let level = level.round() as u8;
             rgba.extend([level, level, level, 255]);
-            #[expect(clippy::cast_possible_truncation, reason = "metres of a test")]
+            #[expect(clippy::cast_possible_truncation, reason = "meters in a test")]
             depth_m.push(if z.is_finite() { z as f32 } else { 0.0 });
         }
         (rgba, depth_m)
@@ -451,12 +456,12 @@ mod tests {
     const SIZE_PX: [u32; 2] = [160, 120];
     const FOCAL_PX: f64 = 120.0;
 
-    /// Where the base truly is: at one place, on the way, at another place.
+    /// True base pose: at one station, on the way, at another station.
     fn true_base(fraction: f64) -> Transform {
         Transform::new(Vector3::new(0.5 * fraction, 0.1 * fraction, 0.0), Vector3::new(0.0, 0.0, 0.15 * fraction))
     }
 
-    /// What its source gets wrong on the way.
+    /// Error of the reported base pose, which grows on the way.
     fn reported_base(fraction: f64) -> Transform {
         let truth = true_base(fraction);
         let rotation = nalgebra::UnitQuaternion::from_scaled_axis(Vector3::new(0.003, -0.004, 0.014) * fraction);
@@ -466,7 +471,7 @@ mod tests {
         )
     }
 
-    /// The `ix`-th image of a second each half: ten seconds at a stand, three on the way, ten at the next.
+    /// The `ix`-th keyframe at 2 Hz: ten seconds at a station, three on the way, ten at the next station.
     fn keyframe(ix: usize) -> Arc<Keyframe> {
         let (station, fraction) = match ix {
             0..24 => (Some(0), 0.0),
@@ -521,14 +526,14 @@ mod tests {
 
     fn stations() -> Stations {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/mobile-arm.toml");
-        Stations::new(&Rig::load(&path, &[]).unwrap()).expect("its base walks")
+        Stations::new(&Rig::load(&path, &[]).unwrap()).expect("its base moves")
     }
 
-    /// Millimetres and degrees that a keyframe's base is off.
+    /// Error of a keyframe's base pose, millimeters and degrees.
     fn base_error(keyframe: &Keyframe) -> (f64, f64) {
-        let base_place = keyframe.base.as_ref().unwrap();
-        let base = base_place.map_from_odom * base_place.world_from_base;
-        let left = base_place.truth.unwrap().inverse() * base;
+        let base_state = keyframe.base.as_ref().unwrap();
+        let base = base_state.map_from_odom * base_state.world_from_base;
+        let left = base_state.truth.unwrap().inverse() * base;
         (1e3 * left.translation.vector.norm(), left.rotation.angle().to_degrees())
     }
 
@@ -548,20 +553,20 @@ mod tests {
         assert_eq!(stamps(&given), stamps(&released));
         assert!(
             given[..24].iter().zip(&released).all(|(given, released)| Arc::ptr_eq(given, released)),
-            "the first stays"
+            "keyframes of the first station are unchanged"
         );
         for (given, released) in given.iter().zip(&released).skip(24) {
             let ((before_mm, _), (mm, degrees)) = (base_error(given), base_error(released));
             assert!(mm < 0.5 && degrees < 0.05, "{:?}: {before_mm} mm, now {mm} mm, {degrees}", released.stamp);
-            // Depth goes along.
+            // Depth is corrected too.
             let [was, is] = [given, released]
                 .map(|of| of.world_from_camera.inverse() * of.depth.as_ref().unwrap().world_from_camera);
             assert!((was.to_homogeneous() - is.to_homogeneous()).abs().max() < 1e-9);
         }
         let [report] = stations.reports() else { panic!("{:?}", stations.reports()) };
-        let [before, resume_from] = report.base_error.unwrap();
-        assert!(report.station == 1 && before.m > 0.019 && resume_from.m < 5e-4 && resume_from.rad < 1e-3, "{report}");
-        assert!(report.to_string().starts_with("base at stand 1: moved by"), "{report}");
+        let [before, after] = report.base_error.unwrap();
+        assert!(report.station == 1 && before.m > 0.019 && after.m < 5e-4 && after.rad < 1e-3, "{report}");
+        assert!(report.to_string().starts_with("base at station 1: moved by"), "{report}");
         let camera = Transform::translation(0.1, 0.2, 0.3);
         assert_ne!(stations.corrected_pose("wrist", &camera), camera);
         assert_eq!(stations.corrected_pose("of the room", &camera), camera);
@@ -593,16 +598,16 @@ mod tests {
         let mut stations = stations();
         let count = |released: &[Change]| released.len();
         for keyframe in all().into_iter().take(24) {
-            assert_eq!(count(&stations.push(Change::Accepted(keyframe))), 1, "the first stand waits for nothing");
+            assert_eq!(count(&stations.push(Change::Accepted(keyframe))), 1, "the first station is not queued");
         }
         let evicted = || Change::Evicted { camera: "wrist".into(), stamp: Stamp(0) };
         assert_eq!(count(&stations.push(evicted())), 1);
         assert!(stations.push(Change::Accepted(keyframe(25))).is_empty(), "on the way");
         assert!(stations.push(evicted()).is_empty());
         assert!(stations.advance_to(Stamp::from_secs(30.0)).is_empty());
-        let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_WALK_SECS + 1.0));
+        let released = stations.advance_to(Stamp::from_secs(12.5 + MAX_TRAVEL_SECS + 1.0));
         assert!(matches!(&released[..], [Change::Accepted(_), Change::Evicted { .. }]), "{}", released.len());
-        // A scan that is too short is looked at when it has lasted long enough.
+        // A scan with too few keyframes is registered once it has lasted long enough.
         for ix in 40..44 {
             assert!(stations.push(Change::Accepted(keyframe(ix))).is_empty());
         }
@@ -628,7 +633,7 @@ mod tests {
         let released = stations.corrected(given.clone());
         assert_eq!(bits(&given), bits(&released));
         assert!(
-            stations.reports()[0].to_string().contains("show nothing of earlier ones"),
+            stations.reports()[0].to_string().contains("do not overlap with earlier ones"),
             "{}",
             stations.reports()[0]
         );

@@ -1,8 +1,8 @@
 //! Signals that end a run: it stops, saves, and exits.
 //!
-//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal closed) request an orderly stop. A second Ctrl-C ends the process at once;
-//! SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground group, the shell to its jobs.
-//! Under `nohup`, where SIGHUP is ignored, it stays ignored.
+//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
+//! process at once. SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground
+//! group, the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
 
 use anyhow::Context;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -51,7 +51,7 @@ impl Stop {
         self.requested.store(true, Ordering::Relaxed);
     }
 
-    /// Whether the end was asked for.
+    /// Whether a stop was requested.
     pub(crate) fn requested(&self) -> bool {
         self.requested.load(Ordering::Relaxed) || self.signaled()
     }
@@ -66,7 +66,7 @@ impl Stop {
     }
 }
 
-/// The signals that ask for an end; without SIGHUP where it is ignored.
+/// The signals that request a stop; without SIGHUP if it is ignored.
 pub(crate) fn termination_signals() -> impl Iterator<Item = i32> {
     [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
 }
@@ -77,7 +77,7 @@ fn is_ignored(signal: i32) -> bool {
     is_in_ignore_mask(&status, signal)
 }
 
-/// Reads the mask `SigIgn` of `/proc/self/status`: bit n - 1 stands for signal n.
+/// Reads the mask `SigIgn` of `/proc/self/status`: bit n - 1 is set if signal n is ignored.
 fn is_in_ignore_mask(status: &str, signal: i32) -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());

@@ -1,7 +1,7 @@
 //! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
 //!
-//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth as PNG.
-//! Ground truth from a simulator is left out.
+//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
+//! as PNG. Ground truth from a simulator is left out.
 
 use crate::join::{split_from_name, split_name};
 use anyhow::{Context, ensure};
@@ -72,7 +72,7 @@ impl StoredKeyframes {
 
     /// Writes the keyframes that are not stored yet.
     pub(crate) fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
-        std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot make {}", self.folder.display()))?;
+        std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot create {}", self.folder.display()))?;
         let existing = self.names()?;
         for keyframe in keyframes {
             let name = name_of(keyframe);
@@ -160,14 +160,14 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     })
 }
 
-fn keyframe_of(to_checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
-    ensure!(to_checkpoint.method == METHOD, "it holds a {}, expected a {METHOD}", to_checkpoint.method);
-    let metadata: Description = serde_json::from_value(to_checkpoint.state.clone())?;
+fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
+    ensure!(checkpoint.method == METHOD, "it contains a {}, expected a {METHOD}", checkpoint.method);
+    let metadata: Description = serde_json::from_value(checkpoint.state.clone())?;
     let pixels = |name: &str, size_px: [u32; 2]| {
-        let array = to_checkpoint.arrays.iter().find(|array| array.name == name);
+        let array = checkpoint.arrays.iter().find(|array| array.name == name);
         let png = &array.with_context(|| format!("array {name:?} is missing"))?.bytes;
         let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
-        ensure!([image.width(), image.height()] == size_px, "array {name:?} has another size than {size_px:?}");
+        ensure!([image.width(), image.height()] == size_px, "array {name:?} has the wrong size, expected {size_px:?}");
         Ok(image.into_rgba8().into_raw())
     };
     let depth = metadata.depth.map(|depth| {
@@ -204,7 +204,8 @@ fn keyframe_of(to_checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
     })
 }
 
-/// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between neighbors.
+/// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between
+/// neighbors.
 fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
     let mut png = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
@@ -275,9 +276,9 @@ mod tests {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
         let all = [keyframe(9_000_000_000, true), keyframe(20, false), keyframe(10_000_000_000, true)];
-        stored.add(&all[..2]).expect("room");
-        stored.add(&all).expect("room");
-        let read = stored.read().expect("whole");
+        stored.add(&all[..2]).expect("disk space");
+        stored.add(&all).expect("disk space");
+        let read = stored.read().expect("complete files");
         let in_order = [&all[1], &all[0], &all[2]];
         assert_eq!(read.len(), 3);
         for (read, expected) in read.iter().zip(in_order) {
@@ -286,20 +287,20 @@ mod tests {
             assert_eq!(read.base, expected.base);
         }
         stored.keep_only(&all[1..]).expect("they are there");
-        assert_eq!(stored.read().expect("whole").len(), 2);
+        assert_eq!(stored.read().expect("complete files").len(), 2);
     }
 
     #[test]
     fn damaged_file_is_named_in_the_error() {
         let run = tempfile::tempdir().expect("a folder");
         let stored = StoredKeyframes::of_run(run.path());
-        assert!(stored.read().is_err(), "there is no folder");
-        stored.add(&[keyframe(1, true)]).expect("room");
+        assert!(stored.read().is_err(), "no folder yet");
+        stored.add(&[keyframe(1, true)]).expect("disk space");
         let path = run.path().join(FOLDER).join("wrist_00000000000000000001.keyframe");
         let mut bytes = std::fs::read(&path).expect("a file");
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
-        std::fs::write(&path, bytes).expect("room");
+        std::fs::write(&path, bytes).expect("disk space");
         let message = format!("{:#}", stored.read().expect_err("damaged"));
         assert!(message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"), "{message}");
     }

@@ -1,18 +1,19 @@
-//! Several models on one device: whose turn it is to learn.
+//! Time slices for several models on one device.
 //!
-//! Turns go by the time that each had so far. What a model learns does not depend on them: it is a function of its steps and
-//! of its keyframes alone.
+//! The next slice goes to the model with the least device time so far. Results do not depend on the slices: a model is
+//! a function of its steps and keyframes alone.
 
 use crate::session::Session;
 use std::time::Duration;
 
-/// A turn among several lasts about this long: at its end the device has nothing to do for a moment.
+/// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
 
-/// Lets the model learn that had the least time of those that can, then tells what is due of all.
+/// Trains the model that has used the device least, among those that can train, and then evaluates all sessions that
+/// are due.
 ///
-/// `max_steps`: maximum number of steps of a session in this turn, by its index. `is_render_pending`: whether a picture waits for the end
-/// of the turn, which then comes after the current submit.
+/// `max_steps`: maximum number of steps of a session in this slice, given its index. `is_render_pending`: whether a
+/// picture waits; the slice then ends after the current submit.
 pub(crate) fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
@@ -29,7 +30,7 @@ pub(crate) fn train_next(
         if sessions.len() == 1 {
             sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
         } else {
-            // Who had nothing to learn for a while does not catch up on that.
+            // A session that had nothing to train on for a while does not catch up.
             sessions.iter_mut().for_each(|session| session.raise_device_time(min_time));
             sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
         }
@@ -37,7 +38,8 @@ pub(crate) fn train_next(
     sessions.iter_mut().try_for_each(Session::evaluate_when_due)
 }
 
-/// Place and time of the one that had the least, the first of several; `None` where nobody can learn.
+/// Index and device time of the session with the least device time, the first of several; `None` if no session can
+/// train.
 fn next(device_time: &[Option<Duration>]) -> Option<(usize, Duration)> {
     device_time
         .iter()
@@ -55,7 +57,7 @@ mod tests {
         const MILLIS: [u64; 3] = [40, 90, 55];
         let mut device_time = [Duration::ZERO; 3];
         for _ in 0..1000 {
-            let (ix, _) = next(&device_time.map(Some)).expect("all can learn");
+            let (ix, _) = next(&device_time.map(Some)).expect("all can train");
             device_time[ix] += Duration::from_millis(MILLIS[ix]);
         }
         let (max_time, min_time) = (device_time.iter().max().expect("three"), device_time.iter().min().expect("three"));

@@ -1,4 +1,4 @@
-//! One training from keyframes on disk to a model: what `train` does once, and `bench` many times over.
+//! Trains models from keyframes on disk: once in `train`, many times in `bench`.
 
 use crate::config::{DEFAULT_SEED, Rig};
 use crate::data::{self, Data, DataArgs};
@@ -16,7 +16,7 @@ use trainer::Keyframe;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 
-/// All that settles a training beside its keyframes.
+/// Everything that determines a training besides its keyframes.
 pub(crate) struct TrainingPlan {
     pub(crate) model_spec: ModelSpec,
     pub(crate) evaluators: Evaluators,
@@ -24,9 +24,9 @@ pub(crate) struct TrainingPlan {
     pub(crate) output: OutputMode,
 }
 
-/// Trains a fresh model until a limit, or until `stop` is asked.
+/// Trains a new model until a limit or until `stop` is requested.
 ///
-/// The clock starts when everything is compiled; seeding counts.
+/// The clock starts once all pipelines are compiled; seeding counts.
 pub(crate) fn train(
     gpu: Arc<Gpu>,
     plan: TrainingPlan,
@@ -42,9 +42,9 @@ pub(crate) fn train(
     Ok(session)
 }
 
-/// Starts the clock, pushes the keyframes to all models, and trains each until a limit, or until `stop` is asked.
+/// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until `stop` is requested.
 ///
-/// `preparation_time`: time spent on learning from the keyframes before; it counts.
+/// `preparation_time`: time already spent on preparing the keyframes, which counts as training time.
 pub(crate) fn drive(
     sessions: &mut [Session],
     keyframes: &[Arc<Keyframe>],
@@ -61,8 +61,8 @@ pub(crate) fn drive(
         if session.is_idle() && session.progress().step == 0 {
             let name = session.kind().name();
             return Err(InsufficientData(format!(
-                "no image to learn from has depth, and the scene model of the method {name} is made of depth: \
-                 --depth-from gives them that of a model of the same place, and splat and nerf do without"
+                "the method {name} needs depth, but no training image has depth: \
+                 use --depth-from to render it from another model of the scene, or the method splat or nerf"
             ))
             .into());
         }
@@ -83,7 +83,8 @@ pub(crate) fn drive(
     }
 }
 
-/// The scene models: the recording's rig file says which, with the flags over it; a folder has the flags only.
+/// The methods and their options. For a recording, its rig file sets them and flags override it; for a folder, only
+/// flags set them.
 pub(crate) fn model_specs(
     args: &TrainingArgs,
     data: &Data,
@@ -93,11 +94,11 @@ pub(crate) fn model_specs(
     let rig_methods = data.rig.as_ref().map(|rig| rig.train.methods.as_slice());
     let kinds = rig_methods.or(args.methods()).unwrap_or(&[ModelKind::Splat]);
     args.check_for(kinds)?;
-    // A trial takes hundreds of steps more: on a processor that is minutes.
+    // A trial takes hundreds of additional steps, which take minutes on a CPU.
     let available = AvailableData {
         joints: data.rig.is_some(),
         drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
-        // Depth drawn from where a camera is told to be does not say where it is.
+        // Depth rendered from reported camera poses contains no information about the true poses.
         depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
     };
     let RefineSettings { align, with_scene: cameras } =
@@ -122,14 +123,14 @@ pub(crate) fn model_specs(
     Ok(kinds.iter().map(|kind| ModelSpec { kind: *kind, options: options.clone() }).collect())
 }
 
-/// Refuses flags that make no sense whatever the data hold, before all of those are read.
+/// Checks flags that do not depend on the contents of the data, before all data are read.
 pub(crate) fn check_before_data(args: &TrainingArgs, path: &Path, images: &DataArgs) -> anyhow::Result<()> {
     let defaults = || Data::default_methods(path, images);
     let kinds = args.methods().map_or_else(defaults, |kinds| Ok(kinds.to_vec()))?;
     Ok(args.check_before_data(&kinds, data::is_recording(path))?)
 }
 
-/// When to stop, from `--seconds` and `--steps`; after `default_secs` when neither is given.
+/// When to stop, from `--seconds` and `--steps`; `default_secs` if neither is given.
 pub(crate) fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, BadArgument> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
         return Err(BadArgument("--seconds: must be a number of at least 0".into()));

@@ -1,4 +1,4 @@
-//! Draws saved or finished models for the page: the loop of a run without devices and training.
+//! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
 
 use crate::method::ModelKind;
 use crate::stop::Stop;
@@ -16,7 +16,7 @@ pub(crate) struct ServedModel {
     pub(crate) method: Box<dyn Method>,
 }
 
-/// Models that no longer change, and the hub of the clients that view them.
+/// Models that no longer change, and the hub of clients that view them.
 pub(crate) struct ModelViewer {
     /// The first is drawn for clients that name no method.
     models: Vec<ServedModel>,
@@ -26,7 +26,7 @@ pub(crate) struct ModelViewer {
 }
 
 impl ModelViewer {
-    /// A viewer of models that are z up.
+    /// A viewer of models whose z axis points up.
     pub(crate) fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
         Self { models, hub, model_from_page: Transform::identity() }
     }

@@ -118,7 +118,7 @@ fn missing_or_invalid_data_is_reported() {
     std::fs::write(&recording, b"\x89MCAP0\r\n").expect("room on the disk");
     assert_fails_with(&["train", recording.to_str().expect("a plain name")], 1, &["torn.mcap"]);
     assert_fails_with(&["eval", empty, "absent"], 1, &["absent does not exist"]);
-    let no_model = format!("{empty} holds no model");
+    let no_model = format!("{empty} contains no model");
     assert_fails_with(&["eval", empty, empty], 1, &[&no_model]);
     let pose = ["--pose", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"];
     assert_fails_with(&["render", empty, pose[0], pose[1]], 1, &[&no_model]);
@@ -127,12 +127,12 @@ fn missing_or_invalid_data_is_reported() {
         let file = folder.path().join(part);
         std::fs::write(&file, "a part").expect("room on the disk");
         let file = file.to_str().expect("a plain name");
-        assert_fails_with(&["render", file, pose[0], pose[1]], 2, &[part, "name its folder"]);
-        assert_fails_with(&["eval", file, empty], 2, &[part, "name its folder"]);
+        assert_fails_with(&["render", file, pose[0], pose[1]], 2, &[part, "give its folder"]);
+        assert_fails_with(&["eval", file, empty], 2, &[part, "give its folder"]);
     }
     let mesh = folder.path().join("mesh.ply");
     let export = ["export", mesh.to_str().expect("a plain name"), "--to", "glb", "--out", "a.glb"];
-    assert_fails_with(&export, 2, &["name its folder"]);
+    assert_fails_with(&export, 2, &["give its folder"]);
 }
 
 #[test]

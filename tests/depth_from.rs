@@ -75,21 +75,22 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     // A checkpoint names the model, and a resumed run finds it without a flag; a decision log has only its hash.
     let found = done(folder, &[&resume[..], &["--out", "found"]].concat());
     assert_eq!(found["checkpoint_sha256"], *sha256, "resumed without --depth-from");
-    assert_fails_with(folder, &replay, 2, "name it with --depth-from");
+    assert_fails_with(folder, &replay, 2, "give that model with --depth-from");
     for again in [&resume[..], &replay] {
-        assert_fails_with(folder, &[again, &["--depth-from", "drawn"]].concat(), 2, "--depth-from names one with");
+        let drawn = [again, &["--depth-from", "drawn"]].concat();
+        assert_fails_with(folder, &drawn, 2, "the model given with --depth-from has");
     }
     let bare = ["seen", "--resume", "bare", "--depth-from", "field"];
-    assert_fails_with(folder, &bare, 2, "leave out --depth-from");
-    assert_fails_with(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
-    assert_fails_with(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
+    assert_fails_with(folder, &bare, 2, "remove the flag");
+    assert_fails_with(folder, &["elsewhere", "--depth-from", "field"], 4, "the model is not visible in any image");
+    assert_fails_with(folder, &["seen", "--depth-from", "measured"], 2, "measured contains no model");
     assert_fails_with(
         folder,
         &["seen", "--depth-from", "field/mesh.ply"],
         2,
-        "--depth-from: field/mesh.ply is no file of splats",
+        "--depth-from: field/mesh.ply is not a file of splats",
     );
-    assert_fails_with(folder, &["seen", "--method", "tsdf"], 4, "no image to learn from has depth");
+    assert_fails_with(folder, &["seen", "--method", "tsdf"], 4, "no training image has depth");
 
     // Depth from splats makes a mesh of images that have none.
     done(folder, &["seen", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
@@ -97,6 +98,6 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     let evaluated: Value = serde_json::from_slice(&evaluated).expect("a JSON object");
     let elsewhere = fieldrig(folder, &["eval", "mesh", "elsewhere"]).stderr;
     let elsewhere = String::from_utf8(elsewhere).expect("stderr is UTF-8");
-    assert!(elsewhere.contains("the model covers 0.0 % of 2 views; are both of one place"), "{elsewhere}");
+    assert!(elsewhere.contains("the model covers 0.0 % of 2 views; do both show the same scene"), "{elsewhere}");
     assert!(evaluated["depth_rmse_m"].as_f64().is_some_and(|error_m| error_m < MAX_DEPTH_ERROR_M), "{evaluated}");
 }

@@ -452,7 +452,7 @@ fn decision_log_reproduces_a_real_time_run() {
     };
     let pushed = &entries[1]["push"];
     let stamp = number(pushed, "stamp_nanos").to_string();
-    refused(log.replace(&stamp, "7"), "names image 7 of camera \"wrist\", which scan.mcap does not have");
+    refused(log.replace(&stamp, "7"), "contains image 7 of camera \"wrist\", which is not in scan.mcap");
     let fingerprint = pushed["fingerprint"].as_str().expect("a fingerprint");
     refused(log.replace(fingerprint, "0123"), &format!("image {stamp} of camera \"wrist\" has other pixels"));
 }

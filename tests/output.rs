@@ -255,7 +255,7 @@ fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
     let output = train(&temporary);
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{printed}");
-    assert!(printed.contains("cannot save the model in disk/out, it was saved in "), "{printed}");
+    assert!(printed.contains("cannot save the model in disk/out; it was saved in "), "{printed}");
     let saved = std::fs::read_dir(&temporary).unwrap().next().unwrap().unwrap().path();
     expect_model(folder, saved.strip_prefix(folder).unwrap().to_str().unwrap());
     assert!(!disk.join("out/model.part").exists(), "the incomplete file is removed");

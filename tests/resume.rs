@@ -98,7 +98,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
         assert!(assert_fails(&train(folder, &["--resume", "half", flag, "5"]).output().unwrap(), 2).contains(flag));
     }
     let printed = assert_fails(&train(folder, &["--resume", "data"]).output().unwrap(), 1);
-    assert!(printed.contains("nothing to go on from in data") && printed.contains("training.ckpt"), "{printed}");
+    assert!(printed.contains("no checkpoint to resume from in data") && printed.contains("training.ckpt"), "{printed}");
     assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
 }
 
@@ -126,17 +126,15 @@ fn decision_log_reproduces_a_timed_training() {
     assert!(printed(&["--replay-decisions", &log]).contains("with --resume"));
     assert!(
         printed(&["--resume", "timed", "--scale", "1"])
-            .contains("--scale 1: the checkpoint in timed is of images with --scale 0.5")
+            .contains("--scale 1: the checkpoint in timed was trained with --scale 0.5")
     );
     assert!(printed(&["--resume", "timed", "--holdout", "8"]).contains("with --holdout 5"));
     assert!(
         printed(&["--resume", "timed", "--seconds", "0.5"])
-            .contains("--seconds 0.5: the checkpoint in timed has been trained for 1.")
+            .contains("--seconds 0.5: the checkpoint in timed has already been trained for 1.")
     );
-    assert!(printed(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is of step"));
-    assert!(
-        printed(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("leave out --resume")
-    );
+    assert!(printed(&["--replay-decisions", &log, "--resume", "both"]).contains("the checkpoint is at step"));
+    assert!(printed(&["--replay-decisions", "timed/decisions.jsonl", "--resume", "timed"]).contains("remove --resume"));
     for flag in ["--seed", "--seconds", "--steps", "--holdout", "--scale", "--max-splats"] {
         let printed = printed(&["--replay-decisions", "timed/decisions.jsonl", flag, "1"]);
         assert!(printed.contains(flag), "{printed}");

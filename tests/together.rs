@@ -65,7 +65,7 @@ fn several_methods_equal_single_trainings() {
     assert_fails_with(folder, &small, &["the smallest distance field takes 2629632 bytes"]);
     assert!(!folder.join("small").exists(), "what is refused leaves nothing behind");
     assert_fails_with(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
-    assert_fails_with(folder, &["train", "data", "--out", "all"], &["holds a model already", "splat/model.json"]);
+    assert_fails_with(folder, &["train", "data", "--out", "all"], &["already contains a model", "splat/model.json"]);
 }
 
 /// The folder of each method is that of a run of its own.

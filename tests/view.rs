@@ -256,12 +256,12 @@ fn non_model_paths_give_one_error() {
     write("torn.ply", b"ply\n");
     let refused = |model: &str, code: i32, words: &[&str]| assert_fails_with(folder, &["view", model], code, words);
     refused("absent", 1, &["absent does not exist"]);
-    refused("cut", 1, &["cut holds no model", "train --resume"]);
+    refused("cut", 1, &["cut contains no model", "train --resume"]);
     refused("scan.mcap", 2, &["scan.mcap is a recording, not a model", "run RIG.toml --from scan.mcap"]);
     refused("data", 2, &["data is a dataset, not a model", "fieldrig train data"]);
     refused("new.spz", 1, &["new.spz", "version 4", "only 2 and 3"]);
     refused("torn.ply", 1, &["torn.ply"]);
-    refused("data/00.png", 2, &["00.png is no file of splats"]);
+    refused("data/00.png", 2, &["00.png is not a file of splats"]);
     refused("http://127.0.0.1:7007/", 2, &["open it in a browser"]);
     assert_fails_with(folder, &["view", "absent", "--up", "north"], 2, &["--up", "-z"]);
     assert_fails_with(folder, &["view", "absent", "--listen", "7007"], 2, &["127.0.0.1:7007"]);
@@ -364,7 +364,7 @@ fn report_without_test_images_says_so() {
     let printed = train(folder, &args);
     assert!(printed.contains(" view second") && !printed.contains(" eval "), "{printed}");
     let page = std::fs::read_to_string(folder.join("second/report.html")).expect("a page");
-    assert!(page.contains("no image was held out"), "{page}");
+    assert!(page.contains("there are no test images"), "{page}");
 }
 
 #[test]
@@ -379,7 +379,7 @@ fn unwritable_report_page_keeps_the_model() {
         fieldrig(folder, &["train", "data", "--steps", "1", "--max-splats", "500", "--out", "model", "--json"]);
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(0), "{printed}");
-    assert!(printed.contains("no report.html") && printed.contains("no cameras.json"), "{printed}");
+    assert!(printed.contains("report.html was not") && printed.contains("cameras.json was not"), "{printed}");
     assert!(folder.join("model/splats.ply").is_file() && folder.join("model/report.json").is_file());
     assert!(!String::from_utf8_lossy(&output.stdout).contains(" view "), "commands are for people");
 }

@@ -1,4 +1,4 @@
-//! From dataset folders to keyframes.
+//! Loading dataset folders as keyframes.
 
 use super::*;
 use crate::test_data;
@@ -6,7 +6,7 @@ use image::{GrayImage, Luma, RgbImage};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// A folder with `n` photos of 64 x 48 pixels, brighter to the right, all from one place, through `lens`.
+/// A folder with `n` photos of 64 x 48 pixels, brighter to the right, all from one pose, through `lens`.
 fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let rows = json!([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]);
@@ -59,9 +59,9 @@ fn fisheye_photo_is_undistorted_and_masked() {
     let keyframe = load_at(folder.path(), 1.0).unwrap().keyframes[0].clone();
     let pixel = |x: usize, y: usize| &keyframe.rgba_srgb[4 * (y * 64 + x)..][..4];
     assert_eq!(pixel(32, 24)[3], 255);
-    // Seven pixels right of the centre, the fisheye with this k1 shows what a pinhole shows at most a pixel off.
+    // Seven pixels right of the center, the fisheye with this k1 matches a pinhole to within one pixel.
     assert!(pixel(39, 24)[0].abs_diff(4 * 39) <= 4, "{:?}", pixel(39, 24));
-    // With a strong k1 the corner of the pinhole image lies outside the photo: theta_d exceeds its half diagonal.
+    // With a large k1 the corner of the pinhole image lies outside the photo: theta_d exceeds its half diagonal.
     let strong = folder_of(3, &json!({ "camera_model": "OPENCV_FISHEYE", "k1": 2.0 }));
     let keyframe = load_at(strong.path(), 1.0).unwrap().keyframes[0].clone();
     assert_eq!(keyframe.rgba_srgb[3], 0);
@@ -81,7 +81,7 @@ fn scaling_averages_areas_and_propagates_masks() {
         .unwrap();
     let keyframe = load_at(folder.path(), 0.5).unwrap().keyframes[1].clone();
     let row: Vec<[u8; 4]> = keyframe.rgba_srgb.as_chunks::<4>().0[..32].to_vec();
-    // Columns 0 and 1 hold 0 and 4; column 1 of the small picture covers the masked one.
+    // Columns 0 and 1 hold 0 and 4; column 1 of the scaled image covers the masked column.
     assert_eq!((row[0], row[1][3], row[2]), ([2, 100, 7, 255], 0, [18, 100, 7, 255]));
     assert_eq!((keyframe.size_px, keyframe.principal_px), ([32, 24], [16.0, 12.0]));
     assert!(format!("{:#}", load_at(folder.path(), 0.2).unwrap_err()).contains("64x48 pixels would have 13x10"));
@@ -99,7 +99,7 @@ fn truncated_photos_are_skipped_and_named() {
     let loaded = load_at(folder.path(), 1.0).unwrap();
     assert_eq!((loaded.keyframes.len(), loaded.names.contains(&"03.png".to_owned())), (9, false));
     assert!(loaded.data_losses[0].contains("1 image cannot be used") && loaded.data_losses[0].contains("03.png"));
-    // The others keep the split they had.
+    // The other photos keep their splits.
     assert_eq!(loaded.keyframes[7].split, Split::Test);
     (0..10).for_each(|ix| truncate(&format!("{ix:02}.png")));
     let text = load_at(folder.path(), 1.0).unwrap_err().to_string();

@@ -1,6 +1,6 @@
-//! Which images of one camera are worth keeping.
+//! Decides which images of one camera become keyframes.
 //!
-//! The tests go from cheap to dear: motion, then predicted blur and shear, then the pixels.
+//! The tests run from cheap to expensive: motion, then predicted blur and shear, then the pixels.
 
 use super::motion::{self, CameraPose};
 use super::pixels::{PixelStatistics, SharpnessHistory};
@@ -15,8 +15,8 @@ pub(super) struct Acceptance {
     spacing: Spacing,
     is_fixed: bool,
     readout_secs: f64,
-    /// Every pose accepted so far, also of keyframes that were evicted since: else a full store would take the same
-    /// views again and again. The spacing bounds their number by the space that the camera can reach.
+    /// All poses accepted so far, including those of evicted keyframes: otherwise a full store would accept the same
+    /// views again and again. Their number is bounded by the spacing and the space that the camera can reach.
     accepted: Vec<Transform>,
     last: Option<Stamp>,
     sharpness: SharpnessHistory,
@@ -40,7 +40,8 @@ impl Acceptance {
         self.readout_secs
     }
 
-    /// Moved since the nearest keyframe? A camera that stands still is asked instead whether enough time has passed.
+    /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera, checks instead that
+    /// enough time has passed.
     pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Refusal> {
         let moved = if self.is_fixed {
             let waited = self.last.is_none_or(|last| stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis);
@@ -51,7 +52,7 @@ impl Acceptance {
         if moved { Ok(()) } else { Err(Refusal::NotMoved) }
     }
 
-    /// Slow enough for its exposure and readout? `depth_m` is how far away the scene is.
+    /// Checks that the camera is slow enough for its exposure and readout time. `depth_m`: distance of the scene.
     pub(super) fn check_speed(
         &self,
         camera_pose: &CameraPose,
@@ -65,7 +66,7 @@ impl Acceptance {
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
         let shear_px = speed_px_s * self.readout_secs;
-        // Accepting what is small, not refusing what is large, also refuses a speed that is no number.
+        // Written so that a NaN speed is rejected too.
         match (blur_px <= self.config.max_blur_px, shear_px <= self.config.max_shear_px) {
             (true, true) => Ok(()),
             (false, _) => Err(Refusal::Blur),
@@ -73,7 +74,7 @@ impl Acceptance {
         }
     }
 
-    /// Well exposed and sharp? `rgb` is `[height, width, 3]`.
+    /// Checks exposure and sharpness. `rgb` is `[height, width, 3]`.
     pub(super) fn check_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Refusal> {
         let statistics = PixelStatistics::of(rgb, size_px);
         let is_well_exposed = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&statistics.luma_frac);
@@ -84,13 +85,13 @@ impl Acceptance {
         if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Refusal::NotSharp) }
     }
 
-    /// Remembers a keyframe of the run that is resumed. Its stamp may be of another clock: the wait of a camera that stands still
-    /// begins anew.
+    /// Adds the pose of a keyframe of the resumed run. Its stamp may be from another clock, so the interval of a fixed
+    /// camera starts again.
     pub(super) fn accept_resumed(&mut self, pose: &Transform) {
         self.accepted.push(*pose);
     }
 
-    /// Remembers a keyframe.
+    /// Adds the pose of a new keyframe.
     pub(super) fn accept(&mut self, stamp: Stamp, pose: &Transform) {
         self.accepted.push(*pose);
         self.last = Some(stamp);

@@ -1,4 +1,4 @@
-//! From device images to the plain arrays of a keyframe: decoded, undistorted, depth in metres.
+//! Converts device images to the arrays of a keyframe: decoded, undistorted, depth in meters.
 
 use super::motion::CameraPose;
 use crate::config;
@@ -10,7 +10,7 @@ use kinematics::{Intrinsics, Undistortion};
 use std::sync::Arc;
 use trainer::{DepthMap, Truth};
 
-/// How the images of one camera become pinhole images of the size for training; computed once.
+/// Undistorts and scales the images of one camera. The maps are computed once.
 pub(super) struct Undistorter {
     full: Intrinsics,
     pinhole: Intrinsics,
@@ -18,29 +18,30 @@ pub(super) struct Undistorter {
 }
 
 impl Undistorter {
-    /// `scale` shrinks the width and height of the undistorted images.
+    /// `scale`: factor for the width and height of the undistorted images.
     pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> Result<Self, BadArgument> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
         Ok(Self { pinhole: downscale::intrinsics(&full, scale)?, full, undistortion })
     }
 
-    /// The pinhole camera of the undistorted images at the size that the device delivers.
+    /// The pinhole camera of the undistorted images at the size of the device images.
     pub(super) fn full(&self) -> &Intrinsics {
         &self.full
     }
 
-    /// The pinhole camera of the keyframes' images.
+    /// The pinhole camera of the keyframe images.
     pub(super) fn pinhole(&self) -> &Intrinsics {
         &self.pinhole
     }
 
-    /// Whether the keyframes' images are smaller than the device's.
+    /// Whether keyframe images are smaller than device images.
     pub(super) fn is_downscaled(&self) -> bool {
         self.pinhole.size_px != self.full.size_px
     }
 
-    /// `[height, width, 3]` to `[height, width, 4]`, undistorted and shrunk; alpha tells what was seen.
+    /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the source image has no
+    /// pixel.
     pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
         let opaque = || rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]);
         if !self.is_downscaled() {
@@ -64,7 +65,7 @@ impl Undistorter {
     }
 }
 
-/// Depth of a camera, decoded and undistorted; readings out of the sensor's range count as nothing seen.
+/// Decoded and undistorted depth of a camera. Readings outside the sensor's range become 0.
 pub(super) fn depth_map(
     image: &Image,
     depth: &config::Depth,
@@ -73,7 +74,7 @@ pub(super) fn depth_map(
 ) -> anyhow::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
-    #[expect(clippy::cast_possible_truncation, reason = "a range in metres needs no more digits")]
+    #[expect(clippy::cast_possible_truncation, reason = "f32 is precise enough for a range in meters")]
     let (factor, min_m, max_m) = (depth.factor as f32, depth.min_m as f32, depth.max_m as f32);
     for depth_m in &mut depth_m {
         *depth_m *= factor;
@@ -90,21 +91,21 @@ pub(super) fn depth_map(
     })
 }
 
-/// Decodes a colour image to `[height, width, 3]` of the size that the rig file says.
+/// Decodes a color image to `[height, width, 3]`. Its size must be the one in the rig file.
 pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<u8>> {
     expect_size(image, intrinsics)?;
     Ok(image.decode_rgb()?)
 }
 
-/// What a simulator knows about a keyframe, in the same undistorted pixels.
+/// Ground truth of a simulator for a keyframe, undistorted with the same maps.
 pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> anyhow::Result<Truth> {
     let rgba_srgb = undistorter.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
-    // The ceiling is that of the noise at full size; averaging areas takes away much of it.
+    // The ceiling is for noise at full size; averaging areas removes much of the noise.
     let psnr_ceiling = if undistorter.is_downscaled() { None } else { truth.psnr_ceiling };
     Ok(Truth { rgba_srgb, world_from_camera: truth.world_from_camera, psnr_ceiling })
 }
 
-/// Median of the readings of a depth map, every eighth of every eighth row; `None` when there is none.
+/// Median of a depth map, sampled at every eighth pixel of every eighth row; `None` if there are no readings.
 pub(super) fn median_depth_m(map: &DepthMap) -> Option<f64> {
     let width = map.size_px[0] as usize;
     let rows = map.depth_m.chunks(width.max(1)).step_by(8);

@@ -1,4 +1,4 @@
-//! Lists of keyframes: one line each with camera, stamp in nanoseconds, and split.
+//! Lists of keyframes, one per line: camera, stamp in nanoseconds, split.
 
 use crate::exit::InsufficientData;
 use anyhow::{Context, bail};
@@ -11,11 +11,11 @@ use trainer::{Keyframe, Split};
 
 const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "selection"), (Split::Test, "test")];
 
-/// Exactly these keyframes, with these splits.
+/// The selected keyframes and their splits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct KeyframeList(BTreeMap<(String, i64), SplitIx>);
 
-/// A split as its place in [`SPLITS`].
+/// Index of a split in [`SPLITS`].
 type SplitIx = usize;
 
 impl KeyframeList {
@@ -25,14 +25,14 @@ impl KeyframeList {
         Self::parse(&text).with_context(|| format!("the keyframe list {path:?}"))
     }
 
-    /// How many keyframes are listed.
+    /// Number of listed keyframes.
     pub(crate) fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// What of the list is not among these cameras and stamps: one sentence, an error when that is all of it.
+    /// Returns a message if some listed keyframes are not among these cameras and stamps, and an error if none is.
     ///
-    /// `example_image` is one image of the data, listed or not.
+    /// `example_image`: an image of the data, listed or not, for the error message.
     pub(crate) fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,
@@ -44,14 +44,14 @@ impl KeyframeList {
         let n_missing = 1 + missing.count();
         if n_missing < self.len() {
             return Ok(Some(format!(
-                "{n_missing} of {} listed keyframes cannot be had from the data, the first is {camera} {stamp}",
+                "{n_missing} of {} listed keyframes are not in the data; the first is {camera} {stamp}",
                 self.len()
             )));
         }
         let example_image =
             example_image.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
         Err(InsufficientData(format!(
-            "the keyframe list fits nothing in the data: it names {camera} {stamp}, the data has {example_image}"
+            "the keyframe list matches nothing in the data: it lists {camera} {stamp}, the data has {example_image}"
         )))
     }
 
@@ -76,16 +76,16 @@ impl KeyframeList {
             };
             let Some((key, split)) = parsed else {
                 bail!(
-                    "line {}: {line:?} is not a camera, a stamp in nanoseconds and train, selection or test",
+                    "line {}: expected a camera, a stamp in nanoseconds and train, selection or test; found {line:?}",
                     line_ix + 1
                 );
             };
             if list.insert(key, split).is_some() {
-                bail!("line {}: {line:?} comes twice", line_ix + 1);
+                bail!("line {}: {line:?} is listed twice", line_ix + 1);
             }
         }
         if list.is_empty() {
-            bail!("it names no keyframe");
+            bail!("it lists no keyframe");
         }
         Ok(Self(list))
     }

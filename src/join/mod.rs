@@ -1,7 +1,7 @@
-//! Images + joint readings + calibration -> keyframes: the only place where devices and trainer meet.
+//! Joins images, joint readings and calibration to keyframes. This is the only place where devices and trainer meet.
 //!
-//! Samples go in one by one; what comes out depends on their order alone, so a live lockstep run, its recording and the
-//! replay of that give the same keyframes bit for bit.
+//! Samples are pushed one by one. The result depends only on their order, so a live lockstep run, its recording and the
+//! replay of that recording give bit-identical keyframes.
 
 mod accept;
 mod assemble;
@@ -35,45 +35,46 @@ use store::KeyframeStore;
 use trainer::{Keyframe, RangePoints, Split};
 use waiting::{Partner, Waiting};
 
-/// Makes keyframes of samples.
+/// Converts samples to keyframes.
 pub(crate) struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
     store: KeyframeStore,
     ranges: RangeScans,
     list: Option<KeyframeList>,
-    /// The first image that was asked about the list.
+    /// The first image that was compared with the list.
     first_image: Option<(Arc<str>, Stamp)>,
     counts: Counts,
-    /// That a joint is where it cannot be was told.
+    /// Whether the warning about joint limits was logged.
     warned_joint_limits: bool,
     max_wait_secs: f64,
     default_depth_m: f64,
-    /// The latest stamp of all samples: the only clock there is.
+    /// The latest stamp of all samples. The join uses no other clock.
     newest: Stamp,
-    /// The latest stamp among the keyframes of the resumed run.
+    /// The latest stamp of the keyframes of the resumed run.
     newest_resumed: Option<Stamp>,
-    /// Nanoseconds added to the stamps of new keyframes so that they follow the earlier ones; none before the first keyframe.
+    /// Nanoseconds added to the stamps of new keyframes so that they follow earlier ones; `None` before the first
+    /// keyframe.
     stamp_offset_nanos: Option<i64>,
 }
 
-/// What a sample led to.
+/// An event that follows from a sample.
 #[derive(Clone, Debug)]
 pub(crate) enum JoinEvent {
-    /// A new keyframe; it is in the store.
+    /// A new keyframe was added to the store.
     Accepted(Arc<Keyframe>),
-    /// A keyframe left the full store.
+    /// A keyframe was evicted from the full store.
     Evicted { camera: Arc<str>, stamp: Stamp },
-    /// A colour image whose pose is known, keyframe or not.
+    /// A color image with a known pose, whether or not it becomes a keyframe.
     PosedImage(PosedImage),
-    /// A colour image that became no keyframe.
+    /// A color image did not become a keyframe.
     Refused { why: Refusal },
 }
 
-/// A colour image and where it was taken.
+/// A color image and its camera pose.
 #[derive(Clone, Debug)]
 pub(crate) struct PosedImage {
-    /// As the device sent it; not undistorted.
+    /// As delivered by the device; not undistorted.
     pub(crate) image: Image,
     pub(crate) world_from_camera: Transform,
 }
@@ -89,7 +90,7 @@ struct CameraState {
     warned_undecodable: bool,
 }
 
-/// A colour image about which everything is known that will be.
+/// A color image with all available data for it.
 struct ReadyImage {
     image: Image,
     stamp: Stamp,
@@ -124,17 +125,17 @@ impl Join {
         })
     }
 
-    /// Takes exactly the keyframes of a list, with its splits: no acceptance test, no bound.
+    /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store limits.
     pub(crate) fn taking_only(mut self, list: KeyframeList) -> Self {
         self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
         self.list = Some(list);
         self
     }
 
-    /// Continues a run that had these keyframes; returns those for which the store has no room.
+    /// Continues a run with these keyframes. Returns the camera and stamp of those that do not fit into the store.
     ///
-    /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, the stamps of
-    /// all new keyframes are shifted.
+    /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, all
+    /// new keyframes get a stamp offset.
     pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
@@ -148,12 +149,12 @@ impl Join {
         (self, evicted)
     }
 
-    /// The stamp of a sample on the clock of keyframes.
+    /// Converts the stamp of a sample to the clock of the keyframes.
     pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
         Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
     }
 
-    /// Takes in one sample; tells what followed from it.
+    /// Processes one sample and returns the resulting events.
     pub(crate) fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
         let mut events = Vec::new();
         self.newest = self.newest.max(sample.stamp());
@@ -188,29 +189,29 @@ impl Join {
         events
     }
 
-    /// Ends the stream: decides about the images that still wait.
+    /// Ends the stream and decides about the images that are still waiting.
     pub(crate) fn finish(&mut self) -> Vec<JoinEvent> {
         let mut events = Vec::new();
         self.process_ready(true, &mut events);
         events
     }
 
-    /// What became of all images so far.
+    /// Counts of all images so far.
     pub(crate) fn counts(&self) -> &Counts {
         &self.counts
     }
 
-    /// The keyframes in the store, in the order of their acceptance.
+    /// The keyframes in the store, in order of acceptance.
     pub(crate) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.store.iter()
     }
 
-    /// The newest turns of range scanners, with every point in the world, oldest first.
+    /// The newest scans of range scanners, with points in the world frame, oldest first.
     pub(crate) fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
         self.ranges.iter()
     }
 
-    /// What of the list could not be had, as [`KeyframeList::check_found`] tells it.
+    /// Compares the result with the list, as [`KeyframeList::check_found`] does.
     pub(crate) fn check_list(&self) -> Result<Option<String>, InsufficientData> {
         let Some(list) = &self.list else { return Ok(None) };
         let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
@@ -236,7 +237,7 @@ impl Join {
         }
     }
 
-    /// Places the turns of scanners, then decides about every image that is ripe, oldest first, camera by camera.
+    /// Transforms range scans, then decides about every image that is ready, camera by camera, oldest first.
     fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
         let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
         self.counts.range_scans += counts_placed.n_placed;
@@ -258,7 +259,8 @@ impl Join {
         }
     }
 
-    /// The oldest waiting image of a camera once all is known about it; an error names one that will never have a pose.
+    /// The oldest waiting image of a camera, once all its data have arrived. The error identifies an image that will
+    /// never have a pose.
     fn next_ready(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
         let camera = &mut self.cameras[camera_ix];
         let device_stamp = camera.waiting.oldest()?.stamp;
@@ -305,7 +307,7 @@ impl Join {
         self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
-            Some(None) => return, // Not asked for, which is no refusal.
+            Some(None) => return, // Not listed, which is not a refusal.
             Some(Some(split)) => split,
             None => Split::of(camera.n_accepted),
         };
@@ -331,7 +333,7 @@ impl Join {
     }
 
     fn refuse(&mut self, camera: &str, stamp: Stamp, why: Refusal, events: &mut Vec<JoinEvent>) {
-        log::debug!("camera {camera:?}: the image at {} ns became no keyframe: {why}", stamp.0);
+        log::debug!("camera {camera:?}: the image at {} ns did not become a keyframe: {why}", stamp.0);
         self.counts.refuse(why);
         events.push(JoinEvent::Refused { why });
     }
@@ -346,12 +348,12 @@ impl CameraState {
             Parent::World => true,
         };
         if camera.readout_micros.is_none() && !is_fixed {
-            log::warn!("camera {:?}: readout_micros is not in the rig file; taken for a global shutter", camera.name);
+            log::warn!("camera {:?}: readout_micros is not in the rig file; assuming a global shutter", camera.name);
         }
         if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
-            log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; taken for 0", camera.name);
+            log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; assuming 0", camera.name);
         }
-        // Depth keeps its size: it has its own lens, and means of distances at edges would lie in the air.
+        // Depth keeps its size: it has its own intrinsics, and averages across depth edges would lie on no surface.
         let depth_undistorter =
             camera.depth.as_ref().map(|depth| Undistorter::new(&depth.intrinsics, 1.0)).transpose()?;
         Ok(Self {
@@ -365,7 +367,7 @@ impl CameraState {
         })
     }
 
-    /// The keyframe of an image, or why it becomes none; `run_checks` is off where a list has decided already.
+    /// The keyframe of an image, or the reason for refusing it. `run_checks` is false if a list selects the keyframes.
     fn keyframe(
         &mut self,
         ready: ReadyImage,
@@ -416,7 +418,7 @@ impl CameraState {
         })
     }
 
-    /// Depth that does not decode costs the depth, not the keyframe.
+    /// If depth does not decode, the keyframe is kept without depth.
     fn depth_of(&mut self, ready: &ReadyImage) -> Option<trainer::DepthMap> {
         let (image, camera_pose) = ready.depth.as_ref()?;
         let map =
@@ -424,7 +426,7 @@ impl CameraState {
         map.map_err(|e| self.undecodable(&e)).ok()
     }
 
-    /// Says once a camera what is wrong with its images; the count tells how often.
+    /// Logs the first decoding error of a camera; all of them are counted.
     fn undecodable(&mut self, error: &anyhow::Error) -> Refusal {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");

@@ -1,4 +1,4 @@
-//! Where the cameras are at a stamp, and what their velocity does to an image.
+//! Camera poses and velocities at a stamp, and the resulting image motion.
 
 use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
@@ -10,35 +10,35 @@ use std::sync::Arc;
 use std::time::Duration;
 use trainer::BaseState;
 
-/// Readings kept: 20 s at 1 kHz, more than any image waits.
+/// Maximum number of readings kept: 20 s at 1 kHz, longer than any image waits.
 const MAX_READINGS: usize = 20_000;
-/// How far beyond its range a joint may be found: calibrations and soft ends do less, radians or metres.
+/// Tolerance for joint positions beyond the limits, radians or meters: calibration errors and soft stops stay below.
 const MAX_LIMIT_EXCESS: f64 = 0.2;
-/// Images of a camera between whose poses by tags the base's pose is interpolated: one may be without.
+/// Maximum gap for interpolating base poses from tags, in image periods: one image may lack a pose.
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
-/// The robot's recent motion.
+/// The recent motion of the robot.
 pub(crate) struct Motion {
     chain: Chain,
-    /// Where each joint of the chain stands in the readings.
+    /// Index of each chain joint in the readings.
     order: Vec<usize>,
-    /// What is added to each joint of the chain.
+    /// Offset added to the reading of each chain joint.
     offsets: Vec<f64>,
     joints: JointHistory,
     base: BaseMotion,
 }
 
-/// Where the base is.
+/// The pose of the base.
 enum BaseMotion {
     Fixed(Transform),
     ReportedPoses(Box<ReportedPoses>),
 }
 
-/// What a base that moves told.
+/// Poses of a moving base.
 struct ReportedPoses {
     poses: PoseHistory,
     station_detector: StationDetector,
-    /// Its true poses, from a simulator.
+    /// Ground truth poses from a simulator.
     truth: PoseHistory,
 }
 
@@ -47,9 +47,9 @@ struct ReportedPoses {
 pub(crate) struct CameraPose {
     pub(crate) world_from_camera: Transform,
     pub(crate) twist: Option<Twist>,
-    /// Of the camera for each joint of the chain that moves by a radian or metre; none where no joint carries the camera.
+    /// Camera twist per unit velocity of each chain joint (1 rad/s or 1 m/s); empty if no joint moves the camera.
     pub(super) joint_twists: Arc<[Twist]>,
-    /// Where the base was, where one that moves carries the camera.
+    /// State of a moving base that carries the camera.
     pub(super) base: Option<BaseState>,
 }
 
@@ -59,7 +59,7 @@ impl Motion {
             Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
         let max_gap = Duration::from_secs_f64(rig.join.max_gap_millis * 1e-3);
-        // Tags tell where the base is in each image, and not between.
+        // Tags give the base pose only at images, not in between.
         let min_rate_hz = rig.cameras.iter().map(|camera| camera.rate_hz).fold(f64::INFINITY, f64::min);
         let between_images = Duration::from_secs_f64(MAX_IMAGE_INTERVALS / min_rate_hz.max(1.0));
         let max_base_gap = if rig.base.driver == BaseDriver::Tags { max_gap.max(between_images) } else { max_gap };
@@ -78,23 +78,24 @@ impl Motion {
         Ok(Self { chain, order, offsets, joints: JointHistory::new(max_gap, MAX_READINGS), base })
     }
 
-    /// A sentence on the first joint that is told to be where the robot's description says that it cannot be.
+    /// A warning for the first joint whose reading lies outside its limits in the URDF.
     pub(super) fn joint_limit_warning(&self, state: &JointState) -> Option<String> {
         let joints = self.chain.joint_names().iter().zip(self.chain.limits()).zip(self.order.iter().zip(&self.offsets));
         joints.into_iter().find_map(|((name, limits), (ix, offset))| {
             let position = state.position.get(*ix)? + offset;
-            let is_beyond_limits = position < limits.lower - MAX_LIMIT_EXCESS || position > limits.upper + MAX_LIMIT_EXCESS;
+            let is_beyond_limits =
+                position < limits.lower - MAX_LIMIT_EXCESS || position > limits.upper + MAX_LIMIT_EXCESS;
             is_beyond_limits.then(|| {
                 format!(
-                    "joint {name:?} is told to be at {position:.3}, and its range is {:.3} to {:.3}: is it told in degrees, or has an \
-                     offset?",
+                    "joint {name:?} reports {position:.3}, outside its range of {:.3} to {:.3}: are the readings in \
+                     degrees, or is an offset missing?",
                     limits.lower, limits.upper
                 )
             })
         })
     }
 
-    /// Takes joint readings in the order of the device; says whether they made sense.
+    /// Adds joint readings in the order of the device; returns whether they were valid.
     pub(crate) fn push_joints(&mut self, state: JointState) -> bool {
         let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
             if numbers.is_empty() {
@@ -112,7 +113,7 @@ impl Motion {
         self.joints.push(state).is_ok()
     }
 
-    /// Takes a pose of the base where that moves; says whether it made sense.
+    /// Adds a pose of a moving base; returns whether it was valid.
     pub(super) fn push_base(&mut self, pose: &BasePose) -> bool {
         match &mut self.base {
             BaseMotion::Fixed(_) => true,
@@ -126,15 +127,15 @@ impl Motion {
         }
     }
 
-    /// Takes what a simulator knows of the base.
+    /// Adds a ground truth base pose from a simulator.
     pub(super) fn push_base_truth(&mut self, truth: &BasePose) {
         if let BaseMotion::ReportedPoses(reported) = &mut self.base {
-            // Only told to people: what is refused here is missing there.
+            // Used in reports only, so an invalid pose is just left out.
             let _ = reported.truth.push(truth.stamp, truth.world_from_base);
         }
     }
 
-    /// The base at a stamp; `NotYet` when the poses do not reach so far.
+    /// The base pose at a stamp; `NotYet` if the poses do not reach that far.
     pub(super) fn world_from_base(&self, stamp: Stamp) -> Result<Transform, HistoryError> {
         match &self.base {
             BaseMotion::Fixed(pose) => Ok(*pose),
@@ -142,19 +143,19 @@ impl Motion {
         }
     }
 
-    /// A camera at a stamp; `NotYet` when the readings do not reach so far.
+    /// The pose and velocity of a camera at a stamp; `NotYet` if the readings do not reach that far.
     pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {
                 let (world_from_base, twist) = reported.poses.with_twist_at(stamp)?;
-                let base_place = BaseState {
+                let base_state = BaseState {
                     station: reported.station_detector.at(stamp),
                     world_from_base,
                     map_from_odom: Transform::identity(),
                     truth: reported.truth.at(stamp).ok(),
                 };
-                (world_from_base, twist, Some(base_place))
+                (world_from_base, twist, Some(base_state))
             }
             BaseMotion::ReportedPoses(_) => (Transform::identity(), Twist::zero(), None),
         };
@@ -172,7 +173,7 @@ impl Motion {
             )),
             Parent::Flange => {
                 let joints = self.joints.at(stamp)?;
-                // A reading of another length is refused when it is pushed, so the chain cannot fail on these.
+                // Readings of the wrong length are refused when they are pushed, so the chain cannot fail here.
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };
@@ -194,7 +195,8 @@ impl Motion {
     }
 }
 
-/// Mean speed of the image over its centre and the middles of its quarters, pixels per second, of a scene at one depth.
+/// Mean image speed in pixels per second for a scene at a constant depth, over the image center and the centers of its
+/// quadrants.
 pub(super) fn image_speed_px_s(twist: &Twist, intrinsics: &Intrinsics, depth_m: f64) -> f64 {
     let [width, height] = intrinsics.size_px.map(f64::from);
     let [fx, fy] = intrinsics.focal_px;
@@ -224,7 +226,7 @@ mod tests {
             lens: Lens::Pinhole,
             rectified: false,
         };
-        // The design's own figure: 0.1 m/s at 0.3 m shears a 720p image by 4.6 px in 15 ms.
+        // From the design document: 0.1 m/s at 0.3 m shears a 720p image by 4.6 px in 15 ms.
         let sideways = Twist { linear_m_s: Vector3::new(0.1, 0.0, 0.0), angular_rad_s: Vector3::zeros() };
         assert!((image_speed_px_s(&sideways, &intrinsics, 0.3) * 0.015 - 4.6).abs() < 0.05);
 

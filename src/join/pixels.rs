@@ -1,10 +1,11 @@
-//! What the pixels of an image say about it: brightness, clipping, sharpness.
+//! Pixel statistics of an image: brightness, clipping, sharpness.
 
-/// The reduced image is about this wide, so that sharpness means the same for every camera and noise averages out.
+/// Approximate width of the reduced image. A common width makes sharpness comparable between cameras and averages out
+/// noise.
 const REDUCED_WIDTH: usize = 320;
-/// Sharpness is compared with the median of this many images: few enough that they show much the same.
+/// Sharpness is compared with the median of this many images, few enough that they show similar content.
 const SHARPNESS_WINDOW: usize = 9;
-/// Brightness at and beyond which a pixel is clipped, of 255.
+/// Brightness limits of 255: pixels at or beyond them are clipped.
 const CLIPPED: [u8; 2] = [1, 254];
 
 /// Brightness and sharpness of one image.
@@ -12,15 +13,15 @@ const CLIPPED: [u8; 2] = [1, 254];
 pub(super) struct PixelStatistics {
     /// Mean brightness, 0 to 1.
     pub(super) luma_frac: f64,
-    /// Share of the pixels that are black or white.
+    /// Fraction of pixels that are black or white.
     pub(super) clipped_frac: f64,
-    /// Variance of the Laplacian of the reduced image, relative to the variance of the image itself, so that a change of
-    /// contrast is no change of sharpness; only its ratio to other images of the same camera means something.
+    /// Variance of the Laplacian of the reduced image, relative to the variance of the image, so that contrast does not
+    /// affect it. Only ratios between images of the same camera are meaningful.
     pub(super) sharpness: f64,
 }
 
 impl PixelStatistics {
-    /// `rgb` is `[height, width, 3]`, sRGB.
+    /// Computes the statistics of `rgb`, `[height, width, 3]`, sRGB.
     pub(super) fn of(rgb: &[u8], size_px: [u32; 2]) -> Self {
         let [width, height] = size_px.map(|side| side as usize);
         let block = (width / REDUCED_WIDTH).max(1);
@@ -105,17 +106,17 @@ impl Variance {
     }
 }
 
-/// Brightness 0 to 255 with the weights of Rec. 601 in 256ths.
+/// Brightness, 0 to 255, with the weights of Rec. 601 in 256ths.
 fn luma([red, green, blue]: [u8; 3]) -> u32 {
     (u32::from(red) * 77 + u32::from(green) * 150 + u32::from(blue) * 29) >> 8
 }
 
-/// The sharpness of a camera's last images.
+/// Sharpness of the latest images of a camera.
 #[derive(Clone, Debug, Default)]
 pub(super) struct SharpnessHistory(std::collections::VecDeque<f64>);
 
 impl SharpnessHistory {
-    /// Sharpness relative to the median of the last images, this one included; then remembers it.
+    /// Adds a value; returns it relative to the median of the latest images, including this one.
     pub(super) fn relative(&mut self, sharpness: f64) -> f64 {
         if self.0.len() == SHARPNESS_WINDOW {
             self.0.pop_front();
@@ -132,7 +133,7 @@ impl SharpnessHistory {
 mod tests {
     use super::*;
 
-    /// Stripes of a period in pixels, softened over `blur` pixels.
+    /// Stripes with a period in pixels, blurred over `blur` pixels.
     fn stripes(size_px: [u32; 2], period: u32, blur: u32) -> Vec<u8> {
         let level = |x: u32| if (x / period).is_multiple_of(2) { 40_u32 } else { 200 };
         let blurred =
@@ -180,7 +181,7 @@ mod tests {
     fn sharpness_is_relative_to_the_recent_median() {
         for scale in [1.0, 1e4] {
             let mut history = SharpnessHistory::default();
-            assert_eq!(history.relative(5.0 * scale), 1.0, "the first image has nothing to be compared with");
+            assert_eq!(history.relative(5.0 * scale), 1.0, "the first image is compared with itself");
             for _ in 0..40 {
                 history.relative(10.0 * scale);
             }
@@ -188,7 +189,7 @@ mod tests {
             for _ in 0..20 {
                 history.relative(2.0 * scale);
             }
-            assert!(history.relative(2.0 * scale) > 0.9, "a dull scene becomes the new measure");
+            assert!(history.relative(2.0 * scale) > 0.9, "a blurry scene becomes the new reference");
         }
     }
 }

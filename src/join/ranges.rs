@@ -1,4 +1,4 @@
-//! Turns of range scanners: each point is put into the world where the scanner was at that point's own instant.
+//! Range scans: transforms each point to the world frame with the scanner pose at the time of that point.
 
 use super::motion::Motion;
 use crate::config::{Rig, Scanner};
@@ -9,17 +9,17 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use trainer::{DepthMap, Keyframe, RangePoints};
 
-/// Turns that may wait for poses of the base; older ones go.
+/// Maximum number of scans that wait for base poses; beyond it, the oldest are dropped.
 const MAX_WAITING: usize = 64;
 
-/// Pixels along each side of a cell of depth: the rings of a scanner are some ten pixels apart.
+/// Side of a depth cell in pixels. The rings of a scanner are about ten pixels apart.
 const CELL_PX: u32 = 8;
-/// Turns this near in time to an image tell its depth: from far away other things are hidden.
+/// Maximum time between an image and the scans used for its depth: scans from farther away have other occlusions.
 const MAX_TIME_DIFFERENCE_SECS: f64 = 1.0;
-/// With fewer cells there is no depth.
+/// Minimum number of filled cells for a depth map.
 const MIN_CELLS: usize = 16;
 
-/// The turns that wait for poses, and the newest of those that have them.
+/// The scans that wait for base poses, and the newest transformed ones.
 pub(super) struct RangeScans {
     scanners: Vec<Scanner>,
     waiting: VecDeque<RangeScan>,
@@ -27,7 +27,7 @@ pub(super) struct RangeScans {
     max_kept: usize,
 }
 
-/// What became of turns.
+/// Counts of processed scans.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct PlacementCounts {
     pub(super) n_placed: u64,
@@ -44,9 +44,10 @@ impl RangeScans {
         self.kept.iter()
     }
 
-    /// Depth of a keyframe's view from the turns around its instant; `None` where they show too little of it.
+    /// Depth of a keyframe from the scans around its stamp; `None` if they cover too little of the image.
     ///
-    /// A cell of [`CELL_PX`] pixels a side has the nearest of its points: what lies behind shows between the rings, too.
+    /// A cell of [`CELL_PX`] pixels per side takes its nearest point, because points on farther surfaces also project
+    /// between the rings.
     pub(super) fn depth_of(&self, keyframe: &Keyframe) -> Option<DepthMap> {
         let size_px = keyframe.size_px.map(|side| side.div_ceil(CELL_PX));
         let per_cell = f64::from(CELL_PX);
@@ -62,7 +63,7 @@ impl RangeScans {
                 #[expect(
                     clippy::cast_possible_truncation,
                     clippy::cast_sign_loss,
-                    reason = "inside of the map; a range needs no more digits"
+                    reason = "inside the map; f32 is precise enough for a range"
                 )]
                 let (ix, z) = (cell[1] as usize * size_px[0] as usize + cell[0] as usize, point.z as f32);
                 depth_m[ix] = depth_m[ix].min(z);
@@ -83,7 +84,7 @@ impl RangeScans {
         })
     }
 
-    /// Queues a turn; false where it, or an older one, is lost.
+    /// Queues a scan; returns false if this scan or an older one is dropped.
     pub(super) fn push(&mut self, scan: RangeScan) -> bool {
         let is_known_scanner = self.scanners.iter().any(|scanner| scanner.name == scan.scanner);
         if !is_known_scanner {
@@ -97,7 +98,7 @@ impl RangeScans {
         fits
     }
 
-    /// Places every turn whose poses are known, in order; gives up one that waited longer than `max_wait_secs`.
+    /// Transforms every scan whose base poses are known, in order. Drops scans that waited longer than `max_wait_secs`.
     pub(super) fn process_ready(
         &mut self,
         motion: &Motion,
@@ -125,10 +126,10 @@ impl RangeScans {
 
     fn in_world(&self, scan: &RangeScan, motion: &Motion) -> Result<RangePoints, HistoryError> {
         let scanner = self.scanners.iter().find(|scanner| scanner.name == scan.scanner);
-        let scanner = scanner.expect("only turns of known scanners wait");
+        let scanner = scanner.expect("only scans of known scanners are queued");
         let world_from_scanner = |stamp: Stamp| Ok(motion.world_from_base(stamp)? * scanner.base_from_scanner);
         let mut points = Vec::with_capacity(scan.points.len());
-        // Points of one column share their instant.
+        // Points of one column share the same time.
         let mut column = (u32::MAX, world_from_scanner(scan.stamp)?);
         let first = column.1;
         for point in scan.points.iter() {
@@ -138,7 +139,7 @@ impl RangeScans {
             }
             let in_scanner = Point3::from(point.position_m).cast::<f64>();
             let range_m = in_scanner.coords.norm();
-            // A range that is no number is not inside.
+            // False for a NaN range.
             if range_m >= scanner.min_m && range_m <= scanner.max_m {
                 points.push((column.1 * in_scanner).cast::<f32>().coords.into());
             }
@@ -189,7 +190,7 @@ mod tests {
         RangeScans { scanners: Vec::new(), waiting: VecDeque::new(), kept: kept.collect(), max_kept: 9 }
     }
 
-    /// A wall 4 m before the camera, a row of points every 16 pixels.
+    /// A wall 4 m in front of the camera, one row of points every 16 pixels.
     fn wall() -> Vec<[f32; 3]> {
         (0..10).flat_map(|column| [-1.0, 1.0].map(|y| [-3.0 + 0.64 * column as f32, y, 5.0])).collect()
     }
@@ -197,7 +198,7 @@ mod tests {
     #[test]
     fn cell_depth_is_that_of_its_nearest_point() {
         let now = Stamp(10_000_000_000);
-        let pole = [[0.1, 0.5, 3.0], [0.0, 0.0, -2.0]]; // Before the wall's point at (0.2, 1.0), and behind the camera.
+        let pole = [[0.1, 0.5, 3.0], [0.0, 0.0, -2.0]]; // One before the wall at (0.2, 1.0), one behind the camera.
         let ranges = ranges_of(vec![(Stamp(9_500_000_000), wall()), (now, pole.to_vec())]);
         let depth = ranges.depth_of(&keyframe(now)).expect("enough points");
         assert_eq!(depth.size_px, [20, 16]);

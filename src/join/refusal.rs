@@ -1,4 +1,4 @@
-//! Why images did not become keyframes, counted.
+//! Reasons why images did not become keyframes, and their counts.
 
 use crate::print::counted;
 use std::collections::{BTreeMap, BTreeSet};
@@ -13,7 +13,7 @@ pub(crate) enum Refusal {
     QueueFull,
     /// No joint readings around the stamp, or no base pose.
     NoPose,
-    /// The pose holds NaN or infinity.
+    /// The pose contains NaN or infinity.
     PoseNotFinite,
     /// The camera has not moved enough since its nearest keyframe.
     NotMoved,
@@ -21,18 +21,18 @@ pub(crate) enum Refusal {
     Blur,
     /// The predicted rolling-shutter shear is too large.
     Shear,
-    /// The shutter rolls and the velocity of the camera is not known.
+    /// The camera has a rolling shutter and its velocity is not known.
     ShearUnknown,
     /// The image does not decode.
     Undecodable,
     /// The image is too dark, too bright, or clipped.
     Exposure,
-    /// The image is less sharp than its camera's images usually are.
+    /// The image is less sharp than recent images of its camera.
     NotSharp,
 }
 
 impl Refusal {
-    /// A word for programs.
+    /// The key in reports and protocols.
     pub(crate) fn name(self) -> &'static str {
         match self {
             Self::UnknownCamera => "unknown_camera",
@@ -54,9 +54,9 @@ impl std::fmt::Display for Refusal {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::UnknownCamera => "camera not in the rig file",
-            Self::QueueFull => "too many waited for joint readings",
-            Self::NoPose => "no joint readings or pose of the base around the stamp",
-            Self::PoseNotFinite => "pose is not a number",
+            Self::QueueFull => "too many images waiting for joint readings",
+            Self::NoPose => "no joint readings or base pose around the stamp",
+            Self::PoseNotFinite => "pose not finite",
             Self::NotMoved => "not moved",
             Self::Blur => "motion blur",
             Self::Shear => "rolling-shutter shear",
@@ -68,45 +68,45 @@ impl std::fmt::Display for Refusal {
     }
 }
 
-/// What became of all images.
+/// Counts of all samples.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Counts {
-    /// Colour images that came.
+    /// Color images received.
     pub(crate) images: u64,
     /// Images that became keyframes.
     pub(crate) accepted: u64,
-    /// Keyframes that went again because the store was full.
+    /// Keyframes evicted from the full store.
     pub(crate) evicted: u64,
-    /// Keyframes of cameras with depth that had to go without.
+    /// Keyframes of depth cameras without depth.
     pub(crate) without_depth: u64,
-    /// Images that devices or queues lost before they came here.
+    /// Images dropped by devices or queues before the join.
     pub(crate) device_skipped: u64,
-    /// Joint readings that were out of order, not numbers, or of another arm.
+    /// Joint readings that were out of order, not finite, or of another arm.
     pub(crate) joints_refused: u64,
-    /// Base poses that were out of order or not numbers.
+    /// Base poses that were out of order or not finite.
     pub(crate) base_poses_refused: u64,
-    /// Turns of range scanners that were put into the world.
+    /// Range scans transformed to the world frame.
     pub(crate) range_scans: u64,
-    /// Turns without base poses, of unknown scanners, or too many that waited.
+    /// Range scans without base poses, of unknown scanners, or dropped because too many were waiting.
     pub(crate) range_scans_refused: u64,
     /// Images refused, by reason.
     pub(crate) refused: BTreeMap<Refusal, u64>,
-    /// Cameras that sent images and are not in the rig file.
+    /// Cameras that sent images but are not in the rig file.
     pub(crate) unknown_cameras: BTreeSet<Arc<str>>,
 }
 
-/// What becomes of samples.
+/// Purpose of the samples, which determines whether dropped images are a loss.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum SampleUse {
-    /// They are recorded: every image counts.
+    /// The samples are recorded: every image counts.
     Recorded,
-    /// They are looked at: live, an image that comes too fast is replaced by the next; in a replay, what the devices
-    /// lost was told when the recording was made.
+    /// The samples are only processed. A live image that comes too fast is replaced by the next; in a replay, drops by
+    /// devices were reported when the recording was made.
     Watched,
 }
 
 impl Counts {
-    /// What was lost of what should have been kept, one sentence each.
+    /// Lost data that should have been kept, one sentence each.
     pub(crate) fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
@@ -123,10 +123,10 @@ impl Counts {
     }
 }
 
-/// The loss of images before they came here.
+/// Message about images dropped before the join.
 fn dropped_by_devices(n_images: u64) -> String {
     let what = counted(n_images, "image");
-    format!("{what} lost by the devices, or dropped because we were too slow for them")
+    format!("{what} dropped by the devices, or because this computer was too slow")
 }
 
 impl std::fmt::Display for Counts {
@@ -138,10 +138,10 @@ impl std::fmt::Display for Counts {
         let rest = [
             (self.evicted, "evicted from the full store"),
             (self.without_depth, "without depth"),
-            (self.device_skipped, "lost by devices"),
+            (self.device_skipped, "dropped by devices"),
             (self.joints_refused, "joint readings refused"),
             (self.base_poses_refused, "base poses refused"),
-            (self.range_scans, "range scans placed"),
+            (self.range_scans, "range scans transformed"),
             (self.range_scans_refused, "range scans refused"),
         ];
         for (n, what) in rest {
@@ -172,6 +172,6 @@ mod tests {
         counts.refuse(Refusal::NotMoved);
         counts.refuse(Refusal::NotMoved);
         counts.refuse(Refusal::Blur);
-        assert_eq!(counts.to_string(), "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 lost by devices");
+        assert_eq!(counts.to_string(), "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 dropped by devices");
     }
 }

@@ -1,8 +1,8 @@
-//! How far apart two poses are, in units of the distance that makes a new keyframe worth its memory.
+//! Distance between poses, in units of the minimum distance between keyframes.
 
 use kinematics::Transform;
 
-/// The motion that counts as one.
+/// The translation and rotation that count as distance 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Spacing {
     pub(super) translation_m: f64,
@@ -10,7 +10,7 @@ pub(super) struct Spacing {
 }
 
 impl Spacing {
-    /// The larger of translation and rotation, each in units of its own; 1 is just enough.
+    /// The larger of translation and rotation, each divided by its unit; keyframes need at least 1.
     pub(super) fn between(&self, a: &Transform, b: &Transform) -> f64 {
         let translation_m = (a.translation.vector - b.translation.vector).norm();
         (translation_m / self.translation_m).max(a.rotation.angle_to(&b.rotation) / self.rotation_rad)

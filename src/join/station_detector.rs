@@ -1,22 +1,23 @@
-//! Where the base stands still: told by its own poses, looking back only, so that nothing has to wait for what comes later.
+//! Detects stations of the base from its reported poses. Only past poses are used, so nothing has to wait for later
+//! ones.
 
 use kinematics::{Stamp, Transform};
 use std::collections::VecDeque;
 
-/// The base stands once it has stayed this long ...
+/// The base is stationary once it has stayed this long ...
 const STATIONARY_SECS: f64 = 0.5;
-/// ... so near to one place, metres and radians.
+/// ... within this distance of one pose, meters and radians.
 const STATIONARY_M: f64 = 0.005;
 const STATIONARY_RAD: f64 = 0.005;
-/// Stands that are remembered: far more than any image waits.
+/// Maximum number of stations kept, far more than any image waits for.
 const MAX_STATIONS: usize = 64;
 
-/// The stands of a base that walks, counted from 0.
+/// The stations of a moving base, counted from 0.
 #[derive(Debug, Default)]
 pub(super) struct StationDetector {
-    /// Since when the base is near this place.
+    /// Pose near which the base is, and the stamp since when.
     stationary_since: Option<(Stamp, Transform)>,
-    /// Whether the newest stand is the one of that place.
+    /// Whether the newest station is at that pose.
     is_known: bool,
     stations: VecDeque<Span>,
 }
@@ -29,7 +30,7 @@ struct Span {
 }
 
 impl StationDetector {
-    /// Takes the next pose of the base.
+    /// Adds the next pose of the base.
     pub(super) fn push(&mut self, stamp: Stamp, world_from_base: &Transform) {
         let Some((since, _)) = self.stationary_since.filter(|(_, pose)| is_near(pose, world_from_base)) else {
             (self.stationary_since, self.is_known) = (Some((stamp, *world_from_base)), false);
@@ -50,7 +51,7 @@ impl StationDetector {
         }
     }
 
-    /// Which stand it was at a stamp no later than the newest pose; `None` while the base walked or had just come to rest.
+    /// The station at a stamp no later than the newest pose; `None` while the base moves or has just stopped.
     pub(super) fn at(&self, stamp: Stamp) -> Option<usize> {
         let span = self.stations.iter().rev().find(|span| span.from <= stamp)?;
         (stamp <= span.to).then_some(span.station)
@@ -58,7 +59,7 @@ impl StationDetector {
 }
 
 fn is_near(pose: &Transform, other: &Transform) -> bool {
-    // A pose that is no number is near nothing.
+    // False for a pose with NaN.
     (pose.translation.vector - other.translation.vector).norm() <= STATIONARY_M
         && pose.rotation.angle_to(&other.rotation) <= STATIONARY_RAD
 }
@@ -70,7 +71,7 @@ mod tests {
 
     #[test]
     fn station_begins_after_rest_and_ends_with_motion() {
-        // Stands 2 s, walks 1 m within 2 s, stands and turns on the spot, stands.
+        // Rests 2 s, moves 1 m within 2 s, rests and turns on the spot, rests.
         let pose = |secs: f64| {
             let x = (0.5 * (secs - 2.0)).clamp(0.0, 1.0);
             let yaw_rad = (0.3 * (secs - 6.0)).clamp(0.0, 0.3);
@@ -89,8 +90,8 @@ mod tests {
             [0.4, 0.6, 1.9, 2.1, 3.0, 4.3, 4.7, 5.9, 6.1, 7.7].map(at),
             [None, Some(0), Some(0), None, None, None, Some(1), Some(1), None, Some(2)]
         );
-        assert_eq!(at(20.0), None, "nothing is known of later");
-        // What was told at once is what is told later.
+        assert_eq!(at(20.0), None, "no poses yet");
+        // Answers given immediately equal answers given later.
         assert!(immediate.iter().all(|(stamp, station)| station_detector.at(*stamp) == *station));
     }
 

@@ -1,18 +1,18 @@
-//! The keyframes that are kept: bounded in count and bytes, the most redundant goes first.
+//! The keyframe store, bounded in count and bytes. The most redundant keyframe is evicted first.
 //!
-//! What goes comes from the split (train, selection, test) that holds more than its share, so that the three keep their
-//! proportions in a long run: were test keyframes spared, they would fill the store in the end. Within that split the keyframe
-//! nearest to another one of its camera goes, and of two equally near ones the older.
+//! A keyframe is evicted from the split (train, validation, test) that exceeds its share most, so that the splits keep
+//! their proportions in a long run: if test keyframes were spared, they would eventually fill the store. Within that
+//! split, the keyframe nearest to another one of its camera is evicted, and of two equally near ones the older.
 
 use super::spacing::Spacing;
 use kinematics::Stamp;
 use std::sync::Arc;
 use trainer::{Keyframe, Split};
 
-/// Shares of the splits: every 8th is test, every 8th selection.
+/// Shares of the splits: every 8th keyframe is for testing, every 8th for validation.
 const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Validation, 1.0), (Split::Test, 1.0)];
 
-/// Keyframes in the order of their acceptance.
+/// Keyframes in order of acceptance.
 #[derive(Debug)]
 pub(super) struct KeyframeStore {
     max_keyframes: usize,
@@ -39,7 +39,7 @@ impl KeyframeStore {
         self.kept.iter().map(|kept| &kept.keyframe)
     }
 
-    /// Adds a keyframe; gives the cameras and stamps of those that had to go for it.
+    /// Adds a keyframe; returns the cameras and stamps of the evicted ones.
     pub(super) fn push(&mut self, keyframe: Arc<Keyframe>) -> Vec<(Arc<str>, Stamp)> {
         let mut nearest = f64::INFINITY;
         for kept in self.kept.iter_mut().filter(|kept| kept.keyframe.camera == keyframe.camera) {
@@ -128,7 +128,7 @@ mod tests {
     fn most_redundant_keyframe_is_evicted_at_either_bound() {
         for mut store in [store(7, u64::MAX), store(usize::MAX, 7 * 16)] {
             let mut evicted = Vec::new();
-            // 2 and 6 are close to each other, 1 and 8 the same close but of two cameras.
+            // 2 and 6 are close to each other. 1 and 8 are equally close but from different cameras.
             for (ix, camera, x_m) in
                 [(1, "a", 0.0), (2, "a", 9.0), (3, "a", 20.0), (5, "a", 30.0), (6, "a", 9.1), (7, "a", 40.0)]
             {
@@ -138,7 +138,7 @@ mod tests {
             assert_eq!(evicted, []);
             assert_eq!(store.push(keyframe(10, "a", 50.0)), [("a".into(), Stamp(2))]);
             assert_eq!(stamps(&store), [1, 3, 5, 6, 7, 9, 10]);
-            // With 2 gone, 6 stands alone and the closest pair is the next one.
+            // With 2 gone, 6 is isolated and the closest pair is the next one.
             assert_eq!(store.push(keyframe(11, "a", 20.5)), [("a".into(), Stamp(3))]);
         }
     }
@@ -154,7 +154,7 @@ mod tests {
         }
         let count = |split| store.iter().filter(|keyframe| keyframe.split == split).count();
         assert_eq!([count(Split::Train), count(Split::Validation), count(Split::Test)], [30, 5, 5]);
-        // The cached distances are the true ones.
+        // The cached distances are correct.
         for (ix, kept) in store.kept.iter().enumerate() {
             let others = store.kept.iter().enumerate().filter(|(other, _)| *other != ix);
             let poses = others.map(|(_, other)| &other.keyframe.world_from_camera);

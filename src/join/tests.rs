@@ -1,4 +1,4 @@
-//! Generated samples in, keyframes out: poses at the shutter time, every refusal, the bounds, and replay bit for bit.
+//! Generated samples in, keyframes out: poses at the shutter time, every refusal, the bounds, and bit-exact replay.
 
 use super::{Join, JoinEvent, KeyframeList, Refusal, keyframe_list};
 use crate::config::{Override, Rig};
@@ -14,7 +14,7 @@ use trainer::{Keyframe, Split};
 const SIZE_PX: [u32; 2] = [64, 48];
 const CENTER_RAD: [f64; 7] = [0.1, -0.3, 0.2, -2.0, 0.1, 1.8, 0.6];
 
-/// The static arm with a small camera of 10 Hz.
+/// The rig of a static arm with a small 10 Hz camera.
 fn rig(overrides: &[Override]) -> Rig {
     let size = |key| Override::new(key, Value::from(SIZE_PX.map(i64::from).to_vec()));
     let pair = |key, x, y| Override::new(key, Value::from(vec![x, y]));
@@ -27,7 +27,7 @@ fn rig(overrides: &[Override]) -> Rig {
     ];
     all.extend(overrides.iter().cloned());
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
-    Rig::load(&path, &all).expect("a rig file that comes along")
+    Rig::load(&path, &all).expect("a bundled rig file")
 }
 
 fn joints_rad(secs: f64) -> Vec<f64> {
@@ -49,7 +49,7 @@ fn reading(nanos: i64) -> Sample {
     })
 }
 
-/// A chequered picture, different for every stamp.
+/// A checkerboard image, different for every stamp.
 fn color(camera: &str, nanos: i64) -> Image {
     let offset = nanos / 7_000_003;
     let level = |x: i64, y: i64| if ((x + offset) / 3 + (y + offset) / 4) % 2 == 0 { 60 } else { 190 };
@@ -81,7 +81,8 @@ fn truth(nanos: i64) -> Sample {
     Sample::Truth(TruthImage { image, depth_m: Arc::from([]), world_from_camera, psnr_ceiling: Some(42.0) })
 }
 
-/// Joints at 200 Hz; colour at 10 Hz off their beat, depth 5 ms after it; each image after the readings that surround it.
+/// Joints at 200 Hz, color at 10 Hz with other phases, depth 5 ms after color. Each image comes after the readings
+/// around it.
 fn samples(secs: i64) -> Vec<Sample> {
     let mut samples = Vec::new();
     for tick in 0..secs * 200 {
@@ -129,7 +130,7 @@ fn join(rig: &Rig) -> Join {
     Join::new(rig).expect("a good rig")
 }
 
-/// What differs between two lists of keyframes, down to the last bit.
+/// Differences between two lists of keyframes, exact to the last bit.
 fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
     let bits = |keyframe: &Keyframe| {
         let pose = |pose: &Transform| {
@@ -163,7 +164,7 @@ fn differences(a: &[Arc<Keyframe>], b: &[Arc<Keyframe>]) -> Vec<String> {
 
 #[test]
 fn color_and_depth_poses_match_their_exposure_times() {
-    const TOLERANCE: f64 = 1e-7; // A cubic through readings 5 ms apart, of sines of 8 s.
+    const TOLERANCE: f64 = 1e-7; // Cubic interpolation of sines of 8 s between readings 5 ms apart.
     let rig = rig(&[]);
     let outcome = run_join(&mut join(&rig), samples(8));
     let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
@@ -178,12 +179,12 @@ fn color_and_depth_poses_match_their_exposure_times() {
         assert!(distance(&depth.world_from_camera, &pose_at(keyframe.stamp.plus_secs(0.005))) < TOLERANCE);
         assert!(
             distance(&depth.world_from_camera, &keyframe.world_from_camera) > 100.0 * TOLERANCE,
-            "a pose of its own"
+            "depth has its own pose"
         );
         assert_eq!((depth.depth_m[0], depth.depth_m[1], depth.depth_m[2]), (0.0, 0.0, 1.0));
         let (before, after) = (pose_at(keyframe.stamp.plus_secs(-1e-4)), pose_at(keyframe.stamp.plus_secs(1e-4)));
         let twist = kinematics::transform::log(&(before.inverse() * after), 2e-4);
-        let reported = keyframe.twist.expect("velocities are told");
+        let reported = keyframe.twist.expect("velocities are reported");
         assert!(
             (reported.linear_m_s - twist.linear_m_s).norm() < 1e-4
                 && (reported.angular_rad_s - twist.angular_rad_s).norm() < 1e-4
@@ -216,7 +217,7 @@ fn ground_truth_and_depth_are_matched_in_any_order() {
             && truth.world_from_camera.translation.z == keyframe.stamp.secs()
             && truth.psnr_ceiling == Some(42.0)
     }));
-    // Depth, then truth, then colour; and all images half a second's worth of readings earlier than those.
+    // Depth before color, with the truth between or before them; and all images 0.3 s before their readings.
     let is_color = |sample: &Sample| matches!(sample, Sample::Image(image) if !image.is_depth());
     let mut shuffled = in_order.clone();
     let colors: Vec<usize> = (0..shuffled.len()).filter(|ix| is_color(&shuffled[*ix])).collect();
@@ -237,11 +238,9 @@ fn replay_reproduces_keyframes_bit_for_bit() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
     let mut recorder = open::recorder(&path, &rig).expect("a new file");
-    let live = run_join(
-        &mut join(&rig),
-        samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("room on the disk")),
-    );
-    recorder.finish().expect("room on the disk");
+    let live =
+        run_join(&mut join(&rig), samples(6).into_iter().inspect(|sample| recorder.write(sample).expect("disk space")));
+    recorder.finish().expect("disk space");
     for _ in 0..2 {
         let opened = open::recording(&path, None, &[]).expect("a recording");
         let mut source = opened.source;
@@ -254,7 +253,7 @@ fn replay_reproduces_keyframes_bit_for_bit() {
         live.keyframes.iter().any(|keyframe| keyframe.rgba_srgb.chunks(4).any(|pixel| pixel[3] == 0)),
         "undistorted"
     );
-    // The comparison sees a single bit.
+    // The comparison detects a single changed bit.
     let mut changed = (*live.keyframes[3]).clone();
     changed.world_from_camera.translation.x = f64::from_bits(changed.world_from_camera.translation.x.to_bits() ^ 1);
     let mut other = live.keyframes.clone();
@@ -265,7 +264,7 @@ fn replay_reproduces_keyframes_bit_for_bit() {
 #[test]
 fn images_without_joint_readings_are_dropped_and_counted() {
     let rig = rig(&[]);
-    // The joints fall silent from 2 s to 4 s, and for good at 6 s.
+    // No joint readings from 2 s to 4 s and after 6 s.
     let in_gap = |nanos: i64| (2_000_000_000..4_000_000_000).contains(&nanos) || nanos > 6_000_000_000;
     let kept =
         samples(8).into_iter().filter(|sample| !(matches!(sample, Sample::Joints(_)) && in_gap(sample.stamp().0)));
@@ -274,7 +273,7 @@ fn images_without_joint_readings_are_dropped_and_counted() {
     assert_eq!(
         outcome.refused.iter().filter(|why| **why == Refusal::NoPose).count(),
         40,
-        "as many as came in the silence"
+        "all images without readings"
     );
     assert!(outcome.keyframes.iter().all(|keyframe| !in_gap(keyframe.stamp.0)));
     assert_eq!(join.counts().refused[&Refusal::NoPose], 40);
@@ -319,7 +318,7 @@ fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
         let world_from_base = Transform::translation(x_m, 0.0, 0.0);
         Sample::Base(BasePose { stamp: Stamp(nanos), world_from_base })
     };
-    // A metre per second, told at 10 Hz; one pose is no number.
+    // One meter per second, reported at 10 Hz; one pose is NaN.
     let reported = (0..41_i64).map(|tick| {
         let secs = Stamp(tick * 100_000_000).secs();
         base(tick * 100_000_000, if tick == 20 { f64::NAN } else { secs })
@@ -333,7 +332,7 @@ fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
     let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
     for keyframe in &outcome.keyframes {
         let secs = keyframe.stamp.secs();
-        assert!((secs - 2.0).abs() > 0.1, "no pose around the broken one");
+        assert!((secs - 2.0).abs() > 0.1, "no keyframe around the NaN pose");
         let base_from_flange = chain.forward(&joints_rad(secs)).expect("seven joints");
         let expected = Transform::translation(secs, 0.0, 0.0) * base_from_flange * rig.cameras[0].parent_from_camera;
         assert!((keyframe.world_from_camera.translation.vector - expected.translation.vector).norm() < 1e-6);
@@ -374,7 +373,7 @@ fn every_refusal_reason_is_reachable() {
     assert_eq!(
         counts_with(|image| image, &[]).refused.keys().collect::<Vec<_>>(),
         [&Refusal::NotMoved],
-        "nothing else when all is well"
+        "no other refusals for good images"
     );
 }
 
@@ -396,8 +395,8 @@ fn list_selects_exactly_its_keyframes() {
     let path = folder.path().join("keyframes.txt");
     let mut first = join(&rig(&[]));
     let chosen = run_join(&mut first, samples(6));
-    std::fs::write(&path, keyframe_list(first.keyframes())).expect("room on the disk");
-    // A rig that would refuse them all.
+    std::fs::write(&path, keyframe_list(first.keyframes())).expect("disk space");
+    // A rig whose checks would refuse all of them.
     let strict = rig(&[
         Override::new("join.max_shear_px", 0),
         Override::new("join.min_translation_m", 10),
@@ -408,7 +407,7 @@ fn list_selects_exactly_its_keyframes() {
     assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
     assert_eq!((listed.refused, listed.evicted), (vec![], vec![]));
     let again = folder.path().join("again.txt");
-    std::fs::write(&again, keyframe_list(second.keyframes())).expect("room on the disk");
+    std::fs::write(&again, keyframe_list(second.keyframes())).expect("disk space");
     assert_eq!(std::fs::read_to_string(&path).expect("a list"), std::fs::read_to_string(&again).expect("a list"));
 }
 
@@ -430,7 +429,7 @@ fn one_hour_run_keeps_only_the_store_in_memory() {
     for tick in 0..3600 * 20_i64 {
         let mut samples = vec![reading(tick * 50_000_000)];
         if tick % 4 == 2 {
-            // Off the beat of the motion, so that every image is a little elsewhere.
+            // Not in phase with the motion, so that every image has a slightly different pose.
             let stamp = Stamp(tick * 50_000_000 - 21_000_000 - tick % 977 * 10_000);
             n_images += 1;
             samples.extend([&color, &depth].map(|image| Sample::Image(Image { stamp, ..image.clone() })));
@@ -452,7 +451,7 @@ fn downscaled_keyframes_are_area_means_with_scaled_intrinsics() {
     let whole = run_join(&mut join(&rig(&[])), samples(4));
     let half = run_join(&mut join(&rig(&[Override::new("train.scale", 0.5)])), samples(4));
     let stamps = |outcome: &JoinOutcome| outcome.keyframes.iter().map(|keyframe| keyframe.stamp).collect::<Vec<_>>();
-    assert_eq!(stamps(&whole), stamps(&half), "the size of the training images decides nothing");
+    assert_eq!(stamps(&whole), stamps(&half), "scale must not affect acceptance");
     let (full, small) = (&whole.keyframes[1], &half.keyframes[1]);
     assert_eq!((small.size_px, small.focal_px, small.principal_px), ([32, 24], [30.5, 30.75], [16.0, 12.0]));
     let red = |keyframe: &Keyframe, x: usize, y: usize| {

@@ -1,13 +1,13 @@
-//! Images of one camera that wait until everything about them is known.
+//! Images of one camera that wait until all their data have arrived.
 //!
-//! Colour, depth and ground truth come in any order; joint readings may come before or after. What is decided depends on the
-//! order of the samples only, never on a clock, so that a replay decides the same.
+//! Color, depth and ground truth come in any order; joint readings may come before or after. Decisions depend only on
+//! the order of the samples, never on a clock, so that a replay makes the same decisions.
 
 use drivers::{Image, TruthImage};
 use kinematics::Stamp;
 use std::collections::VecDeque;
 
-/// Images of each kind that may wait.
+/// Maximum number of waiting images of each kind.
 const MAX_WAITING: usize = 64;
 
 /// Samples of one camera, each kind in stamp order.
@@ -16,18 +16,18 @@ pub(super) struct Waiting {
     color: VecDeque<Image>,
     depth: VecDeque<(Stamp, Image)>,
     truth: VecDeque<TruthImage>,
-    /// Whether ground truth is worth waiting for.
+    /// Whether ground truth is expected.
     expects_truth: bool,
 }
 
-/// A partner that an image may have.
+/// A matching image that may exist.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Partner<T> {
-    /// It is here.
+    /// It has arrived.
     Available(T),
     /// It may still come.
     NotYet,
-    /// There will be none.
+    /// It will never come.
     Never,
 }
 
@@ -36,7 +36,7 @@ impl Waiting {
         Self { color: VecDeque::new(), depth: VecDeque::new(), truth: VecDeque::new(), expects_truth }
     }
 
-    /// Queues a colour image; gives back the oldest where too many wait.
+    /// Queues a color image; returns the oldest if too many wait.
     pub(super) fn push_color(&mut self, image: Image) -> Option<Image> {
         let dropped_image = if self.color.len() == MAX_WAITING { self.color.pop_front() } else { None };
         self.color.push_back(image);
@@ -61,20 +61,21 @@ impl Waiting {
         self.color.pop_front()
     }
 
-    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether that is final.
+    /// Mid-exposure of the depth image nearest to a stamp, at most `max_difference_secs` away, and whether this is
+    /// final.
     pub(super) fn depth_near(&self, stamp: Stamp, max_difference_secs: f64) -> (Option<Stamp>, bool) {
         let nearest = self.depth.iter().map(|(at, _)| *at).min_by_key(|at| at.nanos_since(stamp).unsigned_abs());
-        // Depth comes in order, so after one at or past the stamp no nearer one follows.
+        // Depth comes in order, so after an image at or past the stamp no nearer one follows.
         let is_final = self.depth.back().is_some_and(|(newest, _)| *newest >= stamp);
         (nearest.filter(|at| at.secs_since(stamp).abs() <= max_difference_secs), is_final)
     }
 
-    /// The depth image of a mid-exposure, for one more colour image may want it too.
+    /// The depth image with this mid-exposure. It stays queued, because the next color image may use it too.
     pub(super) fn depth_at(&self, stamp: Stamp) -> Option<&Image> {
         self.depth.iter().find(|(at, _)| *at == stamp).map(|(_, image)| image)
     }
 
-    /// The ground truth of a colour image, by the stamp the device gave it.
+    /// The ground truth of a color image, found by its device stamp.
     pub(super) fn truth_of(&self, device_stamp: Stamp) -> Partner<&TruthImage> {
         match self.truth.iter().find(|truth| truth.image.stamp == device_stamp) {
             Some(truth) => Partner::Available(truth),
@@ -83,12 +84,12 @@ impl Waiting {
         }
     }
 
-    /// Says that ground truth was waited for in vain.
+    /// Stops expecting ground truth, because it did not come in time.
     pub(super) fn stop_waiting_for_truth(&mut self) {
         self.expects_truth = false;
     }
 
-    /// Forgets what belongs to images before this colour image.
+    /// Removes depth and truth that only earlier color images needed.
     pub(super) fn forget_before(&mut self, stamp: Stamp, device_stamp: Stamp, period_secs: f64) {
         self.truth.retain(|truth| truth.image.stamp > device_stamp);
         self.depth.retain(|(at, _)| stamp.secs_since(*at) <= period_secs);

@@ -1,4 +1,4 @@
-//! Opens what a rig file or a recording names, as one source of samples.
+//! Opens the devices of a rig file, or a recording, as one source of samples.
 
 mod real;
 mod realsense;
@@ -21,27 +21,27 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
-/// What helps where a device is not there.
+/// Hint for missing devices.
 const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
 pub(crate) const FCI_PORT: u16 = 1337;
 
-/// Which devices a rig file stands for.
+/// Which devices to open for a rig file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Devices {
-    /// Those that it names.
+    /// The devices in the rig file.
     Real,
-    /// Their simulated twins: same names, sizes, rates, lenses, robot.
+    /// Simulated devices with the same names, sizes, rates, intrinsics and robot.
     Sim,
 }
 
-/// An open rig.
+/// An open rig or recording.
 pub(crate) struct Opened {
-    /// The settled rig.
+    /// The rig with all settings resolved.
     pub(crate) rig: Rig,
     pub(crate) source: Box<dyn Source>,
-    /// Set once the samples have ended early because a recording is damaged.
+    /// Set when the samples end early because the recording is damaged.
     pub(crate) damage: Arc<OnceLock<String>>,
 }
 
@@ -77,7 +77,8 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     Ok(Opened { rig, source, damage: Arc::default() })
 }
 
-/// Opens a recording with the rig stored in it, or with another one; which joint is which, the recording knows.
+/// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
+/// recording.
 pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
@@ -85,7 +86,9 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
         None => stored_rig(path, &recording, overrides)?,
     };
     if let Some(recorded) = recording.joint_names() {
-        chain_of(&rig)?.order_in(recorded).with_context(|| format!("the recording {path:?} does not fit the robot"))?;
+        chain_of(&rig)?
+            .order_in(recorded)
+            .with_context(|| format!("the recording {path:?} does not match the robot"))?;
         if !rig.arm.joint_offsets.is_empty() {
             let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
             let offset = |name: &String| of(name).map_or(0.0, |ix| rig.arm.joint_offsets[ix]);
@@ -99,7 +102,7 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
     Ok(Opened { rig, source, damage })
 }
 
-/// Begins a recording of a rig; rig file and robot's description go into it.
+/// Creates a recording of a rig, with the rig file and the URDF attached.
 pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
     let resolved = rig.to_toml();
@@ -111,7 +114,7 @@ pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
     Ok(Recorder::create(path, &description)?)
 }
 
-/// The joints from the robot's base to its flange.
+/// The kinematic chain from the robot's base to its flange.
 pub(crate) fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
     let arm = &rig.arm;
     Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
@@ -119,36 +122,36 @@ pub(crate) fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
 
 fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
     let text = |name| {
-        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} holds no {name}"))?;
+        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} contains no {name}"))?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
     };
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
 }
 
-/// A flange needs joint readings to be anywhere.
+/// Cameras on the flange need joint readings.
 fn check_arm(rig: &Rig) -> anyhow::Result<()> {
     let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
         bail!(
-            "camera {:?} has the parent flange, and arm.driver is none: its parent must be base or world",
+            "camera {:?} has the parent flange, but arm.driver is none: the parent must be base or world",
             camera.name
         );
     }
     Ok(())
 }
 
-/// What only a camera knows about its lens is not known without the camera.
+/// Intrinsics that are stored in the camera are unknown unless the camera is opened.
 fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
     if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
         bail!(
-            "camera.{}.intrinsics is missing: only the camera knows it, and the camera is not asked here",
+            "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
             camera.name
         );
     }
     Ok(())
 }
 
-/// Whether anything of a rig is simulated.
+/// Whether any device of a rig is simulated.
 pub(crate) fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
         || rig.base.driver == BaseDriver::Sim
@@ -182,7 +185,7 @@ fn simulate(_rig: &Rig, _real: drivers::Devices) -> anyhow::Result<Box<dyn Sourc
     bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
 }
 
-/// A recording that says at its end what was wrong with it.
+/// A recording that reports damage when it ends.
 struct RecordingSource {
     recording: Recording,
     damage: Arc<OnceLock<String>>,
@@ -194,7 +197,7 @@ impl Source for RecordingSource {
         if sample.is_none()
             && let Some(damage) = self.recording.damage()
         {
-            // Told once: at the end, with the other losses.
+            // Reported once, at the end, with the other losses.
             let _ = self.damage.set(damage.to_owned());
         }
         Ok(sample)
@@ -207,7 +210,7 @@ mod tests {
 
     fn load(name: &str, overrides: &[Override]) -> Rig {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
-        Rig::load(&path, overrides).expect("a rig file that comes along")
+        Rig::load(&path, overrides).expect("a bundled rig file")
     }
 
     #[test]
@@ -250,9 +253,9 @@ mod tests {
             let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
             format!("{:#}", opened.err().expect("nothing is plugged in"))
         };
-        assert!(of(&[]).contains("nokhwa reads no depth"), "{}", of(&[]));
+        assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
         let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
-        assert!(gain.contains("left to the camera"), "{gain}");
+        assert!(gain.contains("nokhwa does not support gain"), "{gain}");
     }
 
     #[test]
@@ -293,7 +296,7 @@ mod tests {
         use drivers::franka::FciVersion;
         use drivers::franka::emulated::{EmulatedRobot, Joints, Limits, RobotConfig};
         const REST_RAD: [f64; 7] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
-        // An arm that stands somewhere on a walking base is compared from its own foot on.
+        // A Franka reports poses relative to its own base link, also on a mobile base.
         for name in ["static-arm.toml", "mobile-arm.toml"] {
             let plain = load(name, &[]);
             let chain = Chain::from_urdf(&plain.arm.urdf_text, "panda_link0", "panda_link8").expect("a Panda");
@@ -337,14 +340,14 @@ mod tests {
             velocity: vec![],
             effort: vec![],
         };
-        recorder.write(&Sample::Joints(joints.clone())).expect("room on the disk");
-        recorder.finish().expect("room on the disk");
+        recorder.write(&Sample::Joints(joints.clone())).expect("disk space");
+        recorder.finish().expect("disk space");
         let mut opened = recording(&path, None, &[]).expect("a recording");
         assert_eq!(opened.rig, rig);
         assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));
         assert_eq!(opened.source.next_sample().expect("readable"), None);
         assert_eq!(opened.damage.get(), None);
-        // Another order in the rig file changes nothing; a joint of another name does.
+        // A different joint order in the rig file has no effect; a different joint name is an error.
         let mut reversed = rig.clone();
         reversed.arm.joints.reverse();
         assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);

@@ -1,4 +1,4 @@
-//! The devices of a rig that are not simulated.
+//! Opens the devices of a rig that are not simulated.
 
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
@@ -20,10 +20,10 @@ use drivers::{Arm, Base, Devices, RangeScanner};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
-/// Where joint states are listened for where nothing says otherwise: of this computer only.
+/// Default address for receiving joint states: this computer only.
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
-/// Opens them; a rig may have none. What only a camera knew is in the rig afterwards.
+/// Opens all real devices of a rig, possibly none. Fills in calibration that is stored in a camera.
 pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
     let mut devices = Devices::default();
     for camera in &mut rig.cameras {
@@ -53,22 +53,20 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
     Ok(devices)
 }
 
-/// Opens the arm to be moved: it is switched on and held where it is. Its joints are as the device tells them, without
+/// Opens the arm for motion: enables it and holds its position. Joint positions are those of the device, without
 /// `arm.joint_offsets`.
 pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
-        bail!(
-            "the rig file has no table [arm.motion], so its arm is only read; docs/guide/moving-arms.md describes the table"
-        );
+        bail!("the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md");
     };
     match rig.arm.driver {
         ArmDriver::Can => movable_can_arm(rig, motion),
         ArmDriver::Franka => movable_franka_arm(rig, motion),
-        _ => bail!("arms of this driver are only read"),
+        _ => bail!("arms with this driver can only be read"),
     }
 }
 
-/// Checks what of that can be checked without the arm.
+/// Checks the motion settings as far as possible without the arm.
 pub(crate) fn check_motion(rig: &Rig) -> anyhow::Result<()> {
     let Some(motion) = &rig.arm.motion else { return Ok(()) };
     match rig.arm.driver {
@@ -76,11 +74,11 @@ pub(crate) fn check_motion(rig: &Rig) -> anyhow::Result<()> {
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
         ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)?),
-        _ => bail!("arms of this driver are only read"),
+        _ => bail!("arms with this driver can only be read"),
     }
 }
 
-/// How each joint may be moved: the description's limits, the rig's speed.
+/// Motion limits of each joint: positions from the URDF, speed from the rig file.
 #[cfg(target_os = "linux")]
 fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
     let Rig { arm, .. } = rig;
@@ -91,7 +89,7 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> 
         let joint =
             joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
         let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, motion.acceleration_secs, motion.jerk_secs);
-        // The description's angles are those told plus the offset.
+        // URDF positions are device positions plus the offset.
         let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
         joint.position = joint.position.map(|bound| bound - offset);
         limits.push(joint);
@@ -119,7 +117,7 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmCon
 
 #[cfg(not(target_os = "linux"))]
 fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
-    bail!("arms on CAN buses are moved on Linux only")
+    bail!("arms on CAN buses can only be moved on Linux")
 }
 
 #[cfg(target_os = "linux")]
@@ -128,7 +126,7 @@ fn can_config(rig: &Rig) -> can::ArmConfig {
     can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz }
 }
 
-/// An arm whose joints are motors on CAN buses.
+/// Opens an arm with motors on CAN buses.
 #[cfg(target_os = "linux")]
 fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     Ok(Box::new(CanArm::open(&can_config(rig))?))
@@ -136,16 +134,16 @@ fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
 
 #[cfg(not(target_os = "linux"))]
 fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
-    bail!("arms on CAN buses are read on Linux only")
+    bail!("arms on CAN buses can only be read on Linux")
 }
 
-/// A Franka arm, over FCI.
+/// Opens a Franka arm for reading over FCI.
 #[cfg(target_os = "linux")]
 fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     Ok(Box::new(FrankaArm::open(&franka_config(rig)?)?))
 }
 
-/// A Franka arm that may be moved, over FCI.
+/// Opens a Franka arm for motion over FCI.
 #[cfg(target_os = "linux")]
 fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
     let defaults = franka::ContactConfig::default();
@@ -161,25 +159,25 @@ fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn M
 
 #[cfg(not(target_os = "linux"))]
 fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
-    bail!("Franka arms are moved on Linux only")
+    bail!("Franka arms can only be moved on Linux")
 }
 
 #[cfg(target_os = "linux")]
 fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
     let Rig { arm, .. } = rig;
     if arm.address.is_empty() {
-        bail!("arm.address is missing: that of the robot's controller, for instance \"172.16.0.2\"");
+        bail!("arm.address is missing: set it to the address of the robot's controller, such as \"172.16.0.2\"");
     }
     Ok(franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain: franka_chain(rig)? })
 }
 
-/// From the link in which a Franka arm tells poses to its flange.
+/// The chain from the link in which a Franka arm reports poses to its flange.
 #[cfg(target_os = "linux")]
 pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
     let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
-    // That is the one that its first joint turns against, wherever on the base that is.
+    // That link is the parent of the arm's first joint, wherever it is on the base.
     let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
     let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
     kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
@@ -187,27 +185,27 @@ pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
 
 #[cfg(not(target_os = "linux"))]
 fn franka_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
-    bail!("Franka arms are read on Linux only")
+    bail!("Franka arms can only be read on Linux")
 }
 
-/// An arm that another program tells about.
+/// Opens an arm whose joint states are sent by another program.
 fn udp_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
     let open = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
     log::info!("arm: listening on {}", open.address());
     Ok(Box::new(open))
 }
 
-/// Where its joint states are listened for.
+/// The address on which joint states are received.
 pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
     match &*rig.arm.address {
         "" => Ok(DEFAULT_ARM_ADDRESS),
         text => text.parse().with_context(|| {
-            format!("arm.address is {text:?}: with the driver udp it is where to listen, like {DEFAULT_ARM_ADDRESS}")
+            format!("arm.address is {text:?}; the driver udp listens on an address such as {DEFAULT_ARM_ADDRESS}")
         }),
     }
 }
 
-/// A camera by V4L2: its color images, and those of its depth where it has that.
+/// Opens a V4L2 camera: its color images, and its depth images if it has depth.
 #[cfg(target_os = "linux")]
 fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
     let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
@@ -217,18 +215,18 @@ fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>
 
 #[cfg(not(target_os = "linux"))]
 fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
-    bail!("camera {:?}: V4L2 is Linux's; driver = \"nokhwa\" reads webcams elsewhere", camera.name)
+    bail!("camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams", camera.name)
 }
 
-/// A camera by nokhwa, which sets nothing but size, rate and format.
+/// Opens a camera with nokhwa, which sets only size, rate and format.
 #[cfg(feature = "nokhwa")]
 fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     let Camera { name, v4l2, .. } = camera;
     if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
-        bail!("camera {name:?}: with the driver nokhwa gain, brightness and white balance are left to the camera");
+        bail!("camera {name:?}: the driver nokhwa does not support gain, brightness or white balance: remove them");
     }
     if camera.depth.is_some() {
-        bail!("camera {name:?}: nokhwa reads no depth");
+        bail!("camera {name:?}: the driver nokhwa does not support depth");
     }
     let config = drivers::nokhwa::Config {
         name: name.to_string(),
@@ -246,13 +244,13 @@ fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
 #[cfg(not(feature = "nokhwa"))]
 fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     bail!(
-        "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; on Linux \
-         driver = \"v4l2\" reads webcams",
+        "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; \
+         on Linux, use driver = \"v4l2\" for webcams",
         camera.name
     )
 }
 
-/// The color images of a camera.
+/// Settings of the color images of a camera.
 #[cfg(target_os = "linux")]
 fn v4l2_color(camera: &Camera) -> Config {
     Config {
@@ -273,7 +271,7 @@ fn v4l2_color(camera: &Camera) -> Config {
     }
 }
 
-/// The depth images of a camera, which come from a device of their own; its exposure is left to itself.
+/// Settings of the depth images of a camera, which come from a separate device with automatic exposure.
 #[cfg(target_os = "linux")]
 fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
     let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {

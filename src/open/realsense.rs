@@ -1,11 +1,11 @@
-//! A RealSense camera of a rig file: opened, and what the rig file leaves to it filled in.
+//! Opens a RealSense camera and fills in calibration that the rig file omits.
 
 /// Opens a camera.
 #[cfg(not(feature = "realsense"))]
 pub(super) fn open(camera: &mut crate::config::Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
     anyhow::bail!(
-        "camera {:?}: this program was built without RealSense cameras: install the RealSense SDK (librealsense2) and build it with \
-         `cargo build --release --features realsense`",
+        "camera {:?}: this program was built without RealSense support: install the RealSense SDK (librealsense2) \
+         and build it with `cargo build --release --features realsense`",
         camera.name
     )
 }
@@ -20,10 +20,11 @@ mod with_sdk {
     use kinematics::{Intrinsics, Lens};
     use std::time::Duration;
 
-    /// Where the lens of a rig file sees something this much elsewhere than the camera says, one of the two is of another camera.
+    /// Maximum difference between the intrinsics in the rig file and those stored in the camera, pixels. Above it, one
+    /// of them is probably of another camera.
     const MAX_DIFFERENCE_PX: f64 = 5.0;
 
-    /// Opens a camera and takes from it what the rig file does not say; where both say something the rig file counts.
+    /// Opens a camera and takes calibration from it that the rig file omits. Values in the rig file take precedence.
     pub(in crate::open) fn open(camera: &mut Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
         let open = RealsenseCamera::open(config(camera))?;
         let known = open.calibration();
@@ -67,20 +68,20 @@ mod with_sdk {
     fn apply_known(key: &str, camera: &str, is_unknown: bool, rig: &mut Intrinsics, known: &Intrinsics) {
         let line = toml_line(known);
         if is_unknown {
-            log::info!("camera {camera:?}: {key} = {line}, by the camera itself");
+            log::info!("camera {camera:?}: using {key} = {line} from the camera");
             *rig = known.clone();
             return;
         }
         let max_difference_px = difference_px(rig, known);
         if max_difference_px > MAX_DIFFERENCE_PX {
             log::warn!(
-                "camera {camera:?}: its rig file sees things up to {max_difference_px:.1} px elsewhere than the camera itself, whose {key} is {line}; \
-                 leave the key out to take that"
+                "camera {camera:?}: {key} in the rig file differs by up to {max_difference_px:.1} px from the camera's \
+                 own, {line}; remove the key to use that"
             );
         }
     }
 
-    /// How far apart two lenses see the same ray, over the image.
+    /// Maximum distance between the projections of the same ray through two lenses, over the image, pixels.
     fn difference_px(rig: &Intrinsics, known: &Intrinsics) -> f64 {
         const STEPS: u32 = 8;
         let pixels = (0..=STEPS).flat_map(|row| (0..=STEPS).map(move |column| [column, row]));

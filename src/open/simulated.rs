@@ -1,4 +1,4 @@
-//! A rig's simulated twin: the same cameras and joints in MuJoCo.
+//! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
 use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
 use anyhow::bail;
@@ -6,19 +6,20 @@ use drivers::{Devices, Error, Live, Sample, Source};
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
-/// Opens the simulated rig, in lockstep or in real time as the rig file says; `real` devices deliver beside it in real time.
+/// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
+/// parallel.
 pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
     let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
     if rig.sim.lockstep {
         if any_real {
-            bail!("with sim.lockstep the simulation waits for whoever takes its samples, which real devices do not");
+            bail!("sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false");
         }
         return Ok(Box::new(sim::open(&config)?.into_lockstep()));
     }
-    // Real devices tell the time of this computer; alone, the simulation begins at 0.
+    // Real devices use the clock of this computer. Without them, the simulation starts at 0.
     let start = if any_real { drivers::clock::now() } else { Stamp::default() };
-    // In real time the end is found here: devices that end would look like devices that fail.
+    // In real time the limits are checked here, because devices that end would look like devices that fail.
     (config.duration_secs, config.n_images) = (None, None);
     let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
     devices.arm = real.arm.or(devices.arm);
@@ -68,14 +69,14 @@ impl Source for RealTime {
     }
 }
 
-/// The simulator's configuration of a rig.
+/// The simulator configuration of a rig.
 fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
     let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
         let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
-        bail!("sim.scene is {:?}, known scenes: {}", rig.sim.scene, known.join(", "));
+        bail!("sim.scene is {:?}; known scenes: {}", rig.sim.scene, known.join(", "));
     };
     if rig.base.world_from_base != Transform::identity() {
-        bail!("a simulated base stands in the world's origin: base.world_from_base has to be the identity");
+        bail!("a simulated base is at the world origin: base.world_from_base must be the identity");
     }
     if scene.has_moving_base() != (rig.base.driver == BaseDriver::Sim) {
         let driver = if scene.has_moving_base() { "sim" } else { "fixed" };

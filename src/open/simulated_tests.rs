@@ -1,4 +1,4 @@
-//! The simulated rig through join: poses against its own ground truth, and live, recorded and replayed keyframes alike.
+//! The simulated rig through the join: poses against ground truth, and identical live, recorded and replayed keyframes.
 
 use super::{Devices, Opened};
 use crate::config::{Override, Rig};
@@ -16,7 +16,7 @@ use std::time::Duration;
 use toml::Value;
 use trainer::Keyframe;
 
-/// A quarter of the resolution, in lockstep.
+/// A rig with a quarter of the resolution, in lockstep.
 fn small(name: &str, overrides: &[Override]) -> Rig {
     let list = |key, numbers: [f64; 2]| Override::new(key, Value::from(numbers.to_vec()));
     let mut all = vec![
@@ -26,11 +26,10 @@ fn small(name: &str, overrides: &[Override]) -> Rig {
         Override::new("sim.lockstep", true),
     ];
     all.extend(overrides.iter().cloned());
-    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all)
-        .expect("a rig file that comes along")
+    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all).expect("a bundled rig file")
 }
 
-/// Plays a source to its end; `on_sample` sees every sample.
+/// Reads a source to its end; `on_sample` is called for every sample.
 fn keyframes(opened: Opened, mut on_sample: impl FnMut(&Sample)) -> (Vec<Arc<Keyframe>>, Join) {
     let mut source = opened.source;
     let mut join = Join::new(&opened.rig).expect("a good rig");
@@ -49,9 +48,9 @@ fn keyframes(opened: Opened, mut on_sample: impl FnMut(&Sample)) -> (Vec<Arc<Key
     (keyframes, join)
 }
 
-/// Everything of a keyframe that a trainer sees, as text with every bit in it.
+/// Everything that the trainer gets from a keyframe, as text that is exact to the last bit.
 fn bits(keyframes: &[Arc<Keyframe>]) -> Vec<String> {
-    // Debug prints the shortest digits that give the same float back, so equal texts mean equal bits.
+    // Debug prints the shortest digits that parse to the same float, so equal texts mean equal bits.
     keyframes.iter().map(|keyframe| format!("{keyframe:?}")).collect()
 }
 
@@ -62,8 +61,8 @@ fn live_and_replayed_keyframes_are_identical() {
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 24)]);
     let live = super::rig(rig.clone(), Devices::Sim).expect("the simulator");
     let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
-    let (first, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
-    recorder.finish().expect("room on the disk");
+    let (first, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
+    recorder.finish().expect("disk space");
     assert!(first.len() >= 8, "{}", join.counts());
     assert!(first.iter().all(|keyframe| keyframe.depth.is_some() && keyframe.truth.is_some()), "{}", join.counts());
     let (again, _) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
@@ -74,13 +73,13 @@ fn live_and_replayed_keyframes_are_identical() {
 
 #[test]
 fn forward_kinematics_matches_the_simulator() {
-    const TOLERANCE_M: f64 = 1e-4; // What the whole road from joint readings to keyframes may cost.
+    const TOLERANCE_M: f64 = 1e-4; // Total error from joint readings to keyframes.
     const TOLERANCE_RAD: f64 = 1e-4;
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 40), Override::new("sim.ideal", true)]);
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
     let mut max_error = [0.0_f64; 2];
     for keyframe in &keyframes {
-        let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
+        let truth = keyframe.truth.as_ref().expect("ground truth comes with the images");
         let difference = truth.world_from_camera.inverse() * keyframe.world_from_camera;
         max_error[0] = max_error[0].max(difference.translation.vector.norm());
         max_error[1] = max_error[1].max(difference.rotation.angle());
@@ -95,13 +94,13 @@ fn forward_kinematics_matches_the_simulator() {
 
 #[test]
 fn joint_readings_follow_rig_file_order() {
-    const TOLERANCE_M: f64 = 1e-4; // As with joints in their own order.
+    const TOLERANCE_M: f64 = 1e-4; // Same as for joints in chain order.
     let rig = small("static-arm.toml", &[Override::new("sim.n_images", 12), Override::new("sim.ideal", true)]);
     let reversed: Vec<String> = rig.arm.joints.iter().rev().cloned().collect();
     let rig = Rig { arm: crate::config::Arm { joints: reversed, ..rig.arm.clone() }, ..rig };
     let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
     let difference_m = |keyframe: &Arc<Keyframe>| {
-        let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
+        let truth = keyframe.truth.as_ref().expect("ground truth comes with the images");
         (truth.world_from_camera.translation.vector - keyframe.world_from_camera.translation.vector).norm()
     };
     assert!(
@@ -140,7 +139,7 @@ fn real_time_rig_ends_after_its_duration() {
     assert_eq!(join.counts().images, n_images);
 }
 
-/// Turns of scanners as text with every bit in it.
+/// Range scans as text that is exact to the last bit.
 fn range_bits(join: &Join) -> Vec<String> {
     join.range_scans().map(|scan| format!("{scan:?}")).collect()
 }
@@ -148,8 +147,7 @@ fn range_bits(join: &Join) -> Vec<String> {
 fn mobile(name: &str, overrides: &[Override]) -> Rig {
     let mut all = vec![Override::new("sim.lockstep", true), Override::new("train.scale", 0.25)];
     all.extend(overrides.iter().cloned());
-    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all)
-        .expect("a rig file that comes along")
+    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all).expect("a bundled rig file")
 }
 
 #[test]
@@ -162,10 +160,10 @@ fn moving_base_keyframes_and_scans_replay_identically() {
         let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
         let mut samples = Vec::new();
         let (first, join) = keyframes(live, |sample| {
-            recorder.write(sample).expect("room on the disk");
+            recorder.write(sample).expect("disk space");
             samples.push(format!("{sample:?}"));
         });
-        recorder.finish().expect("room on the disk");
+        recorder.finish().expect("disk space");
         assert!(first.len() >= 3, "{name}: {}", join.counts());
         let n_scans = join.range_scans().count();
         assert!((n_scans >= 30) == (name == "mobile-base-small.toml"), "{name}: {n_scans} scans, {}", join.counts());
@@ -186,31 +184,31 @@ fn moving_base_keyframes_and_scans_replay_identically() {
 
 #[test]
 fn moving_base_poses_and_scans_match_the_simulator() {
-    const TOLERANCE: f64 = 1e-4; // Metres and radians: joints every 1 ms and base poses every 10 ms, interpolated.
+    const TOLERANCE: f64 = 1e-4; // Meters and radians: joints every 1 ms and base poses every 10 ms, interpolated.
     for (name, secs) in [("mobile-base-small.toml", 6.0), ("mobile-arm.toml", 6.0)] {
         let rig = mobile(name, &[Override::new("sim.duration_secs", secs), Override::new("sim.ideal", true)]);
         let (keyframes, join) = keyframes(super::rig(rig, Devices::Sim).expect("the simulator"), |_| {});
         assert!(keyframes.len() > 4, "{name}: {}", join.counts());
         for keyframe in &keyframes {
-            let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images");
+            let truth = keyframe.truth.as_ref().expect("ground truth comes with the images");
             let difference = truth.world_from_camera.inverse() * keyframe.world_from_camera;
             assert!(
                 difference.translation.vector.norm() < TOLERANCE && difference.rotation.angle() < TOLERANCE,
                 "{name}: {difference}"
             );
-            let twist = keyframe.twist.expect("poses come all the time");
+            let twist = keyframe.twist.expect("poses arrive continuously");
             let is_moving = twist.linear_m_s.norm() + twist.angular_rad_s.norm() > 1e-3;
             assert!(is_moving || keyframe.stamp.0 < 1_000_000_000, "{name}: {twist:?} at {:?}", keyframe.stamp);
         }
         for scan in join.range_scans() {
-            // Without noise no echo lies outside the room of 15 x 10 x 3 m by more than poses and f32 allow.
+            // Without noise, echoes lie within the room of 15 x 10 x 3 m up to the errors of poses and f32.
             let inside = |[x, y, z]: [f32; 3]| x.abs() < 7.502 && y.abs() < 5.002 && z > -0.002 && z < 3.002;
             assert!(scan.points_in_world_m.len() > 4000 && scan.points_in_world_m.iter().all(|point| inside(*point)));
         }
     }
 }
 
-/// An address of the loopback interface that nobody uses.
+/// An unused address of the loopback interface.
 fn free_address() -> SocketAddr {
     UdpSocket::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a free port")
 }
@@ -259,14 +257,14 @@ fn network_samples_are_registered_recorded_and_replayed() {
         });
         while join.range_scans().count() < 5 || !reported.iter().any(|sample| matches!(sample, Sample::Image(_))) {
             let sample = source.next_sample().expect("the rig works").expect("it has no end");
-            recorder.write(&sample).expect("room on the disk");
+            recorder.write(&sample).expect("disk space");
             join.push(sample.clone());
             reported.push(sample);
         }
         stop.store(true, Ordering::Relaxed);
     });
-    recorder.finish().expect("room on the disk");
-    // Where the scanner is on the base, and the base in the world.
+    recorder.finish().expect("disk space");
+    // The scanner's position on the base plus the base's position in the world.
     let scan = join.range_scans().next().expect("five of them");
     let [x, y, z] = scan.points_in_world_m[0];
     assert!((x - 2.5).abs() < 1e-6 && y.abs() < 1e-6 && z.abs() < 1e-6, "{x} {y} {z}");
@@ -281,13 +279,13 @@ fn lockstep_with_network_devices_is_rejected() {
         "static-arm.toml",
         &[Override::new("base.driver", "udp"), Override::new("base.address", free_address().to_string())],
     );
-    let error_message = super::rig(rig, Devices::Real).err().expect("one waits, the other does not").to_string();
+    let error_message = super::rig(rig, Devices::Real).err().expect("lockstep with real devices").to_string();
     assert!(error_message.contains("sim.lockstep") && error_message.contains("real devices"), "{error_message}");
 }
 
 #[test]
 fn drifting_base_is_corrected_live_and_in_replay() {
-    const MAX_REMAINING_M: f64 = 1.5e-3; // Of images of 320x180: a pixel of the first stand is 7 mm of the cabinet.
+    const MAX_REMAINING_M: f64 = 1.5e-3; // 320x180 pixels: one covers 7 mm of the cabinet at the first station.
     const MAX_REMAINING_RAD: f64 = 1.5e-3;
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("run.mcap");
@@ -304,18 +302,18 @@ fn drifting_base_is_corrected_live_and_in_replay() {
     );
     let live = super::rig(rig, Devices::Sim).expect("the simulator");
     let mut recorder = super::recorder(&path, &live.rig).expect("a new file");
-    let mut stations = Stations::new(&live.rig).expect("its base walks");
-    let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("room on the disk"));
-    recorder.finish().expect("room on the disk");
+    let mut stations = Stations::new(&live.rig).expect("its base moves");
+    let (reported, join) = keyframes(live, |sample| recorder.write(sample).expect("disk space"));
+    recorder.finish().expect("disk space");
     let first = stations.corrected(reported.clone());
     let recorded = super::recording(&path, None, &[]).expect("a recording");
-    let mut again = Stations::new(&recorded.rig).expect("its base walks");
+    let mut again = Stations::new(&recorded.rig).expect("its base moves");
     let replayed = again.corrected(keyframes(recorded, |_| {}).0);
     assert!(bits(&first) == bits(&replayed), "the replay differs");
     assert_eq!(stations.reports(), again.reports());
 
     let error_of = |keyframe: &Keyframe| {
-        let truth = keyframe.truth.as_ref().expect("ground truth comes beside the images").world_from_camera;
+        let truth = keyframe.truth.as_ref().expect("ground truth comes with the images").world_from_camera;
         let difference = truth.inverse() * keyframe.world_from_camera;
         [difference.translation.vector.norm(), difference.rotation.angle()]
     };
@@ -328,7 +326,7 @@ fn drifting_base_is_corrected_live_and_in_replay() {
     };
     assert!(reported.iter().filter(is_at_second_station).count() >= 14, "{}", join.counts());
     let [before, after] = [max_error(&reported), max_error(&first)];
-    assert!(before[0] > 0.015 && before[1] > 0.005, "{before:?} m and rad to begin with");
+    assert!(before[0] > 0.015 && before[1] > 0.005, "{before:?} m and rad before correction");
     assert!(
         after[0] < MAX_REMAINING_M && after[1] < MAX_REMAINING_RAD,
         "{after:?} m and rad left: {:?}",
@@ -340,7 +338,7 @@ fn drifting_base_is_corrected_live_and_in_replay() {
 fn tags_localize_an_unmeasured_base() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/tags.toml");
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 40)];
-    let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+    let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
     for (id, tag) in &rig.base.tags {
         let truth = sim::layout::world_from_tag(*id as usize);
         let error_of = tag.world_from_tag.inverse() * truth;
@@ -379,7 +377,7 @@ fn tag_corners_match_the_simulator() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
     let at_once = Override::new("camera.wrist.readout_micros", 0);
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 30), at_once];
-    let rig = Rig::load(&path, &overrides).expect("a rig file that comes along");
+    let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
     let mut detector = TagDetector::start(Family::Tag36h11).expect("a thread");
     let mut source = super::rig(rig.clone(), Devices::Sim).expect("the simulator").source;
     let (mut detections, mut off_px) = (Vec::new(), Vec::new());
@@ -399,7 +397,7 @@ fn tag_corners_match_the_simulator() {
                     let corners = [[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]];
                     for ([x, y], detected) in corners.into_iter().zip(tag.corners_px) {
                         let corner = camera_from_tag * nalgebra::Point3::new(0.024 * x, 0.024 * y, 0.0);
-                        let at = rig.cameras[0].intrinsics.project(&corner.coords).expect("before the camera");
+                        let at = rig.cameras[0].intrinsics.project(&corner.coords).expect("in front of the camera");
                         off_px.push([detected[0] - at[0], detected[1] - at[1]]);
                     }
                 }
@@ -407,14 +405,14 @@ fn tag_corners_match_the_simulator() {
             _ => {}
         }
     }
-    // Medians: a side that is seen from far aside has corners that are anywhere.
+    // Medians, because corners of sides at grazing angles are unreliable.
     let median = |mut numbers: Vec<f64>| {
         numbers.sort_by(f64::total_cmp);
         numbers[numbers.len() / 2]
     };
     let along = |axis: usize| median(off_px.iter().map(|error_of| error_of[axis]).collect());
     let spread = median(off_px.iter().map(|[x, y]| x.hypot(*y)).collect());
-    // Half a pixel would be a corner counted from the middle of the first one.
+    // Half a pixel would mean that corners are counted from the center of the first pixel.
     let n = off_px.len();
     assert!(n >= 100 && along(0).abs() < 0.15 && along(1).abs() < 0.15, "{n}: {}, {} px", along(0), along(1));
     assert!(spread < 0.5, "{spread} px");

@@ -1,4 +1,4 @@
-//! A base whose place is told by tags that its cameras see: its poses are made of the images and join the samples.
+//! Locates the base from tags that its cameras see: estimates base poses from images and adds them to the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
 use crate::join::{CameraPose, Motion};
@@ -11,22 +11,23 @@ use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
 
-/// Sightings that wait for joint states; more are of a rig whose arm is silent, which is told elsewhere.
+/// Maximum number of detections that wait for joint states. More mean that the arm sends nothing, which is reported
+/// elsewhere.
 const MAX_WAITING: usize = 64;
-/// So many images in which no pose fits the tags are no chance: one of the tags is not where the rig file has it.
+/// After this many images in which no pose fits the tags, one of the tags is probably not where the rig file places it.
 const MIN_MISFIT_IMAGES: u64 = 3;
-/// After so long without a pose a person is told why, seconds.
+/// Time without a pose after which a warning gives the reason, seconds.
 const WARN_AFTER_SECS: f64 = 5.0;
 
-/// A source with the poses of the base added.
+/// A source that adds base poses to its samples.
 pub(super) struct TagBaseSource {
     source: Box<dyn Source>,
     detector: TagDetector,
-    /// Every image is looked at, however long that takes.
+    /// Whether every image is processed, however long that takes.
     is_lockstep: bool,
     cameras: Vec<Camera>,
     tags: BTreeMap<u32, TagPlacement>,
-    /// The arm alone: on a base in the world's origin.
+    /// The arm alone, on a base at the world origin.
     arm: Motion,
     pending: VecDeque<TagDetections>,
     ready: VecDeque<Sample>,
@@ -37,7 +38,7 @@ pub(super) struct TagBaseSource {
     counts: TagCounts,
 }
 
-/// What became of the images.
+/// Counts of processed images.
 #[derive(Clone, Copy, Debug, Default)]
 struct TagCounts {
     n_images: u64,
@@ -58,7 +59,7 @@ impl TagBaseSource {
         let cameras: Vec<_> = rig.cameras.iter().filter(is_on_robot).cloned().collect();
         if cameras.is_empty() {
             bail!(
-                "base.driver is tags, and no camera is on the base or the arm (camera.NAME.parent): none would see them move"
+                "base.driver is tags, but no camera is on the base or the arm: set camera.NAME.parent to base or flange"
             );
         }
         Ok(Self {
@@ -78,7 +79,7 @@ impl TagBaseSource {
         })
     }
 
-    /// Has an image of a camera that the base carries looked at.
+    /// Starts detection in an image of a camera on the robot.
     fn detect(&mut self, image: &Image) {
         if image.is_depth() || self.camera(&image.camera).is_none() {
             return;
@@ -109,7 +110,7 @@ impl TagBaseSource {
         }
     }
 
-    /// Makes poses of the sightings for which the joints are known.
+    /// Computes base poses for the detections with known joint positions.
     fn process_ready(&mut self) {
         while let Some(detection) = self.pending.front() {
             let Some(camera) = self.camera(&detection.camera) else { return };
@@ -147,7 +148,7 @@ impl TagBaseSource {
                 (self.newest, self.no_pose_since) = (Some(stamp), None);
                 self.counts.n_poses += 1;
             }
-            // Two cameras at once: the other one was first.
+            // Another camera already gave a pose with this or a later stamp.
             Ok(_) => {}
             Err(why) => {
                 let name = camera.name.clone();
@@ -157,13 +158,13 @@ impl TagBaseSource {
         }
     }
 
-    /// Whether a covariance is what the rig file asks for.
+    /// Whether the covariance is within the limits of the rig file.
     fn is_certain(&self, covariance: &Matrix6<f64>) -> bool {
         let sigma = |first: usize| covariance.diagonal().fixed_rows::<3>(first).sum().sqrt();
         sigma(0) <= self.max_sigma[0] && sigma(3) <= self.max_sigma[1]
     }
 
-    /// Counts an image without a pose, and tells of a long time without any.
+    /// Counts an image without a pose, and warns after a long time without any.
     fn count_miss(&mut self, stamp: Stamp, camera: &str, visible_ids: &[String], why: LocateError) {
         match why {
             LocateError::NoTag => self.counts.n_without_tag += 1,
@@ -172,7 +173,8 @@ impl TagBaseSource {
                 self.counts.n_misfit += 1;
                 if self.counts.n_misfit == MIN_MISFIT_IMAGES {
                     log::warn!(
-                        "base: camera {camera:?}: {MIN_MISFIT_IMAGES} images fit no pose: {why}; what single tags told before may be wrong, too"
+                        "base: camera {camera:?}: no pose fits the tags in {MIN_MISFIT_IMAGES} images: {why}; earlier \
+                         poses from single tags may be wrong, too"
                     );
                 }
             }
@@ -180,7 +182,7 @@ impl TagBaseSource {
         let since = *self.no_pose_since.get_or_insert(self.newest.unwrap_or(stamp));
         if stamp.secs_since(since) >= WARN_AFTER_SECS {
             let others = match why {
-                LocateError::NoTag if !visible_ids.is_empty() => format!(", but the tags {}", visible_ids.join(", ")),
+                LocateError::NoTag if !visible_ids.is_empty() => format!("; visible tags: {}", visible_ids.join(", ")),
                 _ => String::new(),
             };
             log::warn!("base: no pose for {:.0} s; camera {camera:?}: {why}{others}", stamp.secs_since(since));
@@ -229,13 +231,14 @@ impl Drop for TagBaseSource {
             n_without_joints,
         } = self.counts;
         log::info!(
-            "base: {n_poses} poses by tags in {n_images} images ({n_skipped} not looked at, {n_without_tag} without a known tag, \
-             {n_ambiguous} ambiguous, {n_misfit} that fit no pose, {n_uncertain} too unsure, {n_without_joints} without joint states)"
+            "base: {n_poses} poses from tags in {n_images} images ({n_skipped} skipped, {n_without_tag} without a \
+             known tag, {n_ambiguous} ambiguous, {n_misfit} without a fitting pose, {n_uncertain} too uncertain, \
+             {n_without_joints} without joint states)"
         );
     }
 }
 
-/// The covariance of the base's pose, in its own axes, by that of a camera on it.
+/// The covariance of the base pose in base axes, computed from that of a camera on it.
 fn of_base(of_camera: &Matrix6<f64>, base_from_camera: &Transform) -> Matrix6<f64> {
     let camera_from_base = base_from_camera.inverse();
     let columns: [Vector6<f64>; 6] = std::array::from_fn(|ix| {
@@ -256,7 +259,7 @@ mod tests {
         let base_from_camera = Transform::translation(0.0, 0.0, 2.0);
         let of_camera = Matrix6::from_diagonal(&Vector6::new(1e-6, 1e-6, 1e-6, 1e-4, 0.0, 0.0));
         let of_base = of_base(&of_camera, &base_from_camera);
-        // Turned by 10 mrad about x, 2 m away: 20 mm along y.
+        // A rotation of 10 mrad about x at 2 m moves the base by 20 mm along y.
         assert!((of_base[(1, 1)] - (1e-6 + 4e-4)).abs() < 1e-12, "{of_base}");
         assert!((of_base[(0, 0)] - 1e-6).abs() < 1e-12 && (of_base[(2, 2)] - 1e-6).abs() < 1e-12, "{of_base}");
         let rotation_error = kinematics::transform::exp(

@@ -1,4 +1,4 @@
-//! `report.html`: the result of a training run in one file without network access: test images beside renders, scores, settings.
+//! `report.html`: the result of training in one file that works offline: test images next to renders, scores, settings.
 //!
 //! The page is made from `report.json`, from pictures drawn for it, and from the commands to run next.
 
@@ -30,7 +30,7 @@ pub(crate) struct Page<'a> {
     pub(crate) primitive: &'a str,
     pub(crate) comparisons: &'a [Comparison],
     pub(crate) next: &'a [NextCommand],
-    /// Settings of the model from the log of decisions; `Null` if there is no log.
+    /// Settings of the model from the decision log; `Null` if there is no log.
     pub(crate) settings: Value,
     /// The command line of the training.
     pub(crate) command: String,
@@ -148,10 +148,10 @@ fn commands(next: &[NextCommand]) -> String {
     format!("<h2>Next commands</h2>\n<dl class=\"commands card\">\n{entries}</dl>\n")
 }
 
-/// Test images beside renders.
+/// Test images next to renders.
 fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     if comparisons.is_empty() {
-        let reason = if n_tests == 0 { "no image was held out for testing" } else { "no test image could be drawn" };
+        let reason = if n_tests == 0 { "there are no test images" } else { "no test image could be drawn" };
         return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {reason}.</p>\n");
     }
     let count_note = match comparisons.len() == n_tests {
@@ -159,8 +159,8 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
         false => format!("{} of {n_tests} test images, with the best and the worst among them. ", comparisons.len()),
     };
     let mut html = format!(
-        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left the image from the camera, then the model's render from the same pose. \
-         None of these images was used for training.</p>\n<div class=\"shots\">\n"
+        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
+         the same pose. None of these images was used for training.</p>\n<div class=\"shots\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
     let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
@@ -397,7 +397,7 @@ fn array(value: &Value) -> &[Value] {
     value.as_array().map_or(&[], Vec::as_slice)
 }
 
-/// The settings in a folder's log of decisions, which are its first line; `Null` if there is no log.
+/// The settings in the decision log of a folder, which are its first line; `Null` if there is no log.
 pub(crate) fn settings_in(folder: &Path) -> Value {
     let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -467,7 +467,7 @@ mod tests {
     #[test]
     fn page_without_scores_is_valid() {
         let html = page(&json!({ "done": { "method": "tsdf", "psnr": null }, "evaluations": [], "per_image": [] }));
-        assert!(html.contains("no image was held out") && !html.contains("<svg "), "{html}");
+        assert!(html.contains("there are no test images") && !html.contains("<svg "), "{html}");
     }
 
     #[test]
@@ -487,7 +487,7 @@ mod tests {
         assert_eq!(settings_in(folder.path()), Value::Null);
         let write = |name: &str, step: u64| {
             let lines = format!("{}\n{}\n", json!({ "from_step": step }), json!({ "end": true }));
-            std::fs::write(folder.path().join(name), lines).expect("room on the disk");
+            std::fs::write(folder.path().join(name), lines).expect("disk space");
         };
         write("decisions.jsonl", 0);
         assert_eq!(settings_in(folder.path())["from_step"], 0);

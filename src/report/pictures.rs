@@ -1,4 +1,4 @@
-//! Test images beside the model's renders, small enough to be embedded in a page.
+//! Test images next to the model's renders, small enough to embed in a page.
 
 use crate::downscale;
 use crate::evaluate;
@@ -19,7 +19,7 @@ const QUALITY: u8 = 82;
 const SMALL_QUALITY: u8 = 75;
 /// Maximum bytes of all pictures together, in the encoding of the page.
 const MAX_TEXT_BYTES: usize = 2_600_000;
-/// Drawing stops after this time: on a processor, one picture of a neural field may take half a minute.
+/// Drawing stops after this time: on a CPU, one picture of a neural field may take half a minute.
 const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
 /// Color difference that is drawn brightest, of 255.
 const MAX_ERROR: u8 = 64;
@@ -44,7 +44,7 @@ pub(super) struct DepthPicture {
     pub(super) range_m: [f32; 2],
 }
 
-/// A test image to be shown.
+/// A test image with its name and scores.
 pub(crate) struct Scored<'a> {
     pub(crate) keyframe: &'a Arc<Keyframe>,
     pub(crate) name: String,
@@ -78,7 +78,7 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
     let by_psnr = |a: &usize, b: &usize| psnr[*a].total_cmp(&psnr[*b]);
     let mut selected: Vec<usize> = (0..psnr.len()).min_by(by_psnr).into_iter().collect();
     let n_spread = MAX_IMAGES.saturating_sub(2).max(1);
-    // Neighbors come late, so that the images are spread over all of them wherever drawing stops.
+    // Images next to each other come late in the order, so that the shown images are spread out wherever drawing stops.
     let mut spread: Vec<usize> = (0..n_spread).collect();
     spread.sort_by_key(|n| n.reverse_bits());
     let spread = spread.into_iter().map(|n| n * psnr.len() / n_spread);
@@ -180,7 +180,8 @@ fn heat(value_frac: f32) -> [u8; 3] {
     std::array::from_fn(|channel| byte(STOPS[ix][channel] + frac * (STOPS[ix + 1][channel] - STOPS[ix][channel])))
 }
 
-/// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved rainbow colormap", reversed.
+/// Color map from red (near) to blue (far): the polynomial of Mikhailov 2019, "Turbo, an improved rainbow colormap",
+/// reversed.
 fn turbo(value_frac: f32) -> [u8; 3] {
     const RED: [f32; 6] = [0.135_721_4, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38];
     const GREEN: [f32; 6] = [0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_5, 2.829_566];

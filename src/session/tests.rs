@@ -1,4 +1,4 @@
-//! Scoring image by image gives the same result as scoring at once.
+//! Scoring image by image gives the same result as scoring all at once.
 
 use super::*;
 use kinematics::{Stamp, Transform};
