@@ -156,5 +156,5 @@ fn model_round_trips_through_spz() {
     std::fs::write(&spz_file, &whole[..whole.len() / 2]).unwrap();
     let again = folder.path().join("cut.ply");
     let stderr_text = error_message(&fieldrig(&["export", text(&spz_file), "--to", "ply", "--out", text(&again)]), 1);
-    assert!(stderr_text.contains("scene.spz") && stderr_text.contains("cut off"), "{stderr_text}");
+    assert!(stderr_text.contains("scene.spz") && stderr_text.contains("truncated"), "{stderr_text}");
 }

@@ -78,9 +78,9 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
         std::fs::write(&file, bytes).unwrap();
         assert_fails(&train(folder, &["--resume", "half", "--out", "x"]).output().unwrap(), 1)
     };
-    assert!(printed(&whole[..whole.len() / 2]).contains("cut off"));
+    assert!(printed(&whole[..whole.len() / 2]).contains("truncated"));
     assert!(
-        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 2")
+        printed(&[&whole[..8], &[9], &whole[9..]].concat()).contains("version 9 of the format, this program reads 3")
     );
     let mut damaged = whole.clone();
     damaged[whole.len() / 2] ^= 1;
