@@ -37,7 +37,7 @@ from scipy.sparse.csgraph import connected_components
 CPU = o3c.Device("CPU:0")
 # What our truncation is where depth is exact, in voxels.
 TRUNCATION_VOXELS = 4.0
-# Our vertices are floats of some metres; vertices of neighboring blocks that should be one differ by less than this.
+# Our vertices are floats of some meters; vertices of neighboring blocks that should be one differ by less than this.
 WELD_M = 1e-5
 N_SAMPLES = 400_000
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

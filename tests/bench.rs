@@ -114,7 +114,7 @@ fn curve_bench_draws_peers_and_resumes() {
     assert_fails_with(folder, &changed, 2, &["max_splats", "--out c"]);
 }
 
-/// Depth images, a metre everywhere: what the wall of [`scene`] is away.
+/// Depth images, a meter everywhere: what the wall of [`scene`] is away.
 fn add_depth(folder: &Path) {
     let file = folder.join("transforms.json");
     let mut scene: Value = serde_json::from_slice(&std::fs::read(&file).expect("a scene")).expect("JSON");

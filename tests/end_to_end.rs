@@ -505,7 +505,7 @@ fn port_in_use_is_one_clear_error() {
     assert!(printed.starts_with("error: ") && printed.contains(&address), "{printed}");
 }
 
-/// The hand-eye calibration of a rig file: metres, and a quaternion as x, y, z, w.
+/// The hand-eye calibration of a rig file: meters, and a quaternion as x, y, z, w.
 fn hand_eye(file: &Path) -> (Vec<f64>, Vec<f64>) {
     let rig: toml::Table = std::fs::read_to_string(file).expect("a rig file").parse().expect("TOML");
     let pose = &rig["camera"]["wrist"]["parent_from_camera"];

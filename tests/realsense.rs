@@ -24,7 +24,7 @@ file = "front.bag"
 [camera.front.depth]
 "#;
 
-/// A camera whose depth lies 15 mm beside its colour.
+/// A camera whose depth lies 15 mm beside its color.
 fn write_bag(path: &Path) {
     let lens = |focal_px| Intrinsics {
         size_px: [320, 240],

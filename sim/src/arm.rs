@@ -11,7 +11,7 @@ use std::sync::Arc;
 /// Nanoseconds a step of the dynamics, and between joint readings.
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
-/// Stiffness, newton metres per radian, and damping, newton metre seconds per radian, of each joint's controller.
+/// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each joint's controller.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
@@ -76,7 +76,7 @@ impl Arm {
         })
     }
 
-    /// Joint positions at a time among the kept readings: a cubic through both neighbours and their velocities.
+    /// Joint positions at a time among the kept readings: a cubic through both neighbors and their velocities.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let first = self.readings.front()?;
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;

@@ -24,13 +24,13 @@ const GAIT_HZ: f64 = 1.7;
 const BOUNCE_M: f64 = 0.007;
 const ROLL_RAD: f64 = 0.008;
 const PITCH_RAD: f64 = 0.006;
-/// Height of the body's middle above the floor, metres.
+/// Height of the body's middle above the floor, meters.
 pub(crate) const BODY_Z_M: f64 = 0.52;
 
 /// When the base leaves its first stand and how long it walks to the second, seconds at speed 1.
 const DEPARTURE_SECS: f64 = 14.0;
 const WALK_DURATION_SECS: f64 = 5.0;
-/// The stands: x, y and heading, metres and radians.
+/// The stands: x, y and heading, meters and radians.
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
 const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 

@@ -11,21 +11,21 @@ use crate::texture::{self, Texture};
 use kinematics::Transform;
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 
-/// The plane of the cabinet's opening, metres along x.
+/// The plane of the cabinet's opening, meters along x.
 pub(crate) const FRONT_X_M: f64 = 2.05;
-/// Middle of the opening, metres.
+/// Middle of the opening, meters.
 pub(crate) const CENTER_Z_M: f64 = 0.95;
-/// Half the side of the opening, and how deep the cabinet is, metres.
+/// Half the side of the opening, and how deep the cabinet is, meters.
 pub(crate) const HALF_M: f64 = 0.5;
-/// Depth of the cabinet, metres.
+/// Depth of the cabinet, meters.
 pub(crate) const DEPTH_M: f64 = 0.36;
-/// Middle of the screen on the box inside, metres.
+/// Middle of the screen on the box inside, meters.
 pub(crate) const SCREEN_M: [f64; 3] = [2.20, 0.12, 0.97];
 
 const SHEET_M: f64 = 0.012;
 const BOX_HALF_M: [f64; 3] = [0.09, 0.16, 0.12];
 const SWITCH_M: [f64; 3] = [2.36, -0.23, 0.98];
-/// The room: nearest and furthest x, half its width, and height, metres.
+/// The room: nearest and furthest x, half its width, and height, meters.
 const ROOM_X_M: [f64; 2] = [-2.2, 2.48];
 const ROOM_HALF_Y_M: f64 = 2.4;
 const ROOM_HEIGHT_M: f64 = 2.7;

@@ -20,7 +20,7 @@ pub(crate) struct CabinetTour {
 /// Seconds at the second stand before the camera goes in, and of one way in and out.
 const OUTSIDE_SECS: f64 = 9.0;
 const IN_AND_OUT_SECS: f64 = 22.0;
-/// The lamps change over this stretch before the opening and behind it, metres.
+/// The lamps change over this stretch before the opening and behind it, meters.
 const LIGHT_TRANSITION_M: [f64; 2] = [-0.20, 0.02];
 
 impl CabinetTour {

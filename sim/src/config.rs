@@ -13,7 +13,7 @@ pub struct Config {
     pub seed: u64,
     /// Switches every flaw of the sensors off: noise, blur, shear, holes, latency, dropped images. Lens and range limits stay.
     pub ideal: bool,
-    /// Whether each colour image is followed by its [`drivers::TruthImage`].
+    /// Whether each color image is followed by its [`drivers::TruthImage`].
     pub truth: bool,
     /// Whether the truth of cameras with depth carries the noise-free depth.
     pub truth_depth: bool,
@@ -23,7 +23,7 @@ pub struct Config {
     pub azimuth_only: bool,
     /// The rig ends after this simulated time, seconds.
     pub duration_secs: Option<f64>,
-    /// The rig ends once the first camera has delivered this many colour images.
+    /// The rig ends once the first camera has delivered this many color images.
     pub n_images: Option<u64>,
     /// Names of the arm's joints from base to flange.
     pub joint_names: Vec<String>,
@@ -44,7 +44,7 @@ pub struct Config {
 pub struct BaseConfig {
     /// Poses a second.
     pub rate_hz: f64,
-    /// Root mean square of the error of the told position at the end of the walk (one lap, or the last stand), metres. The error
+    /// Root mean square of the error of the told position at the end of the walk (one lap, or the last stand), meters. The error
     /// grows with the square root of the way.
     pub drift_m: f64,
     /// The same of the told orientation, radians.
@@ -72,11 +72,11 @@ pub struct ScannerConfig {
     pub elevation_rad: [f64; 2],
     /// Directions of each ring a turn.
     pub n_columns: u32,
-    /// Nearer and further surfaces give no echo, metres.
+    /// Nearer and further surfaces give no echo, meters.
     pub min_m: f64,
     /// See `min_m`.
     pub max_m: f64,
-    /// Standard deviation of the range, metres.
+    /// Standard deviation of the range, meters.
     pub noise_sigma_m: f64,
     /// Share of the echoes that are lost.
     pub dropped_frac: f64,
@@ -164,18 +164,18 @@ pub struct CameraConfig {
     pub parent: Parent,
     /// Pose on the parent.
     pub parent_from_camera: Transform,
-    /// Flaws of the colour images.
+    /// Flaws of the color images.
     pub sensor: SensorConfig,
     /// Depth images, where the camera has them.
     pub depth: Option<DepthConfig>,
 }
 
-/// Flaws of colour images. Exposure and white balance are locked.
+/// Flaws of color images. Exposure and white balance are locked.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorConfig {
-    /// Standard deviation of the noise at mid grey (128), in steps of 255.
+    /// Standard deviation of the noise at mid gray (128), in steps of 255.
     pub noise_sigma: f64,
-    /// Share of the noise variance at mid grey that is shot noise (grows with brightness); the rest is read noise.
+    /// Share of the noise variance at mid gray that is shot noise (grows with brightness); the rest is read noise.
     pub shot_frac: f64,
     /// Exposure time, microseconds. It only blurs when `blur_samples` is above 1.
     pub exposure_micros: f64,
@@ -206,29 +206,29 @@ impl Default for SensorConfig {
     }
 }
 
-/// Flaws and limits of depth images, which come with the stamp of the colour image and a global shutter.
+/// Flaws and limits of depth images, which come with the stamp of the color image and a global shutter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
-    /// Where depth has a lens and a place of its own; else it is registered to the colour image.
+    /// Where depth has a lens and a place of its own; else it is registered to the color image.
     pub sensor: Option<DepthSensor>,
-    /// Standard deviation at 1 m, metres; grows with the square of the depth.
+    /// Standard deviation at 1 m, meters; grows with the square of the depth.
     pub noise_sigma_m: f64,
     /// Share of the pixels without depth, most of them where depth jumps.
     pub hole_frac: f64,
-    /// Nearer surfaces have no depth, metres.
+    /// Nearer surfaces have no depth, meters.
     pub min_m: f64,
-    /// Further surfaces have no depth, metres.
+    /// Further surfaces have no depth, meters.
     pub max_m: f64,
-    /// Metres per count of the delivered image.
+    /// Meters per count of the delivered image.
     pub meters_per_count: f64,
 }
 
-/// A depth sensor beside the colour sensor.
+/// A depth sensor beside the color sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthSensor {
     /// Lens parameters and size of the depth images.
     pub intrinsics: Intrinsics,
-    /// Its pose in the frame of the colour camera.
+    /// Its pose in the frame of the color camera.
     pub camera_from_depth: Transform,
 }
 
@@ -258,7 +258,7 @@ impl CameraConfig {
         }
     }
 
-    /// A wrist RGB-D camera like a `RealSense` L515 for what stands upright before the arm: 1280x720 colour at 4 Hz, depth of
+    /// A wrist RGB-D camera like a `RealSense` L515 for what stands upright before the arm: 1280x720 color at 4 Hz, depth of
     /// 640x480 with a lens and a place of its own, tilted by 80 degrees.
     pub fn mobile_wrist(name: &str) -> Self {
         let pinhole = |size_px, focal_px, principal_px| Intrinsics {

@@ -25,7 +25,7 @@ impl HeadlessContext {
     ///
     /// On machines with a graphics card Mesa's surfaceless platform may draw in software, so devices come first.
     pub(crate) fn open() -> Result<Self, Error> {
-        // SAFETY: loading libEGL runs its initialisers, which are those of the system's own library.
+        // SAFETY: loading libEGL runs its initializers, which are those of the system's own library.
         let egl = unsafe { Egl::load_required() }.map_err(|error| Error::NoEgl { reason: error.to_string() })?;
         let devices = devices(&egl);
         let hardware = devices.iter().filter(|device| !device.is_software);

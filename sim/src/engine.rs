@@ -168,7 +168,7 @@ impl Camera {
         }
     }
 
-    /// What the depth sensor sees where it is not the colour sensor.
+    /// What the depth sensor sees where it is not the color sensor.
     fn depth_view(&self, world_from_camera: &Transform) -> Option<render::View> {
         let sensor = self.config.depth.as_ref()?.sensor.as_ref()?;
         Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, None, 1.0))

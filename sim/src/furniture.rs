@@ -26,9 +26,9 @@ pub(crate) fn upright(at_m: [f64; 3], yaw_degrees: f64) -> Transform {
     Transform::from_parts(Translation3::from(Vector3::from(at_m)), yaw)
 }
 
-/// A light wooden bench: half length, half depth and height of its top, metres.
+/// A light wooden bench: half length, half depth and height of its top, meters.
 const BENCH_M: [f64; 3] = [0.9, 0.375, 0.85];
-/// A shelf: half length, half depth and height, metres.
+/// A shelf: half length, half depth and height, meters.
 const SHELF_M: [f64; 3] = [0.75, 0.22, 2.0];
 
 impl Furniture {

@@ -10,11 +10,11 @@ use crate::texture::{self, Texture};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Half sizes of the room along x and y, and its height, metres.
+/// Half sizes of the room along x and y, and its height, meters.
 pub const ROOM_HALF_M: [f64; 2] = [7.5, 5.0];
-/// Height of the ceiling, metres.
+/// Height of the ceiling, meters.
 pub const ROOM_HEIGHT_M: f64 = 3.0;
-/// Half sizes of the pedestal, metres.
+/// Half sizes of the pedestal, meters.
 pub const PEDESTAL_HALF_M: [f64; 3] = [0.24, 0.24, 0.42];
 
 /// What stands where: `(x, y, degrees)` that it faces.
@@ -123,7 +123,7 @@ pub(crate) fn objects() -> Vec<Object> {
     objects
 }
 
-/// Height of the pedestal's top, metres.
+/// Height of the pedestal's top, meters.
 const TOP_M: f64 = 2.0 * PEDESTAL_HALF_M[2];
 
 fn bowl() -> Mesh {
@@ -136,7 +136,7 @@ fn bowl() -> Mesh {
     mesh
 }
 
-/// Fruit in the bowl, a mesh a colour.
+/// Fruit in the bowl, a mesh a color.
 fn fruit() -> [Mesh; 3] {
     let ball = |places: &[[f64; 4]]| {
         let mut mesh = Mesh::default();
@@ -176,7 +176,7 @@ fn ceiling() -> Mesh {
     let mut mesh = Mesh::default();
     let center = Point3::new(0.0, 0.0, ROOM_HEIGHT_M);
     mesh.rectangle(center, Vector3::x() * ROOM_HALF_M[0], Vector3::y() * -ROOM_HALF_M[1], WHOLE);
-    // Beams, so that the ceiling is not one colour.
+    // Beams, so that the ceiling is not one color.
     for x in [-5.0, -2.5, 0.0, 2.5, 5.0] {
         mesh.append(Mesh::cuboid([0.08, ROOM_HALF_M[1], 0.1], &[WHOLE; 6]), Vector3::new(x, 0.0, ROOM_HEIGHT_M - 0.1));
     }

@@ -10,7 +10,7 @@ const N_ACROSS: usize = 4;
 
 /// Rectangle of a picture on a sheet; numbers beyond the last start again.
 pub(crate) fn picture(ix: usize) -> TextureRect {
-    /// Mip levels must not mix neighbours.
+    /// Mip levels must not mix neighbors.
     const INSET: f64 = 0.004;
     let side = 1.0 / N_ACROSS as f64;
     let (x, y) = ((ix % N_ACROSS) as f64 * side, (ix / N_ACROSS % N_ACROSS) as f64 * side);
@@ -25,7 +25,7 @@ fn sheet(paint: impl Fn(usize, f64, f64) -> Color + Sync) -> Texture {
     })
 }
 
-/// A colour with a hue of 0 to 1.
+/// A color with a hue of 0 to 1.
 fn hue(at: f64, dark: f64, light: f64) -> Color {
     let channel = |shift: f64| dark + (light - dark) * (0.5 + 0.5 * ((at + shift) * std::f64::consts::TAU).cos());
     [channel(0.0), channel(-1.0 / 3.0), channel(1.0 / 3.0)]

@@ -31,7 +31,7 @@ impl RayCaster {
         Self { data }
     }
 
-    /// Distances along unit vectors from one point, metres; `None` where a ray meets nothing within `max_distance_m`.
+    /// Distances along unit vectors from one point, meters; `None` where a ray meets nothing within `max_distance_m`.
     fn cast(
         &mut self,
         from: &Vector3<f64>,

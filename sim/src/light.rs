@@ -61,12 +61,12 @@ pub(crate) fn mjcf(gain: f64) -> (String, String) {
 
 /// What stands in the light's way.
 pub(crate) struct Occluders {
-    /// Boxes: pose of the centre inverted, and half sizes.
+    /// Boxes: pose of the center inverted, and half sizes.
     boxes: Vec<(Transform, Vector3<f64>)>,
     ellipsoids: Vec<Ellipsoid>,
     /// Sphere around all ellipsoids.
     bounds: (Point3<f64>, f64),
-    /// What is further away takes no ambient light, metres.
+    /// What is further away takes no ambient light, meters.
     ambient_reach_m: f64,
 }
 
@@ -86,7 +86,7 @@ impl Occluders {
         self.boxes.push((world_from_box.inverse(), Vector3::from(half_m)));
     }
 
-    /// Adds ellipsoids by centre and half axes that lie inside a sphere.
+    /// Adds ellipsoids by center and half axes that lie inside a sphere.
     pub(crate) fn add_ellipsoids(
         &mut self,
         ellipsoids: impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])>,

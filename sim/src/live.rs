@@ -25,7 +25,7 @@ const MAX_LATE: Duration = Duration::from_millis(50);
 pub struct LiveRig {
     /// Cameras in the order of the configuration, the arm, the base where it moves, scanners.
     pub devices: Devices,
-    /// Ground truth of colour images and base poses; the oldest goes when nobody takes it.
+    /// Ground truth of color images and base poses; the oldest goes when nobody takes it.
     pub truth: LiveTruth,
     /// What the rig is made of.
     pub info: RigInfo,
@@ -70,7 +70,7 @@ struct SharedQueues {
 struct QueueState {
     /// One a camera.
     images: Vec<VecDeque<Image>>,
-    /// Images of a camera lost and not yet told: colour and depth.
+    /// Images of a camera lost and not yet told: color and depth.
     n_dropped: Vec<[u64; 2]>,
     readings: VecDeque<JointState>,
     poses: VecDeque<BasePose>,

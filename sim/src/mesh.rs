@@ -76,7 +76,7 @@ impl Mesh {
     }
 
     /// An ellipsoid given by three perpendicular half axes; `texture_x` tells where in the texture a point looks up its
-    /// colour, by the point and its normal, and `texture_y` is the same for all.
+    /// color, by the point and its normal, and `texture_y` is the same for all.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
@@ -144,7 +144,7 @@ impl Mesh {
         self.append(other, Vector3::zeros());
     }
 
-    /// A surface turned about z: from `(radius, z)` to `(radius, z)`, metres, seen from the left of that way, upwards from outside.
+    /// A surface turned about z: from `(radius, z)` to `(radius, z)`, meters, seen from the left of that way, upwards from outside.
     ///
     /// The texture runs once around, its top at the first point; between points that lie on a bend the normals are smooth.
     pub(crate) fn lathe(profile_m: &[[f64; 2]], n_sectors: u32, texture: TextureRect, is_smooth: bool) -> Self {

@@ -1,4 +1,4 @@
-//! Noise of colour and depth images, and the holes of depth images.
+//! Noise of color and depth images, and the holes of depth images.
 #![expect(clippy::cast_possible_truncation, reason = "values are clamped before they become integers")]
 
 use crate::config::{DepthConfig, SensorConfig};
@@ -7,7 +7,7 @@ use rayon::prelude::{
     IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice, ParallelSliceMut,
 };
 
-/// Rounds colours to bytes.
+/// Rounds colors to bytes.
 pub(crate) fn to_bytes(colors: &[f32]) -> Vec<u8> {
     colors.iter().map(|color| to_byte(*color)).collect()
 }
@@ -16,7 +16,7 @@ fn to_byte(value: f32) -> u8 {
     (value.clamp(0.0, 255.0) + 0.5) as u8
 }
 
-/// Adds shot and read noise to `[height, width, 3]` colours of 0 to 255.
+/// Adds shot and read noise to `[height, width, 3]` colors of 0 to 255.
 pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: Random) -> Vec<u8> {
     const PIXELS_A_CHUNK: usize = 640;
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
@@ -41,7 +41,7 @@ pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
     sensor.noise_sigma * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY).max(0.0).sqrt()
 }
 
-/// PSNR in dB of bytes against colours rounded to bytes; infinite where they are the same.
+/// PSNR in dB of bytes against colors rounded to bytes; infinite where they are the same.
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     const SAMPLES_A_CHUNK: usize = 4096;
     // Chunks, so that the innermost loop is one over slices.
@@ -53,7 +53,7 @@ pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     10.0 * (255.0 * 255.0 / mean_square).log10()
 }
 
-/// Turns true depth into counts: noise, range limits, holes, quantisation. 0 is a hole.
+/// Turns true depth into counts: noise, range limits, holes, quantization. 0 is a hole.
 pub(crate) fn depth_counts(
     depth_m: &[f32],
     width: usize,

@@ -7,22 +7,22 @@ use crate::toy;
 use kinematics::Transform;
 use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Height of the table top above the robot's base, metres.
+/// Height of the table top above the robot's base, meters.
 pub const TABLE_Z_M: f64 = 0.12;
-/// Middle of the target area on the table, metres.
+/// Middle of the target area on the table, meters.
 pub const TARGET_XY_M: [f64; 2] = [0.74, 0.0];
-/// Half the side of the tag cube, metres.
+/// Half the side of the tag cube, meters.
 pub const CUBE_HALF_M: f64 = 0.03;
-/// Half sizes of the wooden block, metres.
+/// Half sizes of the wooden block, meters.
 pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
 
-/// Half sizes of the table's top along x and y, and its nearest x, metres.
+/// Half sizes of the table's top along x and y, and its nearest x, meters.
 const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
 const TABLE_FRONT_X_M: f64 = TARGET_XY_M[0] - 0.34;
 const TABLE_HALF_THICKNESS_M: f64 = 0.02;
-/// Half width and half height of a wall, metres.
+/// Half width and half height of a wall, meters.
 const WALL_HALF_M: [f64; 2] = [0.50, 0.50];
-/// The corner where the walls meet, metres.
+/// The corner where the walls meet, meters.
 const CORNER_XY_M: [f64; 2] = [TARGET_XY_M[0] + 0.42, 0.0];
 
 fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
@@ -32,7 +32,7 @@ fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
     )
 }
 
-/// Pose of the tag cube's centre. Its sides +x, -x, +y, -y, +z, -z carry the tags 0 to 5.
+/// Pose of the tag cube's center. Its sides +x, -x, +y, -y, +z, -z carry the tags 0 to 5.
 pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
 }
@@ -47,7 +47,7 @@ pub fn world_from_tag(id: usize) -> Transform {
     world_from_cube() * cube_from_tag
 }
 
-/// Pose of the wooden block's centre.
+/// Pose of the wooden block's center.
 pub fn world_from_block() -> Transform {
     on_table(-0.045, -0.058, BLOCK_HALF_M[2], -35.0)
 }

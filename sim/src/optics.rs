@@ -15,7 +15,7 @@ pub(crate) struct Optics {
     intrinsics: Intrinsics,
     supersample: u32,
     margin_px: u32,
-    /// `[height, width]`: x and y of the point at z = 1 that each pixel's centre sees.
+    /// `[height, width]`: x and y of the point at z = 1 that each pixel's center sees.
     rays: Vec<[f32; 2]>,
     /// Size and pinhole of the pictures to draw: the image and a margin, supersampled.
     view_size_px: [u32; 2],
@@ -165,7 +165,7 @@ impl Optics {
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
             for row_motion in &row_motions[row * n_samples..(row + 1) * n_samples] {
-                // A pixel's neighbour has moved by almost as much: where the search starts.
+                // A pixel's neighbor has moved by almost as much: where the search starts.
                 let mut offset_px = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
                     let static_px = self.drawn_from_ray(ray);
@@ -185,7 +185,7 @@ impl Optics {
         })
     }
 
-    /// Depth along z at the centre of each pixel, `[height, width]`, metres.
+    /// Depth along z at the center of each pixel, `[height, width]`, meters.
     pub(crate) fn depth_m(&self, picture: &Picture) -> Vec<f32> {
         let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
         let mut depth_m = vec![0.0; width * height];
@@ -234,7 +234,7 @@ impl Optics {
         drawn
     }
 
-    /// Mean colour of the square of one image pixel around a position in the drawn picture.
+    /// Mean color of the square of one image pixel around a position in the drawn picture.
     fn color_at(&self, picture: &Picture, at: [f32; 2]) -> [f32; 3] {
         let side = self.supersample as usize;
         if side == 1 {
@@ -267,7 +267,7 @@ impl Optics {
 
     /// Depth at a position in the drawn picture: the mean of what surrounds it on one surface, else the nearest of it.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
-        /// Neighbours further apart than this share belong to different surfaces.
+        /// Neighbors further apart than this share belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;
         if self.supersample % 2 == 1 {
             return nearest_depth(picture, at);
@@ -280,7 +280,7 @@ impl Optics {
     }
 }
 
-/// Colour at a position between four pixels' centres.
+/// Color at a position between four pixels' centers.
 fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     let [width, height] = picture.size_px;
     let x = (at[0] - 0.5).clamp(0.0, width as f32 - 1.001);

@@ -29,7 +29,7 @@ const LINKS: [Link; N_JOINTS] = [
     Link { a_m: 0.0, alpha_rad: QUARTER, d_m: 0.0 },
     Link { a_m: 0.088, alpha_rad: QUARTER, d_m: 0.0 },
 ];
-/// From the last joint to the flange along its axis, metres.
+/// From the last joint to the flange along its axis, meters.
 const FLANGE_M: f64 = 0.107;
 
 /// Lower limits of the joints, radians.
@@ -42,7 +42,7 @@ pub(crate) const MAX_SPEED_RAD_S: [f64; N_JOINTS] = [2.175, 2.175, 2.175, 2.175,
 pub(crate) const MAX_ACCELERATION_RAD_S2: [f64; N_JOINTS] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
 /// Largest joint jerks, radians per second cubed.
 pub(crate) const MAX_JERK_RAD_S3: [f64; N_JOINTS] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
-/// Largest joint torques, newton metres.
+/// Largest joint torques, newton meters.
 pub(crate) const MAX_TORQUE_NM: [f64; N_JOINTS] = [87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0];
 
 impl Link {
@@ -86,11 +86,11 @@ pub(crate) fn jacobian(position_rad: &Joints, flange_from_tip: &Transform) -> (T
 
 /// A primitive of the arm's body in the frame of its link.
 enum Shape {
-    /// Between two points, metres, with a radius.
+    /// Between two points, meters, with a radius.
     Capsule([f64; 3], [f64; 3], f64),
-    /// Between two points, metres, with a radius.
+    /// Between two points, meters, with a radius.
     Cylinder([f64; 3], [f64; 3], f64),
-    /// Centre and half sizes, metres.
+    /// Center and half sizes, meters.
     Box([f64; 3], [f64; 3]),
 }
 use Shape::{Box, Capsule, Cylinder};

@@ -47,7 +47,7 @@ pub(crate) struct Picture {
     pub(crate) size_px: [u32; 2],
     /// `[height, width, 3]`, sRGB.
     pub(crate) rgb: Vec<u8>,
-    /// `[height, width]`, metres along z.
+    /// `[height, width]`, meters along z.
     pub(crate) depth_m: Vec<f32>,
 }
 
@@ -200,7 +200,7 @@ impl Canvas {
 
     /// Makes all lamps brighter or darker.
     fn scale_lights(&mut self, light_frac: f32) {
-        // SAFETY: only colours of lamps are written, which hold plain numbers.
+        // SAFETY: only colors of lamps are written, which hold plain numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
         for lamp in scene.lights.iter_mut().take(n_lamps) {

@@ -61,7 +61,7 @@ pub struct RigInfo {
 pub struct CameraInfo {
     /// Name in the rig file.
     pub name: String,
-    /// Lens parameters of colour and depth.
+    /// Lens parameters of color and depth.
     pub intrinsics: Intrinsics,
     /// What the camera is fixed to.
     pub parent: Parent,

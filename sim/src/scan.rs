@@ -36,7 +36,7 @@ const DISTANCE_M: Oscillation = Oscillation(0.35, 0.10, 9.2, 0.10);
 const ROLL_DEGREES: Oscillation = Oscillation(0.0, 20.0, 8.3, 0.60);
 const LOOK_AT_X_M: Oscillation = Oscillation(0.0, 0.03, 6.3, 0.0);
 const LOOK_AT_Y_M: Oscillation = Oscillation(0.0, 0.04, 7.7, 0.5);
-/// Height of the point looked at above the table, metres.
+/// Height of the point looked at above the table, meters.
 const LOOK_AT_HEIGHT_M: f64 = 0.06;
 /// The motion starts from rest within this time, seconds.
 const START_SECS: f64 = 0.5;
@@ -122,7 +122,7 @@ const REST_POSTURE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::
 const LIMIT_MARGIN_RAD: f64 = 0.05;
 /// Share of the joints' largest speed that the scan uses.
 const SPEED_LIMIT_FRAC: f64 = 0.5;
-/// Damping of the least squares, in metres and radians.
+/// Damping of the least squares, in meters and radians.
 const DAMPING: f64 = 0.03;
 /// How fast pose errors and discomfort fade, per second.
 const POSE_GAIN_HZ: f64 = 8.0;

@@ -18,7 +18,7 @@ pub(crate) const ARM_GROUP: usize = 1;
 /// Group of the geometry that light passes through.
 pub(crate) const GLASS_GROUP: usize = 2;
 
-/// Nearest and furthest drawn distance, metres.
+/// Nearest and furthest drawn distance, meters.
 pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     match scene {
         Scene::StaticArm | Scene::MobileArm => [0.02, 12.0],
@@ -153,7 +153,7 @@ fn add_file(files: &mut MjVfs, name: &str, bytes: &[u8]) -> Result<(), Error> {
     files.add_from_buffer(name, bytes).map_err(|error| Error::Scene { reason: format!("{name}: {error}") })
 }
 
-/// Bodies of the cameras on the flange, just behind their optical centres.
+/// Bodies of the cameras on the flange, just behind their optical centers.
 fn brackets(config: &Config) -> String {
     let mut xml = String::new();
     for camera in config.cameras.iter().filter(|camera| camera.parent == Parent::Flange) {

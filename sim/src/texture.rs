@@ -7,7 +7,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator, ParallelSliceMut};
 
-/// Colour, sRGB 0 to 1.
+/// Color, sRGB 0 to 1.
 pub(crate) type Color = [f64; 3];
 
 /// A square picture, sRGB.
@@ -34,7 +34,7 @@ impl Texture {
     /// `share_at` takes the position in the rectangle, 0 to 1 from its top left, and a number of its own.
     pub(crate) fn shade(&mut self, rectangle: [f64; 4], n: usize, share_at: impl Fn(f64, f64, u64) -> f64 + Sync) {
         let step = 1.0 / (n - 1) as f64;
-        // On the very edge a point may lie inside its neighbour.
+        // On the very edge a point may lie inside its neighbor.
         let inside = |at: usize| (at as f64 * step).clamp(EDGE, 1.0 - EDGE);
         let shares: Vec<f64> =
             (0..n * n).into_par_iter().map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64)).collect();
@@ -84,7 +84,7 @@ pub(crate) const SIDE_PX: usize = 1024;
 /// How far from a rectangle's edge light is told at the least, as a share of its side.
 const EDGE: f64 = 0.005;
 
-/// Mean of each point of a square grid and its neighbours.
+/// Mean of each point of a square grid and its neighbors.
 fn blurred(grid: &[f64], side: usize) -> Vec<f64> {
     let around = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
     let mean = |ix: usize| {
@@ -299,7 +299,7 @@ impl Grain {
     }
 }
 
-/// Fur colours, brighter to the right. Top to bottom of a band: tip to root. Bands: [`FurBand`].
+/// Fur colors, brighter to the right. Top to bottom of a band: tip to root. Bands: [`FurBand`].
 pub(crate) fn fur() -> Texture {
     let skin = Noise::new(52);
     Texture::paint(SIDE_PX / 2, |x, y| {

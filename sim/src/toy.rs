@@ -80,12 +80,12 @@ const PARTS: [Part; 22] = [
 /// Share of the light at a point of the toy, with the normal there and a number of its own.
 pub(crate) type Light<'a> = &'a dyn Fn(&Point3<f64>, &Vector3<f64>, u64) -> f64;
 
-/// The parts that stand in the light's way: centres and half axes.
+/// The parts that stand in the light's way: centers and half axes.
 pub(crate) fn ellipsoids() -> impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])> {
     PARTS.iter().map(|part| (part.center(), part.half_axes()))
 }
 
-/// A sphere around the toy: centre and radius, metres.
+/// A sphere around the toy: center and radius, meters.
 pub(crate) fn bounds() -> (Point3<f64>, f64) {
     (Point3::new(0.02, 0.0, 0.085), 0.115)
 }
@@ -95,7 +95,7 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Skin has the colour of the roots where hair grows, else the whole band's.
+        // Skin has the color of the roots where hair grows, else the whole band's.
         let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
         let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
             // Patches as small as tufts, so that skin between hairs does not look bare.

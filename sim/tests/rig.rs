@@ -27,7 +27,7 @@ fn chain(info: &RigInfo) -> Chain {
     Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("our URDF is valid")
 }
 
-/// Joint positions at a stamp, by a straight line between the neighbouring readings.
+/// Joint positions at a stamp, by a straight line between the neighboring readings.
 fn joints_at(joints: &[JointState], stamp: Stamp) -> Vec<f64> {
     let after = joints.partition_point(|state| state.stamp < stamp).max(1);
     let (a, b) = (&joints[after - 1], &joints[after]);
@@ -208,7 +208,7 @@ fn depth_matches_table_and_cube() {
         let in_camera = camera_from_world * point;
         let [u, v] = intrinsics.project(&in_camera.coords).expect("in front");
         let ix = v as usize * intrinsics.size_px[0] as usize + u as usize;
-        // The depth of the plane z = point.z along the ray of the pixel's centre.
+        // The depth of the plane z = point.z along the ray of the pixel's center.
         let ray = intrinsics.unproject([u.floor() + 0.5, v.floor() + 0.5]).expect("a pinhole");
         let up_in_camera = camera_from_world.rotation * Vector3::z();
         let expected = up_in_camera.dot(&in_camera.coords) / up_in_camera.dot(&ray);

@@ -114,7 +114,7 @@ pub(crate) struct CropMessage {
 pub(crate) enum Output {
     /// JPEG.
     Color,
-    /// Metres along z, see [`DepthFormat`].
+    /// Meters along z, see [`DepthFormat`].
     Depth,
 }
 

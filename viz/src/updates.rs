@@ -79,9 +79,9 @@ impl Status {
 /// Where the scene is and where an operator's view starts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneHint {
-    /// What to look at and turn around, in world, metres.
+    /// What to look at and turn around, in world, meters.
     pub center_m: [f64; 3],
-    /// Distance from the center that holds what matters, metres.
+    /// Distance from the center that holds what matters, meters.
     pub radius_m: f64,
     /// First view.
     pub world_from_camera: Transform,

@@ -11,9 +11,9 @@ pub(crate) const MAX_SIZE_PX: u32 = 4096;
 const MAX_STAGES: usize = 8;
 /// Shares of the full width and height that are drawn one after the other if the client does not say.
 pub(crate) const DEFAULT_STAGES: [f64; 3] = [0.1, 0.5, 1.0];
-/// Nearest drawn depth if the client does not say, metres.
+/// Nearest drawn depth if the client does not say, meters.
 const DEFAULT_NEAR_M: f64 = 0.01;
-/// Furthest drawn depth if the client does not say, metres.
+/// Furthest drawn depth if the client does not say, meters.
 const DEFAULT_FAR_M: f64 = 100.0;
 
 /// What is wrong with a message; shown to the client.

@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use trainer::{Picture, Projection, RenderRequest};
 
-/// A ball: center and radius in metres, sRGB color.
+/// A ball: center and radius in meters, sRGB color.
 struct Ball {
     center: Point3<f64>,
     radius_m: f64,

@@ -1,5 +1,5 @@
 // The one place where three.js cameras (x right, y up, z backward) and ours (x right, y down, z forward) meet.
-// Both worlds are the same: right-handed, z up, metres.
+// Both worlds are the same: right-handed, z up, meters.
 
 import { Matrix4, type PerspectiveCamera } from "three";
 import type { Pinhole } from "./protocol";
