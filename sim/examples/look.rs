@@ -1,4 +1,4 @@
-//! Plays the default rig and writes its pictures into a folder, to look at and to time.
+//! Runs the default rig and writes its images into a folder, for inspection and timing.
 //!
 //! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal|mobile-base|mobile-arm]`
 
