@@ -1,4 +1,4 @@
-# The same commands by hand and in continuous integration; `make` alone lists them.
+# The same commands for developers and continuous integration; `make` without arguments lists them.
 #
 # As root, every target installs missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages)
 # and lists them; without root, it prints the one command that installs them.
@@ -11,13 +11,13 @@
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
-# Tests have webcams by nokhwa beside that, and RealSense cameras where there is a library for them: see `realsense`.
+# Tests also cover webcams through nokhwa, and RealSense cameras if their library is available: see `realsense`.
 TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
-# The rig that `make demo` simulates: a file of the folder rigs.
+# The rig that `make demo` simulates: a file name in the folder rigs, without extension.
 RIG ?= static-arm
-# How long `make hil` listens.
+# Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 
 help: ## List the targets
@@ -47,7 +47,7 @@ check: check-packages deps realsense open-ends ## Format, clippy, documentation,
 		else echo "cargo deny: advisories skipped, their database is out of reach"; fi; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
 
-# Of each target.
+# Duration per fuzz target in seconds.
 SECONDS ?= 600
 fuzz: cargo ## Feed random bytes to every reader, SECONDS=600 each, all or TARGET=can (scripts/fuzz.sh)
 	scripts/fuzz.sh $(SECONDS) $(TARGET)

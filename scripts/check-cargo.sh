@@ -22,7 +22,7 @@ if ! command -v cargo >/dev/null 2>&1; then
     fi
     exit 1
 fi
-# With rustup this downloads the pinned toolchain where it is missing; its messages are shown.
+# With rustup, this downloads the pinned toolchain if it is missing, and shows its messages.
 if ! found=$(cargo --version); then
     echo "cargo does not run; with rustup, run this command, then try again:" >&2
     echo "    rustup toolchain install $wanted --profile minimal --component clippy --component rustfmt" >&2

@@ -28,7 +28,7 @@ STEP_M, REACH_M, ALONG_M, LEAST_JUMP_M = 0.00025, 0.008, 0.003, 0.01
 
 
 def layout(sources):
-    """The target's place from the simulator's source, so that it is written once."""
+    """The target's position, parsed from the simulator's source to avoid a copy."""
     import re
 
     text = (sources / "sim/src/objects.rs").read_text()
@@ -59,7 +59,7 @@ def exact_depth(camera, world_from_camera, px):
 
 
 def sample(depth, px):
-    """Bilinear, pixel centres at + 0.5; NaN outside."""
+    """Bilinear, pixel centers at + 0.5; NaN outside."""
     at = px - 0.5
     x, y = np.floor(at).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x + 1 < depth.shape[1]) & (y + 1 < depth.shape[0])
@@ -70,7 +70,7 @@ def sample(depth, px):
 
 
 def edge_errors(depth, camera, world_from_camera):
-    """Signed distance of each sampled silhouette point from the true edge, metres, outward positive."""
+    """Signed distance of each sampled silhouette point from the true edge, meters, outward positive."""
     camera_from_world = np.linalg.inv(world_from_camera)
     block = world_from_block()
     eye = (np.linalg.inv(block) @ world_from_camera)[:3, 3]
@@ -79,13 +79,13 @@ def edge_errors(depth, camera, world_from_camera):
     for axis in range(3):
         for sign in (-1, 1):
             if sign * eye[axis] <= BLOCK_HALF[axis]:
-                continue  # The face looks away.
+                continue  # The face points away.
             for outward in (a for a in range(3) if a != axis):
                 for side in (-1, 1):
                     hidden = side * eye[outward] < BLOCK_HALF[outward]
                     along = 3 - axis - outward
                     if not hidden or (along != 2 and outward == 2 and side < 0):
-                        continue  # No silhouette, or where block and table touch.
+                        continue  # No silhouette, or block and table touch here.
                     for place in np.arange(-BLOCK_HALF[along] + 0.006, BLOCK_HALF[along] - 0.006, ALONG_M):
                         points = np.zeros((len(offsets), 3))
                         points[:, axis] = sign * BLOCK_HALF[axis]
@@ -98,7 +98,7 @@ def edge_errors(depth, camera, world_from_camera):
                         px = seen[:, :2] / seen[:, 2:] * camera["f"] + camera["c"]
                         found, plane = sample(depth, px), seen[:, 2]
                         if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < LEAST_JUMP_M:
-                            continue  # Outside the image, something in front, or no jump.
+                            continue  # Outside the image, occluded, or no depth jump.
                         is_beyond_edge = found - plane > 0.5 * (found[-1] - plane[-1])
                         first = int(np.argmax(is_beyond_edge))
                         errors.append(offsets[first] - STEP_M / 2)
@@ -120,7 +120,7 @@ def main():
     folder = pathlib.Path(folder)
     transforms = json.loads((folder / "transforms.json").read_text())
     frames = [f for f in transforms["frames"] if f["file_path"] in set(transforms["test_filenames"])]
-    first = {**transforms, **frames[0]}  # What is the same for all frames stands at the top.
+    first = {**transforms, **frames[0]}  # Values that all frames share are at the top level.
     height, width = int(first["h"]), int(first["w"])
     fov = 2 * np.degrees(np.arctan(height / 2 / first["fl_y"]))
     path = {"render_height": height, "render_width": width, "camera_path": [

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""How does a distance field of ours compare with Open3D's VoxelBlockGrid on the same frames?
+"""Compares a fieldrig distance field with Open3D's VoxelBlockGrid on the same images.
 
 usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of `fieldrig train DATA --method tsdf --refine none`)
-       compare-open3d.py frame                            (beside `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
+       compare-open3d.py frame                            (compare with `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
 
 `surfaces` fuses, on the processor, the frames of a nerfstudio folder that MODEL/keyframes.txt says ours was fused from, with the
 same poses, lens, depth range, voxels and truncation (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
@@ -35,16 +35,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 CPU = o3c.Device("CPU:0")
-# What our truncation is where depth is exact, in voxels.
+# fieldrig's truncation for exact depth, in voxels.
 TRUNCATION_VOXELS = 4.0
-# Our vertices are floats of some meters; vertices of neighboring blocks that should be one differ by less than this.
+# fieldrig's vertices are f32 coordinates of a few meters. Coincident vertices of neighboring blocks differ by less
+# than this.
 WELD_M = 1e-5
 N_SAMPLES = 400_000
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Frame:
-    """Depth in metres, color, and where they were seen from; pixel centers of `principal` at + 0.5, as in our files."""
+    """Depth in meters, color, and camera pose; pixel centers of `principal` at + 0.5, as in fieldrig's files."""
 
     def __init__(self, name, depth_m, rgb, focal, principal, world_from_camera):
         self.name, self.depth_m, self.rgb = name, depth_m, rgb
@@ -67,7 +68,7 @@ class Grid:
             attr_channels=((1), (1), (3)), voxel_size=voxel_m, block_resolution=block, block_count=n_blocks, device=CPU)
 
     def fuse(self, frame):
-        """Milliseconds it took: finding blocks, and integrating."""
+        """Fuses a frame. Returns the milliseconds for finding blocks and for integration."""
         begin = time.perf_counter()
         blocks = self.grid.compute_unique_block_coordinates(
             frame.depth_image, frame.lens, frame.camera_from_world, 1.0, self.depth_max_m, self.truncation_voxels)
@@ -83,7 +84,7 @@ class Grid:
 
 
 class Mesh:
-    """Triangles in world metres; colors of vertices 0 to 1."""
+    """Triangles in world, meters; colors of vertices 0 to 1."""
 
     def __init__(self, places, triangles, colors):
         self.places, self.triangles, self.colors = places.astype(np.float64), triangles.astype(np.int64), colors
@@ -118,7 +119,7 @@ class Mesh:
         }
 
     def samples(self, n, seed):
-        """Points spread evenly over the surface."""
+        """Uniform samples on the surface."""
         random = np.random.default_rng(seed)
         areas = area_of(self.places, self.triangles)
         chosen = self.triangles[random.choice(len(areas), n, p=areas / areas.sum())]
@@ -128,7 +129,7 @@ class Mesh:
         return a + u * (b - a) + v * (c - a)
 
     def seen(self, frame):
-        """Depth along z (0 where nothing is) and color of each pixel."""
+        """Depth along z (0 where no surface is hit) and color of each pixel."""
         height, width = frame.depth_m.shape
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         in_camera = np.stack([(x - frame.principal[0]) / frame.focal[0], (y - frame.principal[1]) / frame.focal[1], np.ones_like(x)], -1)
@@ -150,13 +151,13 @@ def area_of(places, triangles):
 
 
 def parts(begins, ends, n):
-    """Connected parts of a graph of n points, and the part of each."""
+    """Connected components of a graph of n points, and the component of each point."""
     begins, ends = begins.reshape(-1), ends.reshape(-1)
     return connected_components(coo_matrix((np.ones(len(begins)), (begins, ends)), (n, n)), directed=False)
 
 
 def distances(one, other, voxel_m):
-    """How far points on one mesh are from the other."""
+    """Distances from samples of one mesh to the other."""
     points = one.samples(N_SAMPLES, 1).astype(np.float32)
     away = other.scene.compute_distance(o3c.Tensor(points), nthreads=2).numpy()
     return {"mean_mm": round(1e3 * float(away.mean()), 2), "median_mm": round(1e3 * float(np.median(away)), 2),
@@ -215,7 +216,7 @@ def surfaces(args):
             grid.fuse(frame)
         theirs = grid.mesh(0.0)
         summary["open3d"]["mesh"], summary["open3d"]["mesh_default_threshold"] = theirs.summary(), grid.mesh(3.0).summary()
-        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
+        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks allocated.
     ours = Mesh.read(args.model / "mesh.ply")
     summary["fieldrig"] = {"mesh": ours.summary()}
     summary["voxel_mm"], summary["truncation_voxels"], summary["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)
@@ -231,7 +232,7 @@ def surfaces(args):
 
 
 def exact_frame(ix):
-    """Frame `ix` of the test `frame_of_640x480`: a ball on a floor before a wall, seen exactly."""
+    """Frame `ix` of the test `frame_of_640x480`: exact depth and color of a ball on a floor in front of a wall."""
     turn = 0.02 * ix - 1.57
     eye, target = np.array([1.6 * np.cos(turn), 1.6 * np.sin(turn), 0.9]), np.array([0.0, 0.3, 0.3])
     ahead = (target - eye) / np.linalg.norm(target - eye)
@@ -272,12 +273,12 @@ def frame(_args):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    of_data = commands.add_parser("surfaces", help="both meshes of the same frames")
+    of_data = commands.add_parser("surfaces", help="compare both meshes of the same images")
     of_data.add_argument("data", type=pathlib.Path, help="nerfstudio folder with depth")
-    of_data.add_argument("model", type=pathlib.Path, help="folder that `fieldrig train --method tsdf` wrote")
-    of_data.add_argument("out", type=pathlib.Path, help="folder for pictures")
+    of_data.add_argument("model", type=pathlib.Path, help="output folder of `fieldrig train --method tsdf`")
+    of_data.add_argument("out", type=pathlib.Path, help="folder for images")
     of_data.set_defaults(run=surfaces)
-    commands.add_parser("frame", help="the time of an exact frame of 640x480").set_defaults(run=frame)
+    commands.add_parser("frame", help="time the fusion of an exact image of 640x480").set_defaults(run=frame)
     args = parser.parse_args()
     print(json.dumps(args.run(args), indent=1))
 

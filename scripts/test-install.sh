@@ -1,5 +1,6 @@
 #!/bin/sh
-# Runs the installation scripts in Debian systems with no packages or only some of them: chroots made with debootstrap.
+# Tests the installation scripts in Debian systems with no packages or only some of them: chroots made with
+# debootstrap.
 #
 # For each state, the script makes such a system and checks: install-packages.sh --check names exactly the missing packages; without
 # root, install-packages.sh prints one command to run and fails; as root it installs them; a second run prints nothing; and the installed
@@ -56,7 +57,7 @@ trap 'exit 130' HUP INT TERM
 make_base() {
     base=$folder/$suite
     if [ ! -e "$base/.complete" ]; then
-        echo "making a minimal $suite"
+        echo "creating a minimal $suite"
         rm -rf --one-file-system "$base"
         mkdir -p "$folder/$suite-debs"
         debootstrap --variant=minbase "$suite" "$base" "$mirror" >"$folder/$suite.log" 2>&1 || {
@@ -65,7 +66,7 @@ make_base() {
             exit 1
         }
         printf 'deb %s %s main\ndeb %s %s-updates main\n' "$mirror" "$suite" "$mirror" "$suite" >"$base/etc/apt/sources.list"
-        # As on a machine that has never run apt-get update.
+        # Same state as a machine that has never run apt-get update.
         rm -rf "$base"/var/lib/apt/lists/* "$base"/var/cache/apt/archives/*.deb
         touch "$base/.complete"
     fi
@@ -78,7 +79,7 @@ make_root() {
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     [ -z "${FILES-}" ] || cp -a "$FILES/." "$root/"
     mkdir -p "$root/src" "$root/var/cache/apt/archives"
-    # Thousands of temporary files: they need not reach the disk.
+    # Thousands of temporary files do not need to reach the disk.
     echo force-unsafe-io >"$root/etc/dpkg/dpkg.cfg.d/unsafe-io"
     git ls-files -z -co --exclude-standard | tar --create --null --ignore-failed-read --files-from=- 2>/dev/null |
         tar --extract --directory "$root/src" --no-same-owner
@@ -145,7 +146,7 @@ state() {
 
     status=0
     if $run_line; then
-        # Run the printed command as a person would paste it.
+        # Run the printed command, as a user would.
         line=$(sed -nE "s/^ +(sudo sh|su -) -c '(.*)'$/\2/p" "$folder/out")
         inside "$line" >>"$log" 2>&1 || status=$?
     else
@@ -276,7 +277,7 @@ int main(void) {
 }
 C
     inside scripts/fetch-mujoco.sh >>"$log" 2>&1 || fail "fetch-mujoco.sh, see $log"
-    [ -z "$(inside scripts/fetch-mujoco.sh 2>&1)" ] || fail "a second fetch-mujoco.sh does not find what the first one fetched"
+    [ -z "$(inside scripts/fetch-mujoco.sh 2>&1)" ] || fail "a second fetch-mujoco.sh does not recognize the installed library"
 }
 
 use_web() {

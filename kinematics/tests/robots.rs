@@ -1,5 +1,5 @@
 //! Checks forward kinematics against poses from an independent rigid-body library, for every robot of the test data.
-#![expect(clippy::unwrap_used, reason = "a test ends at what it did not expect")]
+#![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
 use kinematics::Chain;
 use kinematics::urdf::Robot;
