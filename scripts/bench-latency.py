@@ -7,7 +7,7 @@ stage has arrived completely. Prints one JSON object; needs only Python 3.9.
     fieldrig run rigs/static-arm.toml --sim &
     scripts/bench-latency.py --clients 0,1,8 --seconds 10
 
-`--clients 0` measures training alone. Every client requests the first view of the scene.
+`--clients 0` measures training alone. Every client requests the initial view of the scene.
 """
 
 import argparse

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Does a model of the simulated static arm show its details?
+"""Checks whether a model of the simulated static arm reproduces details.
 
 usage: check-static-arm.py FIELDRIG MODEL NERFSTUDIO_FOLDER   (the folder: `fieldrig export REC.mcap --to nerfstudio`)
 
-Draws every test view and tells, as one JSON object,
-- tags: how many tag36h11 codes OpenCV reads in the true test images, and how many of those in the renders;
-- edges: how far the silhouette edges of the wooden block lie from the truth in rendered depth, millimetres, measured
-  across the edge within the plane of the face it bounds, where depth crosses half of its jump; `ideal` is the same
-  measure of exact depth at the same pixels, so what the measure itself cannot tell.
+Renders every test view and prints one JSON object with
+- tags: number of tag36h11 codes that OpenCV detects in the true test images, and how many of those in the renders;
+- edges: distance of the wooden block's silhouette edges in rendered depth from the truth, millimeters, measured across
+  the edge in the plane of the adjacent face, at the point where depth crosses half of its jump; `ideal` is the same
+  measure for exact depth at the same pixels, that is, the error of the measurement.
 
 Needs numpy and OpenCV with its aruco module. Geometry: sim/src/objects.rs.
 """
@@ -24,7 +24,7 @@ import numpy as np
 TARGET_XY, TABLE_Z = None, None  # Set in `main`.
 BLOCK_HALF = np.array([0.045, 0.02, 0.025])
 BLOCK_IN_TARGET, BLOCK_YAW = np.array([-0.045, -0.058]), np.radians(-35.0)
-STEP_M, REACH_M, ALONG_M, LEAST_JUMP_M = 0.00025, 0.008, 0.003, 0.01
+STEP_M, REACH_M, ALONG_M, MIN_JUMP_M = 0.00025, 0.008, 0.003, 0.01
 
 
 def layout(sources):
@@ -92,12 +92,12 @@ def edge_errors(depth, camera, world_from_camera):
                         points[:, outward] = side * (BLOCK_HALF[outward] + offsets)
                         points[:, along] = place
                         world = points @ block[:3, :3].T + block[:3, 3]
-                        seen = world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-                        if (seen[:, 2] <= 0).any():
+                        in_camera = world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+                        if (in_camera[:, 2] <= 0).any():
                             continue
-                        px = seen[:, :2] / seen[:, 2:] * camera["f"] + camera["c"]
-                        found, plane = sample(depth, px), seen[:, 2]
-                        if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < LEAST_JUMP_M:
+                        px = in_camera[:, :2] / in_camera[:, 2:] * camera["f"] + camera["c"]
+                        found, plane = sample(depth, px), in_camera[:, 2]
+                        if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < MIN_JUMP_M:
                             continue  # Outside the image, occluded, or no depth jump.
                         is_beyond_edge = found - plane > 0.5 * (found[-1] - plane[-1])
                         first = int(np.argmax(is_beyond_edge))

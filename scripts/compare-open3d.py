@@ -4,20 +4,21 @@
 usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of `fieldrig train DATA --method tsdf --refine none`)
        compare-open3d.py frame                            (compare with `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
 
-`surfaces` fuses, on the processor, the frames of a nerfstudio folder that MODEL/keyframes.txt says ours was fused from, with the
-same poses, lens, depth range, voxels and truncation (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
-- fusing: milliseconds a frame with color, the median after the first pass over all frames, images decoded before;
-- mesh (of all voxels seen; `mesh_default_threshold`: of those seen more than three times, Open3D's default): triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
-  made one, as neither program promises that blocks share theirs;
-- against_depth: the depth images of test frames, which neither has fused, against the depth of the mesh there: share of measured
-  pixels with a surface at all, and with one within two voxels (along z), and the median error;
-- distances of points spread evenly over each mesh from the other mesh;
-- pictures of both meshes side by side, with the photo, from test frames, in OUT_FOLDER.
+`surfaces` fuses, on the CPU, the images of a nerfstudio folder that MODEL/keyframes.txt lists, with the same poses, lens, depth
+range, voxels and truncation as fieldrig (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
+- fusing: milliseconds per image with color, the median after the first pass over all images, excluding image decoding;
+- mesh (of all observed voxels; `mesh_default_threshold`: of those observed more than three times, Open3D's default): triangles, area,
+  boundary edges (number, length and loops), connected components. Vertices closer than 10 um are merged first, because neither program
+  guarantees that blocks share vertices;
+- against_depth: measured depth of test images, which neither program has fused, against the depth of the mesh: fraction of measured
+  pixels with a surface, fraction with one within two voxels (along z), and the median error;
+- distances of uniform samples on each mesh from the other mesh;
+- renders of both meshes next to the photo, from the poses of test images, in OUT_FOLDER.
 
-`frame` fuses the exact frames of our ignored test `frame_of_640x480` with voxels of 1 cm: 8 frames, then the time of 4 more, then of
-all 12 once more, for the three block sizes and number formats that Open3D has on offer.
+`frame` fuses the exact images of fieldrig's ignored test `frame_of_640x480` with voxels of 1 cm: 8 images, then the time of 4 more, then
+of all 12 again, for the three block sizes and number formats that Open3D supports.
 
-Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To hold both sides to the same cores, run both under
+Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To limit both programs to the same cores, run both with
 `taskset -c 0,1` and this one with OMP_NUM_THREADS=2.
 """
 
@@ -128,7 +129,7 @@ class Mesh:
         a, b, c = (self.places[chosen[:, corner]] for corner in range(3))
         return a + u * (b - a) + v * (c - a)
 
-    def seen(self, frame):
+    def render(self, frame):
         """Depth along z (0 where no surface is hit) and color of each pixel."""
         height, width = frame.depth_m.shape
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -169,7 +170,7 @@ def against_depth(mesh, frames, voxel_m, depth_max_m):
     n_measured = n_hit = n_near = 0
     errors = []
     for frame in frames:
-        depth_m, _ = mesh.seen(frame)
+        depth_m, _ = mesh.render(frame)
         measured = (frame.depth_m > 0) & (frame.depth_m <= depth_max_m)
         hit = measured & (depth_m > 0)
         error = np.abs(depth_m[hit] - frame.depth_m[hit])
@@ -205,9 +206,9 @@ def timing(millis):
 
 
 def surfaces(args):
-    about = json.loads((args.model / "model.json").read_text())["lattice"]
-    voxel_m, depth_max_m = about["voxel_m"], about["max_depth_m"]
-    truncation_voxels = about["truncation_m"] / voxel_m
+    lattice = json.loads((args.model / "model.json").read_text())["lattice"]
+    voxel_m, depth_max_m = lattice["voxel_m"], lattice["max_depth_m"]
+    truncation_voxels = lattice["truncation_m"] / voxel_m
     frames, test_frames = frames_of(args.data, args.model / "keyframes.txt")
     summary = {"open3d": {"version": o3d.__version__}}
     for block in (8, 16):
@@ -226,7 +227,7 @@ def surfaces(args):
     summary["from_open3d_to_fieldrig"] = distances(theirs, ours, voxel_m)
     args.out.mkdir(parents=True, exist_ok=True)
     for frame in test_frames:
-        row = [frame.rgb, ours.seen(frame)[1], theirs.seen(frame)[1]]
+        row = [frame.rgb, ours.render(frame)[1], theirs.render(frame)[1]]
         Image.fromarray(np.concatenate(row, 1)).save(args.out / f"{pathlib.Path(frame.name).stem}.png")
     return summary
 

@@ -310,9 +310,9 @@ if [ "$(id -u)" -ne 0 ]; then
 fi
 echo "installing:$missing" >&2
 export DEBIAN_FRONTEND=noninteractive
-wanted=$missing
+requested=$missing
 if ! sh -c "$line" >&2; then
-    echo "apt-get did not install all of$wanted; its message is above" >&2
+    echo "apt-get did not install all of$requested; its message is above" >&2
     give_up
 fi
 hash -r

@@ -93,20 +93,20 @@ class Trial:
         """Reads the recording; if the disk was full, the number of samples must match the number that the command reported."""
         recording = self.out / "run.mcap"
         output = self.folder / "output.txt"
-        said = output.read_text() if output.exists() else ""
+        printed = output.read_text() if output.exists() else ""
         if not recording.exists():
-            expect("No space left" in said, f"no recording: {said[-1500:]}")
+            expect("No space left" in printed, f"no recording: {printed[-1500:]}")
             return "no space for a single sample"
         read = self.fieldrig("export", recording, "--to", "nerfstudio", "--out", self.folder / "read", codes=(0, 1, 3))
         cut_off = re.search(r"cut off after (\d+) readable samples", read.stderr)
-        if "no keyframe to export" in read.stderr and "keeps the first" in said:
+        if "no keyframe to export" in read.stderr and "keeps the first" in printed:
             return "enough space for joint states, but not for an image"
         if not cut_off:
             expect(read.returncode == 0, read.stderr[-1500:])
             return "the recording can be read"
-        if not said:
+        if not printed:
             return f"{cut_off[1]} samples can be read"
-        expect(f"({cut_off[1]} samples)" in said, f"{cut_off[0]}, but the command said: {said[-1500:]}")
+        expect(f"({cut_off[1]} samples)" in printed, f"{cut_off[0]}, but the command printed: {printed[-1500:]}")
         return f"{cut_off[1]} samples, as reported"
 
     def close(self):
@@ -179,12 +179,12 @@ class Trial:
         more = ["--scale", "0.25", "--holdout", "30", *(SMALL if self.args.method == "splat" else [])]
         command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
         uninterrupted = self.data.parent / f"whole-{self.args.method}"
-        about = uninterrupted.with_suffix(".json")
-        if not about.exists():
+        summary = uninterrupted.with_suffix(".json")
+        if not summary.exists():
             begun = time.monotonic()
             done = json.loads(self.fieldrig(*command[1:], uninterrupted).stdout.splitlines()[-1])
-            about.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
-        expected = json.loads(about.read_text())
+            summary.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
+        expected = json.loads(summary.read_text())
         process = self.start([*command, self.out / "model"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         wait_secs, was_killed = self.kill_after_checkpoint(process, expected["secs"])
         done = json.loads(self.fieldrig("train", self.data, "--resume", self.out / "model", "--json").stdout.splitlines()[-1])
@@ -215,13 +215,13 @@ class Trial:
 
     def run(self):
         try:
-            told = getattr(self, self.args.case)()
+            result = getattr(self, self.args.case)()
             if (self.args.case, self.args.command) != ("kill", "train"):
-                told += "; " + self.check()
+                result += "; " + self.check()
         finally:
             if self.args.case == "disk":
                 subprocess.run(["umount", "--lazy", self.out], check=False)
-        return told
+        return result
 
 
 def main():

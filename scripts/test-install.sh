@@ -187,7 +187,7 @@ cargo_state() {
     esac
     problems=0
     make_root
-    wanted=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
+    required=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
     # prints EXPECTED COMMANDS: what check-cargo.sh must print (a pattern) when it fails after these commands; empty if it must pass.
     prints() {
         status=0
@@ -207,10 +207,10 @@ cargo_state() {
     reports() {
         printf '%s\n' "printf '#!/bin/sh\\necho cargo $2\\n' >$1; chmod +x $1"
     }
-    prints 'not on the path' "$(reports /tmp/.cargo/bin/cargo "$wanted")"
+    prints 'not on the path' "$(reports /tmp/.cargo/bin/cargo "$required")"
     prints 'is version 1.85.1' "$(reports /usr/local/bin/cargo 1.85.1)"
     prints 'does not run' "printf '#!/bin/sh\nexit 1\n' >/usr/local/bin/cargo"
-    prints '' "$(reports /usr/local/bin/cargo "$wanted")"
+    prints '' "$(reports /usr/local/bin/cargo "$required")"
     prints '' "$(reports /usr/local/bin/cargo 2.0.0-nightly)"
     finish
 }
@@ -268,11 +268,11 @@ int main(void) {
     int (*bind)(int) = (int (*)(int))dlsym(library, "eglBindAPI");
     int (*choose)(void *, const int *, void **, int, int *) = (int (*)(void *, const int *, void **, int, int *))dlsym(library, "eglChooseConfig");
     void *(*context)(void *, void *, void *, const int *) = (void *(*)(void *, void *, void *, const int *))dlsym(library, "eglCreateContext");
-    int major = 0, minor = 0, n = 0, wanted[] = {0x3033, 0x0001, 0x3040, 0x0008, 0x3038};
+    int major = 0, minor = 0, n = 0, attributes[] = {0x3033, 0x0001, 0x3040, 0x0008, 0x3038};
     void *display = get(0x31DD, 0, 0), *config = 0;
     if (!display || !start(display, &major, &minor)) return puts("no surfaceless display"), 1;
     printf("EGL %d.%d\n", major, minor);
-    if (!bind(0x30A2) || !choose(display, wanted, &config, 1, &n) || n < 1) return puts("no OpenGL configuration"), 1;
+    if (!bind(0x30A2) || !choose(display, attributes, &config, 1, &n) || n < 1) return puts("no OpenGL configuration"), 1;
     return context(display, config, 0, 0) ? 0 : (puts("no OpenGL context"), 1);
 }
 C

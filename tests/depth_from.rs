@@ -38,7 +38,7 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("measured"), true, 0.0);
-    wall::write(&folder.join("seen"), false, 0.0);
+    wall::write(&folder.join("color"), false, 0.0);
     wall::write(&folder.join("elsewhere"), false, 50.0);
     done(folder, &["measured", "--method", "tsdf", "--refine", "none", "--out", "field"]);
 
@@ -48,8 +48,8 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     };
     let from_field = ["--depth-from", "field"];
     let with = |more: &[&'static str]| [&from_field[..], more].concat();
-    let bare = splats("seen", N_STEPS, &["--out", "bare"]);
-    let rendered = splats("seen", N_STEPS, &with(&["--out", "drawn"]));
+    let bare = splats("color", N_STEPS, &["--out", "bare"]);
+    let rendered = splats("color", N_STEPS, &with(&["--out", "drawn"]));
     let psnr = |done: &Value| done["psnr"].as_f64().expect("a score");
     assert!(psnr(&rendered) > psnr(&bare) + MIN_GAIN_DB, "{bare} {rendered}");
     let report = std::fs::read(folder.join("drawn/report.json")).expect("a report");
@@ -63,12 +63,12 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     assert_eq!(both["checkpoint_sha256"], measured["checkpoint_sha256"]);
 
     let sha256 = &rendered["checkpoint_sha256"];
-    assert_eq!(splats("seen", N_STEPS, &with(&["--out", "twice"]))["checkpoint_sha256"], *sha256);
-    splats("seen", "12", &with(&["--out", "half"]));
-    let resume = ["seen", "--resume", "half", "--steps", N_STEPS];
+    assert_eq!(splats("color", N_STEPS, &with(&["--out", "twice"]))["checkpoint_sha256"], *sha256);
+    splats("color", "12", &with(&["--out", "half"]));
+    let resume = ["color", "--resume", "half", "--steps", N_STEPS];
     let whole = done(folder, &[&resume[..], &with(&["--out", "whole"])].concat());
     assert_eq!(whole["checkpoint_sha256"], *sha256, "the resumed run gives a different model");
-    let replay = ["seen", "--replay-decisions", "drawn/decisions.jsonl"];
+    let replay = ["color", "--replay-decisions", "drawn/decisions.jsonl"];
     let repeated = done(folder, &[&replay[..], &with(&["--out", "repeated"])].concat());
     assert_eq!(repeated["checkpoint_sha256"], *sha256, "the log gives a different model");
 
@@ -79,20 +79,20 @@ fn rendered_depth_improves_training_and_is_repeatable() {
     for again in [&resume[..], &replay] {
         assert_fails_with(folder, &[again, &["--depth-from", "drawn"]].concat(), 2, "--depth-from names one with");
     }
-    let bare = ["seen", "--resume", "bare", "--depth-from", "field"];
+    let bare = ["color", "--resume", "bare", "--depth-from", "field"];
     assert_fails_with(folder, &bare, 2, "leave out --depth-from");
     assert_fails_with(folder, &["elsewhere", "--depth-from", "field"], 4, "no image sees anything of that model");
-    assert_fails_with(folder, &["seen", "--depth-from", "measured"], 2, "measured holds no model");
+    assert_fails_with(folder, &["color", "--depth-from", "measured"], 2, "measured holds no model");
     assert_fails_with(
         folder,
-        &["seen", "--depth-from", "field/mesh.ply"],
+        &["color", "--depth-from", "field/mesh.ply"],
         2,
         "--depth-from: field/mesh.ply is no file of splats",
     );
-    assert_fails_with(folder, &["seen", "--method", "tsdf"], 4, "no image to learn from has depth");
+    assert_fails_with(folder, &["color", "--method", "tsdf"], 4, "no image to learn from has depth");
 
     // Depth rendered from splats gives a mesh from images without depth.
-    done(folder, &["seen", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
+    done(folder, &["color", "--method", "tsdf", "--depth-from", "drawn", "--out", "mesh"]);
     let evaluated = fieldrig(folder, &["eval", "mesh", "measured", "--json"]).stdout;
     let evaluated: Value = serde_json::from_slice(&evaluated).expect("a JSON object");
     let elsewhere = fieldrig(folder, &["eval", "mesh", "elsewhere"]).stderr;

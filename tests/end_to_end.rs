@@ -226,7 +226,7 @@ fn several_live_methods_equal_single_runs() {
     assert!(rig("both/rig.toml").contains("method = [") && rig("both/splat/rig.toml").contains("method = \"splat\""));
 
     let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
-    let common = ["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"];
+    let common = ["--steps-per-keyframe", "1", "--out", "viewed", "--listen", "127.0.0.1:0", "--json"];
     let printed = interrupted(folder, &[&args[..], &common].concat(), |serving| {
         request_picture_of_each_method(serving["url"].as_str().expect("an address"));
     });

@@ -62,7 +62,7 @@ fn resumed_training_equals_uninterrupted_training() {
     assert_eq!((&finished["event"], &finished["out"]), (&json!("finished"), &json!("both")));
     assert!(!folder.join("runs").exists());
 
-    // When asked for the number of steps it has already made, it saves the model in a new folder, because its own
+    // When the requested number of steps is already reached, it saves the model in a new folder, because its own
     // already contains a model.
     let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
     assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);

@@ -43,7 +43,7 @@ pub enum Error {
         allowed: &'static str,
     },
     /// A pixel buffer does not fit the camera's image size.
-    #[error("image of {got} values, must be {expected} for {width} x {height} pixels")]
+    #[error("image has {got} values, expected {expected} for {width} x {height} pixels")]
     ImageSize {
         /// Values given.
         got: usize,
@@ -133,7 +133,7 @@ pub enum Error {
         kind: &'static str,
     },
     /// A number of a joint is non-finite or out of range, or its axis is zero.
-    #[error("joint {joint:?}: {what} is {value:?}, not usable")]
+    #[error("joint {joint:?}: {what} is {value:?}, which is invalid")]
     JointNumber {
         /// The joint.
         joint: String,

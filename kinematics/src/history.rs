@@ -9,7 +9,7 @@ use std::time::Duration;
 #[non_exhaustive]
 pub enum HistoryError {
     /// The newest reading is older than the stamp. Retry after more readings have arrived.
-    #[error("no reading as late as the stamp asked for yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
+    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
     NotYet {
         /// Stamp of the newest reading; `None` if the history is empty.
         newest: Option<Stamp>,
@@ -17,7 +17,7 @@ pub enum HistoryError {
         asked: Stamp,
     },
     /// The stamp is before the oldest reading kept. Retrying does not help.
-    #[error("the stamp asked for is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
+    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
     TooOld {
         /// The oldest reading kept.
         oldest: Stamp,
@@ -25,7 +25,7 @@ pub enum HistoryError {
         asked: Stamp,
     },
     /// The readings around the stamp are too far apart to interpolate. Retrying does not help.
-    #[error("readings are missing for {:.1} ms around the stamp asked for (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
+    #[error("readings are missing for {:.1} ms around the requested stamp (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
     Gap {
         /// The last reading before the stamp.
         before: Stamp,
@@ -43,10 +43,10 @@ pub enum HistoryError {
         pushed: Stamp,
     },
     /// A pushed reading contained NaN or infinity and was dropped.
-    #[error("reading holds a number that is not finite, dropped")]
+    #[error("reading contains a non-finite value, dropped")]
     NotFinite,
     /// A pushed reading had a different number of joints than earlier ones and was dropped.
-    #[error("reading of {got} joints, those before had {expected}, dropped")]
+    #[error("reading has {got} joints, earlier readings had {expected}; dropped")]
     JointCount {
         /// Number of joints in the reading.
         got: usize,
@@ -368,7 +368,7 @@ mod tests {
         assert!(matches!(ask(1.03), Err(HistoryError::Gap { .. })));
         assert_eq!(
             ask(1.03).unwrap_err().to_string(),
-            "readings are missing for 30.0 ms around the stamp asked for (at most 20.0 ms)"
+            "readings are missing for 30.0 ms around the requested stamp (at most 20.0 ms)"
         );
         // Stamps at the edges of a gap and of the history have values.
         for secs in [1.01, 1.015, 1.02, 1.05] {

@@ -240,9 +240,9 @@ fn limits(parsed: &urdf_rs::Joint) -> JointLimits {
 }
 
 fn refuse_duplicates<'a>(kind: &'static str, names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
-    let mut seen = std::collections::HashSet::new();
+    let mut unique = std::collections::HashSet::new();
     for name in names {
-        if !seen.insert(name) {
+        if !unique.insert(name) {
             return Err(Error::Duplicate { kind, name: name.clone() });
         }
     }
@@ -281,7 +281,7 @@ mod tests {
     }
 
     fn error_message(result: Result<Robot, Error>) -> String {
-        let message = result.expect_err("this URDF must be refused").to_string();
+        let message = result.expect_err("this URDF must be rejected").to_string();
         assert!(!message.contains('\n'), "more than one line: {message}");
         message
     }

@@ -1,5 +1,5 @@
 //! A rotating range scanner: one ray per direction, cast from the scanner's pose at that instant.
-#![expect(clippy::cast_possible_truncation, reason = "points are told in f32, times of a turn fit their integers")]
+#![expect(clippy::cast_possible_truncation, reason = "points are in f32, times within a revolution fit their integers")]
 
 use crate::Error;
 use crate::config::ScannerConfig;

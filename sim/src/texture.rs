@@ -1,5 +1,5 @@
 //! Procedural textures made of noise and simple shapes: walls, table, wood, fur, tags.
-#![expect(clippy::cast_possible_truncation, reason = "colours are clamped before they become bytes")]
+#![expect(clippy::cast_possible_truncation, reason = "colors are clamped before they become bytes")]
 
 use crate::random::Random;
 use crate::tag;

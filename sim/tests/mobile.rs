@@ -136,7 +136,7 @@ fn separate_depth_sensor_matches_color_camera() {
     let run = run_rig(&config);
     let color = lens_of(&config);
     let sensor = config.cameras[0].depth.clone().and_then(|depth| depth.sensor).expect("a separate sensor");
-    let (mut n_matching, mut n_seen) = (0, 0);
+    let (mut n_matching, mut n_valid) = (0, 0);
     for (image, truth) in run.depth.iter().zip(&run.truth) {
         assert_eq!(image.size_px, [160, 120]);
         for (ix, count) in image.data.chunks_exact(2).enumerate() {
@@ -147,13 +147,13 @@ fn separate_depth_sensor_matches_color_camera() {
             let Some([u, v]) = color.project(&in_color.coords).filter(|at| z > 0.0 && color.contains(*at)) else {
                 continue;
             };
-            let seen = f64::from(truth.depth_m[v as usize * 320 + u as usize]);
-            n_seen += 1;
-            n_matching += usize::from((seen / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
+            let depth_m = f64::from(truth.depth_m[v as usize * 320 + u as usize]);
+            n_valid += 1;
+            n_matching += usize::from((depth_m / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
         }
     }
     // The rest are depth edges, which the two sensors see differently.
-    assert!(n_seen > 20_000 && n_matching as f64 > 0.93 * f64::from(n_seen), "{n_matching} of {n_seen}");
+    assert!(n_valid > 20_000 && n_matching as f64 > 0.93 * f64::from(n_valid), "{n_matching} of {n_valid}");
 }
 
 #[test]

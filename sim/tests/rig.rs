@@ -114,8 +114,8 @@ fn scan_stays_within_limits_and_covers_the_target() {
         elevations.push((from_target.z / from_target.norm()).asin().to_degrees());
         distances.push(from_target.norm());
         // The target stays in view.
-        let seen = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &target());
-        assert!(run.info.cameras[0].intrinsics.contains(seen), "{seen:?}");
+        let target_px = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &target());
+        assert!(run.info.cameras[0].intrinsics.contains(target_px), "{target_px:?}");
     }
     let span = |values: &[f64]| {
         values.iter().fold(f64::MIN, |a, b| a.max(*b)) - values.iter().fold(f64::MAX, |a, b| a.min(*b))
@@ -160,8 +160,8 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
     for (row, cells) in sim::tag::cells(4).iter().enumerate() {
         for (column, white) in cells.iter().enumerate() {
             let center = on_tag((column as f64 + 0.5) / n_cells, (row as f64 + 0.5) / n_cells);
-            let seen = gray_at(&truth.image, pixel(intrinsics, &truth.world_from_camera, &center));
-            assert_eq!(seen > 100.0, *white, "cell {row}, {column} has brightness {seen}");
+            let gray = gray_at(&truth.image, pixel(intrinsics, &truth.world_from_camera, &center));
+            assert_eq!(gray > 100.0, *white, "cell {row}, {column} has brightness {gray}");
         }
     }
 }
@@ -232,18 +232,18 @@ fn noise_matches_configuration() {
         assert!(ceiling > 40.0 && ceiling < 44.0, "{ceiling} dB");
     }
     let DepthConfig { noise_sigma_m, hole_frac, .. } = DepthConfig::default();
-    let (mut squares, mut n_seen, mut n_holes) = (0.0, 0.0, 0.0);
+    let (mut squares, mut n_valid, mut n_holes) = (0.0, 0.0, 0.0);
     for (depth, truth) in run.depth.iter().zip(&run.truth) {
         for (count, exact) in counts(depth).into_iter().zip(truth.depth_m.iter().map(|depth| f64::from(*depth))) {
             if count > 0.0 {
                 squares += ((count * 1e-4 - exact) / (exact * exact)).powi(2);
-                n_seen += 1.0;
+                n_valid += 1.0;
             } else {
                 n_holes += 1.0;
             }
         }
     }
-    let (sigma, holes) = (f64::sqrt(squares / n_seen), n_holes / (n_seen + n_holes));
+    let (sigma, holes) = (f64::sqrt(squares / n_valid), n_holes / (n_valid + n_holes));
     assert!((sigma / noise_sigma_m - 1.0).abs() < 0.05, "depth sigma {sigma} m at 1 m");
     assert!((holes - hole_frac).abs() < 0.006, "holes {holes}");
 }
@@ -269,14 +269,14 @@ fn rolling_shutter_uses_the_pose_of_each_row() {
         let line: Vec<Point3<f64>> = (0..=200).map(|ix| on_tag(0.5, 0.85 + 0.1 * f64::from(ix) / 200.0)).collect();
         let static_pixel = |point: &Point3<f64>| pixel(intrinsics, &truth.world_from_camera, point);
         let rolling_pixel = |point: &Point3<f64>| {
-            let mut seen = static_pixel(point);
+            let mut at_px = static_pixel(point);
             for _ in 0..3 {
-                let share = seen[1] / f64::from(intrinsics.size_px[1]) - 0.5;
+                let share = at_px[1] / f64::from(intrinsics.size_px[1]) - 0.5;
                 let stamp = truth.image.stamp.plus_secs(READOUT_SECS * share);
                 let flange = chain.forward(&joints_at(&run.joints, stamp)).expect("seven joints");
-                seen = pixel(intrinsics, &(flange * run.info.cameras[0].parent_from_camera), point);
+                at_px = pixel(intrinsics, &(flange * run.info.cameras[0].parent_from_camera), point);
             }
-            seen
+            at_px
         };
         if !line.iter().all(|point| static_pixel(point).iter().all(|value| *value > 40.0 && *value < 440.0)) {
             continue;

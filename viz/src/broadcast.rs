@@ -257,7 +257,7 @@ mod tests {
         assert_eq!(next(&latest_messages, &mut received, false), None, "only long messages are left");
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("3"));
         latest_messages.live_images.insert("left".into(), item(6));
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera's turn");
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera comes next");
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("6"));
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("2"));
         assert_eq!(next(&latest_messages, &mut received, true), None);

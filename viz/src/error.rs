@@ -16,7 +16,7 @@ pub enum Error {
     },
     /// The address is reachable from other machines, and the server does not support encryption yet.
     #[error(
-        "the address {address} can be reached from other machines, which needs TLS that does not exist yet: \
+        "the address {address} can be reached from other machines, but the server does not support TLS yet: \
          listen on a loopback address such as 127.0.0.1:7007"
     )]
     NotLoopback {

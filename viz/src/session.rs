@@ -124,7 +124,9 @@ impl Reader<'_> {
             }
             Ok(ParsedMessage::SameVersion) => None,
             Ok(ParsedMessage::OtherVersion(client_version)) => Some(Reply::Goodbye {
-                reason: format!("the client speaks protocol {client_version}, this server {PROTOCOL_VERSION}"),
+                reason: format!(
+                    "the client uses protocol version {client_version}, this server version {PROTOCOL_VERSION}"
+                ),
             }),
             Ok(ParsedMessage::Ping { t }) => Some(Reply::Pong { t }),
             Ok(ParsedMessage::Goodbye) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),

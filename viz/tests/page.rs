@@ -39,41 +39,51 @@ fn is_accent([red, green, blue]: [u8; 3]) -> bool {
 }
 
 /// A request and its model.
-type Asked = (RenderRequest, Option<String>);
+type ReceivedRequest = (RenderRequest, Option<String>);
 
 /// Renders requests on a separate thread, like a training thread, and records them.
 struct RenderThread {
-    requests_seen: Arc<Mutex<Vec<Asked>>>,
+    received_requests: Arc<Mutex<Vec<ReceivedRequest>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl RenderThread {
     fn start(hub: Hub) -> Self {
-        let requests_seen: Arc<Mutex<Vec<Asked>>> = Arc::default();
+        let received_requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let (seen, stopped) = (Arc::clone(&requests_seen), Arc::clone(&stop));
+        let (received, stopped) = (Arc::clone(&received_requests), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
                 hub.wait_for_request(Duration::from_millis(50));
                 if let Some(pending) = hub.next_request() {
                     let order = (pending.request.clone(), pending.method().map(str::to_owned));
-                    seen.lock().expect("no panic holds it").push(order);
+                    received.lock().expect("no thread panicked while holding the lock").push(order);
                     let picture = draw(&pending.request);
                     std::thread::sleep(DRAWING);
                     pending.deliver(picture);
                 }
             }
         });
-        Self { requests_seen, stop, thread: Some(thread) }
+        Self { received_requests, stop, thread: Some(thread) }
     }
 
     fn requests(&self) -> Vec<RenderRequest> {
-        self.requests_seen.lock().expect("no panic holds it").iter().map(|(request, _)| request.clone()).collect()
+        self.received_requests
+            .lock()
+            .expect("no thread panicked while holding the lock")
+            .iter()
+            .map(|(request, _)| request.clone())
+            .collect()
     }
 
     fn methods(&self) -> Vec<Option<String>> {
-        self.requests_seen.lock().expect("no panic holds it").iter().map(|(_, method)| method.clone()).collect()
+        self.received_requests
+            .lock()
+            .expect("no thread panicked while holding the lock")
+            .iter()
+            .map(|(_, method)| method.clone())
+            .collect()
     }
 }
 
@@ -205,7 +215,7 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     let press = |browser: &mut Browser, method: &str| {
         browser.evaluate(&format!("document.querySelector('#models button[data-method={method}]').click()"));
     };
-    assert!(render_thread.methods().iter().all(Option::is_none), "nobody chose");
+    assert!(render_thread.methods().iter().all(Option::is_none), "no model was chosen");
     press(browser, "tsdf");
     wait_for(browser, "the other model's values", |browser| browser.text("primitives-name") == "Voxel blocks");
     wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
@@ -449,9 +459,9 @@ fn pixel_of(request: &RenderRequest, point: Point3<f64>) -> (i64, i64) {
     let Projection::Pinhole { focal_px, principal_px } = request.projection else {
         panic!("the page requests a pinhole projection")
     };
-    let seen = request.world_from_camera.inverse_transform_point(&point);
-    let u = focal_px[0] * seen.x / seen.z + principal_px[0];
-    let v = focal_px[1] * seen.y / seen.z + principal_px[1];
+    let point_in_camera = request.world_from_camera.inverse_transform_point(&point);
+    let u = focal_px[0] * point_in_camera.x / point_in_camera.z + principal_px[0];
+    let v = focal_px[1] * point_in_camera.y / point_in_camera.z + principal_px[1];
     (u.floor() as i64, v.floor() as i64)
 }
 

@@ -29,7 +29,7 @@ pub(crate) fn looking_along_y() -> Isometry3<f64> {
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "colors are between 0 and 1, depths are metres"
+    reason = "colors are between 0 and 1, depths are meters"
 )]
 pub(crate) fn draw(request: &RenderRequest) -> Picture {
     let [width, height] = request.size_px;
