@@ -233,7 +233,7 @@ impl Canvas {
 
 /// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
 fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
-    let [near, far] = near_far_m.map(|metres| metres as f32);
+    let [near, far] = near_far_m.map(|meters| meters as f32);
     near * far / (far - depth * (far - near))
 }
 

@@ -24,7 +24,7 @@ fn ideal(n_images: u64) -> Config {
 }
 
 fn chain(info: &RigInfo) -> Chain {
-    Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("our URDF is valid")
+    Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("the URDF is valid")
 }
 
 /// Joint positions at a stamp, interpolated linearly between neighboring readings.
@@ -156,7 +156,7 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
     let run = run_rig(&ideal(12));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let n_cells = sim::tag::N_CELLS as f64;
-    let truth = run.truth.last().expect("images came");
+    let truth = run.truth.last().expect("at least one image");
     for (row, cells) in sim::tag::cells(4).iter().enumerate() {
         for (column, white) in cells.iter().enumerate() {
             let center = on_tag((column as f64 + 0.5) / n_cells, (row as f64 + 0.5) / n_cells);
@@ -173,7 +173,7 @@ fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
     config.cameras[0].sensor.supersample = 4; // Averaging out aliased edges would need many of them.
     let run = run_rig(&config);
     let intrinsics = &run.info.cameras[0].intrinsics;
-    let truth = run.truth.last().expect("images came");
+    let truth = run.truth.last().expect("at least one image");
     // Across the four outer edges of the black border, one cell inside the margin: brightness falls to half at the
     // edge.
     let edges = [
@@ -201,8 +201,8 @@ fn depth_matches_table_and_cube() {
     const TOLERANCE_M: f64 = 1e-4; // Twice the depth image's resolution of 0.1 mm would be too lax for noise-free depth.
     let run = run_rig(&ideal(5));
     let intrinsics = &run.info.cameras[0].intrinsics;
-    let truth = run.truth.last().expect("images came");
-    let depth = run.depth.last().expect("depth came");
+    let truth = run.truth.last().expect("at least one image");
+    let depth = run.depth.last().expect("at least one depth image");
     assert_eq!(depth.stamp, truth.image.stamp);
     let camera_from_world = truth.world_from_camera.inverse();
     let corners = [on_table(-0.10, -0.16), on_table(-0.14, 0.0), on_tag(0.3, 0.6), on_tag(0.7, 0.2)];

@@ -361,7 +361,7 @@ fn page_shows_connection_loss_and_run_result() {
     assert_eq!(browser.text("banner"), "");
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
     assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
-    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was called live");
+    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");
     assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
