@@ -17,7 +17,7 @@ pub(crate) enum BaseMotion {
     Stations(f64),
 }
 
-/// Duration of a lap at speed 1 in seconds, and number of laps in a whole walk.
+/// Duration of a lap at speed 1, seconds.
 const LAP_SECS: f64 = 36.0;
 /// Gait frequency at speed 1, and the body motion caused by a step.
 const GAIT_HZ: f64 = 1.7;

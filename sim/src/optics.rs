@@ -266,8 +266,8 @@ impl Optics {
         sum.map(|channel| channel / area)
     }
 
-    /// Depth at a position in the rendered image: bilinear if the surrounding pixels lie on one surface, else the
-    /// nearest of them.
+    /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they lie on one surface,
+    /// else the nearest depth of the four. With odd supersampling, the depth of the closest pixel.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
         /// Neighbors whose depths differ by more than this fraction belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;

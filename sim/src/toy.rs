@@ -43,7 +43,7 @@ impl Part {
     }
 }
 
-/// Density of the hairs relative to the numbers below, in halves.
+/// Factor on the hair counts below, in units of 1/2.
 const DENSITY: u64 = 3;
 
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.

@@ -56,7 +56,7 @@ pub(crate) struct RenderMessage {
     pub(crate) method: Option<String>,
     /// Row major.
     pub(crate) world_from_camera: [f64; 16],
-    /// Size of the last stage at scale 1.
+    /// Full size, at scale 1.
     pub(crate) size_px: [u32; 2],
     /// Projection from directions to pixels.
     pub(crate) projection: ProjectionMessage,
