@@ -1,4 +1,4 @@
-# The same commands by hand and in continuous integration; `make` alone lists them.
+# The same commands for developers and continuous integration; `make` without arguments lists them.
 #
 # As root, every target installs missing dependencies (system packages with apt, the pinned MuJoCo library, the page's npm packages)
 # and lists them; without root, it prints the one command that installs them.
@@ -11,48 +11,48 @@
 # One feature set everywhere, so that dependencies compile once.
 FEATURES := --features sim
 
-# Tests have webcams by nokhwa beside that, and RealSense cameras where there is a library for them: see `realsense`.
+# Tests also cover webcams through nokhwa, and RealSense cameras if their library is available: see `realsense`.
 TEST_FEATURES = $(FEATURES),nokhwa$(shell [ -e .deps/realsense/made-of ] && \
 	scripts/install-packages.sh --check realsense 2>/dev/null && echo ,realsense)
 
-# The rig that `make demo` simulates: a file of the folder rigs.
+# The rig that `make demo` simulates: a file name in the folder rigs, without extension.
 RIG ?= static-arm
-# How long `make hil` listens.
+# Duration of `make hil` in seconds.
 LISTEN_SECONDS ?= 20
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the growing scene; needs no display
+demo: deps web ## Simulate a rig (RIG=static-arm, mobile-arm, mobile-base-small, ...) and serve the live scene; needs no display
 	cargo build --release $(FEATURES)
 	target/release/fieldrig run rigs/$(RIG).toml --sim
 
-test: test-packages check web ## Lints, documentation and every test that needs no device
+test: test-packages check web ## Run lints, documentation and all tests that need no device
 	cargo test --workspace $(TEST_FEATURES) --no-fail-fast
 
-hil: cargo packages web ## Check the rig RIG=file.toml on whatever is plugged in: everything is read for LISTEN_SECONDS=20, nothing is moved
+hil: cargo packages web ## Check the rig RIG=file.toml on the connected devices: reads all of them for LISTEN_SECONDS=20 and moves nothing
 	cargo build --release $(shell pkg-config --exists realsense2 2>/dev/null && echo --features realsense)
 	target/release/fieldrig doctor $(if $(filter file,$(origin RIG)),$(error say which rig: make hil RIG=file.toml),$(RIG)) --listen $(LISTEN_SECONDS)
 
-check: check-packages deps realsense open-ends ## Format, clippy, documentation, kernels, licences, open ends
+check: check-packages deps realsense open-ends ## Check format, clippy, documentation, kernels, licenses, open ends
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
 	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(TEST_FEATURES)
 	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_parses_and_validates
-	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock is not of fuzz/Cargo.toml: cargo metadata --manifest-path fuzz/Cargo.toml brings it up to date" >&2; exit 1; }
+	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock does not match fuzz/Cargo.toml; to update it, run: cargo metadata --manifest-path fuzz/Cargo.toml" >&2; exit 1; }
 	@if cargo deny --version >/dev/null 2>&1; then \
 		cargo deny check licenses bans sources || exit 1; \
 		if cargo deny fetch db >/dev/null 2>&1; then cargo deny check advisories; \
-		else echo "cargo deny: advisories skipped, their database is out of reach"; fi; \
+		else echo "cargo deny: advisories skipped, their database is unreachable"; fi; \
 	else echo "cargo deny: skipped, not installed (cargo install --locked cargo-deny)"; fi
 
-# Of each target.
+# Duration per fuzz target in seconds.
 SECONDS ?= 600
-fuzz: cargo ## Feed random bytes to every reader, SECONDS=600 each, all or TARGET=can (scripts/fuzz.sh)
+fuzz: cargo ## Fuzz all parsers, SECONDS=600 each, or only TARGET=can (scripts/fuzz.sh)
 	scripts/fuzz.sh $(SECONDS) $(TARGET)
 
-deps: cargo packages mujoco ## Install what building and testing need
+deps: cargo packages mujoco ## Install build and test dependencies
 
 web: cargo packages ## Build the web page that the binary embeds
 	scripts/build-web.sh

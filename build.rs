@@ -1,9 +1,10 @@
-//! Tells the linker where the MuJoCo and RealSense libraries lie, for binaries and tests of the features `sim` and `realsense`.
+//! Tells the linker where the MuJoCo and RealSense libraries are, for binaries and tests with the features `sim` and
+//! `realsense`.
 
 fn main() {
     println!("cargo::rerun-if-env-changed=MUJOCO_DYNAMIC_LINK_DIR");
     if std::env::var_os("CARGO_FEATURE_REALSENSE").is_some() {
-        // Where `scripts/fetch-realsense.sh` puts the library; an installed one is found without.
+        // Paths to the library from `scripts/fetch-realsense.sh`; an installed one is found without them.
         for folder in ["$ORIGIN", "$ORIGIN/../../.deps/realsense", "$ORIGIN/../../../.deps/realsense"] {
             println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
         }
@@ -14,7 +15,7 @@ fn main() {
     if std::env::var_os("CARGO_FEATURE_SIM").is_none() {
         return;
     }
-    // Beside the executable; in a checkout that was moved with its target folder; where it was built.
+    // Next to the executable, in a checkout that was moved with its target folder, and in the build location.
     for folder in ["$ORIGIN", "$ORIGIN/../../.deps/mujoco", "$ORIGIN/../../../.deps/mujoco"] {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{folder}");
     }

@@ -7,7 +7,7 @@ stage has arrived completely. Prints one JSON object; needs only Python 3.9.
     fieldrig run rigs/static-arm.toml --sim &
     scripts/bench-latency.py --clients 0,1,8 --seconds 10
 
-`--clients 0` measures training alone. Every client requests the first view of the scene.
+`--clients 0` measures training alone. Every client requests the initial view of the scene.
 """
 
 import argparse
@@ -41,7 +41,7 @@ class WebSocket:
         self.reader = self.socket.makefile("rb", buffering=1 << 20)
         status = self.reader.readline()
         if b" 101 " not in status:
-            raise ConnectionError(f"the server refused the WebSocket: {status.decode(errors='replace').strip()}")
+            raise ConnectionError(f"the server rejected the WebSocket: {status.decode(errors='replace').strip()}")
         while self.reader.readline() not in (b"\r\n", b""):
             pass
 
@@ -208,7 +208,7 @@ def phase(args, address, n_clients):
         try:
             parts.append(results.get(timeout=2 * REPLY_TIMEOUT_S))
         except queue.Empty:
-            parts.append({"error": "the client did not end"})
+            parts.append({"error": "the client did not stop"})
     for client in clients:
         client.join(timeout=5)
         client.terminate()
@@ -244,12 +244,12 @@ def phase(args, address, n_clients):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--listen", default="127.0.0.1:7007", help="address of the running program [%(default)s]")
-    parser.add_argument("--clients", default="0,1,8", help="numbers of clients, separated by commas; one phase each [%(default)s]")
-    parser.add_argument("--seconds", type=float, default=10.0, help="length of a phase [%(default)s]")
+    parser.add_argument("--clients", default="0,1,8", help="numbers of clients, separated by commas; one measurement each [%(default)s]")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of a measurement [%(default)s]")
     parser.add_argument("--size", type=int, default=1024, help="width and height, pixels [%(default)s]")
     parser.add_argument("--outputs", choices=["color", "depth", "both"], default="both", help="[%(default)s]")
-    parser.add_argument("--stages", help="scales separated by commas [those of the server]")
-    parser.add_argument("--method", help="model to request if the run trains several [the first]")
+    parser.add_argument("--stages", help="scales separated by commas [the server's defaults]")
+    parser.add_argument("--method", help="model to request if the run trains several [the first model]")
     parser.add_argument("--wait", type=float, default=120.0, help="seconds to wait for the first step [%(default)s]")
     parser.add_argument("--after", type=float, default=0.0, help="start after this many seconds of training [%(default)s]")
     args = parser.parse_args()

@@ -2,7 +2,7 @@
 # Checks that cargo is installed and new enough for rust-toolchain.toml; otherwise prints the command to run and fails.
 set -eu
 cd "$(dirname "$0")/.."
-wanted=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
+required=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
 
 # print_rustup: prints how to install Rust. A fresh Debian has no curl.
 print_rustup() {
@@ -22,15 +22,15 @@ if ! command -v cargo >/dev/null 2>&1; then
     fi
     exit 1
 fi
-# With rustup this downloads the pinned toolchain where it is missing; its messages are shown.
+# With rustup, this downloads the pinned toolchain if it is missing, and shows its messages.
 if ! found=$(cargo --version); then
     echo "cargo does not run; with rustup, run this command, then try again:" >&2
-    echo "    rustup toolchain install $wanted --profile minimal --component clippy --component rustfmt" >&2
+    echo "    rustup toolchain install $required --profile minimal --component clippy --component rustfmt" >&2
     exit 1
 fi
 found=$(echo "$found" | cut -d ' ' -f 2)
-if [ "$(printf '%s\n' "$wanted" "${found%%-*}" | sort -V | head -n 1)" != "$wanted" ]; then
-    echo "$(command -v cargo) is version $found, but $wanted or newer is needed (Debian's package is older); run this, then try again:" >&2
+if [ "$(printf '%s\n' "$required" "${found%%-*}" | sort -V | head -n 1)" != "$required" ]; then
+    echo "$(command -v cargo) is version $found, but $required or newer is needed (Debian's package is older); run this, then try again:" >&2
     print_rustup
     exit 1
 fi

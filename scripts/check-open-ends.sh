@@ -1,5 +1,6 @@
 #!/bin/sh
-# Refuses an open end that names no issue: the marker is followed by the issue's number in brackets, then what and why.
+# Fails on open ends without an issue number: the marker must be followed by the number in parentheses, then what and
+# why.
 set -eu
 cd "$(dirname "$0")/.."
 

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Does a model of the simulated static arm show its details?
+"""Checks whether a model of the simulated static arm reproduces details.
 
 usage: check-static-arm.py FIELDRIG MODEL NERFSTUDIO_FOLDER   (the folder: `fieldrig export REC.mcap --to nerfstudio`)
 
-Draws every test view and tells, as one JSON object,
-- tags: how many tag36h11 codes OpenCV reads in the true test images, and how many of those in the renders;
-- edges: how far the silhouette edges of the wooden block lie from the truth in rendered depth, millimetres, measured
-  across the edge within the plane of the face it bounds, where depth crosses half of its jump; `ideal` is the same
-  measure of exact depth at the same pixels, so what the measure itself cannot tell.
+Renders every test view and prints one JSON object with
+- tags: number of tag36h11 codes that OpenCV detects in the true test images, and how many of those in the renders;
+- edges: distance of the wooden block's silhouette edges in rendered depth from the truth, millimeters, measured across
+  the edge in the plane of the adjacent face, at the point where depth crosses half of its jump; `ideal` is the same
+  measure for exact depth at the same pixels, that is, the error of the measurement.
 
 Needs numpy and OpenCV with its aruco module. Geometry: sim/src/objects.rs.
 """
@@ -24,11 +24,11 @@ import numpy as np
 TARGET_XY, TABLE_Z = None, None  # Set in `main`.
 BLOCK_HALF = np.array([0.045, 0.02, 0.025])
 BLOCK_IN_TARGET, BLOCK_YAW = np.array([-0.045, -0.058]), np.radians(-35.0)
-STEP_M, REACH_M, ALONG_M, LEAST_JUMP_M = 0.00025, 0.008, 0.003, 0.01
+STEP_M, REACH_M, ALONG_M, MIN_JUMP_M = 0.00025, 0.008, 0.003, 0.01
 
 
 def layout(sources):
-    """The target's place from the simulator's source, so that it is written once."""
+    """The target's position, parsed from the simulator's source to avoid a copy."""
     import re
 
     text = (sources / "sim/src/objects.rs").read_text()
@@ -59,7 +59,7 @@ def exact_depth(camera, world_from_camera, px):
 
 
 def sample(depth, px):
-    """Bilinear, pixel centres at + 0.5; NaN outside."""
+    """Bilinear, pixel centers at + 0.5; NaN outside."""
     at = px - 0.5
     x, y = np.floor(at).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x + 1 < depth.shape[1]) & (y + 1 < depth.shape[0])
@@ -70,7 +70,7 @@ def sample(depth, px):
 
 
 def edge_errors(depth, camera, world_from_camera):
-    """Signed distance of each sampled silhouette point from the true edge, metres, outward positive."""
+    """Signed distance of each sampled silhouette point from the true edge, meters, outward positive."""
     camera_from_world = np.linalg.inv(world_from_camera)
     block = world_from_block()
     eye = (np.linalg.inv(block) @ world_from_camera)[:3, 3]
@@ -79,26 +79,26 @@ def edge_errors(depth, camera, world_from_camera):
     for axis in range(3):
         for sign in (-1, 1):
             if sign * eye[axis] <= BLOCK_HALF[axis]:
-                continue  # The face looks away.
+                continue  # The face points away.
             for outward in (a for a in range(3) if a != axis):
                 for side in (-1, 1):
                     hidden = side * eye[outward] < BLOCK_HALF[outward]
                     along = 3 - axis - outward
                     if not hidden or (along != 2 and outward == 2 and side < 0):
-                        continue  # No silhouette, or where block and table touch.
+                        continue  # No silhouette, or block and table touch here.
                     for place in np.arange(-BLOCK_HALF[along] + 0.006, BLOCK_HALF[along] - 0.006, ALONG_M):
                         points = np.zeros((len(offsets), 3))
                         points[:, axis] = sign * BLOCK_HALF[axis]
                         points[:, outward] = side * (BLOCK_HALF[outward] + offsets)
                         points[:, along] = place
                         world = points @ block[:3, :3].T + block[:3, 3]
-                        seen = world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
-                        if (seen[:, 2] <= 0).any():
+                        in_camera = world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+                        if (in_camera[:, 2] <= 0).any():
                             continue
-                        px = seen[:, :2] / seen[:, 2:] * camera["f"] + camera["c"]
-                        found, plane = sample(depth, px), seen[:, 2]
-                        if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < LEAST_JUMP_M:
-                            continue  # Outside the image, something in front, or no jump.
+                        px = in_camera[:, :2] / in_camera[:, 2:] * camera["f"] + camera["c"]
+                        found, plane = sample(depth, px), in_camera[:, 2]
+                        if np.isnan(found).any() or abs(found[0] - plane[0]) > 0.01 or found[-1] - plane[-1] < MIN_JUMP_M:
+                            continue  # Outside the image, occluded, or no depth jump.
                         is_beyond_edge = found - plane > 0.5 * (found[-1] - plane[-1])
                         first = int(np.argmax(is_beyond_edge))
                         errors.append(offsets[first] - STEP_M / 2)
@@ -120,7 +120,7 @@ def main():
     folder = pathlib.Path(folder)
     transforms = json.loads((folder / "transforms.json").read_text())
     frames = [f for f in transforms["frames"] if f["file_path"] in set(transforms["test_filenames"])]
-    first = {**transforms, **frames[0]}  # What is the same for all frames stands at the top.
+    first = {**transforms, **frames[0]}  # Values that all frames share are at the top level.
     height, width = int(first["h"]), int(first["w"])
     fov = 2 * np.degrees(np.arctan(height / 2 / first["fl_y"]))
     path = {"render_height": height, "render_width": width, "camera_path": [

@@ -1,23 +1,24 @@
 #!/usr/bin/env python3
-"""How does a distance field of ours compare with Open3D's VoxelBlockGrid on the same frames?
+"""Compares a fieldrig distance field with Open3D's VoxelBlockGrid on the same images.
 
 usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of `fieldrig train DATA --method tsdf --refine none`)
-       compare-open3d.py frame                            (beside `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
+       compare-open3d.py frame                            (compare with `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
 
-`surfaces` fuses, on the processor, the frames of a nerfstudio folder that MODEL/keyframes.txt says ours was fused from, with the
-same poses, lens, depth range, voxels and truncation (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
-- fusing: milliseconds a frame with color, the median after the first pass over all frames, images decoded before;
-- mesh (of all voxels seen; `mesh_default_threshold`: of those seen more than three times, Open3D's default): triangles, area, boundary edges (their number, length and loops), connected parts, after vertices closer than 10 um are
-  made one, as neither program promises that blocks share theirs;
-- against_depth: the depth images of test frames, which neither has fused, against the depth of the mesh there: share of measured
-  pixels with a surface at all, and with one within two voxels (along z), and the median error;
-- distances of points spread evenly over each mesh from the other mesh;
-- pictures of both meshes side by side, with the photo, from test frames, in OUT_FOLDER.
+`surfaces` fuses, on the CPU, the images of a nerfstudio folder that MODEL/keyframes.txt lists, with the same poses, lens, depth
+range, voxels and truncation as fieldrig (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
+- fusing: milliseconds per image with color, the median after the first pass over all images, excluding image decoding;
+- mesh (of all observed voxels; `mesh_default_threshold`: of those observed more than three times, Open3D's default): triangles, area,
+  boundary edges (number, length and loops), connected components. Vertices closer than 10 um are merged first, because neither program
+  guarantees that blocks share vertices;
+- against_depth: measured depth of test images, which neither program has fused, against the depth of the mesh: fraction of measured
+  pixels with a surface, fraction with one within two voxels (along z), and the median error;
+- distances of uniform samples on each mesh from the other mesh;
+- renders of both meshes next to the photo, from the poses of test images, in OUT_FOLDER.
 
-`frame` fuses the exact frames of our ignored test `frame_of_640x480` with voxels of 1 cm: 8 frames, then the time of 4 more, then of
-all 12 once more, for the three block sizes and number formats that Open3D has on offer.
+`frame` fuses the exact images of fieldrig's ignored test `frame_of_640x480` with voxels of 1 cm: 8 images, then the time of 4 more, then
+of all 12 again, for the three block sizes and number formats that Open3D supports.
 
-Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To hold both sides to the same cores, run both under
+Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To limit both programs to the same cores, run both with
 `taskset -c 0,1` and this one with OMP_NUM_THREADS=2.
 """
 
@@ -35,16 +36,17 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 CPU = o3c.Device("CPU:0")
-# What our truncation is where depth is exact, in voxels.
+# fieldrig's truncation for exact depth, in voxels.
 TRUNCATION_VOXELS = 4.0
-# Our vertices are floats of some metres; vertices of neighboring blocks that should be one differ by less than this.
+# fieldrig's vertices are f32 coordinates of a few meters. Coincident vertices of neighboring blocks differ by less
+# than this.
 WELD_M = 1e-5
 N_SAMPLES = 400_000
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class Frame:
-    """Depth in metres, color, and where they were seen from; pixel centers of `principal` at + 0.5, as in our files."""
+    """Depth in meters, color, and camera pose; pixel centers of `principal` at + 0.5, as in fieldrig's files."""
 
     def __init__(self, name, depth_m, rgb, focal, principal, world_from_camera):
         self.name, self.depth_m, self.rgb = name, depth_m, rgb
@@ -67,7 +69,7 @@ class Grid:
             attr_channels=((1), (1), (3)), voxel_size=voxel_m, block_resolution=block, block_count=n_blocks, device=CPU)
 
     def fuse(self, frame):
-        """Milliseconds it took: finding blocks, and integrating."""
+        """Fuses a frame. Returns the milliseconds for finding blocks and for integration."""
         begin = time.perf_counter()
         blocks = self.grid.compute_unique_block_coordinates(
             frame.depth_image, frame.lens, frame.camera_from_world, 1.0, self.depth_max_m, self.truncation_voxels)
@@ -83,7 +85,7 @@ class Grid:
 
 
 class Mesh:
-    """Triangles in world metres; colors of vertices 0 to 1."""
+    """Triangles in world, meters; colors of vertices 0 to 1."""
 
     def __init__(self, places, triangles, colors):
         self.places, self.triangles, self.colors = places.astype(np.float64), triangles.astype(np.int64), colors
@@ -118,7 +120,7 @@ class Mesh:
         }
 
     def samples(self, n, seed):
-        """Points spread evenly over the surface."""
+        """Uniform samples on the surface."""
         random = np.random.default_rng(seed)
         areas = area_of(self.places, self.triangles)
         chosen = self.triangles[random.choice(len(areas), n, p=areas / areas.sum())]
@@ -127,8 +129,8 @@ class Mesh:
         a, b, c = (self.places[chosen[:, corner]] for corner in range(3))
         return a + u * (b - a) + v * (c - a)
 
-    def seen(self, frame):
-        """Depth along z (0 where nothing is) and color of each pixel."""
+    def render(self, frame):
+        """Depth along z (0 where no surface is hit) and color of each pixel."""
         height, width = frame.depth_m.shape
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         in_camera = np.stack([(x - frame.principal[0]) / frame.focal[0], (y - frame.principal[1]) / frame.focal[1], np.ones_like(x)], -1)
@@ -150,13 +152,13 @@ def area_of(places, triangles):
 
 
 def parts(begins, ends, n):
-    """Connected parts of a graph of n points, and the part of each."""
+    """Connected components of a graph of n points, and the component of each point."""
     begins, ends = begins.reshape(-1), ends.reshape(-1)
     return connected_components(coo_matrix((np.ones(len(begins)), (begins, ends)), (n, n)), directed=False)
 
 
 def distances(one, other, voxel_m):
-    """How far points on one mesh are from the other."""
+    """Distances from samples of one mesh to the other."""
     points = one.samples(N_SAMPLES, 1).astype(np.float32)
     away = other.scene.compute_distance(o3c.Tensor(points), nthreads=2).numpy()
     return {"mean_mm": round(1e3 * float(away.mean()), 2), "median_mm": round(1e3 * float(np.median(away)), 2),
@@ -168,7 +170,7 @@ def against_depth(mesh, frames, voxel_m, depth_max_m):
     n_measured = n_hit = n_near = 0
     errors = []
     for frame in frames:
-        depth_m, _ = mesh.seen(frame)
+        depth_m, _ = mesh.render(frame)
         measured = (frame.depth_m > 0) & (frame.depth_m <= depth_max_m)
         hit = measured & (depth_m > 0)
         error = np.abs(depth_m[hit] - frame.depth_m[hit])
@@ -204,9 +206,9 @@ def timing(millis):
 
 
 def surfaces(args):
-    about = json.loads((args.model / "model.json").read_text())["lattice"]
-    voxel_m, depth_max_m = about["voxel_m"], about["max_depth_m"]
-    truncation_voxels = about["truncation_m"] / voxel_m
+    lattice = json.loads((args.model / "model.json").read_text())["lattice"]
+    voxel_m, depth_max_m = lattice["voxel_m"], lattice["max_depth_m"]
+    truncation_voxels = lattice["truncation_m"] / voxel_m
     frames, test_frames = frames_of(args.data, args.model / "keyframes.txt")
     summary = {"open3d": {"version": o3d.__version__}}
     for block in (8, 16):
@@ -215,7 +217,7 @@ def surfaces(args):
             grid.fuse(frame)
         theirs = grid.mesh(0.0)
         summary["open3d"]["mesh"], summary["open3d"]["mesh_default_threshold"] = theirs.summary(), grid.mesh(3.0).summary()
-        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks there.
+        summary["open3d"][f"fusing_blocks_of_{block}"] = timing([grid.fuse(frame) for frame in frames])  # Warm, with all blocks allocated.
     ours = Mesh.read(args.model / "mesh.ply")
     summary["fieldrig"] = {"mesh": ours.summary()}
     summary["voxel_mm"], summary["truncation_voxels"], summary["frames"] = 1e3 * voxel_m, truncation_voxels, len(frames)
@@ -225,13 +227,13 @@ def surfaces(args):
     summary["from_open3d_to_fieldrig"] = distances(theirs, ours, voxel_m)
     args.out.mkdir(parents=True, exist_ok=True)
     for frame in test_frames:
-        row = [frame.rgb, ours.seen(frame)[1], theirs.seen(frame)[1]]
+        row = [frame.rgb, ours.render(frame)[1], theirs.render(frame)[1]]
         Image.fromarray(np.concatenate(row, 1)).save(args.out / f"{pathlib.Path(frame.name).stem}.png")
     return summary
 
 
 def exact_frame(ix):
-    """Frame `ix` of the test `frame_of_640x480`: a ball on a floor before a wall, seen exactly."""
+    """Frame `ix` of the test `frame_of_640x480`: exact depth and color of a ball on a floor in front of a wall."""
     turn = 0.02 * ix - 1.57
     eye, target = np.array([1.6 * np.cos(turn), 1.6 * np.sin(turn), 0.9]), np.array([0.0, 0.3, 0.3])
     ahead = (target - eye) / np.linalg.norm(target - eye)
@@ -272,12 +274,12 @@ def frame(_args):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    of_data = commands.add_parser("surfaces", help="both meshes of the same frames")
+    of_data = commands.add_parser("surfaces", help="compare both meshes of the same images")
     of_data.add_argument("data", type=pathlib.Path, help="nerfstudio folder with depth")
-    of_data.add_argument("model", type=pathlib.Path, help="folder that `fieldrig train --method tsdf` wrote")
-    of_data.add_argument("out", type=pathlib.Path, help="folder for pictures")
+    of_data.add_argument("model", type=pathlib.Path, help="output folder of `fieldrig train --method tsdf`")
+    of_data.add_argument("out", type=pathlib.Path, help="folder for images")
     of_data.set_defaults(run=surfaces)
-    commands.add_parser("frame", help="the time of an exact frame of 640x480").set_defaults(run=frame)
+    commands.add_parser("frame", help="time the fusion of an exact image of 640x480").set_defaults(run=frame)
     args = parser.parse_args()
     print(json.dumps(args.run(args), indent=1))
 

@@ -1,7 +1,7 @@
 #!/bin/sh
-# Puts the pinned MuJoCo library into .deps/mujoco, out of its wheel on the Python package index.
-# Does nothing if the right library is already there. Needs python3 with pip (any version: the wheel is only unpacked);
-# installs no Python package.
+# Installs the pinned MuJoCo library into .deps/mujoco, from its wheel on the Python package index. Does nothing if
+# the right library is already there. Needs python3 with pip (any version: the wheel is only unpacked); installs no
+# Python package.
 set -eu
 
 version=3.17.0
@@ -58,10 +58,10 @@ wheel = next(folder.glob("*.whl"))
 (folder / library).write_bytes(zipfile.ZipFile(wheel).read("mujoco/" + library))
 PYTHON
 if ! is_right "$download/$library"; then
-    echo "fetch-mujoco: $library does not have the pinned sha256 $sha256; nothing installed" >&2
+    echo "fetch-mujoco: $library does not have the pinned sha256 $sha256; nothing was installed" >&2
     exit 1
 fi
 chmod 755 "$download/$library"
 mv "$download/$library" "$folder/$library"
 link_names
-echo "fetch-mujoco: $folder/$library is in place"
+echo "fetch-mujoco: $folder/$library is installed"

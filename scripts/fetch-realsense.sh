@@ -1,9 +1,10 @@
 #!/bin/sh
-# Puts a pinned librealsense2 into .deps/realsense, for the tests and for machines without the RealSense SDK.
+# Installs a pinned librealsense2 into .deps/realsense, for the tests and for machines without the RealSense SDK.
 #
-# Debian has no package of it. The wheel pyrealsense2 on the Python package index holds the whole library in its extension
-# module, which exports the C functions. Renamed, and with a library beside it that has the names of Python's C functions
-# (none is ever called), programs link with it as with the SDK's own. Does nothing when it is there already.
+# Debian has no package for it. The extension module in the wheel pyrealsense2 on the Python package index contains
+# the whole library and exports its C functions. The script renames the module and adds a stub library that defines
+# Python's C functions, none of which is ever called. Programs then link with it like with the SDK's library. Does
+# nothing if the right version is already there.
 set -eu
 
 version=2.56.5
@@ -17,7 +18,7 @@ fi
 cd "$(dirname "$0")/.."
 folder=.deps/realsense
 library=librealsense2.so.2.56
-# Written last: it names what all of it was made of, this script among that.
+# Written last. Identifies all inputs, including this script.
 stamp="$sha256 $(sha256sum scripts/fetch-realsense.sh | cut -d ' ' -f 1)"
 
 if [ "$(cat "$folder/made-of" 2>/dev/null)" = "$stamp" ]; then
@@ -45,7 +46,7 @@ if ! python3 -m pip download --quiet --disable-pip-version-check --no-deps --onl
     exit 1
 fi
 if [ "$(cat "$download"/*.whl | sha256sum | cut -d ' ' -f 1)" != "$sha256" ]; then
-    echo "fetch-realsense: the wheel does not have the pinned sha256 $sha256; nothing installed" >&2
+    echo "fetch-realsense: the wheel does not have the pinned sha256 $sha256; nothing was installed" >&2
     exit 1
 fi
 python3 - "$download" "$library" <<'PYTHON'
@@ -56,10 +57,10 @@ module = next(name for name in wheel.namelist() if name.startswith("pyrealsense2
 (folder / library).write_bytes(wheel.read(module))
 PYTHON
 
-# Names of Python's C interface are looked up when the library is loaded, so each has to be something.
+# Symbols of Python's C interface are resolved when the library is loaded, so each needs a definition.
 nm -D --undefined-only "$download/$library" | awk '$2 ~ /^_?Py/ { print "char " $2 "[64];" }' >"$download/no-python.c"
 cc -shared -nostdlib -Wl,-soname,librealsense2-no-python.so -o "$download/librealsense2-no-python.so" "$download/no-python.c"
-# In two runs: asked for both at once, patchelf 0.14 loses one.
+# Two separate calls: with both options in one call, patchelf 0.14 applies only one.
 patchelf --set-soname "$library" "$download/$library"
 patchelf --add-needed librealsense2-no-python.so "$download/$library"
 # shellcheck disable=SC2016
@@ -74,4 +75,4 @@ chmod 755 "$download/$library" "$download/librealsense2-no-python.so"
 mv "$download/$library" "$download/librealsense2-no-python.so" "$download/realsense2.pc" "$folder/"
 ln -sf "$library" "$folder/librealsense2.so"
 echo "$stamp" >"$folder/made-of"
-echo "fetch-realsense: $folder/$library is in place"
+echo "fetch-realsense: $folder/$library is installed"

@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# Fuzzes the readers of every wire and file format: fuzz.sh SECONDS [TARGET...], all targets where none is named.
+# Fuzzes the parsers of all wire and file formats: fuzz.sh SECONDS [TARGET...]; all targets if none is named.
 #
-# One after the other, SECONDS each; needs a nightly compiler and cargo-fuzz. What is found lies in fuzz/artifacts: mend it, and put
-# the smallest input that shows it into fuzz/seeds. What was learned stays in fuzz/corpus for the next run.
+# Runs the targets one after the other, SECONDS each. Needs a nightly compiler and cargo-fuzz. Crashes are saved in
+# fuzz/artifacts: fix the bug, and add the smallest input that triggers it to fuzz/seeds. The corpus stays in
+# fuzz/corpus for the next run.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 seconds=$1
 shift
 cargo +nightly fuzz --version >/dev/null 2>&1 || {
-    echo "cargo-fuzz or a nightly compiler is missing; run these lines, then try again:" >&2
+    echo "cargo-fuzz or a nightly compiler is missing; run this command, then try again:" >&2
     echo "    rustup toolchain install nightly && cargo install --locked cargo-fuzz" >&2
     exit 1
 }
@@ -20,13 +21,13 @@ for target in "${@:-${all[@]}}"; do
         [ ! -d "$folder" ] || seeds+=("$folder")
     done
     echo "== $target"
-    # A target that does not build, or that does not exist, is no finding: that ends here.
+    # A target that does not exist or does not build is not a finding: the script stops here.
     cargo +nightly fuzz build "$target"
     mkdir -p "fuzz/corpus/$target"
     cargo +nightly fuzz run "$target" "fuzz/corpus/$target" "${seeds[@]}" -- \
         -max_total_time="$seconds" -timeout=5 -rss_limit_mb=2048 -max_len=8192 -print_final_stats=1 || found+=("$target")
 done
 [ ${#found[@]} -eq 0 ] || {
-    echo "found something: ${found[*]}" >&2
+    echo "fuzzing found failures in: ${found[*]}" >&2
     exit 1
 }

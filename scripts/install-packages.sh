@@ -37,7 +37,7 @@ need_package() {
         grep -qxE "installed ($(dpkg --print-architecture)|all)" || need "$1" "$2"
 }
 
-# need_command COMMAND PACKAGE REASON: asks for a package unless the command is on the path, wherever it came from.
+# need_command COMMAND PACKAGE REASON: adds the package unless the command is on the path, regardless of its source.
 need_command() {
     command -v "$1" >/dev/null 2>&1 || need "$2" "$3"
 }
@@ -71,7 +71,7 @@ need_library() {
     has_library "$1" || need "$2" "$3"
 }
 
-# links SOURCE [FLAG...]: whether the C compiler makes a program of this source.
+# links SOURCE [FLAG...]: whether the C compiler can build a program from this source.
 links() {
     source=$1
     shift
@@ -173,7 +173,7 @@ check_libclang() {
             [ ! -r "$header" ] || return 0
         done
     done
-    need "libclang${version:+-common-$version}-dev" "headers of clang ${version:+$version }itself, for $library"
+    need "libclang${version:+-common-$version}-dev" "headers of clang ${version:+$version }for $library"
 }
 
 # check GROUP: adds the missing packages of a group.
@@ -185,7 +185,7 @@ check() {
             if echo 'int nothing;' | cc -x c -c -o /dev/null - >/dev/null 2>&1; then
                 need libc6-dev "headers and start files of the C library"
             else
-                need gcc "links Rust programs, compiles the C parts of a few crates"
+                need gcc "links Rust programs and compiles the C parts of some crates"
                 need_package libc6-dev "headers and start files of the C library"
             fi
         fi
@@ -193,7 +193,7 @@ check() {
         ;;
     gpu)
         need_library libvulkan.so.1 libvulkan1 "the Vulkan loader"
-        has_lavapipe || need mesa-vulkan-drivers "Vulkan in software (lavapipe), used where there is no GPU and by the tests"
+        has_lavapipe || need mesa-vulkan-drivers "Vulkan in software (lavapipe), used without a GPU and by the tests"
         ;;
     sim)
         need_library libEGL.so.1 libegl1 "rendering without a display"
@@ -212,8 +212,8 @@ check() {
         check_libclang
         ;;
     realsense)
-        need_library libusb-1.0.so.0 libusb-1.0-0 "how librealsense2 speaks to cameras"
-        need_library libudev.so.1 libudev1 "how librealsense2 finds cameras"
+        need_library libusb-1.0.so.0 libusb-1.0-0 "used by librealsense2 to access cameras"
+        need_library libudev.so.1 libudev1 "used by librealsense2 to find cameras"
         need_command patchelf patchelf "renames the pinned librealsense2 for the linker"
         need_command nm binutils "lists the Python functions that the pinned librealsense2 imports"
         need_pip "downloads the RealSense wheel"
@@ -310,15 +310,16 @@ if [ "$(id -u)" -ne 0 ]; then
 fi
 echo "installing:$missing" >&2
 export DEBIAN_FRONTEND=noninteractive
-wanted=$missing
+requested=$missing
 if ! sh -c "$line" >&2; then
-    echo "apt-get did not install all of$wanted; its message is above" >&2
+    echo "apt-get did not install all of$requested; its message is above" >&2
     give_up
 fi
 hash -r
 check_all
 if [ -n "$missing" ]; then
-    # The usual cause is another copy earlier on the path, such as an old Node.js in /usr/local or a Python without pip.
+    # A common cause is another copy earlier on the path, such as an old Node.js in /usr/local or a Python without
+    # pip.
     printf 'installed, but still not usable:\n%s' "$reasons" >&2
     for command in cc pkg-config python3 node npm; do
         echo "    $command is $(command -v $command || echo not found)" >&2

@@ -31,7 +31,7 @@ from pathlib import Path
 PATIENCE_SECS = 300
 # Limits with which a model trains within seconds even without a GPU.
 SMALL = ["--max-splats", "2000"]
-# The files of a saved model that its hash covers, in this order.
+# Files of a saved model covered by its hash, in this order.
 MODEL_FILES = ["model.json", "splats.ply", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf"]
 # What each command prints once it has its first keyframe or image.
 FIRST_WORDS = {"train": b"step", "run": b"step", "record": b"color images"}
@@ -90,23 +90,23 @@ class Trial:
         return "training resumes from the checkpoint"
 
     def check_recording(self):
-        """Reads the recording; if the disk was full, the number of samples must be the one that the command reported."""
+        """Reads the recording; if the disk was full, the number of samples must match the number that the command reported."""
         recording = self.out / "run.mcap"
         output = self.folder / "output.txt"
-        said = output.read_text() if output.exists() else ""
+        printed = output.read_text() if output.exists() else ""
         if not recording.exists():
-            expect("No space left" in said, f"no recording: {said[-1500:]}")
-            return "no room for a single sample"
+            expect("No space left" in printed, f"no recording: {printed[-1500:]}")
+            return "no space for a single sample"
         read = self.fieldrig("export", recording, "--to", "nerfstudio", "--out", self.folder / "read", codes=(0, 1, 3))
         cut_off = re.search(r"truncated after (\d+) readable samples", read.stderr)
-        if "no keyframe to export" in read.stderr and "samples) are saved" in said:
-            return "room for joint states, not for an image"
+        if "no keyframe to export" in read.stderr and "samples) are saved" in printed:
+            return "enough space for joint states, but not for an image"
         if not cut_off:
             expect(read.returncode == 0, read.stderr[-1500:])
             return "the recording can be read"
-        if not said:
+        if not printed:
             return f"{cut_off[1]} samples can be read"
-        expect(f"({cut_off[1]} samples)" in said, f"{cut_off[0]}, but the command said: {said[-1500:]}")
+        expect(f"({cut_off[1]} samples)" in printed, f"{cut_off[0]}, but the command printed: {printed[-1500:]}")
         return f"{cut_off[1]} samples, as reported"
 
     def close(self):
@@ -125,9 +125,9 @@ class Trial:
                 close_at = time.monotonic() + wait_secs
         os.close(ours)
         closed = time.monotonic()
-        if self.args.no_hangup:  # It would run for the full minute, so it is stopped.
+        if self.args.no_hangup:  # Otherwise it would run for the full minute.
             time.sleep(3.0)
-            expect(process.poll() is None, "it ended when its terminal closed")
+            expect(process.poll() is None, "the process ended when its terminal closed")
             process.send_signal(signal.SIGINT)
         code = process.wait(PATIENCE_SECS)
         expect(code == 3, f"exit code {code}: {text[-1500:]}")
@@ -166,7 +166,7 @@ class Trial:
         """Kills a run at a random moment between its first checkpoint and its end; returns that moment, and whether it was running."""
         begun = time.monotonic()
         while not (self.out / "model/training.ckpt").exists():
-            expect(process.poll() is None, "it ended before its first checkpoint")
+            expect(process.poll() is None, "the process ended before its first checkpoint")
             time.sleep(0.01)
         wait_secs = self.random.uniform(0.0, max(begun + ends_after_secs - time.monotonic(), 0.2))
         time.sleep(wait_secs)
@@ -175,22 +175,22 @@ class Trial:
 
     def kill_train(self):
         steps = ["--steps", str(self.args.steps), "--method", self.args.method, "--checkpoint-secs", "1"]
-        # Few and small test images: scoring them takes most of the time without a GPU.
+        # Few, small test images: without a GPU, evaluation takes most of the time.
         more = ["--scale", "0.25", "--holdout", "30", *(SMALL if self.args.method == "splat" else [])]
         command = [self.exe, "train", self.data, *steps, *more, "--json", "--out"]
         uninterrupted = self.data.parent / f"whole-{self.args.method}"
-        about = uninterrupted.with_suffix(".json")
-        if not about.exists():
+        summary = uninterrupted.with_suffix(".json")
+        if not summary.exists():
             begun = time.monotonic()
             done = json.loads(self.fieldrig(*command[1:], uninterrupted).stdout.splitlines()[-1])
-            about.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
-        expected = json.loads(about.read_text())
+            summary.write_text(json.dumps({"sha256": done["checkpoint_sha256"], "secs": time.monotonic() - begun}))
+        expected = json.loads(summary.read_text())
         process = self.start([*command, self.out / "model"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         wait_secs, was_killed = self.kill_after_checkpoint(process, expected["secs"])
         done = json.loads(self.fieldrig("train", self.data, "--resume", self.out / "model", "--json").stdout.splitlines()[-1])
         if done["event"] == "finished":  # Killed after its model was saved.
             done, was_killed = {"checkpoint_sha256": self.sha256_of_model()}, False
-        expect(done["checkpoint_sha256"] == expected["sha256"], f"another hash: {done}")
+        expect(done["checkpoint_sha256"] == expected["sha256"], f"hash differs: {done}")
         return f"killed {wait_secs:.1f} s after the first checkpoint" if was_killed else "killed after its end"
 
     def sha256_of_model(self):
@@ -204,7 +204,7 @@ class Trial:
     def kill_run(self):
         process = self.start(self.command(12), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         wait_secs, was_killed = self.kill_after_checkpoint(process, 12.0)
-        expect(was_killed, "it had ended")
+        expect(was_killed, "the process had already ended")
         n_kept = len(list((self.out / "model/keyframes").glob("*.keyframe")))
         live = ["--listen", "127.0.0.1:0", "--when-done", "exit"]
         self.fieldrig("run", self.rig, "--resume", self.out / "model", *live, codes=(0, 3))
@@ -215,13 +215,13 @@ class Trial:
 
     def run(self):
         try:
-            told = getattr(self, self.args.case)()
+            result = getattr(self, self.args.case)()
             if (self.args.case, self.args.command) != ("kill", "train"):
-                told += "; " + self.check()
+                result += "; " + self.check()
         finally:
             if self.args.case == "disk":
                 subprocess.run(["umount", "--lazy", self.out], check=False)
-        return told
+        return result
 
 
 def main():

@@ -71,7 +71,7 @@ def read_frame(stream):
 
 
 def view(address):
-    """Seconds until the page and `hello` arrive, and until a picture or its refusal arrives."""
+    """Seconds until the page and `hello` arrive, and until a picture or its error arrives."""
     begun = time.monotonic()
     page = connect(address)
     page.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
@@ -134,7 +134,7 @@ def main():
         try:
             stream, connected, answered = view(address)
         except OSError as error:
-            sys.exit(f"a new viewer was refused: {error}")
+            sys.exit(f"a new viewer was rejected: {error}")
         viewers.append(stream)
         waits.append(connected)
         pictures.append(answered)

@@ -1,5 +1,6 @@
 #!/bin/sh
-# Runs the installation scripts in Debian systems with no packages or only some of them: chroots made with debootstrap.
+# Tests the installation scripts in Debian systems with no packages or only some of them: chroots made with
+# debootstrap.
 #
 # For each state, the script makes such a system and checks: install-packages.sh --check names exactly the missing packages; without
 # root, install-packages.sh prints one command to run and fails; as root it installs them; a second run prints nothing; and the installed
@@ -56,7 +57,7 @@ trap 'exit 130' HUP INT TERM
 make_base() {
     base=$folder/$suite
     if [ ! -e "$base/.complete" ]; then
-        echo "making a minimal $suite"
+        echo "creating a minimal $suite"
         rm -rf --one-file-system "$base"
         mkdir -p "$folder/$suite-debs"
         debootstrap --variant=minbase "$suite" "$base" "$mirror" >"$folder/$suite.log" 2>&1 || {
@@ -65,7 +66,7 @@ make_base() {
             exit 1
         }
         printf 'deb %s %s main\ndeb %s %s-updates main\n' "$mirror" "$suite" "$mirror" "$suite" >"$base/etc/apt/sources.list"
-        # As on a machine that has never run apt-get update.
+        # Same state as a machine that has never run apt-get update.
         rm -rf "$base"/var/lib/apt/lists/* "$base"/var/cache/apt/archives/*.deb
         touch "$base/.complete"
     fi
@@ -78,7 +79,7 @@ make_root() {
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     [ -z "${FILES-}" ] || cp -a "$FILES/." "$root/"
     mkdir -p "$root/src" "$root/var/cache/apt/archives"
-    # Thousands of temporary files: they need not reach the disk.
+    # Thousands of temporary files do not need to reach the disk.
     echo force-unsafe-io >"$root/etc/dpkg/dpkg.cfg.d/unsafe-io"
     git ls-files -z -co --exclude-standard | tar --create --null --ignore-failed-read --files-from=- 2>/dev/null |
         tar --extract --directory "$root/src" --no-same-owner
@@ -145,7 +146,7 @@ state() {
 
     status=0
     if $run_line; then
-        # Run the printed command as a person would paste it.
+        # Run the printed command, as a user would.
         line=$(sed -nE "s/^ +(sudo sh|su -) -c '(.*)'$/\2/p" "$folder/out")
         inside "$line" >>"$log" 2>&1 || status=$?
     else
@@ -186,7 +187,7 @@ cargo_state() {
     esac
     problems=0
     make_root
-    wanted=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
+    required=$(sed -n 's/^channel = "\(.*\)"$/\1/p' rust-toolchain.toml)
     # prints EXPECTED COMMANDS: what check-cargo.sh must print (a pattern) when it fails after these commands; empty if it must pass.
     prints() {
         status=0
@@ -206,10 +207,10 @@ cargo_state() {
     reports() {
         printf '%s\n' "printf '#!/bin/sh\\necho cargo $2\\n' >$1; chmod +x $1"
     }
-    prints 'not on the path' "$(reports /tmp/.cargo/bin/cargo "$wanted")"
+    prints 'not on the path' "$(reports /tmp/.cargo/bin/cargo "$required")"
     prints 'is version 1.85.1' "$(reports /usr/local/bin/cargo 1.85.1)"
     prints 'does not run' "printf '#!/bin/sh\nexit 1\n' >/usr/local/bin/cargo"
-    prints '' "$(reports /usr/local/bin/cargo "$wanted")"
+    prints '' "$(reports /usr/local/bin/cargo "$required")"
     prints '' "$(reports /usr/local/bin/cargo 2.0.0-nightly)"
     finish
 }
@@ -267,16 +268,16 @@ int main(void) {
     int (*bind)(int) = (int (*)(int))dlsym(library, "eglBindAPI");
     int (*choose)(void *, const int *, void **, int, int *) = (int (*)(void *, const int *, void **, int, int *))dlsym(library, "eglChooseConfig");
     void *(*context)(void *, void *, void *, const int *) = (void *(*)(void *, void *, void *, const int *))dlsym(library, "eglCreateContext");
-    int major = 0, minor = 0, n = 0, wanted[] = {0x3033, 0x0001, 0x3040, 0x0008, 0x3038};
+    int major = 0, minor = 0, n = 0, attributes[] = {0x3033, 0x0001, 0x3040, 0x0008, 0x3038};
     void *display = get(0x31DD, 0, 0), *config = 0;
     if (!display || !start(display, &major, &minor)) return puts("no surfaceless display"), 1;
     printf("EGL %d.%d\n", major, minor);
-    if (!bind(0x30A2) || !choose(display, wanted, &config, 1, &n) || n < 1) return puts("no OpenGL configuration"), 1;
+    if (!bind(0x30A2) || !choose(display, attributes, &config, 1, &n) || n < 1) return puts("no OpenGL configuration"), 1;
     return context(display, config, 0, 0) ? 0 : (puts("no OpenGL context"), 1);
 }
 C
     inside scripts/fetch-mujoco.sh >>"$log" 2>&1 || fail "fetch-mujoco.sh, see $log"
-    [ -z "$(inside scripts/fetch-mujoco.sh 2>&1)" ] || fail "a second fetch-mujoco.sh does not find what the first one fetched"
+    [ -z "$(inside scripts/fetch-mujoco.sh 2>&1)" ] || fail "a second fetch-mujoco.sh does not recognize the installed library"
 }
 
 use_web() {

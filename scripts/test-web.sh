@@ -1,5 +1,5 @@
 #!/bin/sh
-# Opens the bundled page in headless Chromium and checks what it shows; skipped where Chromium or Node.js is missing.
+# Opens the bundled page in headless Chromium and checks its contents. Skipped if Chromium or Node.js is missing.
 set -eu
 cd "$(dirname "$0")/.."
 if ! command -v node >/dev/null 2>&1; then

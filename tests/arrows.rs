@@ -1,9 +1,10 @@
-//! Which crate of the workspace may depend on which: the arrows of ARCHITECTURE.md, read from `cargo metadata`.
+//! Checks the dependencies between the crates of the workspace, read from `cargo metadata`, against the arrows of
+//! ARCHITECTURE.md.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
-/// Every crate and all that it may depend on inside the workspace.
+/// Every crate, and the workspace crates that it may depend on.
 const ALLOWED: [(&str, &[&str]); 6] = [
     ("kinematics", &[]),
     ("drivers", &["kinematics"]),
@@ -13,10 +14,10 @@ const ALLOWED: [(&str, &[&str]); 6] = [
     ("fieldrig", &["drivers", "kinematics", "sim", "trainer", "viz"]),
 ];
 
-/// Crates that only `fieldrig` itself may use: printing and command lines are its business.
+/// Crates that only `fieldrig` may use, because only it prints and parses command lines.
 const BINARY_ONLY: [&str; 5] = ["anyhow", "clap", "ctrlc", "env_logger", "indicatif"];
 
-/// Direct dependencies by package, dev-dependencies left out.
+/// Direct dependencies by package, without dev-dependencies.
 type Dependencies = BTreeMap<String, BTreeSet<String>>;
 
 fn dependencies() -> Dependencies {
@@ -40,7 +41,7 @@ fn dependencies() -> Dependencies {
         .collect()
 }
 
-/// Every arrow that should not be there, and every crate that has no rule.
+/// Every forbidden arrow, and every crate without a rule.
 fn violations(dependencies: &Dependencies) -> Vec<String> {
     let mut violations_found = Vec::new();
     let workspace_crates: BTreeSet<&str> = dependencies.keys().map(String::as_str).collect();

@@ -1,15 +1,16 @@
-//! `fieldrig bench curve`, `budget`, `ablation` and `stability` as their users run them, on a scene of a few tiny photos.
+//! Tests `fieldrig bench curve`, `budget`, `ablation` and `stability` as users run them, on a scene of a few tiny
+//! photos.
 
 use image::RgbImage;
 use serde_json::{Value, json};
 use std::path::Path;
 use std::process::{Command, Output};
 
-/// Photos of the scene; two of them are held out.
+/// Photos of the scene; two of them are test images.
 const N_PHOTOS: u32 = 12;
 const SIZE_PX: [u32; 2] = [32, 24];
 
-/// A nerfstudio folder: a camera slides along a colorful wall, 1 m away from it.
+/// Writes a nerfstudio folder: a camera slides along a colorful wall, 1 m away from it.
 fn scene(folder: &Path) {
     let (mut frames, focal_px) = (Vec::new(), 30.0);
     for ix in 0..N_PHOTOS {
@@ -21,14 +22,14 @@ fn scene(folder: &Path) {
             image::Rgb([wave(0.0), wave(1.0), wave(2.0)])
         };
         let name = format!("{ix:02}.png");
-        RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], color).save(folder.join(&name)).expect("room on the disk");
-        // An OpenGL camera that looks along -z, as nerfstudio has it.
+        RgbImage::from_fn(SIZE_PX[0], SIZE_PX[1], color).save(folder.join(&name)).expect("the disk has space");
+        // An OpenGL camera that looks along -z, as in nerfstudio.
         let rows = [[1.0, 0.0, 0.0, x_m], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0]];
         frames.push(json!({ "file_path": name, "transform_matrix": rows }));
     }
     let [w, h] = SIZE_PX;
     let scene = json!({ "fl_x": focal_px, "fl_y": focal_px, "cx": 16.0, "cy": 12.0, "w": w, "h": h, "frames": frames });
-    std::fs::write(folder.join("transforms.json"), scene.to_string()).expect("room on the disk");
+    std::fs::write(folder.join("transforms.json"), scene.to_string()).expect("the disk has space");
 }
 
 fn bench(folder: &Path, args: &[&str]) -> Output {
@@ -37,15 +38,15 @@ fn bench(folder: &Path, args: &[&str]) -> Output {
     command.output().expect("fieldrig starts")
 }
 
-/// The JSON lines of a bench that succeeded.
+/// The JSON lines of a successful bench.
 fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
     let output = bench(folder, args);
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
     let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+    stdout.lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect()
 }
 
-/// Asserts that a bench refused, and that its one sentence holds `words`.
+/// Asserts that a bench fails with one sentence that contains all `words`.
 fn assert_fails_with(folder: &Path, args: &[&str], code: i32, words: &[&str]) {
     let output = bench(folder, args);
     let printed = String::from_utf8_lossy(&output.stderr);
@@ -71,7 +72,7 @@ fn kernel_bench_reports_every_variant() {
     for column in ["render_ms", "step_ms", "step_touched_ms", "step_unordered_ms"] {
         assert!(row[column].as_f64() > Some(0.0), "{column}: {row}");
     }
-    assert!(row["touched"].as_u64().is_some_and(|n| (50..1500).contains(&n)), "it sees a part: {row}");
+    assert!(row["touched"].as_u64().is_some_and(|n| (50..1500).contains(&n)), "a part of the splats is visible: {row}");
     let plain = Command::new(env!("CARGO_BIN_EXE_fieldrig"))
         .args([&["bench"], &args[..]].concat())
         .env("FIELDRIG_GPU_FEATURES", "none")
@@ -88,7 +89,7 @@ fn curve_bench_draws_peers_and_resumes() {
     scene(folder);
     let peer =
         json!({ "rows": [{ "seconds": 0.25, "psnr": 12.0, "n": 50 }, { "seconds": 1.0, "psnr": 26.0, "n": 90 }] });
-    std::fs::write(folder.join("other.json"), peer.to_string()).expect("room on the disk");
+    std::fs::write(folder.join("other.json"), peer.to_string()).expect("the disk has space");
     let args =
         ["curve", ".", "--seconds", "0.6", "--seeds", "2", "--max-splats", "500", "--peer", "other.json", "--out", "c"];
     let printed = events(folder, &[&args[..], &["--json"]].concat());
@@ -103,7 +104,7 @@ fn curve_bench_draws_peers_and_resumes() {
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
     assert!(page.contains("<svg ") && page.contains("to 28 dB"));
 
-    // What is finished is not repeated: only a removed run is done again.
+    // Finished runs are not repeated; only a removed run is.
     let runs = std::fs::read_dir(folder.join("c/bench-runs")).expect("runs");
     let first = runs.map(|run| run.expect("a run").path()).min().expect("a run");
     std::fs::remove_file(first).expect("removed");
@@ -114,7 +115,7 @@ fn curve_bench_draws_peers_and_resumes() {
     assert_fails_with(folder, &changed, 2, &["max_splats", "--out c"]);
 }
 
-/// Depth images, a metre everywhere: what the wall of [`scene`] is away.
+/// Adds depth images of 1 m everywhere, the distance of the wall of [`scene`].
 fn add_depth(folder: &Path) {
     let file = folder.join("transforms.json");
     let mut scene: Value = serde_json::from_slice(&std::fs::read(&file).expect("a scene")).expect("JSON");
@@ -122,10 +123,10 @@ fn add_depth(folder: &Path) {
     for frame in scene["frames"].as_array_mut().expect("frames") {
         let name = format!("depth_{}", frame["file_path"].as_str().expect("a name"));
         let depth = image::ImageBuffer::<image::Luma<u16>, _>::from_pixel(width, height, image::Luma([1000]));
-        depth.save(folder.join(&name)).expect("room on the disk");
+        depth.save(folder.join(&name)).expect("the disk has space");
         frame["depth_file_path"] = json!(name);
     }
-    std::fs::write(file, scene.to_string()).expect("room on the disk");
+    std::fs::write(file, scene.to_string()).expect("the disk has space");
 }
 
 #[test]
@@ -133,14 +134,14 @@ fn curve_bench_skips_methods_without_sufficient_data() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for data in ["deep", "flat"] {
-        std::fs::create_dir(folder.join(data)).expect("room on the disk");
+        std::fs::create_dir(folder.join(data)).expect("the disk has space");
         scene(&folder.join(data));
     }
     add_depth(&folder.join("deep"));
     let one = ["curve", "deep", "flat", "--seconds", "0.4", "--seeds", "1", "--max-splats", "300", "--out", "c"];
     let printed = events(folder, &[&one[..], &["--method", "splat", "--json"]].concat());
     assert_eq!(printed.iter().filter(|event| event["event"] == "run").count(), 2);
-    // More methods join in the same folder, and what is done is not repeated.
+    // More methods are added in the same folder, and finished runs are not repeated.
     let printed = events(folder, &[&one[..], &["--method", "splat,tsdf,nerf", "--json"]].concat());
     let cached: Vec<bool> = printed.iter().filter_map(|event| event["cached"].as_bool()).collect();
     assert_eq!(cached, [true, false, false, true, false]);
@@ -156,7 +157,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
             assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
         }
     }
-    assert!(lines[1]["summary"]["seconds"].as_f64() < Some(0.4), "a distance field is done early: {}", lines[1]);
+    assert!(lines[1]["summary"]["seconds"].as_f64() < Some(0.4), "a distance field finishes early: {}", lines[1]);
     assert_chart(&folder.join("c"), "curve");
     assert_chart(&folder.join("c"), "curve-size");
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");
@@ -229,7 +230,7 @@ fn stability_bench_is_repeatable_and_needs_times() {
     };
     assert_eq!(psnrs(&first).len(), 2);
     assert_eq!(psnrs(&first), psnrs(&second), "one seed, one result");
-    assert_ne!(psnrs(&first)[0], psnrs(&first)[1], "the noise reaches the trainer");
+    assert_ne!(psnrs(&first)[0], psnrs(&first)[1], "the noise affects training");
     assert_chart(&folder.join("s"), "stability-pose-noise");
 
     let clock = ["stability", ".", "--disturb", "clock-offset", "--levels", "100", "--out", "t"];
@@ -239,7 +240,7 @@ fn stability_bench_is_repeatable_and_needs_times() {
         events(folder, &clock).iter().filter(|event| event["event"] == "run").count()
     };
     assert_eq!(n_runs("none", "t"), 2, "undisturbed, and 100 ms");
-    assert_eq!(n_runs("image-gains", "u"), 4, "each with and without what is settled about cameras");
+    assert_eq!(n_runs("image-gains", "u"), 4, "each with and without the estimated camera parameters");
     let few = ["stability", ".", "--disturb", "keyframes,exposure", "--levels", "1"];
     assert_fails_with(folder, &few, 2, &["--levels", "one disturbance"]);
 }

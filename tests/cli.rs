@@ -1,9 +1,9 @@
-//! The command line as a stranger meets it: help, exit codes, one clear sentence for wrong input.
+//! Tests the command line as a new user sees it: help, exit codes, one clear sentence for wrong input.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-/// Commands that `fieldrig --help` must list, each with help of its own.
+/// Commands that `fieldrig --help` must list, each with its own help.
 const COMMANDS: [&str; 14] = [
     "run", "record", "train", "view", "render", "eval", "metrics", "bench", "export", "fk", "devices", "doctor", "sim",
     "move",
@@ -21,14 +21,14 @@ fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).expect("stderr is UTF-8")
 }
 
-/// Asserts the exit code and one sentence on stderr that holds every word of `words`.
+/// Asserts the exit code and one sentence on stderr that contains all `words`.
 fn assert_fails_with(args: &[&str], code: i32, words: &[&str]) {
     let output = fieldrig(args);
     let printed = stderr(&output);
     assert_eq!(output.status.code(), Some(code), "{args:?}: {printed}");
     assert!(!printed.contains("panicked"), "{args:?}: {printed}");
     for word in words {
-        assert!(printed.contains(word), "{args:?} does not speak of {word:?}: {printed}");
+        assert!(printed.contains(word), "{args:?} does not mention {word:?}: {printed}");
     }
     let sentences: Vec<&str> = printed.lines().filter(|line| line.starts_with("error: ")).collect();
     assert_eq!(sentences.len(), 1, "{args:?}: {printed}");
@@ -69,15 +69,15 @@ fn missing_file_exits_with_1_and_is_named() {
     );
 }
 
-/// A shipped rig file with one piece of text replaced, beside the robot that it names.
+/// A shipped rig file with one piece of text replaced, next to the robot description that it refers to.
 fn changed_rig(folder: &Path, from: &str, to: &str) -> String {
     let rigs = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
     let text = std::fs::read_to_string(rigs.join("static-arm.toml")).expect("a shipped rig file");
     assert!(text.contains(from), "the shipped rig file has no {from:?}");
-    std::fs::create_dir_all(folder.join("robots")).expect("room on the disk");
+    std::fs::create_dir_all(folder.join("robots")).expect("the disk has space");
     std::fs::copy(rigs.join("robots/panda.urdf"), folder.join("robots/panda.urdf")).expect("the robot");
     let file = folder.join("rig.toml");
-    std::fs::write(&file, text.replacen(from, to, 1)).expect("room on the disk");
+    std::fs::write(&file, text.replacen(from, to, 1)).expect("the disk has space");
     file.into_os_string().into_string().expect("a temporary folder has a plain name")
 }
 
@@ -115,7 +115,7 @@ fn missing_or_invalid_data_is_reported() {
     assert_fails_with(&["train", empty], 1, &[empty]);
     assert_fails_with(&["train", "absent.mcap"], 1, &["absent.mcap does not exist"]);
     let recording = folder.path().join("torn.mcap");
-    std::fs::write(&recording, b"\x89MCAP0\r\n").expect("room on the disk");
+    std::fs::write(&recording, b"\x89MCAP0\r\n").expect("the disk has space");
     assert_fails_with(&["train", recording.to_str().expect("a plain name")], 1, &["torn.mcap"]);
     assert_fails_with(&["eval", empty, "absent"], 1, &["absent does not exist"]);
     let no_model = format!("{empty} contains no model");
@@ -125,7 +125,7 @@ fn missing_or_invalid_data_is_reported() {
     assert_fails_with(&["render", "absent", pose[0], pose[1]], 1, &["absent does not exist"]);
     for part in ["torn.mcap", "mesh.ply", "report.json"] {
         let file = folder.path().join(part);
-        std::fs::write(&file, "a part").expect("room on the disk");
+        std::fs::write(&file, "a part").expect("the disk has space");
         let file = file.to_str().expect("a plain name");
         assert_fails_with(&["render", file, pose[0], pose[1]], 2, &[part, "give its folder"]);
         assert_fails_with(&["eval", file, empty], 2, &[part, "give its folder"]);
@@ -145,7 +145,7 @@ fn invalid_arguments_exit_with_2() {
         assert_fails_with(&["train", "absent", flag, value], 2, &[flag]);
         assert_fails_with(&["run", "absent.toml", flag, value], 2, &[flag]);
     }
-    // Before data are read: there are none here.
+    // Checked before data are read: there are none here.
     let refine = |words| ["train", "absent", "--method", "tsdf", "--refine", words];
     assert_fails_with(
         &refine("extrinsics,image-gains"),
@@ -169,7 +169,7 @@ fn invalid_arguments_exit_with_2() {
     let out = folder.path().join("endless.mcap");
     let record = ["record", &rig, "--sim", "--lockstep", "--out", out.to_str().expect("a plain name")];
     assert_fails_with(&record, 2, &["lockstep", "--seconds"]);
-    assert!(!out.exists(), "what is refused leaves nothing behind");
+    assert!(!out.exists(), "a rejected command leaves no files behind");
     let out = folder.path().join("refused");
     let to = ["--listen", "127.0.0.1:0", "--out", out.to_str().expect("a plain name")];
     for (flag, value) in [("--max-splats", "9"), ("--refine", "extrinsics"), ("--count", "to-cap")] {
@@ -180,7 +180,7 @@ fn invalid_arguments_exit_with_2() {
     }
     let run = ["run", &rig, "--sim", "--method", "tsdf", "--max-bytes", "1000000"];
     assert_fails_with(&[&run[..], &to].concat(), 2, &["1000000", "the smallest distance field takes 2629632 bytes"]);
-    assert!(!out.exists(), "what is refused leaves nothing behind");
+    assert!(!out.exists(), "a rejected command leaves no files behind");
     for address in ["7105", "localhost:7105"] {
         assert_fails_with(&["run", "rig.toml", "--sim", "--listen", address], 2, &["127.0.0.1:7007"]);
     }
@@ -197,7 +197,7 @@ fn invalid_arguments_exit_with_2() {
 #[test]
 fn existing_model_is_not_overwritten() {
     let folder = tempfile::tempdir().expect("a folder");
-    std::fs::write(folder.path().join("splats.ply"), "a model").expect("room on the disk");
+    std::fs::write(folder.path().join("splats.ply"), "a model").expect("the disk has space");
     let model = folder.path().to_str().expect("a plain name");
     assert_fails_with(&["train", "absent", "--out", model], 2, &[model, "splats.ply"]);
     assert_fails_with(&["run", "absent.toml", "--out", model], 2, &[model, "splats.ply"]);
@@ -210,7 +210,7 @@ fn devices_are_printed_as_json() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let kinds: Vec<String> = stdout(&output)
         .lines()
-        .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("a JSON object a line"))
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("one JSON object per line"))
         .map(|device| device["kind"].as_str().expect("a kind").to_owned())
         .collect();
     assert!(kinds.contains(&"gpu".to_owned()) && kinds.contains(&"simulation".to_owned()), "{kinds:?}");
@@ -220,16 +220,12 @@ fn devices_are_printed_as_json() {
 fn doctor_fails_exactly_when_a_check_fails() {
     let output = fieldrig(&["doctor", "--json"]);
     let findings: Vec<serde_json::Value> =
-        stdout(&output).lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect();
+        stdout(&output).lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect();
     assert!(findings.len() >= 7, "{findings:?}");
     let failed = findings.iter().any(|finding| finding["verdict"] == "fail");
     assert_eq!(output.status.code(), Some(i32::from(failed)));
     for finding in &findings {
-        assert_eq!(
-            finding["verdict"] != "ok",
-            finding["remedy"].is_string(),
-            "a remedy for all that is amiss: {finding}"
-        );
+        assert_eq!(finding["verdict"] != "ok", finding["remedy"].is_string(), "every problem has a remedy: {finding}");
     }
 }
 

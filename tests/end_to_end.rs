@@ -1,4 +1,5 @@
-//! The whole program on a simulated rig: devices to keyframes to a model, recorded, replayed, scored and drawn.
+//! Tests the whole program on a simulated rig: devices to keyframes to a model; recording, replay, evaluation and
+//! rendering.
 
 #![cfg(feature = "sim")]
 
@@ -10,16 +11,16 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use trainer::gpu::{Gpu, GpuOptions};
 
-/// Images the simulated camera delivers.
+/// Number of images that the simulated camera delivers.
 const N_IMAGES: i64 = 40;
-/// Steps of every run here.
+/// Steps of every run in this file.
 const N_STEPS: &str = "300";
 /// Measured 22.1 dB after these few steps, most of them coarse ones; the first keyframe's seeds alone score 16.4 dB.
 const MIN_PSNR: f64 = 21.0;
-/// Forward kinematics, interpolation and the camera's mounting together.
+/// Tolerance for forward kinematics, interpolation and camera extrinsics together.
 const MAX_POSITION_ERROR_M: f64 = 1e-4;
 
-/// `rigs/static-arm.toml` at a quarter of its size, without flaws, in lockstep.
+/// Writes `rigs/static-arm.toml` at a quarter of its size, without sensor imperfections, in lockstep.
 fn rig_file(folder: &Path) {
     rig_file_for(folder, N_IMAGES);
 }
@@ -35,12 +36,12 @@ fn fieldrig(folder: &Path, args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_fieldrig")).args(args).current_dir(folder).output().expect("fieldrig starts")
 }
 
-/// Runs a command that must succeed; its JSON lines come back.
+/// Runs a command that must succeed, and returns its JSON lines.
 fn events(folder: &Path, args: &[&str]) -> Vec<Value> {
     let output = fieldrig(folder, args);
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
     let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+    stdout.lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect()
 }
 
 fn number(value: &Value, key: &str) -> f64 {
@@ -67,12 +68,12 @@ fn simulated_run_and_its_replay_are_identical() {
     let report = std::fs::read_to_string(folder.join("live/report.json")).expect("a report");
     let report: Value = serde_json::from_str(&report).expect("JSON");
     let error_m = number(&report, "max_position_error_m");
-    assert!(error_m < MAX_POSITION_ERROR_M, "a camera is {error_m} m off");
+    assert!(error_m < MAX_POSITION_ERROR_M, "a camera pose is off by {error_m} m");
     assert!(number(&report, "keyframes") >= 12.0, "{report}");
 
     let replayed = events(folder, &[&replay[..], &common[..]].concat());
     let replayed = replayed.last().expect("events");
-    assert_eq!(replayed["checkpoint_sha256"], done["checkpoint_sha256"], "the replay gives another model");
+    assert_eq!(replayed["checkpoint_sha256"], done["checkpoint_sha256"], "the replay gives a different model");
     for list in ["keyframes.txt", "splats.ply"] {
         let [first, second] = ["live", "replay"].map(|run| std::fs::read(folder.join(run).join(list)).expect(list));
         assert!(first == second, "{list} differs");
@@ -89,7 +90,7 @@ fn memory_bench_measures_a_run_with_a_viewer() {
     let folder = folder.path();
     rig_file(folder);
     let small = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file") + "\n[join]\nmax_keyframes = 8\n";
-    std::fs::write(folder.join("rig.toml"), small).expect("room on the disk");
+    std::fs::write(folder.join("rig.toml"), small).expect("the disk has space");
     let bench = ["bench", "memory", "rig.toml", "--sim", "--seconds", "20", "--every-secs", "0.2", "--json"];
     let printed = events(
         folder,
@@ -111,12 +112,12 @@ fn memory_bench_measures_a_run_with_a_viewer() {
         assert!(folder.join(format!("memory/memory.{ending}")).is_file(), "{ending}");
     }
     let left = std::fs::read_dir(folder.join("memory")).expect("a folder").count();
-    assert_eq!(left, 4, "the run's own folder is removed");
+    assert_eq!(left, 4, "the folder of the run is removed");
 }
 
-/// Keyframes that are fused.
+/// Number of keyframes fused.
 const N_FUSED: &str = "10";
-/// Measured 18 dB: what was not seen yet has no surface.
+/// Measured 18 dB: regions not observed yet have no surface.
 const MIN_PSNR_OF_MESH: f64 = 15.0;
 
 #[test]
@@ -139,7 +140,7 @@ fn tsdf_runs_live_replays_and_resumes() {
     assert_eq!(replayed.last().expect("events")["checkpoint_sha256"], done["checkpoint_sha256"]);
     let mesh = std::fs::read(folder.join("live/mesh.glb")).expect("a mesh");
 
-    // More steps than there are keyframes: it ends when the recording is through.
+    // More steps than keyframes: training ends with the recording.
     let more = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf", "--steps", "100000", "--json"];
     let ended = events(folder, &[&more[..], &["--listen", "127.0.0.1:0", "--out", "ended"]].concat());
     let steps = number(ended.last().expect("events"), "steps");
@@ -159,7 +160,7 @@ fn tsdf_runs_live_replays_and_resumes() {
     let [half, whole] = [half, whole].map(|printed| printed.last().cloned().expect("events"));
     assert_eq!(half["steps"], 4);
     assert!(number(&half, "psnr") < psnr);
-    assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "two halves give another model");
+    assert_eq!(whole["checkpoint_sha256"], done["checkpoint_sha256"], "the resumed run gives a different model");
 }
 
 /// Steps that train a NeRF: few on a software adapter, where each is slow. On a GPU the model is larger and needs more.
@@ -198,7 +199,7 @@ fn nerf_runs_live_replays_and_resumes() {
     train_and_get_done(&[&begin[..], &["--steps", "15", "--out", "half"]].concat());
     let whole = train_and_get_done(&[&begin[..], &["--steps", "30", "--out", "whole"]].concat());
     let resumed = train_and_get_done(&["--resume", "half", "--steps", "30", "--out", "resumed"]);
-    assert_eq!(resumed["checkpoint_sha256"], whole["checkpoint_sha256"], "two halves give another model");
+    assert_eq!(resumed["checkpoint_sha256"], whole["checkpoint_sha256"], "the resumed run gives a different model");
 
     let exported = fieldrig(folder, &["export", "live", "--to", "ply", "--out", "splats.ply"]);
     let printed = String::from_utf8_lossy(&exported.stderr);
@@ -225,20 +226,20 @@ fn several_live_methods_equal_single_runs() {
     assert_eq!(together, [replay("tsdf", "tsdf"), replay("splat", "splat")].concat());
     let lists = ["both/tsdf", "tsdf", "both/splat", "splat"].map(|run| folder.join(run).join("keyframes.txt"));
     let [tsdf_there, tsdf, splat_there, splat] = lists.map(|file| std::fs::read_to_string(file).expect("a list"));
-    assert!(tsdf_there == tsdf && splat_there == splat, "which keyframes a model had");
+    assert!(tsdf_there == tsdf && splat_there == splat, "each model has the same keyframes");
     let rig = |file: &str| std::fs::read_to_string(folder.join(file)).expect("a settled rig file");
     assert!(rig("both/rig.toml").contains("method = [") && rig("both/splat/rig.toml").contains("method = \"splat\""));
 
     let args = ["run", "rig.toml", "--from", "scan.mcap", "--method", "tsdf,splat"];
-    let common = ["--steps-per-keyframe", "1", "--out", "seen", "--listen", "127.0.0.1:0", "--json"];
+    let common = ["--steps-per-keyframe", "1", "--out", "viewed", "--listen", "127.0.0.1:0", "--json"];
     let printed = interrupted(folder, &[&args[..], &common].concat(), |serving| {
         request_picture_of_each_method(serving["url"].as_str().expect("an address"));
     });
     assert_eq!(printed.iter().filter(|event| event["event"] == "done").count(), 2);
 }
 
-/// Runs a command that serves, and asks for its end, as Ctrl-C does, once it told a score; what it told from there on comes
-/// back. `meanwhile` is given what it told first.
+/// Runs a serving command and stops it with SIGINT after its first evaluation. Returns the events from then on.
+/// `meanwhile` receives the first event.
 fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> Vec<Value> {
     let mut command = Command::new(env!("CARGO_BIN_EXE_fieldrig"));
     let mut run = command.args(args).current_dir(folder).stdout(Stdio::piped()).spawn().expect("fieldrig starts");
@@ -247,7 +248,7 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     let serving = event().expect("the address");
     while event().expect("an event before the end")["event"] != "eval" {}
     meanwhile(&serving);
-    // The shell's own `kill`: a bare system has no other.
+    // The `kill` built into the shell, because a minimal system has no other.
     let interrupt_status =
         Command::new("sh").args(["-c", &format!("kill -INT {}", run.id())]).status().expect("sh starts");
     assert!(interrupt_status.success());
@@ -256,7 +257,7 @@ fn interrupted(folder: &Path, args: &[&str], meanwhile: impl FnOnce(&Value)) -> 
     printed
 }
 
-/// Asks for a picture of each model there is, and of one that is not there.
+/// Requests a picture of each model, and of a model that does not exist.
 fn request_picture_of_each_method(url: &str) {
     let address = url.trim_start_matches("http://").trim_end_matches('/');
     let stream = std::net::TcpStream::connect(address).expect("the server listens");
@@ -290,10 +291,10 @@ fn request_picture_of_each_method(url: &str) {
             }
         }
     };
-    // Both are the same once the distance field has taken in all there is.
+    // Both answers refer to the same model until the distance field has fused all images.
     let mut ids = 1..200;
     let tsdf = loop {
-        let mut next = || ids.next().expect("the first is never the usual one");
+        let mut next = || ids.next().expect("the ids do not run out");
         let (default_picture, tsdf) = (request_picture(next(), None), request_picture(next(), Some("tsdf")));
         if default_picture == tsdf {
             break tsdf;
@@ -306,14 +307,14 @@ fn request_picture_of_each_method(url: &str) {
     assert!(printed.contains("\"nerf\"") && printed.contains("tsdf, splat"), "{printed}");
 }
 
-/// What `run` said of its model, `eval` says of the saved one.
+/// `eval` of the saved model gives the same score as `run`.
 fn check_saved_model_scores(folder: &Path, psnr: f64) {
     /// The file keeps the parameters' bits; scores are sums in the same order.
     const TOLERANCE_DB: f64 = 1e-6;
     let list = ["--keyframes", "live/keyframes.txt", "--json"];
     let evaluated = events(folder, &[&["eval", "live", "scan.mcap"][..], &list[..]].concat());
     let again = number(&evaluated[0], "psnr");
-    assert!((again - psnr).abs() < TOLERANCE_DB, "eval says {again} dB, run said {psnr} dB");
+    assert!((again - psnr).abs() < TOLERANCE_DB, "eval reports {again} dB, run reported {psnr} dB");
     let n_tests = evaluated[0]["per_image"].as_array().expect("scores").len();
     assert!(n_tests >= 2, "{}", evaluated[0]);
 
@@ -339,15 +340,15 @@ fn check_saved_model_renders(folder: &Path) {
     assert!(folder.join(rendered[0]["depth"].as_str().expect("a depth file")).is_file());
 }
 
-/// Half a recording trains; the exit code and one sentence say that something is missing.
+/// Training on half a recording works; the exit code and one sentence report the truncation.
 fn check_truncated_recording_is_a_loss(folder: &Path) {
     let whole = std::fs::read(folder.join("scan.mcap")).expect("the recording");
-    std::fs::write(folder.join("half.mcap"), &whole[..whole.len() / 2]).expect("room on the disk");
+    std::fs::write(folder.join("half.mcap"), &whole[..whole.len() / 2]).expect("the disk has space");
     let output = fieldrig(folder, &["train", "half.mcap", "--steps", "1", "--out", "half", "--json"]);
     let printed = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(3), "{printed}");
     assert!(printed.contains("half.mcap") || printed.contains("recording"), "{printed}");
-    assert!(folder.join("half/splats.ply").is_file(), "what was there is used");
+    assert!(folder.join("half/splats.ply").is_file(), "the readable part is used");
 }
 
 #[test]
@@ -362,7 +363,7 @@ fn record_reports_losses_and_does_not_overwrite() {
     let wrist = rig["camera"]["wrist"].as_table_mut().expect("a camera");
     let sensor_noise = wrist.entry("sim").or_insert_with(|| toml::Table::new().into());
     sensor_noise.as_table_mut().expect("a table").insert("dropped_frac".into(), 0.4.into());
-    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("room on the disk");
+    std::fs::write(folder.join("rig.toml"), rig.to_string()).expect("the disk has space");
 
     let record = ["record", "rig.toml", "--sim", "--out", "scan.mcap", "--json"];
     let output = fieldrig(folder, &record);
@@ -397,7 +398,8 @@ fn interrupted_run_saves_model_and_recording() {
     assert!(replayed.status.success(), "{}", String::from_utf8_lossy(&replayed.stderr));
 }
 
-/// In real time the machine's speed decides what is learned when; the log of that gives the same model again.
+/// In real time, the machine's speed determines when keyframes are trained on. The decision log reproduces the same
+/// model.
 #[test]
 fn decision_log_reproduces_a_real_time_run() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -406,15 +408,15 @@ fn decision_log_reproduces_a_real_time_run() {
     let rig = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let live = rig.replace("lockstep = true", "lockstep = false");
     assert_ne!(live, rig);
-    // Small enough that keyframes have to go.
-    std::fs::write(folder.join("rig.toml"), live + "[join]\nmax_keyframes = 10\n").expect("room on the disk");
-    // Images that the machine is too slow for are a loss (3).
+    // Small enough that keyframes are evicted.
+    std::fs::write(folder.join("rig.toml"), live + "[join]\nmax_keyframes = 10\n").expect("the disk has space");
+    // Images dropped because the machine is too slow count as a loss (3).
     let done = |args: &[&str], codes: &[i32]| -> Value {
         let output = fieldrig(folder, args);
         let printed = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.code().is_some_and(|code| codes.contains(&code)), "{args:?}: {printed}");
         let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-        serde_json::from_str(stdout.lines().last().expect("events")).expect("a JSON object a line")
+        serde_json::from_str(stdout.lines().last().expect("events")).expect("one JSON object per line")
     };
     let run = ["run", "rig.toml", "--sim", "--seconds", "5", "--refine", "extrinsics", "--max-splats", "3000"];
     let outputs = ["--record", "scan.mcap", "--out", "live", "--listen", "127.0.0.1:0", "--json"];
@@ -425,7 +427,7 @@ fn decision_log_reproduces_a_real_time_run() {
     let n_pushed_late =
         entries.iter().filter(|entry| entry.get("push").is_some() && number(entry, "step") > 0.0).count();
     let n_evicted = entries.iter().filter(|entry| entry.get("remove").is_some()).count();
-    assert!(n_pushed_late > 3 && n_evicted > 0, "{n_pushed_late} came while it learned, {n_evicted} went: {log}");
+    assert!(n_pushed_late > 3 && n_evicted > 0, "{n_pushed_late} arrived during training, {n_evicted} evicted: {log}");
 
     let replay = |log: &str, out: &str, codes: &[i32]| {
         done(&["train", "scan.mcap", "--replay-decisions", log, "--out", out, "--json"], codes)
@@ -433,22 +435,22 @@ fn decision_log_reproduces_a_real_time_run() {
     let again = replay("live/decisions.jsonl", "again", &[0, 3]);
     assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&live["checkpoint_sha256"], &live["steps"]));
     let log_again = std::fs::read_to_string(folder.join("again/decisions.jsonl")).expect("a log");
-    // Checkpoints decide nothing, and are due by the clock.
+    // Checkpoints do not affect decisions, and are due by the clock.
     let decisions = |log: &str| -> Vec<String> {
         log.lines().filter(|line| !line.contains("\"checkpoint\"")).map(str::to_owned).collect()
     };
-    assert_eq!(decisions(&log_again), decisions(&log), "the repetition decided otherwise");
+    assert_eq!(decisions(&log_again), decisions(&log), "the replay made different decisions");
 
-    // Killed in the middle of a line: what was whole is repeated.
-    std::fs::write(folder.join("cut.jsonl"), &log[..log.len() / 2]).expect("room on the disk");
+    // Truncated in the middle of a line: complete lines are replayed.
+    std::fs::write(folder.join("cut.jsonl"), &log[..log.len() / 2]).expect("the disk has space");
     let cut = replay("cut.jsonl", "cut", &[3]);
     assert!(cut["steps"].as_u64() <= live["steps"].as_u64());
     let refused = |log: String, words: &str| {
-        std::fs::write(folder.join("changed.jsonl"), log).expect("room on the disk");
+        std::fs::write(folder.join("changed.jsonl"), log).expect("the disk has space");
         let output = fieldrig(folder, &["train", "scan.mcap", "--replay-decisions", "changed.jsonl", "--out", "no"]);
         let printed = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.code() == Some(4) && printed.contains(words), "{printed}");
-        assert!(!folder.join("no").exists(), "what is refused leaves nothing behind");
+        assert!(!folder.join("no").exists(), "a rejected command leaves no files behind");
     };
     let pushed = &entries[1]["push"];
     let stamp = number(pushed, "stamp_nanos").to_string();
@@ -457,7 +459,7 @@ fn decision_log_reproduces_a_real_time_run() {
     refused(log.replace(fingerprint, "0123"), &format!("image {stamp} of camera \"wrist\" has other pixels"));
 }
 
-/// A replay that leaves nothing to train on ends by itself, and says what was amiss.
+/// A replay without images to train on stops with an error that names the problem.
 #[test]
 fn replay_without_training_keyframes_reports_the_reason() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -466,8 +468,9 @@ fn replay_without_training_keyframes_reports_the_reason() {
     let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let once = text.replace(&format!("n_images = {N_IMAGES}"), "n_images = 1");
     assert_ne!(once, text);
-    std::fs::write(folder.join("once.toml"), once).expect("room on the disk");
-    std::fs::write(folder.join("other.toml"), text.replace("camera.wrist", "camera.front")).expect("room on the disk");
+    std::fs::write(folder.join("once.toml"), once).expect("the disk has space");
+    std::fs::write(folder.join("other.toml"), text.replace("camera.wrist", "camera.front"))
+        .expect("the disk has space");
     events(folder, &["record", "once.toml", "--sim", "--out", "one.mcap", "--json"]);
     for (rig, reason) in [("rig.toml", "the only keyframe is a test image"), ("other.toml", "are from \"wrist\"")] {
         let output = fieldrig(
@@ -477,11 +480,11 @@ fn replay_without_training_keyframes_reports_the_reason() {
         let printed = String::from_utf8_lossy(&output.stderr);
         assert_eq!(output.status.code(), Some(4), "{printed}");
         assert!(printed.contains(reason), "{printed}");
-        assert!(!folder.join(format!("out-{rig}")).exists(), "what is refused leaves nothing behind");
+        assert!(!folder.join(format!("out-{rig}")).exists(), "a rejected command leaves no files behind");
     }
 }
 
-/// A disk that fills up is a loss, told with its cause; what was written before can be read.
+/// A full disk is a loss, reported with its cause. Data written before it can be read.
 #[test]
 fn full_disk_during_recording_is_a_loss() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -510,7 +513,7 @@ fn port_in_use_is_one_clear_error() {
     assert!(printed.starts_with("error: ") && printed.contains(&address), "{printed}");
 }
 
-/// The hand-eye calibration of a rig file: metres, and a quaternion as x, y, z, w.
+/// The hand-eye calibration of a rig file: meters, and a quaternion in the order x, y, z, w.
 fn hand_eye(file: &Path) -> (Vec<f64>, Vec<f64>) {
     let rig: toml::Table = std::fs::read_to_string(file).expect("a rig file").parse().expect("TOML");
     let pose = &rig["camera"]["wrist"]["parent_from_camera"];
@@ -532,7 +535,7 @@ fn wrong_hand_eye_calibration_is_corrected() {
     let record = fieldrig(folder, &["record", "rig.toml", "--sim", "--out", "scan.mcap"]);
     assert!(record.status.success(), "{}", String::from_utf8_lossy(&record.stderr));
 
-    // 5 mm, and 1 degree about the camera's axes: q * (sin, cos of half of it).
+    // 5 mm, and 1 degree about the camera's axes: q * (sin, cos of half the angle).
     let text = std::fs::read_to_string(folder.join("rig.toml")).expect("a rig file");
     let mut rig: toml::Table = text.parse().expect("TOML");
     let (right_m, right) = hand_eye(&folder.join("rig.toml"));
@@ -549,9 +552,9 @@ fn wrong_hand_eye_calibration_is_corrected() {
     let pose = rig["camera"]["wrist"]["parent_from_camera"].as_table_mut().expect("a pose");
     pose.insert("xyz_m".into(), vec![right_m[0] + 0.003, right_m[1] - 0.004, right_m[2]].into());
     pose.insert("quat_xyzw".into(), wrong.to_vec().into());
-    std::fs::write(folder.join("wrong.toml"), rig.to_string()).expect("room on the disk");
+    std::fs::write(folder.join("wrong.toml"), rig.to_string()).expect("the disk has space");
 
-    std::fs::create_dir(folder.join("found")).expect("room on the disk");
+    std::fs::create_dir(folder.join("found")).expect("the disk has space");
     let args = ["train", "scan.mcap", "--rig", "wrong.toml", "--refine", "auto", "--steps", "8", "--out", "out"];
     let printed = events(folder, &[&args[..], &["--write-rig", "found/rig.toml", "--json"]].concat());
     assert_eq!(printed.last().expect("events")["event"], "done");
@@ -569,7 +572,7 @@ fn wrong_hand_eye_calibration_is_corrected() {
     assert!((number(&found[0], "rotation_rad").to_degrees() - 1.0).abs() < MAX_REMAINING_DEGREES);
     assert!(number(&found[0], "translation_sigma_m") < 5e-4);
 
-    // With the corrected rig nothing is wrong any more.
+    // With the corrected rig, no correction remains.
     let args = ["train", "scan.mcap", "--rig", "found/rig.toml", "--refine", "auto", "--steps", "8", "--out", "again"];
     events(folder, &[&args[..], &["--json"]].concat());
     let report = std::fs::read_to_string(folder.join("again/report.json")).expect("a report");

@@ -1,12 +1,12 @@
-//! `fieldrig fk` as a program: poses against published numbers and an independent library, and what it refuses.
-#![expect(clippy::unwrap_used, reason = "a test ends at what it did not expect")]
+//! Tests `fieldrig fk` as a program: poses against published numbers and an independent library, and rejected input.
+#![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const PANDA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/kinematics/tests/data/panda.urdf");
-/// Metres, and rotation matrix elements: rounding of a dozen products of numbers near 1.
+/// Meters and rotation matrix elements: rounding of a dozen products of numbers near 1.
 const TOLERANCE: f64 = 1e-12;
 
 /// Exit code, stdout and stderr of `fieldrig fk` with these joints.
@@ -37,7 +37,7 @@ fn largest_difference(a: &[f64], b: &[f64]) -> f64 {
 
 #[test]
 fn stretched_panda_matches_published_pose() {
-    // All joints zero: 0.333 + 0.316 + 0.384 - 0.107 up, 0.088 out, the flange looking down.
+    // All joints zero: 0.333 + 0.316 + 0.384 - 0.107 up, 0.088 out, the flange pointing down.
     let stretched = [1.0, 0.0, 0.0, 0.088, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.926, 0.0, 0.0, 0.0, 1.0];
     let names = ["joint7", "joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "finger_joint_left"];
     let stretch = [0.0; 8];
@@ -47,7 +47,7 @@ fn stretched_panda_matches_published_pose() {
     let got = poses(Path::new(PANDA), &["--tip", "link8"], &joints);
     assert_eq!(got.len(), 2);
     assert!(largest_difference(&got[0], &stretched) < TOLERANCE, "{:?}", got[0]);
-    // A quarter turn of the first joint turns x into y.
+    // A quarter turn of the first joint rotates x into y.
     assert!((got[1][3] - 0.0).abs() < TOLERANCE && (got[1][7] - 0.088).abs() < TOLERANCE, "{:?}", got[1]);
     let from_hand = json!({"joint_names": ["finger_joint_left"], "configurations": [[0.04]]});
     let finger = poses(Path::new(PANDA), &["--tip", "finger_right", "--base", "hand"], &from_hand);
@@ -122,5 +122,5 @@ fn invalid_input_gives_one_error_and_no_output() {
     }
     let (code, _, err) = fk(Path::new("no-such-robot.urdf"), &["--tip", "link1"], fine);
     assert!(code == 1 && err.contains("no-such-robot.urdf"), "{err}");
-    assert_eq!(fk(Path::new(PANDA), &[], fine).0, 2, "--tip is needed");
+    assert_eq!(fk(Path::new(PANDA), &[], fine).0, 2, "--tip is required");
 }

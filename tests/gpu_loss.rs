@@ -1,4 +1,4 @@
-//! A GPU that is lost during a run or has too little memory: the run continues, or stops without losing what it has.
+//! A GPU that is lost during a run or has too little memory: the run continues, or stops without losing its results.
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 mod photos;
@@ -20,7 +20,7 @@ fn stderr(output: &Output) -> String {
     text
 }
 
-/// The last line of a run that succeeded.
+/// The last event of a successful run.
 fn done(output: &Output) -> Value {
     assert!(output.status.success(), "{}", stderr(output));
     let stdout = String::from_utf8_lossy(&output.stdout);
@@ -86,7 +86,7 @@ fn out_of_gpu_memory_stops_growth() {
         fieldrig(folder, &["train", "data", "--json", "--steps", "300", "--plan-steps", "1500", "--out", out], env)
     };
     let free = done(&train("free", &[]));
-    // Memory for the first 50 000 splats and for drawing them, but not for half as many more.
+    // Enough memory to train and render the first 50 000 splats, but not half as many more.
     let full = train("full", &[("FIELDRIG_TEST_GPU_BYTES", "48000000")]);
     let text = stderr(&full);
     assert_eq!(text.matches("the model stops growing at").count(), 1, "{text}");
@@ -94,7 +94,7 @@ fn out_of_gpu_memory_stops_growth() {
     assert_eq!(full["steps"], 300);
     assert!(full["primitives"].as_u64() < free["primitives"].as_u64(), "{full} {free}");
 
-    // Not even enough memory to begin: one sentence, and no panic.
+    // Not enough memory to start: one sentence, and no panic.
     let none = train("none", &[("FIELDRIG_TEST_GPU_BYTES", "3000000")]);
     assert_eq!(none.status.code(), Some(1));
     assert!(stderr(&none).contains("the GPU ran out of memory: buffer"), "{}", stderr(&none));
@@ -128,7 +128,7 @@ fn live_run_survives_gpu_loss_or_keeps_its_recording() {
     );
     let listed = std::fs::read_to_string(folder.join("gone/keyframes.txt")).unwrap();
     assert!(listed.lines().count() >= 12, "{listed}");
-    // The recording is closed properly: it can be trained on.
+    // The recording is complete: it can be trained on.
     let args = ["train", "gone.mcap", "--json", "--steps", "20", "--max-splats", "500", "--out", "again"];
     let again = fieldrig(folder, &args, &[]);
     assert!(again.status.success(), "{}", stderr(&again));

@@ -1,5 +1,5 @@
-//! `fieldrig metrics` and `fieldrig export` as their users run them.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+//! Tests `fieldrig metrics` and `fieldrig export` as users run them.
+#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 use image::{ExtendedColorType, RgbaImage};
 use serde_json::Value;
@@ -17,13 +17,13 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// The one line of JSON a command printed.
+/// The single line of JSON that a command printed.
 fn json_of(output: &Output) -> Value {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-/// What a command that failed with `code` said.
+/// The error message of a command that failed with `code`.
 fn error_message(output: &Output, code: i32) -> String {
     let stderr_text = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!((output.status.code(), output.stdout.len()), (Some(code), 0), "{stderr_text}");
@@ -42,7 +42,7 @@ fn metrics_are_one_json_object() {
     let folder = tempfile::tempdir().unwrap();
     let (a, b) = (picture(folder.path(), "a.png", 20, 6), picture(folder.path(), "b.png", 20, 0));
     let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--json"]));
-    // One colour of three is off by 6 everywhere.
+    // One of three color channels is off by 6 everywhere.
     let expected_db = 10.0 * (255.0_f64.powi(2) / 12.0).log10();
     assert!((scores["psnr"].as_f64().unwrap() - expected_db).abs() < 1e-9, "{scores}");
     assert!((0.5..1.0).contains(&scores["ssim"].as_f64().unwrap()), "{scores}");
@@ -128,10 +128,7 @@ fn model_is_exported_as_ply() {
     let stderr_text = error_message(&fieldrig(&["export", text(&nothing), "--to", "ply", "--out", text(&out)]), 2);
     assert!(stderr_text.contains("nothing does not exist"), "{stderr_text}");
     let stderr_text = error_message(&fieldrig(&["export", text(folder.path()), "--to", "ply", "--out", text(&out)]), 2);
-    assert!(
-        stderr_text.contains("not a model folder, a splat file or a recording"),
-        "{stderr_text}"
-    );
+    assert!(stderr_text.contains("not a model folder, a splat file or a recording"), "{stderr_text}");
     let other = folder.path().join("other.bin");
     std::fs::write(&other, b"neither").unwrap();
     let stderr_text =

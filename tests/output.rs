@@ -1,4 +1,4 @@
-//! Output that cannot be written never costs the result: closed terminals, closed pipes, full disks.
+//! Failed output never costs the result: closed terminals, closed pipes, full disks.
 #![cfg(target_os = "linux")]
 #![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 const EXE: &str = env!("CARGO_BIN_EXE_fieldrig");
 /// Longer than any of these commands takes on a busy machine.
 const TIMEOUT: Duration = Duration::from_secs(240);
-/// Exit code of a loss, which includes lost lines of output.
+/// Exit code for losses, which include dropped lines of output.
 const LOSS: i32 = 3;
 
 /// A program on a pseudoterminal that can be closed.
@@ -28,7 +28,8 @@ struct OnTerminal {
 }
 
 impl OnTerminal {
-    /// Starts `fieldrig`. With `controlled` the terminal is its controlling terminal, as for a person, and closing it sends SIGHUP.
+    /// Starts `fieldrig`. With `controlled`, the terminal is its controlling terminal, as in a shell, and closing it
+    /// sends SIGHUP.
     fn start(folder: &Path, args: &[&str], controlled: bool) -> Self {
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
         grantpt(&master).unwrap();
@@ -68,7 +69,7 @@ fn wait_for_exit(mut child: Child) -> ExitStatus {
         }
         if started.elapsed() > TIMEOUT {
             child.kill().unwrap();
-            panic!("it did not end");
+            panic!("the program did not end");
         }
         std::thread::sleep(Duration::from_millis(20));
     }
@@ -124,7 +125,7 @@ fn training_is_not_blocked_by_a_full_terminal() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     wall::write(&folder.join("data"), true, 0.0);
-    // As behind a broken connection: the terminal exists, but nobody reads. 8 kB fill it.
+    // Like a broken connection: the terminal exists, but nothing reads it. 8 kB fill it.
     let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out", "-vv"];
     let mut run = OnTerminal::start(folder, &args, true);
     run.wait_for("step");
@@ -145,7 +146,7 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
         command.current_dir(folder);
         command
     };
-    // As with `| head -1`.
+    // Like `| head -1`.
     let mut head = train("head").stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     let mut line = String::new();
     BufReader::new(head.stdout.take().unwrap()).read_line(&mut line).unwrap();
@@ -159,11 +160,11 @@ fn training_survives_a_closed_pipe_and_full_stdout() {
     assert_eq!(output.status.code(), Some(LOSS), "{printed}");
     assert!(printed.contains("cannot write to stdout") && printed.contains("No space left"), "{printed}");
     expect_model(folder, "full");
-    // Without stderr as well.
+    // Also without stderr.
     assert_eq!(train("mute").stdout(full()).stderr(full()).status().unwrap().code(), Some(LOSS));
     expect_model(folder, "mute");
 
-    // If the output is the result, a reader that closes the pipe is no loss.
+    // If the output is the result, a full output is a failure.
     let mut fk = Command::new(EXE);
     fk.args(["metrics", "data/00.png", "data/00.png"]).current_dir(folder);
     assert_eq!(fk.stdout(full()).output().unwrap().status.code(), Some(1), "the result is lost");
@@ -235,7 +236,7 @@ fn full_disk_keeps_recording_readable_and_saves_model_elsewhere() {
     let count = |key: &str| reported[key].as_u64().unwrap();
     let n_samples = ["images", "depth_images", "joint_states", "truths"].map(count).iter().sum::<u64>();
     assert!(printed.contains(&format!("({n_samples} samples)")), "{n_samples}: {printed}");
-    // The same number everywhere: a reader counts as many samples.
+    // A reader must count the same number of samples.
     let read = wall::fieldrig(folder, &["export", "disk/run.mcap", "--to", "nerfstudio", "--out", "read"]);
     let export_stderr = String::from_utf8_lossy(&read.stderr);
     assert!(export_stderr.contains(&format!("after {n_samples} readable samples")), "{n_samples}: {export_stderr}");

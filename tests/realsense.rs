@@ -1,4 +1,5 @@
-//! A rig whose camera is a file that librealsense2 recorded: the binary reads lens and depth pose from it and records its images.
+//! A rig whose camera is a file recorded by librealsense2: the binary reads lens and depth pose from it and records
+//! its images.
 
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::recording::{RIG_FILE, Recording};
@@ -24,7 +25,7 @@ file = "front.bag"
 [camera.front.depth]
 "#;
 
-/// A camera whose depth lies 15 mm beside its colour.
+/// A camera whose depth sensor is 15 mm next to its color sensor.
 fn write_bag(path: &Path) {
     let lens = |focal_px| Intrinsics {
         size_px: [320, 240],
@@ -57,11 +58,11 @@ fn write_bag(path: &Path) {
             exposure_secs: None,
             n_skipped: 0,
         };
-        writer.write(&color).expect("room on the disk");
+        writer.write(&color).expect("the disk has space");
         let format = PixelFormat::DepthU16 { meters_per_count: 0.001 };
-        writer.write(&Image { format, data: [232, 3].repeat(320 * 240).into(), ..color }).expect("room on the disk");
+        writer.write(&Image { format, data: [232, 3].repeat(320 * 240).into(), ..color }).expect("the disk has space");
     }
-    writer.finish().expect("room on the disk");
+    writer.finish().expect("the disk has space");
 }
 
 #[test]
@@ -82,7 +83,7 @@ fn recording_stores_calibration_read_from_the_bag() {
     assert!(resolved.contains("303.25") && resolved.contains("192.5"), "{resolved}");
     let mut n_images = [0; 2];
     while let Some(sample) = recording.next_sample().unwrap() {
-        let Sample::Image(image) = sample else { panic!("a camera gives images") };
+        let Sample::Image(image) = sample else { panic!("cameras deliver images") };
         match image.is_depth() {
             true => assert!(image.decode_depth_m().unwrap().iter().all(|meters| (meters - 1.0).abs() < 1e-6)),
             false => assert!(image.data.iter().all(|byte| *byte == image.data[0])),

@@ -1,5 +1,5 @@
-//! `fieldrig train --resume`: runs that stopped, or were killed, go on as if they had not.
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+//! Tests `fieldrig train --resume`: runs that stopped or were killed continue as if uninterrupted.
+#![expect(clippy::unwrap_used, reason = "a test that cannot continue may panic")]
 
 mod photos;
 mod small_rig;
@@ -21,7 +21,7 @@ fn train(folder: &Path, args: &[&str]) -> Command {
     command
 }
 
-/// Trains to the end; what is told last.
+/// Trains to the end and returns the final event.
 fn done(folder: &Path, args: &[&str]) -> Value {
     let output = train(folder, args).output().unwrap();
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -50,19 +50,20 @@ fn resumed_training_equals_uninterrupted_training() {
     let both = done(folder, &["--resume", "half", "--steps", N_STEPS, "--out", "both"]);
     assert_eq!(both["checkpoint_sha256"], whole["checkpoint_sha256"]);
     assert_eq!((&both["steps"], &both["psnr"], &both["bytes"]), (&whole["steps"], &whole["psnr"], &whole["bytes"]));
-    assert!(both["seconds"].as_f64() > half["seconds"].as_f64(), "the clock goes on");
-    // The whole state is the same, not only the model: the halves could go on together.
+    assert!(both["seconds"].as_f64() > half["seconds"].as_f64(), "the clock continues");
+    // The whole state is the same, not only the model, so either could be resumed.
     let [one, other] = ["whole", "both"].map(|run| Checkpoint::read(&folder.join(run).join("training.ckpt")).unwrap());
     assert!(one.state == other.state && one.arrays == other.arrays);
 
-    // A run that reached its limit reports that and changes nothing.
+    // A finished run reports that and changes nothing.
     let finished = train(folder, &["--resume", "both"]).output().unwrap();
     assert_eq!(finished.status.code(), Some(0), "{}", String::from_utf8_lossy(&finished.stderr));
     let finished: Value = serde_json::from_slice(&finished.stdout).unwrap();
     assert_eq!((&finished["event"], &finished["out"]), (&json!("finished"), &json!("both")));
     assert!(!folder.join("runs").exists());
 
-    // Asked for the number of steps it has already made, it saves the model in a new folder, because its own already holds a model.
+    // When the requested number of steps is already reached, it saves the model in a new folder, because its own
+    // already contains a model.
     let again = done(folder, &["--resume", "both", "--steps", N_STEPS, "--checkpoint-secs", "0"]);
     assert_eq!(again["checkpoint_sha256"], whole["checkpoint_sha256"]);
     let out = folder.join(again["out"].as_str().unwrap());
@@ -114,8 +115,7 @@ fn decision_log_reproduces_a_timed_training() {
     assert!(timed["steps"].as_u64() > Some(0));
     assert_eq!((&again["checkpoint_sha256"], &again["steps"]), (&timed["checkpoint_sha256"], &timed["steps"]));
 
-    // What went on from a checkpoint is repeated from it, and from nothing else.
-    // Scale and held out images are as they were, unasked.
+    // A resumed run is replayed from its checkpoint only. Scale and test images are taken from the checkpoint.
     let both = done(folder, &["--resume", "timed", "--seconds", "2", "--out", "both"]);
     assert_ne!(both["checkpoint_sha256"], timed["checkpoint_sha256"]);
     let log = format!("both/decisions-from-{}.jsonl", timed["steps"]);
@@ -139,7 +139,7 @@ fn decision_log_reproduces_a_timed_training() {
         let printed = printed(&["--replay-decisions", "timed/decisions.jsonl", flag, "1"]);
         assert!(printed.contains(flag), "{printed}");
     }
-    assert!(!folder.join("x").exists(), "what is refused leaves nothing behind");
+    assert!(!folder.join("x").exists(), "a rejected command leaves no files behind");
 }
 
 #[test]
@@ -152,7 +152,7 @@ fn repeatedly_killed_training_is_identical() {
 
     let file = folder.join("killed/training.ckpt");
     let changed = || std::fs::metadata(&file).and_then(|metadata| metadata.modified()).ok();
-    let resumed = ["--resume", "killed"]; // No other flag: the limit and the time between checkpoints are in the checkpoint.
+    let resumed = ["--resume", "killed"]; // No other flag: the checkpoint contains the limit and the checkpoint interval.
     let mut steps = Vec::new();
     for kill in 0..N_KILLS {
         let from = if file.exists() { &resumed[..] } else { &first[..] };
@@ -163,7 +163,7 @@ fn repeatedly_killed_training_is_identical() {
             assert!(spawned.elapsed() < Duration::from_secs(120), "no checkpoint");
             std::thread::sleep(Duration::from_millis(1));
         }
-        // Never at the same point of the rhythm of steps and checkpoints.
+        // Never at the same point of the cycle of steps and checkpoints.
         std::thread::sleep(Duration::from_micros(u64::from(kill * 23 % 37) * 8000 + 137 * u64::from(kill)));
         run.kill().unwrap();
         run.wait().unwrap();
@@ -173,14 +173,15 @@ fn repeatedly_killed_training_is_identical() {
     assert!(steps.is_sorted() && steps[0] > 0, "{steps:?}");
     eprintln!("killed at steps {steps:?}");
     if folder.join("killed/splats.ply").exists() {
-        return; // A machine so fast that it was over before it was killed.
+        return; // On a very fast machine, training ended before it was killed.
     }
     let end = done(folder, &resumed);
     assert_eq!(end["checkpoint_sha256"], whole["checkpoint_sha256"]);
-    assert!(folder.join("killed/splats.ply").exists(), "it went on in its own folder");
+    assert!(folder.join("killed/splats.ply").exists(), "it continued in the same folder");
 }
 
-/// Kills a live run, continues it, and checks that the result is that of one run: with its time, its keyframes and more steps.
+/// Kills a live run, resumes it, and checks that the result is that of one run: its time and keyframes are kept, and
+/// steps are added.
 #[cfg(feature = "sim")]
 #[test]
 fn killed_live_run_resumes_keyframes_and_clock() {
@@ -219,12 +220,12 @@ fn killed_live_run_resumes_keyframes_and_clock() {
     assert_eq!((&done["event"], &done["out"]), (&json!("done"), &json!("out")));
     assert!(done["steps"].as_u64() > checkpoint.state["step"].as_u64(), "{done}");
     let seconds = done["seconds"].as_f64().unwrap();
-    assert!((14.0..16.0).contains(&seconds), "its clock continued: {seconds} s");
+    assert!((14.0..16.0).contains(&seconds), "the clock continued: {seconds} s");
     let list = std::fs::read_to_string(folder.join("out/keyframes.txt")).unwrap();
     let stamps = list.lines().filter_map(|line| line.split(' ').nth(1)?.parse::<i64>().ok());
     assert!(stamps.clone().count() >= n_stored_at_kill && stamps.is_sorted(), "{list}");
 
-    // It is finished now; a longer time limit continues it in a new folder.
+    // The run is finished now; a longer time limit continues it in a new folder.
     let finished = run(&["--resume", "out"]).output().unwrap();
     assert!(finished.status.success());
     assert!(String::from_utf8_lossy(&finished.stdout).contains("\"finished\""));

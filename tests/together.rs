@@ -1,4 +1,4 @@
-//! Several methods that learn at once from the same images: each ends as it would alone, in a folder of its own.
+//! Several methods trained in parallel from the same images: each gives the same result as alone, in its own folder.
 
 mod wall;
 
@@ -6,16 +6,16 @@ use serde_json::{Value, json};
 use std::path::Path;
 use wall::fieldrig;
 
-/// Steps of each method; the distance field is done after the eight images it may see.
+/// Steps of each method. The distance field finishes after the eight training images.
 const N_STEPS: &str = "24";
 
-/// The JSON lines of a training that succeeded.
+/// The JSON lines of a successful training.
 fn trained(folder: &Path, args: &[&str]) -> Vec<Value> {
     let args = [&["train", "data", "--json"], args].concat();
     let output = fieldrig(folder, &args);
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
     let stdout = String::from_utf8(output.stdout).expect("stdout is UTF-8");
-    stdout.lines().map(|line| serde_json::from_str(line).expect("a JSON object a line")).collect()
+    stdout.lines().map(|line| serde_json::from_str(line).expect("one JSON object per line")).collect()
 }
 
 fn done_events(printed: &[Value]) -> Vec<&Value> {
@@ -50,25 +50,25 @@ fn several_methods_equal_single_trainings() {
             assert_eq!(done[key], alone[key], "{method}: {key}");
         }
         assert_eq!(done["out"], json!(format!("all/{method}")));
-        // The logs differ in their first line alone: it holds the caps, which only splats have.
+        // The logs differ only in their first line: it contains the caps, which only splats have.
         let [log, log_alone] = ["all/", ""].map(|run| {
             let log = std::fs::read_to_string(folder.join(run).join(method).join("decisions.jsonl")).expect("a log");
             log.lines().skip(1).map(str::to_owned).collect::<Vec<_>>()
         });
         assert!(!log.is_empty() && log == log_alone, "{method}: {log:?}");
     }
-    assert_eq!(together[0]["steps"], json!(8), "the distance field has seen all");
+    assert_eq!(together[0]["steps"], json!(8), "the distance field has fused all images");
 
     check_resume_of_one_method(folder, together[1]);
     check_mesh_export(folder);
     let small = ["train", "data", "--method", "tsdf,splat", "--max-bytes", "1000000", "--out", "small"];
     assert_fails_with(folder, &small, &["the smallest distance field takes 2629632 bytes"]);
-    assert!(!folder.join("small").exists(), "what is refused leaves nothing behind");
+    assert!(!folder.join("small").exists(), "a rejected command leaves no files behind");
     assert_fails_with(folder, &["eval", "all", "data"], &["all/splat or all/tsdf or all/nerf"]);
     assert_fails_with(folder, &["train", "data", "--out", "all"], &["already contains a model", "splat/model.json"]);
 }
 
-/// The folder of each method is that of a run of its own.
+/// The folder of each method is that of an independent run.
 fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     let again = trained(folder, &["--replay-decisions", "all/splat/decisions.jsonl", "--out", "again"]);
     assert_eq!(done_events(&again)[0]["checkpoint_sha256"], splat["checkpoint_sha256"]);
@@ -80,7 +80,7 @@ fn check_resume_of_one_method(folder: &Path, splat: &Value) {
     assert_eq!(evaluated["psnr"], splat["psnr"]);
 }
 
-/// Meshes come from distance fields alone, and can be made coarser.
+/// Only distance fields have meshes, which can be made coarser.
 fn check_mesh_export(folder: &Path) {
     let export = |to: &str, more: &[&str], out: &str| {
         let output = fieldrig(folder, &[&["export", "all/tsdf", "--to", to, "--out", out], more].concat());
@@ -107,7 +107,8 @@ fn check_mesh_export(folder: &Path) {
 
 #[test]
 fn several_methods_share_time_and_one_clock() {
-    /// Turns are dealt by time; steps of splats grow longer, and the last turn of a slow machine is a large part.
+    /// Time slices are assigned by time. Steps of splats become longer, and the last time slice on a slow machine is
+    /// a large part.
     const MAX_TIME_RATIO: f64 = 3.0;
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
@@ -121,7 +122,10 @@ fn several_methods_share_time_and_one_clock() {
     let (splat, nerf) = (evals("splat"), evals("nerf"));
     assert!(splat.len() >= 3 && splat.len() == nerf.len(), "{printed:?}");
     for (one, other) in splat.iter().zip(&nerf) {
-        assert!((number(one, "seconds") - number(other, "seconds")).abs() < 0.02, "at the same mark: {one}, {other}");
+        assert!(
+            (number(one, "seconds") - number(other, "seconds")).abs() < 0.02,
+            "at the same evaluation point: {one}, {other}"
+        );
     }
     let millis = |evals: &[&Value]| {
         let last = evals.last().expect("evaluations");
@@ -130,7 +134,7 @@ fn several_methods_share_time_and_one_clock() {
     let time_ratio = millis(&splat) / millis(&nerf);
     assert!(
         (1.0 / MAX_TIME_RATIO..MAX_TIME_RATIO).contains(&time_ratio),
-        "splats had {time_ratio:.2} times as long: {printed:?}"
+        "splats had {time_ratio:.2} times as much time: {printed:?}"
     );
 }
 

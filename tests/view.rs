@@ -1,4 +1,4 @@
-//! `fieldrig view` and the report page of training: what a browser receives, and what is refused.
+//! Tests `fieldrig view` and the report page of training: what a browser receives, and which requests are rejected.
 
 mod wall;
 
@@ -11,7 +11,7 @@ use std::time::Duration;
 use tungstenite::{Message, WebSocket};
 use wall::fieldrig;
 
-/// Far longer than two busy cores need for a small picture.
+/// Much longer than two busy cores need for a small picture.
 const TIMEOUT: Duration = Duration::from_secs(120);
 const SIZE_PX: [u32; 2] = [96, 72];
 /// Angle from the top to the bottom of a picture, degrees.
@@ -59,7 +59,7 @@ impl View {
 
 impl Drop for View {
     fn drop(&mut self) {
-        let _ = self.process.kill(); // It has ended unless a test failed.
+        let _ = self.process.kill(); // Fails if the process has already ended.
     }
 }
 
@@ -157,7 +157,7 @@ fn brightness(picture: &image::RgbImage) -> f64 {
     picture.as_raw().iter().map(|value| f64::from(*value)).sum::<f64>() / picture.as_raw().len() as f64
 }
 
-/// Bound on the change by JPEG compression at quality 92 in these pictures: measured 1.0.
+/// Upper bound on the difference caused by JPEG compression at quality 92 in these pictures: measured 1.0.
 const MAX_JPEG_DIFFERENCE: f64 = 3.0;
 
 #[test]
@@ -182,7 +182,7 @@ fn view_matches_render() {
     let cameras = keyframes["keyframes"].as_array().expect("cameras");
     assert_eq!((cameras.len(), &status["keyframes"]), (10, &json!(10)));
 
-    // The view starts where the first camera is.
+    // The view starts at the first camera.
     let start = pose_of(&scene);
     for (number, of_camera) in start.iter().zip(pose_of(&cameras[0])) {
         assert!((number - of_camera).abs() < 1e-9, "{scene} {}", cameras[0]);
@@ -202,10 +202,10 @@ fn view_matches_render() {
     check_view_without_cameras(folder);
 }
 
-/// A model without a list of cameras is first seen from outside, whichever axis is up.
+/// A model without a list of cameras is first viewed from outside, whichever axis is up.
 fn check_view_without_cameras(folder: &Path) {
     let model = folder.join("all/splat/splats.ply");
-    std::fs::copy(&model, folder.join("lone.ply")).expect("room on the disk");
+    std::fs::copy(&model, folder.join("lone.ply")).expect("the disk has space");
     std::fs::remove_file(folder.join("all/tsdf/cameras.json")).expect("a list of cameras");
     std::fs::remove_file(folder.join("all/nerf/cameras.json")).expect("a list of cameras");
     for (model, up) in [("lone.ply", "z"), ("lone.ply", "-y"), ("all/tsdf", "z"), ("all/nerf", "z")] {
@@ -218,7 +218,7 @@ fn check_view_without_cameras(folder: &Path) {
         // Upright: the camera's x axis is level, its y axis points down.
         assert!(start[8].abs() < 1e-9 && start[9] < -0.1, "{start:?}");
         let received = client.request_picture(&start, None).expect("a picture");
-        assert!(brightness(&received) > 2.0, "{model}, {up} up: nothing is seen from {start:?}");
+        assert!(brightness(&received) > 2.0, "{model}, {up} up: nothing is visible from {start:?}");
         if up == "-y" {
             // Up on the page is -y in the model: the page's world rotated by a quarter turn about x.
             let [x, y, z] = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]];
@@ -248,8 +248,8 @@ fn non_model_paths_give_one_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);
-    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).expect("room on the disk");
-    std::fs::create_dir(folder.join("cut")).expect("room on the disk");
+    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.join(name), bytes).expect("the disk has space");
+    std::fs::create_dir(folder.join("cut")).expect("the disk has space");
     write("cut/training.ckpt", b"a checkpoint");
     write("scan.mcap", b"\x89MCAP0\r\n");
     write("new.spz", b"NGSP\x04\0\0\0and so on");
@@ -276,7 +276,7 @@ fn explicit_port_in_use_is_an_error_default_falls_back() {
     let occupied = TcpListener::bind("127.0.0.1:0").expect("a free port");
     let address = occupied.local_addr().expect("bound").to_string();
     assert_fails_with(folder, &["view", "model", "--listen", &address], 1, &[&address, "in use", "--listen"]);
-    // Taken by this test, or already in use.
+    // Used by this test, or already in use.
     let _default_port = TcpListener::bind("127.0.0.1:7007");
     let view = View::start(folder, &["model"]);
     assert_ne!(view.address().port(), 7007);
@@ -342,7 +342,7 @@ fn printed_commands_work_and_report_page_is_written() {
     // Image, render, error and depth of both test images.
     assert_eq!(pictures.len(), 8);
     assert!(pictures.iter().all(|picture| picture.dimensions() == (36, 27)), "photos of 48x36, shrunk");
-    // Each render is of its own test image rather than of the other one.
+    // Each render is of its own test image rather than the other one.
     let [difference_to_own, difference_to_other] = [0, 4].map(|ix| difference(&pictures[ix], &pictures[1]));
     assert!(
         difference_to_own < 0.7 * difference_to_other && brightness(&pictures[1]) > 30.0,
@@ -359,7 +359,7 @@ fn report_without_test_images_says_so() {
     wall::write(&folder.join("data"), false, 0.0);
     train(folder, &["data", "--steps", "1", "--max-splats", "500", "--out", "first"]);
     let list = std::fs::read_to_string(folder.join("first/keyframes.txt")).expect("a list");
-    std::fs::write(folder.join("list.txt"), list.replace(" test", " train")).expect("room on the disk");
+    std::fs::write(folder.join("list.txt"), list.replace(" test", " train")).expect("the disk has space");
     let args = ["data", "--steps", "1", "--max-splats", "500", "--keyframes", "list.txt", "--out", "second"];
     let printed = train(folder, &args);
     assert!(printed.contains(" view second") && !printed.contains(" eval "), "{printed}");
@@ -373,7 +373,7 @@ fn unwritable_report_page_keeps_the_model() {
     let folder = folder.path();
     wall::write(&folder.join("data"), false, 0.0);
     for file in ["report.html", "cameras.json"] {
-        std::fs::create_dir_all(folder.join("model").join(file).join("in the way")).expect("room on the disk");
+        std::fs::create_dir_all(folder.join("model").join(file).join("in the way")).expect("the disk has space");
     }
     let output =
         fieldrig(folder, &["train", "data", "--steps", "1", "--max-splats", "500", "--out", "model", "--json"]);
@@ -381,7 +381,7 @@ fn unwritable_report_page_keeps_the_model() {
     assert_eq!(output.status.code(), Some(0), "{printed}");
     assert!(printed.contains("report.html was not") && printed.contains("cameras.json was not"), "{printed}");
     assert!(folder.join("model/splats.ply").is_file() && folder.join("model/report.json").is_file());
-    assert!(!String::from_utf8_lossy(&output.stdout).contains(" view "), "commands are for people");
+    assert!(!String::from_utf8_lossy(&output.stdout).contains(" view "), "commands are printed only without --json");
 }
 
 fn bytes_from_base64(text: &str) -> Vec<u8> {

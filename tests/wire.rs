@@ -1,4 +1,5 @@
-//! `fieldrig sim` in one process, the production drivers in others: what is played comes through as it was, and the arm can be moved.
+//! Runs `fieldrig sim` in one process and the production drivers in others: emulated samples arrive unchanged, and
+//! the arm can be moved.
 
 #![cfg(target_os = "linux")]
 
@@ -9,13 +10,13 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 
-/// For a machine that does much else.
+/// Start delay in seconds, for busy machines.
 const START_IN: &str = "5";
 
-/// A `fieldrig sim` that is ready; ended when dropped.
+/// A ready `fieldrig sim`; killed on drop.
 struct EmulatedRig {
     child: Child,
-    /// It ends where nobody reads what it prints.
+    /// `fieldrig sim` ends if nothing reads its output.
     _stdout: BufReader<ChildStdout>,
 }
 
@@ -37,8 +38,8 @@ impl EmulatedRig {
 
 impl Drop for EmulatedRig {
     fn drop(&mut self) {
-        let _ = self.child.kill(); // Gone already.
-        let _ = self.child.wait(); // Its exit code is of no interest.
+        let _ = self.child.kill(); // Fails if the process has already ended.
+        let _ = self.child.wait(); // The exit code does not matter.
     }
 }
 
@@ -55,21 +56,21 @@ fn emulated_franka_rig_is_recorded_and_moved() {
     let emulated_rig = EmulatedRig::start(folder.path());
     let (rig, script, wire) =
         (folder.path().join("rig.toml"), folder.path().join("script.mcap"), folder.path().join("wire.mcap"));
-    // A file's end ends the recording, and is none of a loss; a busy machine may lose images, which is one.
+    // The end of a file ends the recording and is not a loss. A busy machine may drop images, which is a loss.
     let (code, printed) = fieldrig(&["record", "--out", &wire.to_string_lossy(), "--json"], &rig);
     assert!(matches!(code, Some(0 | 3)), "{printed}");
     let difference = compare::difference(&script, &wire);
     assert!(difference.n_images >= 60, "{difference:?}");
-    // A joint turns by half a radian a second at most here: a millisecond is half a milliradian.
+    // A joint rotates by at most half a radian per second here: a millisecond is half a milliradian.
     assert!(difference.joints_rad[0] < 5e-4, "{difference:?}");
-    assert_eq!(difference.base_m, 0.0, "it stands still");
+    assert_eq!(difference.base_m, 0.0, "the base is stationary");
 
     let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--enable-motion", "--json"], &rig);
     assert_eq!(code, Some(0), "{printed}");
     assert!(compare::error_of_move(&printed) < 1e-3, "{printed}");
     let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=9", "--enable-motion", "--json"], &rig);
-    assert_eq!(code, Some(2), "a slip of the pen does not swing it to the end of its range: {printed}");
+    assert_eq!(code, Some(2), "a typing error must not move the joint to the end of its range: {printed}");
     let (code, printed) = fieldrig(&["move", "--by", "panda_joint1=0.05", "--json"], &rig);
-    assert_eq!(code, Some(2), "without a word that it may move it does not: {printed}");
+    assert_eq!(code, Some(2), "the arm does not move without --enable-motion: {printed}");
     drop(emulated_rig);
 }

@@ -5,15 +5,15 @@ use flate2::write::GzEncoder;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// What `scripts/build-web.sh` writes.
+/// Files written by `scripts/build-web.sh`.
 const BUNDLE: [&str; 3] = ["web/dist/index.html", "web/dist/app.js", "web/dist/app.css"];
-/// The page of a binary that was built without Node.js.
+/// The page of binaries built without Node.js.
 const WITHOUT_BUNDLE: [&str; 2] = ["src/without_bundle.html", "src/without_bundle.css"];
 
 fn main() -> std::io::Result<()> {
     println!("cargo::rustc-check-cfg=cfg(web_bundle)");
-    // The bundler touches this file, so that a first bundle is noticed. Naming bundle files that do not
-    // exist would make every build a full one.
+    // The bundler touches this file, so that Cargo notices the first bundle. Listing bundle files that do not exist
+    // would make Cargo rerun this script in every build.
     println!("cargo::rerun-if-changed=build.rs");
     let has_bundle = BUNDLE.iter().all(|file| Path::new(file).is_file());
     if has_bundle {

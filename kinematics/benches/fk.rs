@@ -1,4 +1,4 @@
-//! Time of the things done for every image and every joint reading: poses, Jacobians, projection, undistortion.
+//! Benchmarks of the per-image and per-reading operations: poses, Jacobians, projection and undistortion.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use kinematics::{Chain, Intrinsics, Lens, Transform, Undistortion};

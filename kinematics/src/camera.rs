@@ -11,11 +11,11 @@ pub struct Intrinsics {
     pub size_px: [u32; 2],
     /// Focal length along x and y, pixels.
     pub focal_px: [f64; 2],
-    /// Principal point, pixels; the centre of pixel `(0, 0)` is `(0.5, 0.5)`.
+    /// Principal point, pixels; the center of pixel `(0, 0)` is `(0.5, 0.5)`.
     pub principal_px: [f64; 2],
     /// Distortion of the lens.
     pub lens: Lens,
-    /// The image is undistorted already: the lens's coefficients are ignored.
+    /// Whether the image is already undistorted. If so, the lens coefficients are ignored.
     pub rectified: bool,
 }
 
@@ -31,10 +31,10 @@ pub enum Lens {
 }
 
 impl Intrinsics {
-    /// Pixel where a point in camera coordinates is seen, inside the image or not.
+    /// Projects a point in camera coordinates to a pixel, which may lie outside the image.
     ///
-    /// None where the lens has no picture of it: behind the camera or beside it (`z <= 0`), beyond the radius where the
-    /// distortion polynomial turns back, or not finite.
+    /// Returns `None` if the lens cannot image the point: it lies behind or next to the camera (`z <= 0`), it lies
+    /// beyond the radius up to which the distortion polynomial is monotonic, or it is not finite.
     pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<[f64; 2]> {
         if point_in_camera.z.is_nan() || point_in_camera.z <= 0.0 {
             return None;
@@ -48,7 +48,8 @@ impl Intrinsics {
         self.pixel_at(distorted)
     }
 
-    /// Like [`Intrinsics::project`], with the derivative of the pixel by the point, pixels per metre.
+    /// Like [`Intrinsics::project`], and also returns the derivative of the pixel with respect to the point, pixels
+    /// per meter.
     pub fn project_with_jacobian(&self, point_in_camera: &Vector3<f64>) -> Option<([f64; 2], Matrix2x3<f64>)> {
         let &[x, y, z] = point_in_camera.as_ref();
         if z.is_nan() || z <= 0.0 {
@@ -67,9 +68,9 @@ impl Intrinsics {
         Some((self.pixel_at(distorted.value)?, pixel_by_point))
     }
 
-    /// The point with `z = 1` seen at a pixel; its direction is the pixel's ray. Undoes [`Intrinsics::project`] to 1e-12.
+    /// Back-projects a pixel to the point on its ray with `z = 1`. Inverts [`Intrinsics::project`] to 1e-12.
     ///
-    /// None where the lens shows nothing in front of the camera there, or the pixel is not finite.
+    /// Returns `None` if the pixel is not finite or if no direction in front of the camera projects to it.
     pub fn unproject(&self, pixel: [f64; 2]) -> Option<Vector3<f64>> {
         let distorted = Vector2::new(
             (pixel[0] - self.principal_px[0]) / self.focal_px[0],
@@ -86,16 +87,16 @@ impl Intrinsics {
         Some(Vector3::new(plane.x, plane.y, 1.0))
     }
 
-    /// The same camera with its image resized to `frac` of the size, rounded to whole pixels and at least one.
+    /// Scales the image size by `frac`, rounded to whole pixels and at least one, and returns the intrinsics for it.
     ///
-    /// Focal length and principal point follow the rounded size, so a corner of the image stays a corner.
-    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, which is meant")]
+    /// Focal length and principal point follow the rounded size, so image corners map to image corners.
+    #[expect(clippy::cast_possible_truncation, reason = "the cast saturates, as intended")]
     pub fn scaled(&self, frac: f64) -> Self {
         let size_px = self.size_px.map(|size| ((f64::from(size) * frac).round() as u32).max(1));
         self.resized(size_px)
     }
 
-    /// The same camera with its image resized to `size_px`.
+    /// Returns the intrinsics for the image resized to `size_px`.
     pub fn resized(&self, size_px: [u32; 2]) -> Self {
         let ratio = |axis: usize| f64::from(size_px[axis]) / f64::from(self.size_px[axis]);
         Self {
@@ -106,26 +107,28 @@ impl Intrinsics {
         }
     }
 
-    /// The pinhole camera of the same size, focal length and principal point: what [`crate::Undistortion`] makes of the image.
+    /// Pinhole camera with the same size, focal length and principal point: the camera of the images that
+    /// [`crate::Undistortion`] returns.
     pub fn undistorted(&self) -> Self {
         Self { lens: Lens::Pinhole, rectified: true, ..*self }
     }
 
-    /// Whether a pinhole describes the image as it is: rectified, no lens model, or all coefficients of the lens zero.
+    /// Whether the pinhole model describes the image: it is rectified, has no lens model, or all lens coefficients
+    /// are zero.
     pub fn is_pinhole(&self) -> bool {
         match self.lens_in_use() {
             Lens::Pinhole => true,
             Lens::BrownConrady(k) => k == [0.0; 5],
-            Lens::KannalaBrandt(_) => false, // Without coefficients it is still equidistant.
+            Lens::KannalaBrandt(_) => false, // Even with zero coefficients the projection is equidistant.
         }
     }
 
-    /// Whether a pixel position lies in the image.
+    /// Whether a pixel position lies inside the image.
     pub fn contains(&self, pixel: [f64; 2]) -> bool {
         (0..2).all(|axis| pixel[axis] >= 0.0 && pixel[axis] < f64::from(self.size_px[axis]))
     }
 
-    /// Refuses sizes of zero, focal lengths that are not positive, and anything not finite.
+    /// Rejects zero sizes, focal lengths that are not positive, and non-finite values.
     pub fn validate(&self) -> Result<(), Error> {
         let check = |what, value: f64, fine: bool, allowed| match fine {
             true => Ok(()),
@@ -234,7 +237,7 @@ mod tests {
     #[test]
     fn derivatives_match_central_differences() {
         const NUDGE_M: f64 = 1e-6;
-        const CLOSE: f64 = 1e-6; // Pixels per metre out of hundreds: truncation 1e-12 and rounding 1e-13 / 1e-6 of them.
+        const CLOSE: f64 = 1e-6; // Pixels per meter out of hundreds: truncation 1e-12 and rounding 1e-13 / 1e-6 of them.
         for lens in lenses() {
             let camera = camera(lens);
             for point in [[0.3, -0.2, 1.5], [0.0, 0.0, 0.7], [-0.4, 0.35, 1.1], [1e-9, 0.0, 1.0]] {
@@ -271,13 +274,13 @@ mod tests {
 
     #[test]
     fn barrel_distortion_stops_at_its_limit() {
-        // r (1 - 0.3 r2) turns back at r = 1 / sqrt(0.9), where it is 2 / 3 of that.
+        // r (1 - 0.3 r2) peaks at r = 1 / sqrt(0.9), where it is 2 / 3 of r.
         let camera = camera(Lens::BrownConrady([-0.3, 0.0, 0.0, 0.0, 0.0]));
         let turning_radius = 1.0 / 0.9_f64.sqrt();
         let at = |radius: f64| camera.project(&Vector3::new(radius * 0.6, radius * 0.8, 1.0));
         assert!(at(turning_radius * 0.999).is_some());
         assert_eq!(at(turning_radius * 1.001), None);
-        assert_eq!(at(1.8), None); // The formula alone would put it at 0.03 of the focal length.
+        assert_eq!(at(1.8), None); // Evaluated without the limit, the formula gives 0.03 of the focal length.
         let unproject_at =
             |radius: f64| camera.unproject([321.5 + 600.0 * radius * 0.6, 238.25 + 580.0 * radius * 0.8]);
         assert!(unproject_at(turning_radius * 2.0 / 3.0 * 0.999).is_some());

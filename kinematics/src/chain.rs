@@ -6,8 +6,8 @@ use nalgebra::{Matrix6xX, Quaternion, Translation3, Unit, UnitQuaternion, Vector
 
 /// The joints between two links of a robot, ready to compute poses.
 ///
-/// Configurations are slices in the order of [`Chain::joint_names`]: radians for turning joints, metres for sliding ones.
-/// Joints that mimic others are not in that order; they follow.
+/// Configurations are slices in the order of [`Chain::joint_names`]: radians for revolute joints, meters for
+/// prismatic ones. Mimic joints are not part of a configuration; they are computed from the joints they follow.
 #[derive(Clone, Debug)]
 pub struct Chain {
     base_link: String,
@@ -19,10 +19,10 @@ pub struct Chain {
     last_from_tip: RigidMotion,
 }
 
-/// A constant motion and then one joint along or about the z axis.
+/// A constant transform followed by one joint along or about the z axis.
 ///
-/// Fixed joints are merged into the constant, and the frames are turned so that every joint moves about z: both are done
-/// once, when the chain is built.
+/// Fixed joints are merged into the constant, and frames are rotated so that every joint moves along or about z. Both
+/// happen once, when the chain is built.
 #[derive(Clone, Debug)]
 struct Segment {
     before: RigidMotion,
@@ -39,12 +39,12 @@ struct RigidMotion {
 }
 
 impl Chain {
-    /// Reads a URDF and takes the joints from `base_link` down to `tip_link`.
+    /// Parses a URDF and selects the joints from `base_link` down to `tip_link`.
     pub fn from_urdf(xml: &str, base_link: &str, tip_link: &str) -> Result<Self, Error> {
         Self::new(&Robot::parse(xml)?, base_link, tip_link)
     }
 
-    /// The joints of `robot` from `base_link` down to `tip_link`.
+    /// Selects the joints of `robot` from `base_link` down to `tip_link`.
     pub fn new(robot: &Robot, base_link: &str, tip_link: &str) -> Result<Self, Error> {
         let mut chain = Self {
             base_link: base_link.into(),
@@ -81,22 +81,23 @@ impl Chain {
         Ok(chain)
     }
 
-    /// Name of the link poses are told in.
+    /// Name of the link in whose frame poses are given.
     pub fn base_link(&self) -> &str {
         &self.base_link
     }
 
-    /// Name of the link whose pose is told.
+    /// Name of the link whose pose is computed.
     pub fn tip_link(&self) -> &str {
         &self.tip_link
     }
 
-    /// Names of the moving joints, from the base to the tip; a joint that others mimic stands where it first matters.
+    /// Names of the moving joints, from base to tip. A joint that mimic joints follow is listed where it first
+    /// affects the chain.
     pub fn joint_names(&self) -> &[String] {
         &self.joint_names
     }
 
-    /// How many numbers a configuration has.
+    /// Number of values in a configuration.
     pub fn n_joints(&self) -> usize {
         self.joint_names.len()
     }
@@ -106,7 +107,7 @@ impl Chain {
         &self.limits
     }
 
-    /// Where each of the chain's joints stands in `names`, for devices and files with their own order.
+    /// Index in `names` of each joint of the chain, for devices and files with a different joint order.
     pub fn order_in(&self, names: &[String]) -> Result<Vec<usize>, Error> {
         let find = |joint: &String| {
             names.iter().position(|name| name == joint).ok_or_else(|| Error::MissingJoint {
@@ -125,7 +126,8 @@ impl Chain {
         Ok(base_from_tip)
     }
 
-    /// Like [`Chain::forward`], into a place that exists; neither allocates. On error the place is left as it was.
+    /// Like [`Chain::forward`], but writes into an existing value. Neither allocates. On error the value is
+    /// unchanged.
     pub fn forward_into(&self, q: &[f64], base_from_tip: &mut Transform) -> Result<(), Error> {
         self.check(q)?;
         let mut pose = RigidMotion::IDENTITY;
@@ -138,8 +140,8 @@ impl Chain {
         Ok(())
     }
 
-    /// Geometric Jacobian at `q`: times the joint velocities it gives the velocity of the tip's origin (rows 0 to 2) and the
-    /// angular velocity of the tip (rows 3 to 5), both in the base's axes.
+    /// Geometric Jacobian at `q`. Multiplied by the joint velocities, it gives the velocity of the tip's origin (rows
+    /// 0 to 2) and the angular velocity of the tip (rows 3 to 5), both in the base frame.
     pub fn jacobian(&self, q: &[f64]) -> Result<Matrix6xX<f64>, Error> {
         let tip_in_base = self.forward(q)?.translation.vector;
         let mut jacobian = Matrix6xX::zeros(self.n_joints());
@@ -164,7 +166,8 @@ impl Chain {
         Ok(jacobian)
     }
 
-    /// Velocity of the tip relative to the base, in the tip's own axes, when the joints at `q` move with `qd` (per second).
+    /// Velocity of the tip relative to the base, in the tip frame, when the joints at `q` move with `qd` (per
+    /// second).
     pub fn tip_twist(&self, q: &[f64], qd: &[f64]) -> Result<Twist, Error> {
         self.check(qd)?;
         let mut tip = Twist::zero();
@@ -175,7 +178,8 @@ impl Chain {
         Ok(tip)
     }
 
-    /// Velocity of the tip relative to the base, in the tip's own axes, for each joint at `q` that moves by 1 per second.
+    /// Velocity of the tip relative to the base, in the tip frame, for each joint at `q` moving alone at 1 per
+    /// second.
     pub fn tip_twists_by_joint(&self, q: &[f64]) -> Result<Vec<Twist>, Error> {
         let tip_from_base = self.forward(q)?.rotation.inverse();
         let in_tip = |linear: Vector3<f64>, angular: Vector3<f64>| Twist {
@@ -211,7 +215,7 @@ impl Chain {
     }
 }
 
-/// The joint that really moves, and how `joint` follows it.
+/// The independent joint, and how `joint` follows it.
 struct MimicRule<'a> {
     source: &'a Joint,
     multiplier: f64,
@@ -239,7 +243,7 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<MimicRule<'a>
 }
 
 fn rotation_from_z_to(axis: &Unit<Vector3<f64>>) -> UnitQuaternion<f64> {
-    // Opposite directions leave the turning axis open: any half turn about an axis across z does it.
+    // Opposite directions leave the rotation axis undetermined: a half turn about any axis perpendicular to z works.
     UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), axis)
         .unwrap_or_else(|| UnitQuaternion::from_quaternion(Quaternion::new(0.0, 1.0, 0.0, 0.0)))
 }
@@ -260,7 +264,7 @@ impl RigidMotion {
     }
 
     fn transform(&self) -> Transform {
-        // A product of a few unit quaternions is off unit length by rounding only.
+        // The product of a few unit quaternions deviates from unit length only by rounding.
         Transform::from_parts(self.translation.into(), UnitQuaternion::new_unchecked(self.rotation))
     }
 
@@ -275,7 +279,7 @@ impl RigidMotion {
             self.translation += rotate(&self.rotation, &Vector3::new(0.0, 0.0, value));
             return;
         }
-        // The product with (cos, 0, 0, sin) of half the angle, without the zeros.
+        // The product with (cos, 0, 0, sin) of half the angle, skipping the zeros.
         let (sin, cos) = (0.5 * value).sin_cos();
         let r = &self.rotation;
         self.rotation =
@@ -329,7 +333,8 @@ mod tests {
         (a - b).abs().max()
     }
 
-    /// Every kind of joint, odd axes and mimics with offsets, one of them following a joint off the path.
+    /// Every joint type, non-standard axes, and mimic joints with offsets, one of which follows a joint outside the
+    /// path.
     const ODD: &str = r#"<robot name="odd">
         <link name="a"/><link name="b"/><link name="c"/><link name="d"/><link name="e"/><link name="f"/><link name="g"/>
         <link name="off"/><link name="soft"/>
@@ -374,7 +379,7 @@ mod tests {
             assert!(distance(&chain.forward(&q).unwrap().to_homogeneous(), &panda_by_dh(&q)) < CLOSE);
         }
         let off = distance(&chain.forward(&[0.001; 7]).unwrap().to_homogeneous(), &panda_by_dh(&[0.0; 7]));
-        assert!(off > 1e-4, "the comparison must tell poses apart");
+        assert!(off > 1e-4, "the comparison must distinguish poses");
     }
 
     #[test]
@@ -416,7 +421,7 @@ mod tests {
                     let angular = (ahead.rotation * behind.rotation.inverse()).scaled_axis() / (2.0 * NUDGE);
                     assert!((jacobian.fixed_view::<3, 1>(0, joint) - linear).norm() < ABS, "{tip} joint {joint}");
                     assert!((jacobian.fixed_view::<3, 1>(3, joint) - angular).norm() < ABS, "{tip} joint {joint}");
-                    // The same motion as a twist in the tip's own axes.
+                    // The same motion as a twist in the tip frame.
                     let mut qd = vec![0.0; chain.n_joints()];
                     qd[joint] = 1.0;
                     let twist = chain.tip_twist(&q, &qd).unwrap();

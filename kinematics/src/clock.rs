@@ -1,19 +1,19 @@
-//! A device's clock mapped to ours by what arrives when.
+//! Maps a device's clock to the host clock from message arrival times.
 
 use crate::Stamp;
 use std::collections::VecDeque;
 
-/// Maps stamps of one device's clock to our monotonic clock.
+/// Maps stamps of one device's clock to the host's monotonic clock.
 ///
-/// Every arrival is `device * (1 + drift) + offset + latency`, where the latency is at least some fixed least one and
-/// often much more. So all arrivals lie above a line, and the map is the highest such line, in the sense of Moon, Skelly
-/// and Towsley 1999 (section 4: the lower convex hull's edge across the mean device time). Late arrivals do not move it.
-/// The least latency itself cannot be seen and stays in the result: it is calibrated elsewhere.
+/// Every message arrives at `device * (1 + drift) + offset + latency`, where the latency has a fixed minimum and is
+/// often much larger. All arrivals therefore lie above a line, and the map is the highest such line: the edge of the
+/// lower convex hull across the mean device time (Moon, Skelly and Towsley 1999, section 4). Late arrivals do not
+/// move it. The minimum latency cannot be observed and remains in the result; it is calibrated elsewhere.
 #[derive(Clone, Debug)]
 pub struct ClockMap {
-    /// First device stamp since the start or the last restart; device times are told relative to it.
+    /// First device stamp since the start or the last restart. Device times are relative to it.
     origin: Option<Origin>,
-    /// The earliest arrival, relative to its device time, of each bucket of device time.
+    /// The earliest arrival in each bucket of device time, measured relative to its device time.
     buckets: VecDeque<Bucket>,
     line: Line,
     newest_nanos: i64,
@@ -47,17 +47,20 @@ struct Line {
 const BUCKET_NANOS: i64 = 250_000_000;
 /// Arrivals older than this are forgotten, so that the map follows a drift that changes with temperature.
 const WINDOW_SECS: f64 = 120.0;
-/// No crystal in use is further off; slopes beyond come from latency.
+/// Exceeds the drift of any common crystal. Steeper slopes are caused by latency.
 const MAX_DRIFT: f64 = 200e-6;
-/// Drift is believed in proportion to the time seen, fully from here on: before, latency looks like drift.
+/// Drift is weighted by the observed time span and applied in full from here on, because latency looks like drift
+/// over short spans.
 const FULL_DRIFT_SECS: f64 = 80.0;
-/// A device stamp further back than this is a new start of its clock; less is disorder on the wire.
+/// A device stamp that is further back than this means that the clock restarted. Smaller steps are reordered
+/// messages.
 const MAX_DISORDER_NANOS: i64 = 500_000_000;
-/// An arrival this far before the line, seconds, cannot be: the device clock jumped ahead.
+/// An arrival this far before the line, in seconds, means that the device clock jumped ahead.
 const MAX_EARLY_SECS: f64 = 0.25;
-/// When all arrivals for a while are this late, seconds, the device clock jumped back a little, or was held.
+/// If all arrivals in [`MAX_LATE_NANOS`] are this late, in seconds, the device clock jumped back a little or was
+/// paused.
 const MAX_LATE_SECS: f64 = 1.0;
-/// That while.
+/// How long arrivals must be late before the clock counts as restarted.
 const MAX_LATE_NANOS: i64 = 3_000_000_000;
 
 const NANOS_PER_SEC: f64 = 1e9;
@@ -69,7 +72,7 @@ impl Default for ClockMap {
 }
 
 impl ClockMap {
-    /// A map that knows nothing yet.
+    /// Creates a map without observations.
     pub fn new() -> Self {
         Self {
             origin: None,
@@ -81,7 +84,7 @@ impl ClockMap {
         }
     }
 
-    /// Learns from one message: the device's stamp on it, and when it arrived here.
+    /// Adds one message: its device stamp and its arrival time.
     pub fn observe(&mut self, device_nanos: i64, arrival: Stamp) {
         let Some(origin) = self.origin else {
             return self.start(device_nanos, arrival);
@@ -94,7 +97,8 @@ impl ClockMap {
         let device_secs = since_nanos as f64 / NANOS_PER_SEC;
         let delay_secs = arrival.nanos_since(origin.arrival).saturating_sub(since_nanos) as f64 / NANOS_PER_SEC;
         let lateness_secs = delay_secs - self.line.at(device_secs);
-        // The first arrival of all may have been late by any amount, so early ones are judged once a line has formed.
+        // The very first arrival may have been late by any amount, so early arrivals are checked only after a line
+        // has formed.
         let has_line = self.buckets.len() > 4;
         if has_line && lateness_secs < -MAX_EARLY_SECS {
             return self.restart(device_nanos, arrival);
@@ -107,10 +111,10 @@ impl ClockMap {
         }
     }
 
-    /// Our time of a device stamp; none before the first message.
+    /// Converts a device stamp to host time. Returns `None` before the first message.
     ///
-    /// The least latency of the connection is part of it. Stamps may be mapped a little earlier than before once a quicker
-    /// message has been seen, so two stamps close together can change order while the map is young.
+    /// The result includes the minimum latency of the connection. Stamps may map to slightly earlier times once a
+    /// faster message has arrived, so two stamps close together can change order while there are few observations.
     #[expect(clippy::cast_possible_truncation, reason = "a float to integer cast saturates")]
     pub fn map(&self, device_nanos: i64) -> Option<Stamp> {
         let origin = self.origin?;
@@ -120,18 +124,19 @@ impl ClockMap {
         Some(Stamp(mapped))
     }
 
-    /// Learns from one message and tells its time; never later than its arrival.
+    /// Adds one message and returns its host time, which is never later than its arrival.
     pub fn stamp(&mut self, device_nanos: i64, arrival: Stamp) -> Stamp {
         self.observe(device_nanos, arrival);
         self.map(device_nanos).map_or(arrival, |mapped| mapped.min(arrival))
     }
 
-    /// How much faster our clock runs than the device's, as a share (1e-6 is one part in a million).
+    /// Relative rate difference: how much faster the host clock runs than the device clock (1e-6 is one part per
+    /// million).
     pub fn drift(&self) -> f64 {
         self.line.drift
     }
 
-    /// How often the device's clock was found to have started again or jumped.
+    /// Number of detected restarts and jumps of the device clock.
     pub fn n_restarts(&self) -> u64 {
         self.n_restarts
     }
@@ -158,7 +163,7 @@ impl ClockMap {
         arrival.0.saturating_sub(*self.late_since_nanos.get_or_insert(arrival.0)) > MAX_LATE_NANOS
     }
 
-    /// Takes an arrival into its bucket; whether anything changed.
+    /// Merges an arrival into its bucket. Returns whether anything changed.
     fn insert(&mut self, new: Bucket) -> bool {
         let at = self.buckets.partition_point(|bucket| bucket.index < new.index);
         match self.buckets.get_mut(at) {
@@ -184,7 +189,7 @@ impl ClockMap {
         Line { offset_secs: offset_secs.fold(f64::INFINITY, f64::min), drift }
     }
 
-    /// Slope of the lower hull's edge that spans the mean device time.
+    /// Slope of the edge of the lower hull that spans the mean device time.
     fn hull_slope(&self) -> f64 {
         let mean_secs = self.buckets.iter().map(|bucket| bucket.device_secs).sum::<f64>() / self.buckets.len() as f64;
         let mut hull: Vec<&Bucket> = Vec::with_capacity(self.buckets.len());
@@ -211,19 +216,19 @@ fn slope(a: &Bucket, b: &Bucket) -> f64 {
     (b.delay_secs - a.delay_secs) / (b.device_secs - a.device_secs)
 }
 
-/// Unwraps a device's 32-bit count of microseconds, which starts again every 71.6 minutes, to nanoseconds.
+/// Unwraps a device's 32-bit microsecond counter, which overflows every 71.6 minutes, to nanoseconds.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct WrappingMicros {
     last: Option<(u32, i64)>,
 }
 
 impl WrappingMicros {
-    /// An unwrapper that has seen nothing; its first result is the count itself.
+    /// Creates an unwrapper without a previous count. Its first result equals the count.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The count as nanoseconds that go on growing, taking each count as the one within 35 minutes of the count before.
+    /// Returns the count as monotonic nanoseconds, assuming that it lies within 35 minutes of the previous count.
     pub fn nanos(&mut self, micros: u32) -> i64 {
         const NANOS_PER_MICRO: i64 = 1000;
         let total = match self.last {
@@ -245,7 +250,7 @@ mod tests {
     const JITTER_NANOS: f64 = 75e6;
     const DRIFT: f64 = 50e-6;
 
-    /// A device that sends at a fixed rate over a bad connection; all its numbers come from one seed.
+    /// A device that sends at a fixed rate over a bad connection. All its numbers derive from one seed.
     struct Device {
         rate_hz: f64,
         random: u64,
@@ -271,7 +276,7 @@ mod tests {
         }
     }
 
-    /// Worst error from `settled_secs` to the end, nanoseconds, with the fixed latency taken away.
+    /// Largest error from `settled_secs` to the end, in nanoseconds, after subtracting the fixed latency.
     fn worst_error(clock: &mut ClockMap, device: &mut Device, secs: f64, settled_secs: f64) -> i64 {
         let n_messages = (secs * device.rate_hz) as u32;
         let mut worst = 0;
@@ -288,8 +293,8 @@ mod tests {
 
     #[test]
     fn jitter_and_drift_are_filtered_to_a_millisecond() {
-        // Rate, length of the run, time to settle, largest error in the rest of it. With few messages a quick one is rare:
-        // the quickest of the n seen late in a window is about 75 ms / n late.
+        // Rate, run length, settling time, largest error after settling. With a low rate, fast messages are rare: the
+        // fastest of n messages in a window is about 75 ms / n late.
         const RUNS: [(f64, f64, f64, i64); 4] = [
             (1000.0, 30.0, 2.0, 300_000),
             (200.0, 60.0, 6.0, 700_000),
@@ -352,7 +357,7 @@ mod tests {
         for ix in 0..500 {
             assert_eq!(send(&mut clock, ix * 10, 0), 0);
         }
-        // The device was held for three seconds together with its clock: every stamp is 3 s behind, none goes backwards.
+        // The device and its clock were paused for three seconds: every stamp is 3 s behind, none goes backwards.
         for ix in 800..1200 {
             send(&mut clock, ix * 10, 3000);
         }
@@ -365,7 +370,7 @@ mod tests {
         let mut clock = ClockMap::new();
         for ix in 0..1000_i64 {
             let device = ix * 10_000_000;
-            // Everything sent in the third second arrives at its end.
+            // Everything sent in the third second arrives at the end of that second.
             let sent = if (200..300).contains(&ix) { 3_000_000_000 } else { device };
             clock.observe(device, Stamp(sent + 77));
         }

@@ -1,20 +1,20 @@
-//! What can be wrong with the input of this crate.
+//! Errors for invalid input to this crate.
 
-/// Why an input was refused.
+/// Reason why an input was rejected.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A matrix holds NaN or infinity.
+    /// A matrix contains NaN or infinity.
     #[error("transform: element {row},{column} is {value}, not a finite number")]
     TransformNotFinite {
         /// Row, from 0.
         row: usize,
         /// Column, from 0.
         column: usize,
-        /// What stands there.
+        /// Value found.
         value: f64,
     },
-    /// The upper left 3x3 is no rotation: scaled, sheared or mirrored.
+    /// The upper left 3x3 block is not a rotation: it is scaled, sheared or mirrored.
     #[error(
         "transform: not rigid, its axes are off unit length or right angles by {off:.2e} (at most {allowed:.0e}) and its determinant is {determinant:.4}"
     )]
@@ -35,15 +35,15 @@ pub enum Error {
     /// A lens parameter is out of its range.
     #[error("camera intrinsics: {what} is {value}, must be {allowed}")]
     Intrinsics {
-        /// Which number.
+        /// Name of the value.
         what: &'static str,
-        /// Its value.
+        /// Value found.
         value: f64,
-        /// What would be accepted.
+        /// Accepted values.
         allowed: &'static str,
     },
     /// A pixel buffer does not fit the camera's image size.
-    #[error("image of {got} values, must be {expected} for {width} x {height} pixels")]
+    #[error("image has {got} values, expected {expected} for {width} x {height} pixels")]
     ImageSize {
         /// Values given.
         got: usize,
@@ -54,16 +54,16 @@ pub enum Error {
         /// Height in pixels.
         height: u32,
     },
-    /// The text is no URDF.
+    /// The text is not a valid URDF.
     #[error("urdf: cannot be read: {why}")]
     UrdfSyntax {
-        /// What the parser said.
+        /// Parser message.
         why: String,
     },
-    /// The file parses, but describes no robot.
+    /// The file parses but contains no robot.
     #[error("urdf: robot {robot:?} has no <link> (an export that failed or was never expanded from xacro?)")]
     NoLinks {
-        /// Name of the robot, may be empty.
+        /// Name of the robot; may be empty.
         robot: String,
     },
     /// Two links or two joints share a name.
@@ -74,12 +74,12 @@ pub enum Error {
         /// The shared name.
         name: String,
     },
-    /// A joint names a link that is not defined.
+    /// A joint refers to an undefined link.
     #[error("urdf: joint {joint:?} joins link {link:?}, which is not defined")]
     UndefinedLink {
         /// The joint.
         joint: String,
-        /// The link it names.
+        /// The undefined link.
         link: String,
     },
     /// A link is the child of two joints.
@@ -87,9 +87,9 @@ pub enum Error {
     TwoParents {
         /// The link.
         link: String,
-        /// One joint above it.
+        /// First joint above it.
         first: String,
-        /// The other joint above it.
+        /// Second joint above it.
         second: String,
     },
     /// Following parents leads back to the same link.
@@ -98,33 +98,33 @@ pub enum Error {
         /// A link on the cycle.
         link: String,
     },
-    /// There is no single link above all others.
+    /// The tree has no unique root link.
     #[error("urdf: {} links have no parent ({}), so the base link has to be named", .roots.len(), .roots.join(", "))]
     ManyRoots {
         /// All links without a parent.
         roots: Vec<String>,
     },
-    /// A link asked for is not in the file.
+    /// A requested link is not in the file.
     #[error("link {link:?} is not in the URDF of {robot:?}; its links are {}", .links.join(", "))]
     UnknownLink {
-        /// The link asked for.
+        /// Requested link.
         link: String,
         /// Name of the robot.
         robot: String,
         /// All links of the file.
         links: Vec<String>,
     },
-    /// The base is not above the tip.
+    /// The base link is not an ancestor of the tip link.
     #[error("link {tip:?} is not below link {base:?}; {}", above(.ancestors))]
     NotBelow {
-        /// The tip asked for.
+        /// Requested tip link.
         tip: String,
-        /// The base asked for.
+        /// Requested base link.
         base: String,
         /// The links above the tip, nearest first.
         ancestors: Vec<String>,
     },
-    /// A joint on the way has a type that one number does not describe.
+    /// A joint on the path has a type that cannot be described by one number.
     #[error("joint {joint:?} is {kind}, only fixed, revolute, continuous and prismatic joints can be computed")]
     JointType {
         /// The joint.
@@ -132,42 +132,42 @@ pub enum Error {
         /// Its type.
         kind: &'static str,
     },
-    /// A number of a joint is NaN, infinite, or an axis has no direction.
-    #[error("joint {joint:?}: {what} is {value:?}, not usable")]
+    /// A number of a joint is non-finite or out of range, or its axis is zero.
+    #[error("joint {joint:?}: {what} is {value:?}, which is invalid")]
     JointNumber {
         /// The joint.
         joint: String,
-        /// Which number.
+        /// Name of the number.
         what: &'static str,
         /// Its value.
         value: [f64; 3],
     },
-    /// A mimic joint follows a joint that does not exist, is fixed, or follows it in turn.
+    /// A mimic joint follows a joint that does not exist, is fixed, or follows the mimic joint in turn.
     #[error("joint {joint:?} mimics {source_joint:?}, which {why}")]
     Mimic {
         /// The mimic joint.
         joint: String,
         /// The joint it follows.
         source_joint: String,
-        /// What is wrong.
+        /// Description of the problem.
         why: &'static str,
     },
-    /// A joint of the chain is not among the names given.
+    /// A joint of the chain is not among the given names.
     #[error("joint {joint:?} moves {tip:?} but is not among the joints given: {}", .given.join(", "))]
     MissingJoint {
         /// The joint.
         joint: String,
-        /// The chain's tip.
+        /// Tip link of the chain.
         tip: String,
-        /// The names given.
+        /// Given names.
         given: Vec<String>,
     },
-    /// A configuration has too few or too many numbers.
+    /// A configuration has the wrong number of values.
     #[error("{got} joint values given, the chain has {expected}: {}", .joints.join(", "))]
     JointCount {
-        /// Numbers given.
+        /// Number of values given.
         got: usize,
-        /// Numbers needed.
+        /// Number of values expected.
         expected: usize,
         /// Names of the moving joints in order.
         joints: Vec<String>,

@@ -1,56 +1,56 @@
-//! What the joints and the base were at a given instant: interpolated between readings, never beyond them.
+//! Histories of joints and base poses: interpolate between readings, never extrapolate.
 
 use crate::{JointState, Stamp, Transform, Twist, transform};
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Why a history cannot tell, or did not take a reading.
+/// Reason why a history has no value for a stamp, or dropped a reading.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum HistoryError {
-    /// The newest reading is older than the stamp: ask again when more have come.
-    #[error("no reading as late as the stamp asked for yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
+    /// The newest reading is older than the stamp. Retry after more readings have arrived.
+    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
     NotYet {
-        /// The newest reading; none when there is no reading at all.
+        /// Stamp of the newest reading; `None` if the history is empty.
         newest: Option<Stamp>,
-        /// The stamp asked for.
+        /// Requested stamp.
         asked: Stamp,
     },
-    /// The stamp is before the oldest reading kept: it will never be known.
-    #[error("the stamp asked for is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
+    /// The stamp is before the oldest reading kept. Retrying does not help.
+    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
     TooOld {
         /// The oldest reading kept.
         oldest: Stamp,
-        /// The stamp asked for.
+        /// Requested stamp.
         asked: Stamp,
     },
-    /// The readings on both sides lie too far apart to interpolate: it will never be known.
-    #[error("readings are missing for {:.1} ms around the stamp asked for (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
+    /// The readings around the stamp are too far apart to interpolate. Retrying does not help.
+    #[error("readings are missing for {:.1} ms around the requested stamp (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
     Gap {
         /// The last reading before the stamp.
         before: Stamp,
         /// The first reading after the stamp.
         after: Stamp,
-        /// The longest distance allowed.
+        /// Longest gap allowed.
         max_gap: Duration,
     },
-    /// A reading pushed is not later than the newest one; it was dropped.
+    /// A pushed reading was not later than the newest one and was dropped.
     #[error("reading is {:.3} ms older than the newest one, dropped", .newest.secs_since(*.pushed) * 1e3)]
     OutOfOrder {
         /// The newest reading kept.
         newest: Stamp,
-        /// The stamp of the one pushed.
+        /// Stamp of the dropped reading.
         pushed: Stamp,
     },
-    /// A reading pushed holds NaN or infinity; it was dropped.
-    #[error("reading holds a number that is not finite, dropped")]
+    /// A pushed reading contained NaN or infinity and was dropped.
+    #[error("reading contains a non-finite value, dropped")]
     NotFinite,
-    /// A reading pushed has another number of joints than those before; it was dropped.
-    #[error("reading of {got} joints, those before had {expected}, dropped")]
+    /// A pushed reading had a different number of joints than earlier ones and was dropped.
+    #[error("reading has {got} joints, earlier readings had {expected}; dropped")]
     JointCount {
-        /// Joints in the reading.
+        /// Number of joints in the reading.
         got: usize,
-        /// Joints in the readings before.
+        /// Number of joints in earlier readings.
         expected: usize,
     },
 }
@@ -59,7 +59,7 @@ fn behind(newest: Stamp, asked: Stamp) -> String {
     format!(" (the newest is {:.1} ms older)", asked.secs_since(newest) * 1e3)
 }
 
-/// Stamped readings in order, the oldest falling out.
+/// Stamped readings in order. The oldest are dropped at capacity.
 #[derive(Clone, Debug)]
 struct Readings<T> {
     max_gap: Duration,
@@ -68,8 +68,8 @@ struct Readings<T> {
     n_refused: u64,
 }
 
-/// Two neighbours and where between them the stamp lies: at 0 or 1 it meets a reading, and where that has no neighbour near
-/// enough, it stands twice.
+/// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp coincides with a
+/// reading; if that reading has no neighbor within `max_gap`, both entries are that reading.
 struct Bracket<'a, T> {
     before: (Stamp, &'a T),
     after: (Stamp, &'a T),
@@ -138,19 +138,21 @@ impl<T> Readings<T> {
     }
 }
 
-/// Joint readings of one arm over the last while.
+/// Recent joint readings of one arm.
 #[derive(Clone, Debug)]
 pub struct JointHistory {
     readings: Readings<JointState>,
 }
 
 impl JointHistory {
-    /// Keeps the newest `capacity` readings (at least 2) and interpolates between neighbours at most `max_gap` apart.
+    /// Creates a history that keeps the newest `capacity` readings (at least 2) and interpolates between neighbors at
+    /// most `max_gap` apart.
     pub fn new(max_gap: Duration, capacity: usize) -> Self {
         Self { readings: Readings::new(max_gap, capacity) }
     }
 
-    /// Adds a reading later than all before it. Anything else is dropped, counted, and told.
+    /// Adds a reading that is later than all earlier ones. Anything else is dropped, counted and returned as an
+    /// error.
     pub fn push(&mut self, state: JointState) -> Result<(), HistoryError> {
         let numbers = || state.position.iter().chain(&state.velocity).chain(&state.effort);
         if !numbers().all(|number| number.is_finite()) {
@@ -167,9 +169,9 @@ impl JointHistory {
 
     /// The joints at a stamp.
     ///
-    /// Positions follow a cubic through both neighbours' positions and velocities, or a line where velocities are not told;
-    /// velocities are the slope of that curve, efforts lie on a line. A stamp that meets a reading gives that reading, with
-    /// the slope to a neighbour where it tells no velocities.
+    /// Positions follow the cubic through both neighbors' positions and velocities, or a line if the device does not
+    /// report velocities. Velocities are the derivative of that curve; efforts are interpolated linearly. A stamp
+    /// that coincides with a reading returns that reading; missing velocities are the slope to a neighbor.
     pub fn at(&self, stamp: Stamp) -> Result<JointState, HistoryError> {
         let Bracket { before: (before, a), after: (after, b), frac } = self.readings.around(stamp)?;
         let span_secs = after.secs_since(before);
@@ -206,18 +208,18 @@ impl JointHistory {
         self.readings.oldest()
     }
 
-    /// Readings dropped because they came out of order or made no sense.
+    /// Number of readings dropped because they were out of order or invalid.
     pub fn n_refused(&self) -> u64 {
         self.readings.n_refused
     }
 
-    /// Forgets all readings, for a device whose clock started again.
+    /// Removes all readings, for a device whose clock restarted.
     pub fn clear(&mut self) {
         self.readings.buffer.clear();
     }
 }
 
-/// Position and slope of the cubic with the given ends and slopes at the ends, `frac` of the way.
+/// Position and velocity at `frac` on the cubic with the given end positions and end velocities.
 fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) -> (f64, f64) {
     let (m0, m1, rise) = (v0 * span_secs, v1 * span_secs, p1 - p0);
     let (second, third) = (3.0 * rise - 2.0 * m0 - m1, m0 + m1 - 2.0 * rise);
@@ -226,19 +228,20 @@ fn hermite([p0, p1]: [f64; 2], [v0, v1]: [f64; 2], span_secs: f64, frac: f64) ->
     (position, slope / span_secs)
 }
 
-/// Poses of one body over the last while.
+/// Recent poses of one body.
 #[derive(Clone, Debug)]
 pub struct PoseHistory {
     readings: Readings<Transform>,
 }
 
 impl PoseHistory {
-    /// Keeps the newest `capacity` poses (at least 2) and interpolates between neighbours at most `max_gap` apart.
+    /// Creates a history that keeps the newest `capacity` poses (at least 2) and interpolates between neighbors at
+    /// most `max_gap` apart.
     pub fn new(max_gap: Duration, capacity: usize) -> Self {
         Self { readings: Readings::new(max_gap, capacity) }
     }
 
-    /// Adds a pose later than all before it. Anything else is dropped, counted, and told.
+    /// Adds a pose that is later than all earlier ones. Anything else is dropped, counted and returned as an error.
     pub fn push(&mut self, stamp: Stamp, pose: Transform) -> Result<(), HistoryError> {
         let finite = transform::to_rows(&pose).iter().all(|number| number.is_finite());
         if !finite {
@@ -257,8 +260,8 @@ impl PoseHistory {
         })
     }
 
-    /// The pose at a stamp and the body's velocity there: the constant one between the neighbouring poses, in the body's axes
-    /// at the stamp; zero where a pose has no neighbour near enough.
+    /// The pose and velocity at a stamp. The velocity is constant between neighboring poses and given in the body
+    /// frame at the stamp. It is zero if the pose has no neighbor within the allowed gap.
     pub fn with_twist_at(&self, stamp: Stamp) -> Result<(Transform, Twist), HistoryError> {
         let Bracket { before: (before, a), after: (after, b), .. } = self.readings.around(stamp)?;
         let pose = self.at(stamp)?;
@@ -281,12 +284,12 @@ impl PoseHistory {
         self.readings.oldest()
     }
 
-    /// Poses dropped because they came out of order or were not finite.
+    /// Number of poses dropped because they were out of order or not finite.
     pub fn n_refused(&self) -> u64 {
         self.readings.n_refused
     }
 
-    /// Forgets all poses, for a source whose clock started again.
+    /// Removes all poses, for a source whose clock restarted.
     pub fn clear(&mut self) {
         self.readings.buffer.clear();
     }
@@ -365,9 +368,9 @@ mod tests {
         assert!(matches!(ask(1.03), Err(HistoryError::Gap { .. })));
         assert_eq!(
             ask(1.03).unwrap_err().to_string(),
-            "readings are missing for 30.0 ms around the stamp asked for (at most 20.0 ms)"
+            "readings are missing for 30.0 ms around the requested stamp (at most 20.0 ms)"
         );
-        // Readings at the edges of a gap and of the history are known.
+        // Stamps at the edges of a gap and of the history have values.
         for secs in [1.01, 1.015, 1.02, 1.05] {
             assert!(ask(secs).is_ok(), "{secs}");
         }

@@ -5,12 +5,12 @@ use crate::Stamp;
 /// Joint readings of one arm at one instant, in the order of the chain's moving joints.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointState {
-    /// When the joints were so.
+    /// Time of the reading.
     pub stamp: Stamp,
-    /// Radians or metres.
+    /// Radians or meters.
     pub position: Vec<f64>,
-    /// Radians or metres per second; empty when the device does not tell.
+    /// Radians or meters per second; empty if the device does not report velocities.
     pub velocity: Vec<f64>,
-    /// Newton metres or newtons; empty when the device does not tell.
+    /// Newton meters or newtons; empty if the device does not report efforts.
     pub effort: Vec<f64>,
 }

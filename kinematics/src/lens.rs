@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix2, Vector2};
 
-/// Where a lens puts a point of the plane `z = 1`, and how that moves with the point.
+/// A distorted point of the plane `z = 1` and its derivative with respect to the undistorted point.
 pub(crate) struct Distorted {
     pub(crate) value: Vector2<f64>,
     pub(crate) jacobian: Matrix2<f64>,
@@ -14,10 +14,10 @@ impl Distorted {
     }
 }
 
-/// Newton stops when the step is below this share of the value, just above rounding.
+/// Newton's method stops when the step is below this fraction of the value, just above rounding.
 const CONVERGED: f64 = 1e-15;
 
-/// Brown 1966 and Conrady 1919, in OpenCV's form; none beyond the radius where the radial part turns back.
+/// Brown 1966 and Conrady 1919, in OpenCV's form. `None` beyond the radius up to which the radial part is monotonic.
 pub(crate) fn brown_conrady(k: &[f64; 5], plane: Vector2<f64>) -> Option<Distorted> {
     let distorted = brown_conrady_unchecked(k, plane);
     let monotonic = positive_on(&radial_derivative(k), plane.norm_squared()) && distorted.jacobian.determinant() > 0.0;
@@ -43,24 +43,25 @@ fn brown_conrady_unchecked(&[k1, k2, p1, p2, k3]: &[f64; 5], plane: Vector2<f64>
     Distorted { value, jacobian }
 }
 
-/// Slope of `r (1 + k1 r2 + k2 r4 + k3 r6)` by r, as a polynomial in r2.
+/// Derivative of `r (1 + k1 r2 + k2 r4 + k3 r6)` with respect to r, as a polynomial in r2.
 fn radial_derivative(&[k1, k2, _, _, k3]: &[f64; 5]) -> [f64; 5] {
     [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 0.0]
 }
 
-/// The point that [`brown_conrady`] puts at `distorted`.
+/// The point that [`brown_conrady`] maps to `distorted`.
 pub(crate) fn undistort_brown_conrady(k: &[f64; 5], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
     const MAX_STEPS: usize = 50;
     let length = distorted.norm();
     if length == 0.0 && k[2] == 0.0 && k[3] == 0.0 {
         return Some(distorted);
     }
-    // Without the tangential part one dimension suffices; with it, that answer starts Newton's method in the plane.
+    // Without the tangential part, solving for the radius suffices. With it, that solution is the initial value of
+    // Newton's method in the plane.
     let radial = [1.0, k[0], k[1], k[4], 0.0];
     let mut plane = match solve_odd_polynomial(&radial, &radial_derivative(k), length, f64::INFINITY) {
         Some(radius) if length > 0.0 => distorted * (radius / length),
         Some(_) => distorted,
-        // Just outside the radial limit the tangential part may still bring the point in.
+        // Just outside the radial limit, the tangential part may still move the point inside.
         None if k[2] != 0.0 || k[3] != 0.0 => distorted,
         None => return None,
     };
@@ -88,8 +89,8 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     let series = 1.0 + angle2 * (k[0] + angle2 * (k[1] + angle2 * (k[2] + angle2 * k[3])));
     let length = angle * series;
     let length_by_radius = evaluate(&angle_derivative(k), angle2) / (1.0 + radius * radius);
-    // length / radius and its slope over radius; near the axis both quotients lose all digits, and the map is the identity
-    // up to the third order.
+    // length / radius, and its derivative divided by radius. Near the axis both quotients lose all digits, and the
+    // map is the identity up to third order.
     const NEAR_AXIS: f64 = 1e-6;
     let (share, share_by_radius2) = if radius < NEAR_AXIS {
         (1.0 + (k[0] - 1.0 / 3.0) * radius * radius, 2.0 * (k[0] - 1.0 / 3.0))
@@ -100,12 +101,12 @@ pub(crate) fn kannala_brandt(k: &[f64; 4], plane: Vector2<f64>) -> Option<Distor
     Some(Distorted { value: plane * share, jacobian })
 }
 
-/// Slope of `angle (1 + k1 angle2 + ...)` by the angle, as a polynomial in angle2.
+/// Derivative of `angle (1 + k1 angle2 + ...)` with respect to the angle, as a polynomial in angle2.
 fn angle_derivative(&[k1, k2, k3, k4]: &[f64; 4]) -> [f64; 5] {
     [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]
 }
 
-/// The point that [`kannala_brandt`] puts at `distorted`; none at 90 degrees from the axis and more.
+/// The point that [`kannala_brandt`] maps to `distorted`. `None` at 90 degrees from the axis or more.
 pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) -> Option<Vector2<f64>> {
     let length = distorted.norm();
     if length == 0.0 {
@@ -116,13 +117,14 @@ pub(crate) fn undistort_kannala_brandt(k: &[f64; 4], distorted: Vector2<f64>) ->
     (angle < std::f64::consts::FRAC_PI_2).then(|| distorted * (angle.tan() / length))
 }
 
-/// The smallest `x` from 0 to `limit` with `x p(x²) = target`, where the slope is positive all the way from 0 to it.
+/// The smallest `x` from 0 to `limit` with `x p(x²) = target`, if the derivative is positive from 0 up to it.
 ///
-/// Newton's method inside a bracket that every step narrows.
+/// Newton's method inside a bracket that shrinks with every step.
 fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit: f64) -> Option<f64> {
     const MAX_STEPS: usize = 200; // Bisection alone needs about 60 from any bracket.
     let value = |x: f64| x * evaluate(p, x * x) - target;
-    // First a bracket: x from `low`, where the value is below, to `high`, where it is above or the slope has turned.
+    // Find a bracket: x from `low`, where the value is below the target, to `high`, where it is above or the
+    // derivative has changed sign.
     let (mut low, mut high) = (0.0, target.min(limit));
     let is_rising_to = |x: f64| positive_on(derivative, x * x);
     while is_rising_to(high) && value(high) < 0.0 {
@@ -132,7 +134,7 @@ fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit:
         low = high;
         high = (2.0 * high).min(limit);
     }
-    // Now narrow it.
+    // Narrow the bracket.
     let mut x = 0.5 * (low + high);
     for _ in 0..MAX_STEPS {
         let rising = is_rising_to(x);
@@ -141,7 +143,7 @@ fn solve_odd_polynomial(p: &[f64; 5], derivative: &[f64; 5], target: f64, limit:
         } else {
             high = x;
         }
-        // Beyond the turn Newton's method could settle on another root.
+        // Beyond the maximum, Newton's method could converge to another root.
         let newton = x - value(x) / evaluate(derivative, x * x);
         let next = if rising && newton > low && newton < high { newton } else { 0.5 * (low + high) };
         let step = (next - x).abs();
@@ -160,8 +162,8 @@ fn evaluate(p: &[f64; 5], s: f64) -> f64 {
 
 /// Whether a polynomial of degree 4 with `p[0] > 0` is positive from 0 to `end`.
 ///
-/// Its Bernstein coefficients on the span bound it from below; where they do not decide, the span is halved
-/// (Lane and Riesenfeld 1981). A lens within its range is decided by the first look.
+/// Its Bernstein coefficients on the interval bound it from below. If they are not conclusive, the interval is halved
+/// (Lane and Riesenfeld 1981). For a lens within its range, the first test is conclusive.
 fn positive_on(p: &[f64; 5], end: f64) -> bool {
     const MAX_HALVINGS: u32 = 30;
     let mut power = [p[0], p[1] * end, 0.0, 0.0, 0.0];
@@ -181,7 +183,8 @@ fn all_positive(bernstein: &[f64; 5], halvings_left: u32) -> bool {
     if bernstein.iter().all(|&coefficient| coefficient > 0.0) {
         return true;
     }
-    // The ends are values of the polynomial itself. Written so that NaN is not positive.
+    // The first and last coefficients are values of the polynomial itself. The comparison is written so that NaN is
+    // not positive.
     if !(bernstein[0] > 0.0 && bernstein[4] > 0.0) || halvings_left == 0 {
         return false;
     }
@@ -192,7 +195,7 @@ fn all_positive(bernstein: &[f64; 5], halvings_left: u32) -> bool {
             right[at] = 0.5 * (right[at] + right[at + 1]);
         }
     }
-    // What is left in `right` after de Casteljau's steps is the right half, read from the outside in.
+    // After de Casteljau's steps, `right` holds the coefficients of the right half.
     all_positive(&left, halvings_left - 1) && all_positive(&right, halvings_left - 1)
 }
 
@@ -225,7 +228,8 @@ mod tests {
                 let radius = f64::from(step) * 0.005;
                 let plane = Vector2::new(radius * 0.6, radius * -0.8);
                 let Some(distorted) = brown_conrady(&k, plane) else { continue };
-                // Within a hair of the limit the inverse is not defined to 1e-12: its slope grows without bound.
+                // Very close to the limit the inverse is not accurate to 1e-12 because its derivative grows without
+                // bound.
                 if distorted.jacobian.determinant() < 1e-3 {
                     continue;
                 }

@@ -1,4 +1,4 @@
-//! Transforms, time, camera models and kinematic chains: pure maths in f64, no I/O, no clock, no GPU.
+//! Transforms, time, camera models and kinematic chains: pure math in f64, no I/O, no clock, no GPU.
 
 pub mod camera;
 pub mod chain;

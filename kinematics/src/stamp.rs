@@ -3,16 +3,16 @@
 use std::ops::{Add, AddAssign, Sub};
 use std::time::Duration;
 
-/// Nanoseconds on one monotonic clock; of an image, at mid-exposure when the device says so.
+/// Nanoseconds on one monotonic clock. For images: mid-exposure, if the device reports it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Stamp(pub i64);
 
 const NANOS_PER_SEC: f64 = 1e9;
 
 impl Stamp {
-    /// The stamp nearest to `secs` after the clock's zero; saturates at the ends, NaN becomes zero.
+    /// The stamp closest to `secs` after the clock's zero. Saturates at the ends of the range; NaN becomes zero.
     ///
-    /// A nanosecond is exact up to 104 days from zero; beyond that an f64 of seconds is coarser.
+    /// Exact to a nanosecond up to 104 days from zero; beyond that, an f64 of seconds has a coarser resolution.
     #[expect(clippy::cast_possible_truncation, reason = "a float to integer cast saturates, as documented")]
     pub fn from_secs(secs: f64) -> Self {
         Self((secs * NANOS_PER_SEC).round() as i64)
@@ -23,24 +23,24 @@ impl Stamp {
         self.0 as f64 / NANOS_PER_SEC
     }
 
-    /// Seconds from `earlier` to this stamp, negative where `earlier` is later.
+    /// Seconds from `earlier` to this stamp; negative if `earlier` is later.
     ///
-    /// The difference is taken in nanoseconds first, so it is exact for short spans at any time of the clock.
+    /// The difference is computed in nanoseconds first, so short spans are exact at any clock time.
     pub fn secs_since(self, earlier: Self) -> f64 {
         self.nanos_since(earlier) as f64 / NANOS_PER_SEC
     }
 
-    /// Nanoseconds from `earlier` to this stamp, negative where `earlier` is later.
+    /// Nanoseconds from `earlier` to this stamp; negative if `earlier` is later.
     pub fn nanos_since(self, earlier: Self) -> i64 {
         self.0.saturating_sub(earlier.0)
     }
 
-    /// The stamp `secs` later, or earlier when negative.
+    /// The stamp `secs` later, or earlier if `secs` is negative.
     pub fn plus_secs(self, secs: f64) -> Self {
         Self(self.0.saturating_add(Self::from_secs(secs).0))
     }
 
-    /// Time from `earlier` to this stamp; zero where `earlier` is later.
+    /// Time from `earlier` to this stamp; zero if `earlier` is later.
     pub fn duration_since(self, earlier: Self) -> Duration {
         Duration::from_nanos(u64::try_from(self.nanos_since(earlier)).unwrap_or(0))
     }

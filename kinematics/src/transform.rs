@@ -3,30 +3,35 @@
 use crate::Error;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Rigid motion; `a_from_b` maps coordinates in frame b to coordinates in frame a, in metres.
+/// Rigid motion; `a_from_b` maps coordinates in frame b to coordinates in frame a, in meters.
 pub type Transform = Isometry3<f64>;
 
-/// Velocity of a frame relative to the world, expressed in that frame's own axes.
+/// Velocity of a frame relative to the world, expressed in that frame.
 ///
-/// A point at rest in the world moves in the frame by `-(linear_m_s + angular_rad_s x point_in_frame)` per second.
+/// In this frame, a point at rest in the world moves by `-(linear_m_s + angular_rad_s x point_in_frame)` per second.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Twist {
-    /// Velocity of the frame's origin, metres per second.
+    /// Velocity of the frame's origin, meters per second.
     pub linear_m_s: Vector3<f64>,
     /// Angular velocity, radians per second.
     pub angular_rad_s: Vector3<f64>,
 }
 
-/// Largest element of `|RᵀR - 1|` taken for rounding in a file: three decimals of a quaternion stay below, a scale of 0.1 % does not.
+/// Largest element of `|RᵀR - 1|` accepted as rounding in a file. Quaternions with three decimals stay below it; a
+/// scale error of 0.1 % does not.
 pub const RIGID_TOLERANCE: f64 = 1e-3;
 
-/// Below this angle, in radians, the series replace the quotients of [`exp`] and [`log`]: both agree to 1e-16 there.
+/// Below this angle, in radians, [`exp`] and [`log`] use series instead of quotients. Both agree to 1e-16 there.
 const SMALL_ANGLE_RAD: f64 = 1e-4;
 
-/// Reads a 4x4 matrix, row major.
+/// Parses a row-major 4x4 matrix.
 ///
-/// Rounding in the rotation is removed (nearest rotation in the least-squares sense). Refused: anything not finite, a last
-/// row other than `0 0 0 1`, and a rotation part off by more than [`RIGID_TOLERANCE`] or mirrored.
+/// Removes rounding from the rotation (nearest rotation in the least-squares sense).
+///
+/// # Errors
+///
+/// Rejects non-finite elements, a last row other than `0 0 0 1`, and a rotation part that is mirrored or deviates by
+/// more than [`RIGID_TOLERANCE`].
 pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
     if let Some(at) = rows.iter().position(|value| !value.is_finite()) {
         return Err(Error::TransformNotFinite { row: at / 4, column: at % 4, value: rows[at] });
@@ -47,7 +52,7 @@ pub fn from_rows(rows: &[f64; 16]) -> Result<Transform, Error> {
 
 /// Polar factor by Newton's iteration (Higham 1986), which converges quadratically from a matrix this close to a rotation.
 fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
-    const STEPS: usize = 4; // 1e-3 squares to 1e-6, 1e-12, below rounding; one more costs nothing.
+    const STEPS: usize = 4; // Errors go from 1e-3 to 1e-6 and 1e-12, then below rounding; one extra step is cheap.
     for _ in 0..STEPS {
         let inverse_transpose = matrix.try_inverse().expect("a matrix near a rotation has an inverse").transpose();
         matrix = (matrix + inverse_transpose) * 0.5;
@@ -55,26 +60,27 @@ fn nearest_rotation(mut matrix: Matrix3<f64>) -> Rotation3<f64> {
     Rotation3::from_matrix_unchecked(matrix)
 }
 
-/// The 4x4 matrix, row major.
+/// Returns the row-major 4x4 matrix.
 pub fn to_rows(transform: &Transform) -> [f64; 16] {
     let matrix = transform.to_homogeneous();
     std::array::from_fn(|at| matrix[(at / 4, at % 4)])
 }
 
-/// Whether a pose is made of numbers.
+/// Whether all elements of a pose are finite.
 pub fn is_finite(transform: &Transform) -> bool {
     transform.translation.vector.iter().chain(transform.rotation.coords.iter()).all(|number| number.is_finite())
 }
 
-/// Pose between `a` (`frac` 0) and `b` (`frac` 1): translation on a line, rotation at a constant rate the shorter way round.
+/// Interpolates from `a` (`frac` 0) to `b` (`frac` 1): the translation linearly, the rotation at a constant rate
+/// along the shorter arc.
 pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
     let translation = a.translation.vector.lerp(&b.translation.vector, frac);
-    // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter way.
+    // The scaled axis of a unit quaternion has an angle of at most pi, so this is the shorter arc.
     let rotation_vector = (a.rotation.inverse() * b.rotation).scaled_axis();
     Transform::from_parts(translation.into(), a.rotation * UnitQuaternion::from_scaled_axis(rotation_vector * frac))
 }
 
-/// Motion of a frame that keeps `twist` for `secs`: `world_from_frame` afterwards is the one before times this.
+/// Motion of a frame that keeps `twist` for `secs`: the new `world_from_frame` is the old one times this.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
 pub fn exp(twist: &Twist, secs: f64) -> Transform {
@@ -93,7 +99,7 @@ pub fn exp(twist: &Twist, secs: f64) -> Transform {
     Transform::from_parts(translation.into(), UnitQuaternion::from_scaled_axis(rotation_vector))
 }
 
-/// The constant twist that makes the motion `transform` in `secs`; the inverse of [`exp`] for turns below half a circle.
+/// The constant twist that produces `transform` in `secs`. Inverts [`exp`] for rotations below 180 degrees.
 pub fn log(transform: &Transform, secs: f64) -> Twist {
     let rotation_vector = transform.rotation.scaled_axis();
     let angle = rotation_vector.norm();
@@ -115,14 +121,14 @@ impl Twist {
         Self { linear_m_s: Vector3::zeros(), angular_rad_s: Vector3::zeros() }
     }
 
-    /// Twist of another frame rigidly attached to this one, in the other's own axes (the adjoint change of frame).
+    /// Twist of another frame rigidly attached to this one, expressed in the other frame (adjoint transform).
     pub fn of_attached(&self, this_from_other: &Transform) -> Self {
         let other_from_this = this_from_other.rotation.inverse();
         let linear_m_s = self.linear_m_s + self.angular_rad_s.cross(&this_from_other.translation.vector);
         Self { linear_m_s: other_from_this * linear_m_s, angular_rad_s: other_from_this * self.angular_rad_s }
     }
 
-    /// How a point at rest in the world moves in this frame, metres per second.
+    /// Apparent velocity in this frame of a point at rest in the world, meters per second.
     pub fn apparent_velocity(&self, point_in_frame: &Vector3<f64>) -> Vector3<f64> {
         -(self.linear_m_s + self.angular_rad_s.cross(point_in_frame))
     }

@@ -1,18 +1,18 @@
-//! Resampling of a distorted image to the pinhole image of the same focal length and principal point.
+//! Resamples distorted images to pinhole images with the same focal length and principal point.
 
 use crate::{Error, Intrinsics};
 
-/// For every pixel of the pinhole image, where it lies in the distorted image; made once per camera.
+/// Position in the distorted image of every pixel of the pinhole image. Computed once per camera.
 ///
-/// Input and output have the size of the camera. Positions follow this project's pixel centres at `(0.5, 0.5)`, so against
-/// OpenCV, whose centres are whole numbers, the principal point differs by half a pixel and the pixels are the same.
+/// Input and output have the size of the camera. Pixel centers are at `(0.5, 0.5)`. OpenCV places them at whole
+/// numbers, so its principal point differs by half a pixel while the pixels are the same.
 #[derive(Clone, Debug)]
 pub struct Undistortion {
     size_px: [u32; 2],
     taps: Vec<Tap>,
 }
 
-/// Where one output pixel reads: the upper left of four neighbours, and the shares of the right and lower ones.
+/// Source of one output pixel: the upper left of four neighbors, and the weights of the right and lower ones.
 #[derive(Clone, Copy, Debug)]
 struct Tap {
     upper_left: u32,
@@ -25,12 +25,12 @@ impl Tap {
     const OUTSIDE: Self = Self { upper_left: u32::MAX, right: 0, lower: 0 };
 }
 
-/// One in the fixed point numbers of [`Tap`]. 11 bits twice and 8 bits of color fit 32.
+/// The value 1 in the fixed-point format of [`Tap`]. Two 11-bit weights and 8 bits of color fit 32 bits.
 const ONE: u32 = 1 << SHARE_BITS;
 const SHARE_BITS: u32 = 11;
 
 impl Undistortion {
-    /// Computes the map for one camera. For a rectified or pinhole camera it is the identity.
+    /// Computes the map of one camera. For a rectified or pinhole camera it is the identity.
     pub fn new(intrinsics: &Intrinsics) -> Self {
         let pinhole = intrinsics.undistorted();
         let [width, height] = intrinsics.size_px;
@@ -44,32 +44,35 @@ impl Undistortion {
         Self { size_px: [width, height], taps }
     }
 
-    /// Width and height of input and output, pixels.
+    /// Width and height of input and output, in pixels.
     pub fn size_px(&self) -> [u32; 2] {
         self.size_px
     }
 
-    /// How many output pixels the distorted image does not cover.
+    /// Number of output pixels that the distorted image does not cover.
     pub fn n_outside(&self) -> usize {
         self.taps.iter().filter(|tap| tap.upper_left == u32::MAX).count()
     }
 
-    /// Undistorts `[height, width, 3]` to `[height, width, 4]`, bilinear; alpha is 255, or 0 where the source was outside.
+    /// Undistorts `[height, width, 3]` to `[height, width, 4]` with bilinear sampling. Alpha is 255, or 0 if the
+    /// source lies outside the image.
     pub fn apply_rgb(&self, rgb: &[u8]) -> Result<Vec<u8>, Error> {
         self.check_len(rgb.len(), 3)?;
         Ok(self.resample::<3>(rgb))
     }
 
-    /// Undistorts `[height, width, 4]`, bilinear in all four channels; all zero where the source was outside.
+    /// Undistorts `[height, width, 4]` with bilinear sampling of all four channels. Pixels whose source lies outside
+    /// the image are zero.
     ///
-    /// Alpha is straight: a mask in it is interpolated like a color.
+    /// Alpha is straight: masks stored in it are interpolated like colors.
     pub fn apply_rgba(&self, rgba: &[u8]) -> Result<Vec<u8>, Error> {
         self.check_len(rgba.len(), 4)?;
         Ok(self.resample::<4>(rgba))
     }
 
-    /// Undistorts `[height, width]` of depth along the camera's z axis, which a lens does not change: the nearest source
-    /// pixel, because a mean across an edge is the depth of nothing; 0 where the source was outside.
+    /// Undistorts `[height, width]` of depth along the camera's z axis, which lens distortion does not change. Takes
+    /// the nearest source pixel, because averaging across an edge gives a depth at which there is no surface. Pixels
+    /// whose source lies outside the image are 0.
     pub fn apply_depth(&self, depth_m: &[f32]) -> Result<Vec<f32>, Error> {
         self.check_len(depth_m.len(), 1)?;
         let [step_right, step_down] = self.steps();
@@ -108,7 +111,7 @@ impl Undistortion {
         rgba
     }
 
-    /// How far the right and the lower neighbour lie in the source; none in an image of one column or row.
+    /// Index offsets of the right and the lower neighbor in the source; 0 in an image of one column or row.
     fn steps(&self) -> [usize; 2] {
         let [width, height] = self.size_px;
         [usize::from(width > 1), if height > 1 { width as usize } else { 0 }]
@@ -126,7 +129,7 @@ fn round_share(sum: u32) -> u8 {
     ((sum + (1 << (2 * SHARE_BITS - 1))) >> (2 * SHARE_BITS)) as u8
 }
 
-/// The tap for a source position inside the image; the outer half pixel takes the color of the border.
+/// The tap for a source position inside the image. Positions in the outer half pixel take the color of the border.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -136,7 +139,7 @@ fn tap_at(source: [f64; 2], size_px: [u32; 2]) -> Tap {
     let along = |axis: usize| {
         let last = f64::from(size_px[axis] - 1);
         let position = (source[axis] - 0.5).clamp(0.0, last);
-        // The last pixel is read as the right neighbour of the one before it, so that no read passes the end.
+        // The last pixel is read as the right neighbor of the one before it, so that no read goes past the end.
         let start = position.floor().min((last - 1.0).max(0.0));
         (start as u32, ((position - start) * f64::from(ONE)).round() as u16)
     };
@@ -188,7 +191,7 @@ mod tests {
 
     #[test]
     fn straight_lines_become_straight() {
-        // A ramp over the world's x / z as the lens shows it must become a ramp over columns.
+        // A ramp over x / z in the distorted image must become a ramp over columns.
         for lens in [BARREL, CUSHION, Lens::KannalaBrandt([0.02, -0.01, 0.0, 0.0])] {
             let intrinsics = camera([160, 120], lens);
             let ramp = |x_on_plane: f64| 128.0 + 150.0 * x_on_plane;
@@ -203,7 +206,8 @@ mod tests {
             for (at, pixel) in out.chunks(4).enumerate().filter(|(_, pixel)| pixel[3] == 255) {
                 let ray = intrinsics.undistorted().unproject([(at % 160) as f64 + 0.5, 0.0]).unwrap();
                 let off = (f64::from(pixel[0]) - ramp(ray.x)).abs();
-                // Rounding to bytes twice; the outermost half pixel of the source repeats its border, up to half a step more.
+                // Bytes are rounded twice. The outermost half pixel of the source repeats the border, which adds up
+                // to half a step.
                 assert!(off < 1.8, "{lens:?} at {at}: off by {off}");
                 n_compared += 1;
             }

@@ -1,16 +1,17 @@
-//! URDF text to a checked tree of links and joints.
+//! Parses URDF text into a checked tree of links and joints.
 
 use crate::{Error, Transform};
 use nalgebra::{Translation3, Unit, UnitQuaternion, Vector3};
 use std::collections::HashMap;
 
-/// Links and joints of one robot: every joint's links exist, no link has two parents, no cycle, all numbers finite.
+/// Links and joints of one robot. All links of joints exist, no link has two parents, there is no cycle, and all
+/// numbers are finite.
 #[derive(Clone, Debug)]
 pub struct Robot {
     name: String,
     links: Vec<String>,
     joints: Vec<Joint>,
-    /// Link to the index of the joint above it.
+    /// Index of each link's parent joint.
     joint_above: HashMap<String, usize>,
 }
 
@@ -19,61 +20,61 @@ pub struct Robot {
 pub struct Joint {
     /// Name in the URDF.
     pub name: String,
-    /// How it moves.
+    /// Type of motion.
     pub kind: JointKind,
-    /// Link above.
+    /// Parent link.
     pub parent: String,
-    /// Link below; its frame moves with the joint.
+    /// Child link; its frame moves with the joint.
     pub child: String,
     /// Pose of the joint's frame in the parent link at joint value 0.
     pub parent_from_joint: Transform,
-    /// Direction of motion in the joint's frame; meaningless for fixed joints.
+    /// Direction of motion in the joint's frame; unused for fixed joints.
     pub axis: Unit<Vector3<f64>>,
     /// Allowed range.
     pub limits: JointLimits,
-    /// The joint it follows, if it does not move on its own.
+    /// The joint it follows, if it does not move independently.
     pub mimic: Option<Mimic>,
 }
 
-/// How a joint moves.
+/// Type of a joint's motion.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum JointKind {
-    /// Not at all.
+    /// Does not move.
     Fixed,
     /// About its axis, radians (revolute or continuous).
     Revolute,
-    /// Along its axis, metres (prismatic).
+    /// Along its axis, meters (prismatic).
     Prismatic,
-    /// In a way that one number does not tell; the URDF's word for it.
+    /// A type that one number cannot describe; the URDF's name of it.
     Unsupported(&'static str),
 }
 
-/// Allowed range of a joint; infinite where the URDF sets no bound.
+/// Allowed range of a joint; infinite if the URDF sets no limit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct JointLimits {
-    /// Smallest position, radians or metres.
+    /// Smallest position, radians or meters.
     pub lower: f64,
-    /// Largest position, radians or metres.
+    /// Largest position, radians or meters.
     pub upper: f64,
-    /// Largest speed, radians or metres per second.
+    /// Largest speed, radians or meters per second.
     pub velocity: f64,
-    /// Largest torque or force, newton metres or newtons.
+    /// Largest torque or force, newton meters or newtons.
     pub effort: f64,
 }
 
-/// A joint's rule to follow another one: `multiplier * source + offset`.
+/// Rule by which a mimic joint follows another: `multiplier * source + offset`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mimic {
-    /// Name of the joint followed.
+    /// Name of the followed joint.
     pub source: String,
-    /// Share of the source's value.
+    /// Factor on the source's value.
     pub multiplier: f64,
-    /// Added to it, radians or metres.
+    /// Added to the scaled value, radians or meters.
     pub offset: f64,
 }
 
 impl Robot {
-    /// Reads and checks URDF text.
+    /// Parses and checks URDF text.
     pub fn parse(xml: &str) -> Result<Self, Error> {
         let parsed = urdf_rs::read_from_string(xml).map_err(|error| Error::UrdfSyntax { why: one_line(&error) })?;
         if parsed.links.is_empty() {
@@ -89,27 +90,27 @@ impl Robot {
         Ok(robot)
     }
 
-    /// The robot's name; empty where the file gives none.
+    /// Name of the robot; empty if the file has none.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Names of all links, in the order of the file.
+    /// Names of all links, in file order.
     pub fn links(&self) -> &[String] {
         &self.links
     }
 
-    /// All joints, in the order of the file.
+    /// All joints, in file order.
     pub fn joints(&self) -> &[Joint] {
         &self.joints
     }
 
-    /// The joint of that name.
+    /// The joint with this name.
     pub fn joint(&self, name: &str) -> Option<&Joint> {
         self.joints.iter().find(|joint| joint.name == name)
     }
 
-    /// The link above all others.
+    /// The root link: the ancestor of all other links.
     pub fn root(&self) -> Result<&str, Error> {
         let roots: Vec<&String> = self.links.iter().filter(|link| !self.joint_above.contains_key(*link)).collect();
         match roots[..] {
@@ -146,7 +147,7 @@ impl Robot {
     fn refuse_cycles(&self) -> Result<(), Error> {
         for start in &self.links {
             let mut link = start;
-            // More steps up than there are links must have come to some link twice; the last one is on the cycle.
+            // Going up more steps than there are links visits some link twice; the last one is on the cycle.
             for _ in 0..=self.links.len() {
                 match self.joint_above.get(link) {
                     Some(&above) => link = &self.joints[above].parent,
@@ -202,7 +203,7 @@ fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
         kind,
         parent: parsed.parent.link.clone(),
         child: parsed.child.link.clone(),
-        // Roll, pitch, yaw about the parent's fixed axes x, y, z: the URDF's convention and nalgebra's are one.
+        // Roll, pitch and yaw rotate about the parent's fixed axes x, y, z in both URDF and nalgebra.
         parent_from_joint: Transform::from_parts(
             Translation3::from(Vector3::from(xyz)),
             UnitQuaternion::from_euler_angles(rpy[0], rpy[1], rpy[2]),
@@ -226,7 +227,7 @@ fn kind(joint_type: &urdf_rs::JointType) -> JointKind {
 
 fn limits(parsed: &urdf_rs::Joint) -> JointLimits {
     let limit = &parsed.limit;
-    // The parser gives zeros where the file has no <limit> at all.
+    // The parser returns zeros if the file has no <limit>.
     let has_limit = *limit != urdf_rs::JointLimit::default();
     let has_range = has_limit && parsed.joint_type != urdf_rs::JointType::Continuous;
     let or_infinite = |given: bool, value: f64| if given { value } else { f64::INFINITY };
@@ -239,9 +240,9 @@ fn limits(parsed: &urdf_rs::Joint) -> JointLimits {
 }
 
 fn refuse_duplicates<'a>(kind: &'static str, names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
-    let mut seen = std::collections::HashSet::new();
+    let mut unique = std::collections::HashSet::new();
     for name in names {
-        if !seen.insert(name) {
+        if !unique.insert(name) {
             return Err(Error::Duplicate { kind, name: name.clone() });
         }
     }
@@ -280,7 +281,7 @@ mod tests {
     }
 
     fn error_message(result: Result<Robot, Error>) -> String {
-        let message = result.expect_err("this URDF must be refused").to_string();
+        let message = result.expect_err("this URDF must be rejected").to_string();
         assert!(!message.contains('\n'), "more than one line: {message}");
         message
     }

@@ -1,5 +1,5 @@
-//! Forward kinematics against poses from an independent rigid-body library, for every robot of the test data.
-#![expect(clippy::unwrap_used, reason = "a test ends at what it did not expect")]
+//! Checks forward kinematics against poses from an independent rigid-body library, for every robot of the test data.
+#![expect(clippy::unwrap_used, reason = "a failing test may panic")]
 
 use kinematics::Chain;
 use kinematics::urdf::Robot;
@@ -7,7 +7,7 @@ use nalgebra::Matrix4;
 use serde_json::Value;
 use std::path::PathBuf;
 
-/// Metres, and rotation matrix elements: both sides round differently, by a few 1e-16 a joint.
+/// Meters and rotation matrix elements. Rounding differs between the libraries by a few 1e-16 per joint.
 const CLOSE: f64 = 1e-12;
 
 fn robots() -> Option<PathBuf> {

@@ -1,4 +1,4 @@
-//! Plays the default rig and writes its pictures into a folder, to look at and to time.
+//! Runs the default rig and writes its images into a folder, for inspection and timing.
 //!
 //! `cargo run --release -p sim --example look -- FOLDER N_IMAGES [EVERY] [720p|two|notruth|global|ideal|mobile-base|mobile-arm]`
 
@@ -89,7 +89,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     let millis = began.elapsed().as_secs_f64() * 1e3 / n_taken as f64;
     eprintln!(
-        "{}: opened in {opened:?}, {millis:.1} ms an image, mean PSNR ceiling {:.2} dB, {n_points} echoes",
+        "{}: opened in {opened:?}, {millis:.1} ms per image, mean PSNR ceiling {:.2} dB, {n_points} echoes",
         rig.info().renderer,
         ceiling / n_taken as f64
     );

@@ -8,14 +8,14 @@ use mujoco_rs::prelude::{MjData, MjModel};
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// Nanoseconds a step of the dynamics, and between joint readings.
+/// Period of the dynamics steps and of the joint readings, nanoseconds.
 pub(crate) const STEP_NANOS: i64 = 1_000_000;
 const STEP_SECS: f64 = 1e-3;
-/// Stiffness, newton metres per radian, and damping, newton metre seconds per radian, of each joint's controller.
+/// Stiffness, newton meters per radian, and damping, newton meter seconds per radian, of each joint's controller.
 const STIFFNESS: [f64; N_JOINTS] = [2000.0, 2000.0, 1600.0, 1600.0, 600.0, 600.0, 300.0];
 const DAMPING: [f64; N_JOINTS] = [120.0, 120.0, 90.0, 90.0, 35.0, 35.0, 18.0];
 
-/// What the joints did at one step.
+/// State of the joints at one step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct JointReading {
     pub(crate) nanos: i64,
@@ -24,7 +24,7 @@ pub(crate) struct JointReading {
     pub(crate) torque_nm: Joints,
 }
 
-/// The arm under its controller, with the readings of its recent past.
+/// The arm with its controller and its recent readings.
 pub(crate) struct Arm {
     data: MjData<Arc<MjModel>>,
     follower: Follower,
@@ -34,7 +34,7 @@ pub(crate) struct Arm {
 }
 
 impl Arm {
-    /// Puts the arm at the scan's start, at rest. Readings are kept for `history_duration_nanos`.
+    /// Places the arm at the scan's start, at rest. Readings are kept for `history_duration_nanos`.
     pub(crate) fn new(model: Arc<MjModel>, follower: Follower, history_duration_nanos: i64) -> Result<Self, Error> {
         let mut data = MjData::new(model);
         if data.qpos().len() != N_JOINTS {
@@ -45,7 +45,7 @@ impl Arm {
         Ok(Self { data, follower, n_steps: 0, readings: VecDeque::new(), history_duration_nanos })
     }
 
-    /// Reads the joints, then moves on by one step.
+    /// Reads the joints, then advances by one step.
     pub(crate) fn step(&mut self) -> JointReading {
         let position_rad = Joints::from_column_slice(self.data.qpos());
         let velocity_rad_s = Joints::from_column_slice(self.data.qvel());
@@ -62,7 +62,7 @@ impl Arm {
         reading
     }
 
-    /// Springs and dampers around the scan's joint positions, on top of what holds the arm's weight.
+    /// Spring and damper torques around the scan's joint positions, added to gravity compensation.
     fn control(&self, position_rad: &Joints, velocity_rad_s: &Joints) -> Joints {
         let position_error = self.follower.position_rad() - position_rad;
         let velocity_error = self.follower.velocity_rad_s() - velocity_rad_s;
@@ -76,7 +76,8 @@ impl Arm {
         })
     }
 
-    /// Joint positions at a time among the kept readings: a cubic through both neighbours and their velocities.
+    /// Joint positions at a time covered by the kept readings: cubic interpolation from both neighbors and their
+    /// velocities.
     pub(crate) fn position_at(&self, nanos: i64) -> Option<Joints> {
         let first = self.readings.front()?;
         let ix = usize::try_from((nanos - first.nanos).checked_div(STEP_NANOS)?).ok()?;

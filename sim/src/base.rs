@@ -1,4 +1,4 @@
-//! How the robot's base moves: not at all, walking round a pedestal, or from one stand to the next.
+//! Motion of the robot's base: fixed, walking around a pedestal, or walking from one station to the next.
 
 use crate::config::Scene;
 use crate::random::Random;
@@ -6,46 +6,46 @@ use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::TAU;
 
-/// The base over time, in closed form: any instant can be asked for.
+/// Motion of the base in closed form; can be evaluated at any time.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum BaseMotion {
-    /// The base is the world's origin.
+    /// The base is at the world's origin.
     Fixed,
-    /// A quadruped crabs round the origin, its front mostly turned inwards; the factor on its speed.
+    /// A quadruped walks sideways around the origin, facing mostly inward. The value is a factor on its speed.
     Lap(f64),
-    /// A first stand far off, then a second close by; the factor on the speed.
+    /// A station at a distance, then a second one close by. The value is a factor on the speed.
     Stations(f64),
 }
 
-/// Seconds a lap at speed 1, and the laps that count as the whole walk.
+/// Duration of a lap at speed 1, seconds.
 const LAP_SECS: f64 = 36.0;
-/// Steps of the gait a second at speed 1, and what a step does to the body.
+/// Gait frequency at speed 1, and the body motion caused by a step.
 const GAIT_HZ: f64 = 1.7;
 const BOUNCE_M: f64 = 0.007;
 const ROLL_RAD: f64 = 0.008;
 const PITCH_RAD: f64 = 0.006;
-/// Height of the body's middle above the floor, metres.
+/// Height of the body's center above the floor, meters.
 pub(crate) const BODY_Z_M: f64 = 0.52;
 
-/// When the base leaves its first stand and how long it walks to the second, seconds at speed 1.
+/// Time at which the base leaves the first station, and duration of the walk to the second, seconds at speed 1.
 const DEPARTURE_SECS: f64 = 14.0;
 const WALK_DURATION_SECS: f64 = 5.0;
-/// The stands: x, y and heading, metres and radians.
+/// The stations: x, y in meters and heading in radians.
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
 const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 
-/// Where the arm stands on the quadruped's back; `mount` in the URDFs.
+/// Pose of the arm's base on the quadruped's back; link `mount` in the URDFs.
 pub(crate) fn base_from_arm() -> Transform {
     Transform::translation(0.12, 0.0, 0.10)
 }
 
-/// 0 below zero, 1 above one, smooth with a smooth slope between.
+/// Smoothstep: 0 below zero, 1 above one, with a continuous derivative in between.
 pub(crate) fn smooth(share: f64) -> f64 {
     let share = share.clamp(0.0, 1.0);
     share.powi(3) * (10.0 - 15.0 * share + 6.0 * share * share)
 }
 
-/// A sine with a mean: mean, amplitude, period in seconds, phase in turns.
+/// A sine with an offset: mean, amplitude, period in seconds, phase in turns.
 pub(crate) fn oscillate([mean, amplitude, period, phase]: [f64; 4], at: f64) -> f64 {
     mean + amplitude * ((at / period + phase) * TAU).sin()
 }
@@ -60,7 +60,8 @@ impl BaseMotion {
         }
     }
 
-    /// Share of the whole walk (one lap, or from the first stand to the last) that lies behind; goes on past 1.
+    /// Fraction of the whole walk (one lap, or from the first station to the last) that has been completed; exceeds 1
+    /// after it.
     pub(crate) fn walked_frac(&self, secs: f64) -> f64 {
         match self {
             Self::Fixed => 0.0,
@@ -78,14 +79,14 @@ impl BaseMotion {
                 let share = self.walked_frac(secs);
                 let [x, y, yaw] =
                     std::array::from_fn(|ix| FAR_STATION[ix] + (NEAR_STATION[ix] - FAR_STATION[ix]) * share);
-                // The gait fades out before the base stands.
+                // The gait fades out before the base stops.
                 let gait_amplitude = (4.0 * share * (1.0 - share)).clamp(0.0, 1.0);
                 gait(secs, gait_amplitude, [x, y, yaw])
             }
         }
     }
 
-    /// When the base leaves its first stand and when it comes to its last, seconds; zero where it has none.
+    /// Times at which the base leaves its first station and reaches its last, seconds; zero if it has no stations.
     pub(crate) fn walk_secs(&self) -> [f64; 2] {
         match self {
             Self::Stations(speed) => [DEPARTURE_SECS / speed, (DEPARTURE_SECS + WALK_DURATION_SECS) / speed],
@@ -93,7 +94,8 @@ impl BaseMotion {
         }
     }
 
-    /// Whether the base stands and the arm may scan: seconds since it came to stand, and at which stand.
+    /// Seconds since the base became stationary and the index of its station, or `None` while it moves. The arm scans
+    /// only at stations.
     pub(crate) fn station_at(&self, secs: f64) -> Option<(usize, f64)> {
         match self {
             Self::Fixed => Some((0, secs)),
@@ -110,14 +112,14 @@ impl BaseMotion {
     }
 }
 
-/// Progress along the laps in seconds at even speed: starts at rest, then quickens and slackens by a third.
+/// Progress along the laps in seconds at constant speed: starts at rest, then speeds up and slows down by a third.
 fn lap_secs(secs: f64, speed: f64) -> f64 {
     const START_SECS: f64 = 1.5;
     const OSCILLATION: (f64, f64) = (0.35, 7.3);
     let at = secs * speed;
     let ramp = (at / START_SECS).clamp(0.0, 1.0);
     let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (at - START_SECS).max(0.0);
-    // Its slope starts at zero too, so the first step is soft.
+    // Its derivative starts at zero too, so the first step is smooth.
     started + OSCILLATION.0 * OSCILLATION.1 / TAU * (1.0 - (started * TAU / OSCILLATION.1).cos())
 }
 
@@ -131,7 +133,7 @@ fn lap_pose(at: f64, gait_secs: f64) -> Transform {
     gait(gait_secs, smooth(at / 2.0), position)
 }
 
-/// The body on its legs at a place and heading, bouncing and swaying.
+/// The body on its legs at a position and heading, bouncing and swaying.
 fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     let step = secs * GAIT_HZ * TAU;
     let bounce_m = BOUNCE_M * gait_amplitude * (2.0 * step).sin();
@@ -141,7 +143,7 @@ fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
     Transform::from_parts(Translation3::new(x, y, BODY_Z_M + bounce_m), rotation_vector)
 }
 
-/// What a SLAM system gets wrong: a random walk that goes on as long as the base walks.
+/// Error of a SLAM system: a random walk that advances while the base walks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Drift {
     random: Random,
@@ -152,13 +154,13 @@ pub(crate) struct Drift {
 
 /// Steps of the random walk over the whole walk.
 const N_STEPS: f64 = 64.0;
-/// Height, roll and pitch are kept by gravity and the floor: their errors relative to the others.
+/// Gravity and the floor constrain height, roll and pitch: their errors relative to those of the other axes.
 const CONSTRAINED_AXIS_FRAC: f64 = 0.3;
-/// Names the stream of random numbers.
+/// Identifies the random number stream.
 const DRIFT: u64 = 0xd41f;
 
 impl Drift {
-    /// `size_m` and `size_rad` are the root mean square of the error at the end of the whole walk.
+    /// `size_m` and `size_rad` are the root mean square errors at the end of the whole walk.
     pub(crate) fn new(seed: u64, size_m: f64, size_rad: f64) -> Self {
         let step_sigmas = |size: f64, weights: [f64; 3]| {
             let norm = weights.iter().map(|weight| weight * weight).sum::<f64>().sqrt();
@@ -171,12 +173,12 @@ impl Drift {
         }
     }
 
-    /// The pose that is told for a true pose after a share of the walk.
+    /// The reported pose for a true pose after a fraction of the walk.
     pub(crate) fn reported(&self, world_from_base: &Transform, walked_frac: f64) -> Transform {
         let steps = walked_frac * N_STEPS;
         let (mut translation_error, mut rotation_vector) = (Vector3::zeros(), Vector3::zeros());
         let mut step = 0_u64;
-        // Sums from the start: a few hundred steps even after a long run, and no state that could go out of step.
+        // Sums from the start: a few hundred steps even in a long run, and no state that could become inconsistent.
         while (step as f64) < steps {
             let share = smooth(steps - step as f64);
             let [a, b] = [2 * step, 2 * step + 1].map(|counter| self.random.normals(counter).map(f64::from));
@@ -226,7 +228,7 @@ mod tests {
                 assert!(speed < fastest_m_s, "{motion:?}: {speed} m/s at {secs} s");
                 assert!((speed - speed_before).abs() / STEP_SECS < 4.0, "{motion:?}: a jerk at {secs} s");
                 if motion.station_at(secs).is_some() {
-                    assert!(speed < 1e-9, "{motion:?} moves at {secs} s while it stands");
+                    assert!(speed < 1e-9, "{motion:?} moves at {secs} s while at a station");
                 }
                 (before, speed_before) = (pose, speed);
             }

@@ -1,6 +1,7 @@
-//! The cabinet of the mobile arm: a yellow switchboard of 1 x 1 m with a bar across it, a box with a screen and a switch inside.
+//! The cabinet of the mobile-arm scene: a yellow switchboard of 1 x 1 m with a bar across it, and a box with a screen
+//! and a switch inside.
 //!
-//! The world's origin lies on the floor below the base's start; the cabinet opens towards it.
+//! The world's origin lies on the floor below the initial base position; the cabinet opens toward it.
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
@@ -11,21 +12,21 @@ use crate::texture::{self, Texture};
 use kinematics::Transform;
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 
-/// The plane of the cabinet's opening, metres along x.
+/// x coordinate of the cabinet's opening, meters.
 pub(crate) const FRONT_X_M: f64 = 2.05;
-/// Middle of the opening, metres.
+/// Height of the center of the opening, meters.
 pub(crate) const CENTER_Z_M: f64 = 0.95;
-/// Half the side of the opening, and how deep the cabinet is, metres.
+/// Half the side length of the opening, meters.
 pub(crate) const HALF_M: f64 = 0.5;
-/// Depth of the cabinet, metres.
+/// Depth of the cabinet, meters.
 pub(crate) const DEPTH_M: f64 = 0.36;
-/// Middle of the screen on the box inside, metres.
+/// Center of the screen on the box inside, meters.
 pub(crate) const SCREEN_M: [f64; 3] = [2.20, 0.12, 0.97];
 
 const SHEET_M: f64 = 0.012;
 const BOX_HALF_M: [f64; 3] = [0.09, 0.16, 0.12];
 const SWITCH_M: [f64; 3] = [2.36, -0.23, 0.98];
-/// The room: nearest and furthest x, half its width, and height, metres.
+/// The room: minimum and maximum x, half its width, and height, meters.
 const ROOM_X_M: [f64; 2] = [-2.2, 2.48];
 const ROOM_HALF_Y_M: f64 = 2.4;
 const ROOM_HEIGHT_M: f64 = 2.7;
@@ -49,7 +50,7 @@ fn furniture() -> Furniture {
     furniture
 }
 
-/// What is mounted in the cabinet: the box, breakers on a rail, ducts.
+/// Adds the equipment inside the cabinet: the box, breakers on a rail, ducts.
 fn equip(furniture: &mut Furniture) {
     let [x, y, z] = SCREEN_M;
     let box_pose = upright([x + BOX_HALF_M[0], y, z], 180.0);
@@ -72,7 +73,7 @@ fn equip(furniture: &mut Furniture) {
     furniture.add_item(&upright([x, y, z], 180.0), [0.03, 0.08, 0.10], 10, 10);
 }
 
-/// The sheets of the cabinet, and its open door.
+/// The sheets of the cabinet and its open door.
 fn shell() -> (Mesh, Mesh) {
     let (mut yellow, mut plate) = (Mesh::default(), Mesh::default());
     let middle_x = FRONT_X_M + 0.5 * DEPTH_M;
@@ -83,7 +84,7 @@ fn shell() -> (Mesh, Mesh) {
         let half = [0.5 * DEPTH_M, HALF_M, SHEET_M];
         put(upright([middle_x, 0.0, CENTER_Z_M + side * (HALF_M - SHEET_M)], 0.0), half);
     }
-    // The door hangs open on the left, seen from the base.
+    // The door hangs open on the left as viewed from the base.
     let hinge = upright([FRONT_X_M, HALF_M, CENTER_Z_M], 24.0);
     put(hinge * upright([-0.02, HALF_M, 0.0], 0.0), [SHEET_M, HALF_M, HALF_M]);
     // Feet.
@@ -142,7 +143,7 @@ fn flat(center: [f64; 3], right: Vector3<f64>, up: Vector3<f64>, texture: [f64; 
     mesh
 }
 
-/// Everything but the robot.
+/// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
     let object = |name, material, mesh| Object { name, material, mesh, world_from_mesh: Transform::identity() };
     let Furniture { things, posters, frames, .. } = furniture();
@@ -179,7 +180,7 @@ pub(crate) fn objects() -> Vec<Object> {
     ]
 }
 
-/// The textures by name, light included.
+/// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     const AMBIENT_REACH_M: f64 = 0.3;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);

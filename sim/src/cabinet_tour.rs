@@ -1,4 +1,4 @@
-//! The tour of the mobile arm: the cabinet from two stands, then into it.
+//! The camera tour of the mobile arm: the cabinet from two stations, then into it.
 
 use crate::base::{BaseMotion, base_from_arm, oscillate, smooth};
 use crate::cabinet::{CENTER_Z_M, FRONT_X_M, SCREEN_M};
@@ -6,21 +6,21 @@ use crate::scan::looking_along;
 use kinematics::{Transform, transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
-/// The camera's way; the base stands while it scans.
+/// The camera's path. The base is stationary during scans.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CabinetTour {
     motion: BaseMotion,
-    /// Poses of the base at both stands.
+    /// Poses of the base at both stations.
     world_from_station: [Transform; 2],
-    /// When the first stand ends and the second begins, seconds.
+    /// Time at which the base leaves the first station and reaches the second, seconds.
     walk_secs: [f64; 2],
     speed: f64,
 }
 
-/// Seconds at the second stand before the camera goes in, and of one way in and out.
+/// Seconds at the second station before the camera enters, and duration of one trip in and out.
 const OUTSIDE_SECS: f64 = 9.0;
 const IN_AND_OUT_SECS: f64 = 22.0;
-/// The lamps change over this stretch before the opening and behind it, metres.
+/// The lamps change over this range of distances before and behind the opening, meters.
 const LIGHT_TRANSITION_M: [f64; 2] = [-0.20, 0.02];
 
 impl CabinetTour {
@@ -30,13 +30,13 @@ impl CabinetTour {
         Self { motion, world_from_station, walk_secs: walk_interval_secs, speed }
     }
 
-    /// Where the camera should be, seen from the arm's base.
+    /// Target pose of the camera in the arm's base frame.
     pub(crate) fn arm_from_camera(&self, secs: f64) -> Transform {
         let [departure_secs, arrival_secs] = self.walk_secs;
         match self.motion.station_at(secs) {
             Some((station, at)) => self.at_station(station, at),
             None => {
-                // The last pose at the first stand turns into the first at the second while the base walks.
+                // The last pose at the first station blends into the first at the second while the base walks.
                 let share = smooth((secs - departure_secs) / (arrival_secs - departure_secs));
                 transform::interpolate(
                     &self.at_station(0, departure_secs * self.speed),
@@ -56,7 +56,7 @@ impl CabinetTour {
     }
 }
 
-/// Eye, point looked at, and roll at the first stand, `at` seconds after the start.
+/// Eye, look-at point and roll at the first station, `at` seconds after the start.
 fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     let eye = Vector3::new(
         oscillate([0.60, 0.07, 6.1, 0.2], at),
@@ -71,7 +71,7 @@ fn far(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.6], at))
 }
 
-/// The same at the second stand: before the opening, then in and out again and again.
+/// Eye, look-at point and roll at the second station: before the opening, then repeatedly in and out.
 fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     let cycle = ((at - OUTSIDE_SECS).max(0.0) / IN_AND_OUT_SECS * std::f64::consts::TAU).cos();
     let inside = 0.5 - 0.5 * cycle;
@@ -100,7 +100,7 @@ fn near(at: f64) -> (Vector3<f64>, Vector3<f64>, f64) {
     (eye, look_at, oscillate([0.0, 0.15, 8.3, 0.1], at))
 }
 
-/// Brightness of the lamps for a camera at a place: 1 outside, `inside_frac` inside.
+/// Brightness of the lamps for a camera pose: 1 outside, `inside_frac` inside.
 pub(crate) fn light_frac(world_from_camera: &Transform, inside_frac: f64) -> f64 {
     let [from, to] = LIGHT_TRANSITION_M;
     let share = smooth((world_from_camera.translation.vector.x - FRONT_X_M - from) / (to - from));
@@ -123,7 +123,8 @@ mod tests {
         let motion = BaseMotion::of(Scene::MobileArm, 1.0);
         let tour = CabinetTour::new(motion, 1.0);
         let flange_from_camera = CameraConfig::mobile_wrist("wrist").parent_from_camera;
-        let mut follower = Follower::new(Tour::Cabinet(tour), flange_from_camera).expect("the first pose is reached");
+        let mut follower =
+            Follower::new(Tour::Cabinet(tour), flange_from_camera).expect("the arm can reach the first pose");
         let (mut secs, mut off_tour_secs, mut worst, mut max_depth_m) = (0.0, 0.0, [0.0_f64; 3], f64::MIN);
         while secs < 60.0 {
             secs += STEP_SECS;

@@ -1,4 +1,4 @@
-//! What a simulated rig is made of: scene, cameras, how real their flaws are, and when it ends.
+//! Configuration of a simulated rig: scene, cameras, sensor imperfections, and end conditions.
 
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Transform};
@@ -7,47 +7,49 @@ use nalgebra::{Translation3, UnitQuaternion, Vector3};
 /// A simulated rig.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// Which scene is built.
+    /// Scene to build.
     pub scene: Scene,
-    /// Keys every random number; the same seed gives the same bits in lockstep.
+    /// Seed of all random numbers. In lockstep, the same seed gives identical bits.
     pub seed: u64,
-    /// Switches every flaw of the sensors off: noise, blur, shear, holes, latency, dropped images. Lens and range limits stay.
+    /// Disables all sensor imperfections: noise, blur, rolling-shutter shear, holes, latency, dropped images. Lens
+    /// and range limits stay.
     pub ideal: bool,
-    /// Whether each colour image is followed by its [`drivers::TruthImage`].
+    /// Whether each color image is followed by its [`drivers::TruthImage`].
     pub truth: bool,
-    /// Whether the truth of cameras with depth carries the noise-free depth.
+    /// Whether the ground truth of cameras with depth includes noise-free depth.
     pub truth_depth: bool,
     /// Factor on the speed of the scanning motion, above 0 to 2; at 1 the camera moves at 0.1 to 0.25 m/s.
     pub speed: f64,
-    /// Whether the camera only turns about the vertical axis: a scan that does not show the whole hand-eye transform.
+    /// Whether the camera only rotates about the vertical axis. Such a scan does not determine the whole hand-eye
+    /// transform.
     pub azimuth_only: bool,
-    /// The rig ends after this simulated time, seconds.
+    /// The rig stops after this simulated time, seconds.
     pub duration_secs: Option<f64>,
-    /// The rig ends once the first camera has delivered this many colour images.
+    /// The rig stops after the first camera has delivered this many color images.
     pub n_images: Option<u64>,
     /// Names of the arm's joints from base to flange.
     pub joint_names: Vec<String>,
-    /// The same names in the order of the joint readings.
+    /// The same names, in the order of the joint readings.
     pub reading_order: Vec<String>,
-    /// The cameras, each with its own name.
+    /// The cameras; names are unique.
     pub cameras: Vec<CameraConfig>,
-    /// The range scanners, each with its own name.
+    /// The range scanners; names are unique.
     pub scanners: Vec<ScannerConfig>,
-    /// What is told of a base that moves.
+    /// Reporting of a moving base.
     pub base: BaseConfig,
-    /// Brightness of all lamps once the arm's camera is inside the cabinet, relative to outside; 1 changes nothing.
+    /// Brightness of all lamps while the arm's camera is inside the cabinet, relative to outside; 1 has no effect.
     pub light_inside_frac: f64,
 }
 
-/// What a scene's moving base tells about itself.
+/// Poses reported by a scene's moving base.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BaseConfig {
-    /// Poses a second.
+    /// Poses per second.
     pub rate_hz: f64,
-    /// Root mean square of the error of the told position at the end of the walk (one lap, or the last stand), metres. The error
-    /// grows with the square root of the way.
+    /// Root mean square error of the reported position at the end of the walk (one lap, or the last station), meters.
+    /// The error grows with the square root of the distance.
     pub drift_m: f64,
-    /// The same of the told orientation, radians.
+    /// Root mean square error of the reported orientation there, radians.
     pub drift_rad: f64,
 }
 
@@ -57,33 +59,33 @@ impl Default for BaseConfig {
     }
 }
 
-/// One simulated range scanner that turns about its z axis, fixed to the base.
+/// A simulated range scanner that rotates about its z axis, fixed to the base.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScannerConfig {
     /// Name in the rig file.
     pub name: String,
-    /// Turns a second.
+    /// Revolutions per second.
     pub rate_hz: f64,
-    /// Pose on the base: x ahead, z up.
+    /// Pose on the base: x forward, z up.
     pub base_from_scanner: Transform,
-    /// Rings, spread evenly over the elevations.
+    /// Number of rings, spaced evenly over the elevation range.
     pub n_rings: u32,
-    /// Lowest and highest ring, radians above the sensor's xy plane.
+    /// Elevation of the lowest and highest ring, radians above the sensor's xy plane.
     pub elevation_rad: [f64; 2],
-    /// Directions of each ring a turn.
+    /// Number of rays per ring and revolution.
     pub n_columns: u32,
-    /// Nearer and further surfaces give no echo, metres.
+    /// Minimum range, meters. Closer surfaces give no echo.
     pub min_m: f64,
-    /// See `min_m`.
+    /// Maximum range, meters. Surfaces farther away give no echo.
     pub max_m: f64,
-    /// Standard deviation of the range, metres.
+    /// Standard deviation of the range, meters.
     pub noise_sigma_m: f64,
-    /// Share of the echoes that are lost.
+    /// Fraction of echoes that are dropped.
     pub dropped_frac: f64,
 }
 
 impl ScannerConfig {
-    /// Sixteen rings ten times a second, on the back of the quadruped.
+    /// Sixteen rings at 10 Hz, on the back of the quadruped.
     pub fn sixteen_rings(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -100,19 +102,19 @@ impl ScannerConfig {
     }
 }
 
-/// The scenes that can be built.
+/// The available scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scene {
     /// A Panda on a table between two walls; a furry toy, a tag cube and a wooden block.
     StaticArm,
-    /// A quadruped walks round a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
+    /// A quadruped walks around a wooden pedestal with a glass bowl in a laboratory of 15 x 10 m.
     MobileBase,
-    /// A Panda on a quadruped before a switchboard cabinet, first 2 m off, then close and into it.
+    /// A Panda on a quadruped in front of a switchboard cabinet: first 2 m away, then close to and inside it.
     MobileArm,
 }
 
 impl Scene {
-    /// Every scene.
+    /// All scenes.
     pub const ALL: [Self; 3] = [Self::StaticArm, Self::MobileBase, Self::MobileArm];
 
     /// Whether the robot has an arm.
@@ -120,7 +122,7 @@ impl Scene {
         self != Self::MobileBase
     }
 
-    /// Whether the robot's base moves and tells where it is.
+    /// Whether the robot's base moves and reports its pose.
     pub fn has_moving_base(self) -> bool {
         self != Self::StaticArm
     }
@@ -134,20 +136,20 @@ impl Scene {
         }
     }
 
-    /// The scene of this name in the rig file.
+    /// Returns the scene with this name in the rig file.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|scene| scene.name() == name)
     }
 }
 
-/// Frame that a camera is fixed to.
+/// Frame that a camera is attached to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parent {
     /// The arm's flange: the camera moves with it.
     Flange,
     /// The robot's base.
     Base,
-    /// The world: the camera stands still.
+    /// The world: the camera is stationary.
     World,
 }
 
@@ -158,36 +160,36 @@ pub struct CameraConfig {
     pub name: String,
     /// True lens parameters and image size.
     pub intrinsics: Intrinsics,
-    /// Images a second.
+    /// Images per second.
     pub rate_hz: f64,
-    /// What the camera is fixed to.
+    /// Frame that the camera is attached to.
     pub parent: Parent,
-    /// Pose on the parent.
+    /// Camera pose in the parent frame.
     pub parent_from_camera: Transform,
-    /// Flaws of the colour images.
+    /// Imperfections of the color images.
     pub sensor: SensorConfig,
-    /// Depth images, where the camera has them.
+    /// Depth images, if the camera has them.
     pub depth: Option<DepthConfig>,
 }
 
-/// Flaws of colour images. Exposure and white balance are locked.
+/// Imperfections of color images. Exposure and white balance are locked.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorConfig {
-    /// Standard deviation of the noise at mid grey (128), in steps of 255.
+    /// Standard deviation of the noise at mid gray (128), on a scale of 0 to 255.
     pub noise_sigma: f64,
-    /// Share of the noise variance at mid grey that is shot noise (grows with brightness); the rest is read noise.
+    /// Fraction of the noise variance at mid gray that is shot noise (grows with brightness); the rest is read noise.
     pub shot_frac: f64,
-    /// Exposure time, microseconds. It only blurs when `blur_samples` is above 1.
+    /// Exposure time, microseconds. Causes blur only if `blur_samples` is above 1.
     pub exposure_micros: f64,
-    /// Instants averaged over the exposure time; 1 gives no motion blur.
+    /// Number of instants averaged over the exposure time; 1 gives no motion blur.
     pub blur_samples: u32,
     /// Time from the first row's exposure to the last row's, microseconds; 0 for a global shutter.
     pub readout_micros: f64,
-    /// From the end of the readout to the delivery, milliseconds.
+    /// Time from the end of the readout to the delivery, milliseconds.
     pub latency_millis: f64,
-    /// Share of the images that the device loses.
+    /// Fraction of images that the device drops.
     pub dropped_frac: f64,
-    /// Rendered pixels a pixel along each side, 1 to 4: 1 is cheap and jagged, 2 is smooth.
+    /// Rendered pixels per image pixel along each side, 1 to 4: 1 is fast and aliased, 2 is smooth.
     pub supersample: u32,
 }
 
@@ -206,29 +208,29 @@ impl Default for SensorConfig {
     }
 }
 
-/// Flaws and limits of depth images, which come with the stamp of the colour image and a global shutter.
+/// Imperfections and limits of depth images, which have the stamp of the color image and a global shutter.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthConfig {
-    /// Where depth has a lens and a place of its own; else it is registered to the colour image.
+    /// Separate depth sensor. If `None`, depth is registered to the color image.
     pub sensor: Option<DepthSensor>,
-    /// Standard deviation at 1 m, metres; grows with the square of the depth.
+    /// Standard deviation at 1 m, meters; grows with the square of the depth.
     pub noise_sigma_m: f64,
-    /// Share of the pixels without depth, most of them where depth jumps.
+    /// Fraction of pixels without depth, most of them at depth discontinuities.
     pub hole_frac: f64,
-    /// Nearer surfaces have no depth, metres.
+    /// Minimum depth, meters. Closer surfaces have no depth.
     pub min_m: f64,
-    /// Further surfaces have no depth, metres.
+    /// Maximum depth, meters. Surfaces farther away have no depth.
     pub max_m: f64,
-    /// Metres per count of the delivered image.
+    /// Meters per count of the delivered image.
     pub meters_per_count: f64,
 }
 
-/// A depth sensor beside the colour sensor.
+/// A depth sensor next to the color sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DepthSensor {
     /// Lens parameters and size of the depth images.
     pub intrinsics: Intrinsics,
-    /// Its pose in the frame of the colour camera.
+    /// Its pose in the frame of the color camera.
     pub camera_from_depth: Transform,
 }
 
@@ -239,7 +241,7 @@ impl Default for DepthConfig {
 }
 
 impl CameraConfig {
-    /// A wrist RGB-D camera like a `RealSense` D435i, 640x480 at 15 Hz, tilted on a bracket beside the flange.
+    /// A wrist RGB-D camera like a `RealSense` D435i: 640x480 at 15 Hz, tilted, on a bracket next to the flange.
     pub fn wrist(name: &str) -> Self {
         Self {
             name: name.to_owned(),
@@ -258,8 +260,8 @@ impl CameraConfig {
         }
     }
 
-    /// A wrist RGB-D camera like a `RealSense` L515 for what stands upright before the arm: 1280x720 colour at 4 Hz, depth of
-    /// 640x480 with a lens and a place of its own, tilted by 80 degrees.
+    /// A wrist RGB-D camera like a `RealSense` L515, for upright objects in front of the arm: 1280x720 color at 4 Hz,
+    /// 640x480 depth with its own lens and pose, tilted by 80 degrees.
     pub fn mobile_wrist(name: &str) -> Self {
         let pinhole = |size_px, focal_px, principal_px| Intrinsics {
             size_px,
@@ -288,9 +290,9 @@ impl CameraConfig {
     }
 }
 
-/// The bracket of the wrist camera, as `flange_from_camera`: beside the flange, tilted to look past it.
+/// The bracket of the wrist camera, as `flange_from_camera`: next to the flange, tilted to look past it.
 ///
-/// The tilt lets the arm look at the scene from low elevations without reaching its joint limits.
+/// With the tilt, the arm can view the scene from low elevations without reaching its joint limits.
 fn wrist_extrinsics(tilt_degrees: f64) -> Transform {
     let quarter = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::FRAC_PI_2);
     let tilt = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), tilt_degrees.to_radians());
@@ -320,7 +322,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Which joint, counted from the base, each number of a reading is of.
+    /// Index of the joint, counted from the base, for each value of a reading.
     pub(crate) fn joint_ixs(&self) -> Result<Vec<usize>, Error> {
         let find = |name: &String| {
             let unknown = || Error::UnknownJoint { joint: name.clone(), known: self.joint_names.clone() };
@@ -329,7 +331,7 @@ impl Config {
         self.reading_order.iter().map(find).collect()
     }
 
-    /// Says what is wrong with the numbers before MuJoCo, which would abort the process, sees them.
+    /// Checks all numbers before they reach MuJoCo, which aborts the process on invalid ones.
     pub fn check(&self) -> Result<(), Error> {
         check("sim", "speed", self.speed, 0.01, 2.0)?;
         if let Some(secs) = self.duration_secs {
@@ -436,7 +438,7 @@ fn check_lens(of: &str, lens: &Intrinsics) -> Result<(), Error> {
     Ok(())
 }
 
-/// Refuses numbers outside `lower..=upper`, and NaN.
+/// Rejects numbers outside `lower..=upper`, and NaN.
 fn check(of: &str, key: &'static str, got: f64, lower: f64, upper: f64) -> Result<(), Error> {
     if got >= lower && got <= upper {
         return Ok(());

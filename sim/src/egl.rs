@@ -1,4 +1,4 @@
-//! An OpenGL context without a display, current on the thread that made it.
+//! A headless OpenGL context, current on the thread that created it.
 #![expect(unsafe_code, reason = "EGL is a C interface")]
 
 use crate::Error;
@@ -12,7 +12,7 @@ const PLATFORM_SURFACELESS_MESA: egl::Enum = 0x31dd;
 const EXTENSIONS: i32 = 0x3055;
 const MAX_DEVICES: usize = 32;
 
-/// A context without a surface; dropping it releases the thread and destroys it.
+/// A context without a surface. Dropping it releases the thread and destroys the context.
 pub(crate) struct HeadlessContext {
     egl: Egl,
     display: egl::Display,
@@ -21,11 +21,11 @@ pub(crate) struct HeadlessContext {
 }
 
 impl HeadlessContext {
-    /// Takes the first that works: a hardware device, Mesa's surfaceless platform, a software device.
+    /// Opens the first platform that works: a hardware device, Mesa's surfaceless platform, a software device.
     ///
-    /// On machines with a graphics card Mesa's surfaceless platform may draw in software, so devices come first.
+    /// On machines with a GPU, Mesa's surfaceless platform may render in software, so devices come first.
     pub(crate) fn open() -> Result<Self, Error> {
-        // SAFETY: loading libEGL runs its initialisers, which are those of the system's own library.
+        // SAFETY: loading libEGL runs its initializers, which are those of the system's own library.
         let egl = unsafe { Egl::load_required() }.map_err(|error| Error::NoEgl { reason: error.to_string() })?;
         let devices = devices(&egl);
         let hardware = devices.iter().filter(|device| !device.is_software);
@@ -48,7 +48,7 @@ impl HeadlessContext {
         Err(Error::NoContext { reason: refused.join("; ") })
     }
 
-    /// What draws, as OpenGL names it.
+    /// The renderer's name as reported by OpenGL.
     pub(crate) fn renderer(&self) -> &str {
         &self.renderer
     }
@@ -56,7 +56,7 @@ impl HeadlessContext {
 
 impl Drop for HeadlessContext {
     fn drop(&mut self) {
-        // Errors here have no one to go to; the display itself is shared by the process and stays.
+        // Errors cannot be reported here. The display is shared by the process and stays open.
         let _ = self.egl.make_current(self.display, None, None, None);
         let _ = self.egl.destroy_context(self.display, self.context);
     }
@@ -106,7 +106,7 @@ fn make_current(
     platform: egl::Enum,
     native: egl::NativeDisplayType,
 ) -> Result<(egl::Display, egl::Context), egl::Error> {
-    // SAFETY: the native display is null for the surfaceless platform, else a device that EGL listed itself.
+    // SAFETY: the native display is null for the surfaceless platform, else a device listed by EGL.
     let display = unsafe { egl.get_platform_display(platform, native, &[egl::ATTRIB_NONE]) }?;
     egl.initialize(display)?;
     let attributes = [
@@ -141,6 +141,6 @@ fn renderer_name(egl: &Egl) -> String {
     if name.is_null() {
         return "an unnamed renderer".to_owned();
     }
-    // SAFETY: OpenGL returns a static string that ends in a zero byte, as a context is current.
+    // SAFETY: a context is current, so OpenGL returns a static string that ends in a zero byte.
     unsafe { CStr::from_ptr(name) }.to_string_lossy().into_owned()
 }

@@ -1,4 +1,4 @@
-//! Steps the rig and makes the samples, in the order in which devices would deliver them.
+//! Steps the rig and creates samples in the order in which devices would deliver them.
 
 use crate::arm::{JointReading, STEP_NANOS};
 use crate::base::Drift;
@@ -18,17 +18,17 @@ use mujoco_rs::prelude::MjModel;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-/// A sample and the simulated time at which it arrives.
+/// Simulated arrival time of a sample, nanoseconds, and the sample.
 pub(crate) type Delivery = (i64, Sample);
 
-/// A rig in motion.
+/// A running rig.
 pub(crate) struct Engine {
     config: Config,
-    /// Which joint each number of a reading is of.
+    /// Joint index of each value in a reading.
     joint_ixs: Vec<usize>,
     robot: Robot,
     drift: Drift,
-    /// Where there are range scanners.
+    /// Ray caster; `None` without range scanners.
     rays: Option<RayCaster>,
     n_base_poses: u64,
     n_scans: Vec<u64>,
@@ -36,9 +36,9 @@ pub(crate) struct Engine {
     renderer: Renderer,
     /// Stamp of simulated time zero.
     start: Stamp,
-    /// Images being drawn before the engine waits for the first of them.
+    /// Maximum number of images being rendered before the engine waits for the first.
     max_pending: usize,
-    /// Images that would arrive before this simulated time are skipped: a real-time player that is late says so.
+    /// Images that would arrive before this simulated time are skipped. Set by the real-time loop when it is late.
     skip_before_nanos: i64,
     slots: VecDeque<Slot>,
     n_pending: usize,
@@ -47,13 +47,13 @@ pub(crate) struct Engine {
     has_ended: bool,
 }
 
-/// What is delivered next.
+/// Next item to deliver.
 enum Slot {
     Joints(JointReading),
     Image(Exposure),
-    /// A pose of the base, at a time in nanoseconds.
+    /// A base pose at a time in nanoseconds.
     Base(i64),
-    /// A turn of a scanner: which, the how many'th, and when it began, nanoseconds.
+    /// A scanner revolution: scanner index, revolution number, and start time in nanoseconds.
     Scan(usize, u64, i64),
 }
 
@@ -62,14 +62,14 @@ struct Camera {
     config: CameraConfig,
     sensor: SensorConfig,
     optics: Optics,
-    /// Where depth is seen by a sensor of its own.
+    /// Optics of a separate depth sensor, if any.
     depth_optics: Option<Optics>,
     ix: u64,
     n_exposed: u64,
     n_skipped: u64,
 }
 
-/// An image on its way.
+/// An image being rendered.
 struct Exposure {
     camera_ix: usize,
     image_ix: u64,
@@ -77,21 +77,21 @@ struct Exposure {
     arrival_nanos: i64,
     n_skipped: u64,
     world_from_camera: Transform,
-    /// Camera poses at other instants relative to `world_from_camera`, where the shutter makes a difference.
+    /// Camera poses at other instants relative to `world_from_camera`, if the shutter requires them.
     row_motions: Vec<RowMotion>,
     picture: Pending,
     depth_picture: Option<Pending>,
 }
 
-/// First exposure of the first camera, and how much later each further camera starts.
+/// First exposure of the first camera, and additional delay of each further camera.
 const FIRST_NANOS: i64 = 50_000_000;
 const STAGGER_NANOS: i64 = 3_700_000;
 
-/// Streams of random numbers of one image.
+/// Random number streams of one image.
 const COLOR_NOISE: u64 = 1;
 const DEPTH_NOISE: u64 = 2;
 const DROP_STREAM: u64 = 3;
-/// Stream of random numbers of one scan.
+/// Random number stream of one scan.
 const SCANS: u64 = 4;
 
 #[expect(clippy::cast_possible_truncation, reason = "times of a run in nanoseconds fit an i64")]
@@ -131,18 +131,18 @@ impl Camera {
         first + nanos_from_secs(elapsed)
     }
 
-    /// Half the time over which the image's rows are exposed.
+    /// Half of the time span over which the image's rows are exposed.
     fn half_span_nanos(&self) -> i64 {
         nanos_from_secs(0.5e-6 * (self.sensor.readout_micros + self.sensor.exposure_micros))
     }
 
-    /// From the stamp to the arrival; never before the joints are known up to the last row.
+    /// Time from the stamp to the arrival; never before the joint readings cover the last row.
     fn delivery_delay_nanos(&self) -> i64 {
         self.half_span_nanos() + STEP_NANOS + nanos_from_secs(1e-3 * self.sensor.latency_millis)
     }
 
     /// Instants at which the rows are exposed, relative to the stamp: those of the first row, then of the second.
-    /// Empty where all are zero.
+    /// Empty if all are zero.
     fn row_offsets_nanos(&self) -> Vec<i64> {
         let sensor = &self.sensor;
         if self.config.parent == Parent::World || (sensor.readout_micros <= 0.0 && sensor.blur_samples <= 1) {
@@ -168,7 +168,7 @@ impl Camera {
         }
     }
 
-    /// What the depth sensor sees where it is not the colour sensor.
+    /// View of the depth sensor, if it is separate from the color sensor.
     fn depth_view(&self, world_from_camera: &Transform) -> Option<render::View> {
         let sensor = self.config.depth.as_ref()?.sensor.as_ref()?;
         Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, None, 1.0))
@@ -179,7 +179,7 @@ impl Camera {
     }
 }
 
-/// How much of the arm's past its cameras may still ask for, nanoseconds.
+/// Duration of the arm's history that cameras may request, nanoseconds.
 pub(crate) fn history_nanos(config: &Config) -> i64 {
     let longest = |camera: &CameraConfig| {
         let sensor = &camera.sensor;
@@ -188,7 +188,7 @@ pub(crate) fn history_nanos(config: &Config) -> i64 {
     config.cameras.iter().map(longest).max().unwrap_or(0) + 10 * STEP_NANOS
 }
 
-/// Optics and counters of every camera, before the rest exists.
+/// Optics and counters of all cameras, created before the rest of the engine.
 pub(crate) struct Cameras(Vec<Camera>);
 
 impl Cameras {
@@ -197,7 +197,7 @@ impl Cameras {
         Ok(Self(cameras.collect::<Result<_, _>>()?))
     }
 
-    /// Size that holds the pictures of all cameras.
+    /// Size that fits the rendered images of all cameras.
     pub(crate) fn largest_view_px(&self) -> [u32; 2] {
         let all = self.0.iter().flat_map(|camera| std::iter::once(&camera.optics).chain(&camera.depth_optics));
         let sizes = all.map(Optics::view_size_px);
@@ -239,17 +239,17 @@ impl Engine {
         self.renderer.name()
     }
 
-    /// Sets the stamp of simulated time zero, before the first sample is taken.
+    /// Sets the stamp of simulated time zero. Call before taking the first sample.
     pub(crate) fn set_start(&mut self, start: Stamp) {
         self.start = start;
     }
 
-    /// Skips the images that arrive before a simulated time.
+    /// Skips images that arrive before a simulated time.
     pub(crate) fn skip_before(&mut self, nanos: i64) {
         self.skip_before_nanos = nanos;
     }
 
-    /// The next sample; `None` at the end.
+    /// Returns the next sample, or `None` at the end.
     pub(crate) fn next(&mut self) -> Result<Option<Delivery>, Error> {
         loop {
             if let Some(delivery) = self.ready.pop_front() {
@@ -273,7 +273,7 @@ impl Engine {
         }
     }
 
-    /// Moves the robot by one step and starts drawing the images that arrive by then.
+    /// Moves the robot by one step and starts rendering the images that arrive by then.
     fn step(&mut self) -> Result<(), Error> {
         let (nanos, reading) = self.robot.step();
         if self.config.duration_secs.is_some_and(|secs| nanos > nanos_from_secs(secs)) {
@@ -292,7 +292,7 @@ impl Engine {
         Ok(())
     }
 
-    /// Queues the poses of a moving base, and the turns of its scanners that end by now.
+    /// Queues the poses of a moving base and the scanner revolutions that end by now.
     fn queue_base_and_scans(&mut self, nanos: i64) {
         let due = |n_done: u64, rate_hz: f64| nanos_from_secs(n_done as f64 / rate_hz);
         while self.config.scene.has_moving_base() && due(self.n_base_poses, self.config.base.rate_hz) <= nanos {
@@ -308,7 +308,7 @@ impl Engine {
         }
     }
 
-    /// Tells a pose of the base as its SLAM system sees it, and the truth.
+    /// Emits the base pose as reported by its SLAM system, and the ground truth.
     fn emit_base_pose(&mut self, nanos: i64) {
         let (stamp, secs) = (Stamp(self.start.0 + nanos), nanos as f64 * 1e-9);
         let truth = self.robot.motion().world_from_base(secs);
@@ -335,7 +335,7 @@ impl Engine {
         Ok(())
     }
 
-    /// Starts drawing a camera's next image, or loses it.
+    /// Starts rendering a camera's next image, or drops it.
     fn expose(&mut self, camera_ix: usize) -> Result<(), Error> {
         let camera = &mut self.cameras[camera_ix];
         let (image_ix, stamp_nanos) = (camera.n_exposed, camera.stamp_nanos());
@@ -355,7 +355,7 @@ impl Engine {
             let world_from_row = camera.world_from_camera(&robot_at(stamp_nanos + offset)?);
             row_motions.push(RowMotion::new(&(camera_from_world * world_from_row)));
         }
-        // A camera on the robot sees nothing of it; leaving it out keeps its shadow off the scene as well.
+        // A camera on the robot does not see the robot. Omitting it also keeps its shadow off the scene.
         let robot = (camera.config.parent == Parent::World).then_some(robot);
         let light_frac = match self.config.scene {
             Scene::MobileArm if !self.config.ideal && camera.config.parent == Parent::Flange => {
@@ -387,7 +387,7 @@ impl Engine {
         Ok(())
     }
 
-    /// Waits for the drawn picture and turns it into what the camera delivers.
+    /// Waits for the rendered image and converts it to what the camera delivers.
     fn finish_image(&mut self, exposure: Exposure) -> Result<(), Error> {
         let camera = &self.cameras[exposure.camera_ix];
         let picture = exposure.picture.wait()?;

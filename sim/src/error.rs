@@ -1,32 +1,32 @@
-//! What can go wrong with a simulated rig.
+//! Errors of simulated rigs.
 
 /// Errors of simulated rigs.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A number of the configuration makes no sense.
-    #[error("{of}: {key} is {got}, allowed are {lower} to {upper}")]
+    /// A number in the configuration is out of range.
+    #[error("{of}: {key} is {got}, must be {lower} to {upper}")]
     OutOfRange {
         /// Camera or part of the rig.
         of: String,
-        /// Name of the number.
+        /// Key of the number.
         key: &'static str,
-        /// What it is.
+        /// Value found.
         got: f64,
-        /// Smallest allowed.
+        /// Minimum.
         lower: f64,
-        /// Largest allowed.
+        /// Maximum.
         upper: f64,
     },
-    /// The arm has another number of joints.
+    /// The configuration names a different number of joints than the arm has.
     #[error("the simulated arm has {expected} joints, {got} names were given")]
     NJoints {
-        /// Names given.
+        /// Number of names given.
         got: usize,
-        /// Joints of the arm.
+        /// Number of joints of the arm.
         expected: usize,
     },
-    /// A joint is to be read that the arm does not have.
+    /// The reading order contains a joint that the arm does not have.
     #[error("the simulated arm has no joint {joint:?}, its joints are: {}", .known.join(", "))]
     UnknownJoint {
         /// Name given.
@@ -34,31 +34,31 @@ pub enum Error {
         /// Names of the arm's joints.
         known: Vec<String>,
     },
-    /// Nothing to render.
+    /// The configuration has no cameras.
     #[error("a simulated rig needs at least one camera")]
     NoCamera,
-    /// There is no flange to fix a camera to.
+    /// A camera is attached to the flange of a robot without an arm.
     #[error("camera {camera:?} has the parent flange, but the robot of this scene has no arm")]
     NoFlange {
         /// Name of the camera.
         camera: String,
     },
-    /// Two cameras cannot be told apart.
+    /// Two cameras have the same name.
     #[error("two cameras are named {camera:?}")]
     DuplicateName {
         /// The name.
         camera: String,
     },
-    /// MuJoCo does not accept the scene that was built.
-    #[error("mujoco refuses the scene: {reason}")]
+    /// MuJoCo rejected the generated scene.
+    #[error("mujoco rejected the scene: {reason}")]
     Scene {
-        /// What MuJoCo says.
+        /// Message from MuJoCo.
         reason: String,
     },
-    /// MuJoCo casts no rays.
-    #[error("mujoco casts no rays: {reason}")]
+    /// MuJoCo could not cast rays.
+    #[error("mujoco could not cast rays: {reason}")]
     Rays {
-        /// What MuJoCo says.
+        /// Message from MuJoCo.
         reason: String,
     },
     /// A generated texture or mesh cannot be encoded.
@@ -66,18 +66,18 @@ pub enum Error {
     Texture {
         /// Name of the texture.
         name: &'static str,
-        /// Why.
+        /// Cause.
         source: image::ImageError,
     },
-    /// The lens shows nothing at a pixel.
-    #[error("camera {camera:?}: the lens shows nothing at pixel {pixel:?}")]
+    /// The lens model has no ray for a pixel.
+    #[error("camera {camera:?}: the lens model has no ray for pixel {pixel:?}")]
     Lens {
         /// Name of the camera.
         camera: String,
         /// The pixel.
         pixel: [f64; 2],
     },
-    /// The arm's past does not reach back far enough.
+    /// The arm's history does not reach back far enough.
     #[error("no joint reading around {nanos} ns of simulated time")]
     NoHistory {
         /// Simulated time.
@@ -86,25 +86,25 @@ pub enum Error {
     /// The EGL library is missing.
     #[error("cannot load libEGL.so.1 (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri): {reason}")]
     NoEgl {
-        /// What the loader says.
+        /// Message from the loader.
         reason: String,
     },
-    /// No EGL platform gives an OpenGL context without a display.
+    /// No EGL platform provides an OpenGL context without a display.
     #[error("no headless OpenGL context: {reason}")]
     NoContext {
-        /// What each platform answered.
+        /// Result of each platform.
         reason: String,
     },
-    /// The render thread ended early.
+    /// The render thread stopped early.
     #[error("the render thread stopped: {reason}")]
     Stopped {
-        /// Why, as far as it is known.
+        /// Cause, if known.
         reason: String,
     },
     /// A thread cannot be started.
     #[error("cannot start a thread")]
     Thread(#[source] std::io::Error),
-    /// The scan asks for a pose that the arm cannot take.
+    /// The scan requires a pose that the arm cannot reach.
     #[error("the arm cannot look at the scene from the scan's position at {at_secs:.1} s")]
     Unreachable {
         /// Time in the scan, seconds.

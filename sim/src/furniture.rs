@@ -1,4 +1,4 @@
-//! Boxes of all kinds put together to benches, shelves and clutter, and remembered for the shadows they throw.
+//! Assembles boxes into benches, shelves and clutter, and records them for the shadows they cast.
 
 use crate::lab_texture::picture;
 use crate::light::Occluders;
@@ -7,11 +7,11 @@ use crate::random::Random;
 use kinematics::Transform;
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 
-/// Meshes by the sheet of pictures they show, and the boxes in them.
+/// Meshes by texture sheet, and the boxes they contain.
 pub(crate) struct Furniture {
-    /// Shows the sheet of things.
+    /// Textured with the sheet of items.
     pub(crate) things: Mesh,
-    /// Shows the sheet of posters.
+    /// Textured with the sheet of posters.
     pub(crate) posters: Mesh,
     /// Plain frames and legs.
     pub(crate) frames: Mesh,
@@ -20,15 +20,15 @@ pub(crate) struct Furniture {
     n_drawn: u64,
 }
 
-/// Standing upright at a place, turned about z.
+/// An upright pose at a position, rotated about z.
 pub(crate) fn upright(at_m: [f64; 3], yaw_degrees: f64) -> Transform {
     let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_degrees.to_radians());
     Transform::from_parts(Translation3::from(Vector3::from(at_m)), yaw)
 }
 
-/// A light wooden bench: half length, half depth and height of its top, metres.
+/// A light wooden bench: half length, half depth and height of its top, meters.
 const BENCH_M: [f64; 3] = [0.9, 0.375, 0.85];
-/// A shelf: half length, half depth and height, metres.
+/// A shelf: half length, half depth and height, meters.
 const SHELF_M: [f64; 3] = [0.75, 0.22, 2.0];
 
 impl Furniture {
@@ -55,7 +55,7 @@ impl Furniture {
         among[usize::try_from(self.random.bits(self.n_drawn) % n).expect("below the number of pictures")]
     }
 
-    /// A box whose front (+x), back and sides show one picture and whose top another.
+    /// A box that shows one texture on its front (+x), back and sides, and another on its top.
     pub(crate) fn add_item(&mut self, world_from_box: &Transform, half_m: [f64; 3], front: usize, top: usize) {
         let (around, above) = (picture(front), picture(top));
         self.add_textured_box(world_from_box, half_m, &[around, around, around, around, above, above]);
@@ -72,7 +72,7 @@ impl Furniture {
         self.solids.push((*world_from_box, half_m));
     }
 
-    /// A flat picture on a wall whose outward direction is the x axis of `world_from_wall`.
+    /// A flat poster on a wall whose outward normal is the x axis of `world_from_wall`.
     pub(crate) fn poster(&mut self, world_from_wall: &Transform, half_m: [f64; 2], ix: usize) {
         const LIFT_M: f64 = 0.012;
         let mut mesh = Mesh::default();
@@ -151,7 +151,7 @@ impl Furniture {
         }
     }
 
-    /// Every larger solid, to stand in the light's way; clutter on boards throws no shadow that can be seen on the floor.
+    /// Adds all larger solids as occluders. Clutter on boards casts no shadow visible on the floor.
     pub(crate) fn add_occluders(&self, occluders: &mut Occluders) {
         const MIN_HALF_M: f64 = 0.22;
         let large = |half_m: &[f64; 3]| half_m.iter().any(|half_m| *half_m >= MIN_HALF_M);

@@ -1,5 +1,5 @@
-//! The laboratory of the mobile base: 15 x 10 m with benches, shelves, crates and posters; a pedestal with a glass bowl in the
-//! middle, which is the world's origin on the floor.
+//! The laboratory of the mobile base: 15 x 10 m with benches, shelves, crates and posters. A pedestal with a glass
+//! bowl stands in the middle; the world's origin is on the floor there.
 
 use crate::furniture::{Furniture, upright};
 use crate::lab_texture;
@@ -10,14 +10,14 @@ use crate::texture::{self, Texture};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Half sizes of the room along x and y, and its height, metres.
+/// Half sizes of the room along x and y, and its height, meters.
 pub const ROOM_HALF_M: [f64; 2] = [7.5, 5.0];
-/// Height of the ceiling, metres.
+/// Height of the ceiling, meters.
 pub const ROOM_HEIGHT_M: f64 = 3.0;
-/// Half sizes of the pedestal, metres.
+/// Half sizes of the pedestal, meters.
 pub const PEDESTAL_HALF_M: [f64; 3] = [0.24, 0.24, 0.42];
 
-/// What stands where: `(x, y, degrees)` that it faces.
+/// Positions of furniture: `(x, y, heading in degrees)`.
 const BENCHES: [[f64; 3]; 7] = [
     [-4.6, -4.55, 90.0],
     [-2.5, -4.55, 90.0],
@@ -39,7 +39,7 @@ const BOX_STACKS: [([f64; 3], usize); 8] = [
     ([-1.6, 3.7, 5.0], 2),
     ([6.6, 4.2, 30.0], 4),
 ];
-/// Posters: wall (east, west, north, south), place along it, height, half width, half height, picture.
+/// Posters: wall (east, west, north, south), position along it, height, half width, half height, picture.
 const POSTERS: [(usize, [f64; 4], usize); 17] = [
     (0, [-3.6, 1.6, 0.5, 0.7], 0),
     (0, [0.0, 1.7, 0.55, 0.4], 7),
@@ -60,7 +60,7 @@ const POSTERS: [(usize, [f64; 4], usize); 17] = [
     (3, [6.3, 1.7, 0.5, 0.7], 9),
 ];
 
-/// A wall by number: x points into the room, z up, the origin on the floor at its middle.
+/// Pose of a wall by index: x points into the room, z up, the origin on the floor at its middle.
 fn world_from_wall(wall: usize) -> Transform {
     let [x, y] = ROOM_HALF_M;
     match wall {
@@ -93,7 +93,7 @@ fn world_from_pedestal() -> Transform {
     upright([0.0, 0.0, PEDESTAL_HALF_M[2]], 25.0)
 }
 
-/// Everything but the robot.
+/// All objects except the robot.
 pub(crate) fn objects() -> Vec<Object> {
     let object = |name, material, mesh| Object { name, material, mesh, world_from_mesh: Transform::identity() };
     let Furniture { things, posters, frames, .. } = furniture();
@@ -123,7 +123,7 @@ pub(crate) fn objects() -> Vec<Object> {
     objects
 }
 
-/// Height of the pedestal's top, metres.
+/// Height of the pedestal's top, meters.
 const TOP_M: f64 = 2.0 * PEDESTAL_HALF_M[2];
 
 fn bowl() -> Mesh {
@@ -136,7 +136,7 @@ fn bowl() -> Mesh {
     mesh
 }
 
-/// Fruit in the bowl, a mesh a colour.
+/// Fruit in the bowl, one mesh per color.
 fn fruit() -> [Mesh; 3] {
     let ball = |places: &[[f64; 4]]| {
         let mut mesh = Mesh::default();
@@ -176,7 +176,7 @@ fn ceiling() -> Mesh {
     let mut mesh = Mesh::default();
     let center = Point3::new(0.0, 0.0, ROOM_HEIGHT_M);
     mesh.rectangle(center, Vector3::x() * ROOM_HALF_M[0], Vector3::y() * -ROOM_HALF_M[1], WHOLE);
-    // Beams, so that the ceiling is not one colour.
+    // Beams, so that the ceiling is not a single color.
     for x in [-5.0, -2.5, 0.0, 2.5, 5.0] {
         mesh.append(Mesh::cuboid([0.08, ROOM_HALF_M[1], 0.1], &[WHOLE; 6]), Vector3::new(x, 0.0, ROOM_HEIGHT_M - 0.1));
     }
@@ -193,9 +193,9 @@ fn tubes() -> Mesh {
     mesh
 }
 
-/// The textures by name, light included.
+/// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
-    /// As far as furniture darkens the floor beside it.
+    /// Distance up to which furniture darkens the floor, meters.
     const AMBIENT_REACH_M: f64 = 1.2;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     furniture().add_occluders(&mut occluders);

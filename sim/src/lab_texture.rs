@@ -1,23 +1,24 @@
-//! Pictures painted for rooms: floors, walls, and sheets of 16 small pictures for posters and for things on shelves.
+//! Procedural textures for rooms: floors, walls, and sheets of 16 small pictures for posters and for items on
+//! shelves.
 #![expect(clippy::cast_possible_truncation, reason = "places on a sheet are small whole numbers")]
 
 use crate::mesh::TextureRect;
 use crate::random::Random;
 use crate::texture::{self, Color, Noise, SIDE_PX, Texture, mix, scale, step};
 
-/// Pictures along a side of a sheet.
+/// Number of pictures along a side of a sheet.
 const N_ACROSS: usize = 4;
 
-/// Rectangle of a picture on a sheet; numbers beyond the last start again.
+/// Rectangle of a picture on a sheet. Indices past the last picture wrap around.
 pub(crate) fn picture(ix: usize) -> TextureRect {
-    /// Mip levels must not mix neighbours.
+    /// Keeps mip levels from mixing neighboring pictures.
     const INSET: f64 = 0.004;
     let side = 1.0 / N_ACROSS as f64;
     let (x, y) = ((ix % N_ACROSS) as f64 * side, (ix / N_ACROSS % N_ACROSS) as f64 * side);
     [x + INSET, y + INSET, x + side - INSET, y + side - INSET]
 }
 
-/// Paints a sheet: `paint` takes the picture's number and the place in it.
+/// Paints a sheet. `paint` receives the picture's index and the position in it.
 fn sheet(paint: impl Fn(usize, f64, f64) -> Color + Sync) -> Texture {
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
         let (across, down) = (x * N_ACROSS as f64, y * N_ACROSS as f64);
@@ -25,7 +26,7 @@ fn sheet(paint: impl Fn(usize, f64, f64) -> Color + Sync) -> Texture {
     })
 }
 
-/// A colour with a hue of 0 to 1.
+/// A color from a hue of 0 to 1.
 fn hue(at: f64, dark: f64, light: f64) -> Color {
     let channel = |shift: f64| dark + (light - dark) * (0.5 + 0.5 * ((at + shift) * std::f64::consts::TAU).cos());
     [channel(0.0), channel(-1.0 / 3.0), channel(1.0 / 3.0)]
@@ -108,7 +109,7 @@ fn spots(each: Random, ix: u64, u: f64, v: f64) -> Color {
     top.map_or(ground, |spot| hue(each.unit(ix * 100 + spot * 4 + 3), 0.1, 0.95))
 }
 
-/// Sixteen things to stand on shelves and benches: cartons, crates, books, instruments, screens.
+/// Sixteen items for shelves and benches: cartons, crates, books, instruments, screens.
 pub(crate) fn items() -> Texture {
     let noise = Noise::new(111);
     let each = Random::new(0x7e37, &[112]);
@@ -253,7 +254,7 @@ fn tin(each: Random, ix: u64, u: f64, v: f64) -> Color {
     if emblem { hue(each.unit(ix * 9 + 70), 0.5, 0.98) } else { hue(each.unit(ix * 9 + band), 0.08, 0.75) }
 }
 
-/// Worn floor tiles with a marked lane round the middle; covers a whole room of `size_m` with tiles of 0.5 m.
+/// Worn floor tiles with a marked lane around the middle. Covers a whole room of `size_m` with tiles of 0.5 m.
 pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     let (rough, blotch) = (Noise::new(121), Noise::new(122));
     let each = Random::new(0x7e37, &[123]);
@@ -271,11 +272,11 @@ pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     })
 }
 
-/// A painted wall of panels, 3 m high and as wide, to be repeated: a green dado, a rail, plaster above.
+/// A painted wall of panels, 3 m high and wide, to be repeated: a green dado, a rail, plaster above.
 pub(crate) fn painted_wall() -> Texture {
     let (rough, stain) = (Noise::new(131), Noise::new(132));
     Texture::paint(SIDE_PX, |u, v| {
-        // The noise has to meet itself where the texture repeats.
+        // The noise must match at the edges where the texture repeats.
         let grain = 0.75 + 0.4 * rough.rough((u * 2.0 - 1.0).abs() * 40.0, v * 80.0, 4);
         let stained = stain.rough((u * 2.0 - 1.0).abs() * 5.0, v * 7.0, 5);
         let seam = (u * 4.0).fract() < 0.012;
@@ -313,7 +314,7 @@ pub(crate) fn enamel() -> Texture {
     })
 }
 
-/// A galvanised mounting plate with rows of slots.
+/// A galvanized mounting plate with rows of slots.
 pub(crate) fn mounting_plate() -> Texture {
     let (spangle, rough) = (Noise::new(151), Noise::new(152));
     Texture::paint(SIDE_PX, |u, v| {

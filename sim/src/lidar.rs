@@ -1,5 +1,5 @@
-//! A turning range scanner: a ray a direction, from where the scanner is at that instant.
-#![expect(clippy::cast_possible_truncation, reason = "points are told in f32, times of a turn fit their integers")]
+//! A rotating range scanner: one ray per direction, cast from the scanner's pose at that instant.
+#![expect(clippy::cast_possible_truncation, reason = "points are in f32, times within a revolution fit their integers")]
 
 use crate::Error;
 use crate::config::ScannerConfig;
@@ -11,12 +11,12 @@ use mujoco_rs::prelude::{MjData, MjModel};
 use nalgebra::Vector3;
 use std::sync::Arc;
 
-/// The scene for rays: it stands still, and rays do not see the robot, nor glass.
+/// The static scene for ray casting. Rays do not hit the robot or glass.
 pub(crate) struct RayCaster {
     data: MjData<Arc<MjModel>>,
 }
 
-/// Groups of geometry that rays see: all but the robot and glass.
+/// Geometry groups that rays hit: all but the robot and glass.
 fn visible_groups() -> [u8; 6] {
     let mut groups = [1; 6];
     groups[ARM_GROUP] = 0;
@@ -31,7 +31,7 @@ impl RayCaster {
         Self { data }
     }
 
-    /// Distances along unit vectors from one point, metres; `None` where a ray meets nothing within `max_distance_m`.
+    /// Distances along unit vectors from one point, meters; `None` if a ray hits nothing within `max_distance_m`.
     fn cast(
         &mut self,
         from: &Vector3<f64>,
@@ -48,7 +48,7 @@ impl RayCaster {
     }
 }
 
-/// One turn that began at a time; `world_from_base` tells where the base is so many nanoseconds after it.
+/// One revolution. `world_from_base` returns the base pose at a number of nanoseconds after its start.
 pub(crate) fn scan_revolution(
     rays: &mut RayCaster,
     scanner: &ScannerConfig,
@@ -62,7 +62,7 @@ pub(crate) fn scan_revolution(
     let mut points = Vec::new();
     for column in 0..scanner.n_columns {
         let share = f64::from(column) / f64::from(scanner.n_columns);
-        // Whole microseconds, for that is what a point tells.
+        // Points carry whole microseconds.
         let offset_micros = (share * period_nanos * 1e-3) as u32;
         let world_from_scanner = world_from_base(i64::from(offset_micros) * 1000) * scanner.base_from_scanner;
         let (sin, cos) = (share * std::f64::consts::TAU).sin_cos();

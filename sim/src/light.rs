@@ -1,7 +1,7 @@
-//! The scene's light, and how much of it reaches a point: worked out once and painted into the textures.
+//! Scene lighting: computes how much light reaches each point and bakes it into the textures.
 //!
-//! Nothing in front of a wrist camera moves, so shadows can be drawn before instead of with every picture. That halves
-//! the time of a picture, and gives the lamp an extent: its shadows are soft, and corners get less of the ambient light.
+//! Nothing in front of a wrist camera moves, so shadows can be computed once instead of for every image. This halves
+//! the rendering time and gives the lamp an extent: shadows are soft, and corners get less ambient light.
 
 use crate::random::Random;
 use kinematics::Transform;
@@ -10,7 +10,7 @@ use std::fmt::Write as _;
 
 /// A lamp at infinity.
 pub(crate) struct Lamp {
-    /// From the lamp to the scene.
+    /// Direction from the lamp to the scene.
     direction: [f64; 3],
     diffuse: [f64; 3],
     specular: f64,
@@ -18,17 +18,17 @@ pub(crate) struct Lamp {
 
 /// The lamp that casts shadows.
 const KEY: Lamp = Lamp { direction: [0.42, 0.30, -0.86], diffuse: [0.86, 0.84, 0.78], specular: 0.3 };
-/// Lamps that only fill.
+/// Fill lamps, which cast no shadows.
 const FILLS: [Lamp; 2] = [
     Lamp { direction: [0.55, -0.6, -0.45], diffuse: [0.20, 0.21, 0.24], specular: 0.0 },
     Lamp { direction: [-0.4, 0.1, -0.5], diffuse: [0.10, 0.10, 0.10], specular: 0.0 },
 ];
-/// Light from everywhere, sRGB 0 to 1.
+/// Ambient light, sRGB 0 to 1.
 const AMBIENT: [f64; 3] = [0.37, 0.37, 0.39];
 
-/// Half the angle that the key lamp covers, as a tangent.
+/// Tangent of half the angle that the key lamp covers.
 const KEY_SIZE: f64 = 0.06;
-/// Rays to the key lamp, and rays to everywhere.
+/// Number of rays to the key lamp and of ambient rays.
 const N_KEY_RAYS: u64 = 12;
 const N_AMBIENT_RAYS: u64 = 20;
 
@@ -42,7 +42,8 @@ impl Lamp {
     }
 }
 
-/// The lamps and the ambient light as MJCF, brighter by a factor: elements of the world body, and of the visual settings.
+/// The lamps and the ambient light as MJCF, scaled by a factor: elements of the world body, and of the visual
+/// settings.
 pub(crate) fn mjcf(gain: f64) -> (String, String) {
     let list = |numbers: [f64; 3]| numbers.map(|number| (gain * number).to_string()).join(" ");
     let mut lamps = String::new();
@@ -59,25 +60,25 @@ pub(crate) fn mjcf(gain: f64) -> (String, String) {
     (lamps, ambient)
 }
 
-/// What stands in the light's way.
+/// Geometry that blocks light.
 pub(crate) struct Occluders {
-    /// Boxes: pose of the centre inverted, and half sizes.
+    /// Boxes: inverse pose of the center, and half sizes.
     boxes: Vec<(Transform, Vector3<f64>)>,
     ellipsoids: Vec<Ellipsoid>,
     /// Sphere around all ellipsoids.
     bounds: (Point3<f64>, f64),
-    /// What is further away takes no ambient light, metres.
+    /// Objects farther away do not block ambient light, meters.
     ambient_reach_m: f64,
 }
 
 struct Ellipsoid {
     center: Point3<f64>,
-    /// Makes the ellipsoid a unit sphere.
+    /// Maps the ellipsoid to a unit sphere.
     sphere_from_offset: Matrix3<f64>,
 }
 
 impl Occluders {
-    /// Nothing yet. What is further away than `ambient_reach_m` takes no ambient light.
+    /// Creates an empty set. Objects farther away than `ambient_reach_m` do not block ambient light.
     pub(crate) fn new(ambient_reach_m: f64) -> Self {
         Self { boxes: Vec::new(), ellipsoids: Vec::new(), bounds: (Point3::origin(), 0.0), ambient_reach_m }
     }
@@ -86,7 +87,7 @@ impl Occluders {
         self.boxes.push((world_from_box.inverse(), Vector3::from(half_m)));
     }
 
-    /// Adds ellipsoids by centre and half axes that lie inside a sphere.
+    /// Adds ellipsoids by center and half axes that lie inside a bounding sphere.
     pub(crate) fn add_ellipsoids(
         &mut self,
         ellipsoids: impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])>,
@@ -114,9 +115,9 @@ impl Occluders {
             })
     }
 
-    /// Share of the light that a surface gets of what it would get if nothing stood in the way, 0 to 1.
+    /// Fraction of the unoccluded light that reaches a surface, 0 to 1.
     ///
-    /// `name` tells points apart, for their own random rays.
+    /// `name` identifies the point and selects its random rays.
     pub(crate) fn light_share(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
         const LIFT_M: f64 = 5e-4;
         let random = Random::new(0x11_6874, &[name]);
@@ -133,7 +134,7 @@ impl Occluders {
         let side = to_lamp.cross(&Vector3::x()).normalize();
         let across = to_lamp.cross(&side);
         let n_free = (0..N_KEY_RAYS).filter(|ray| {
-            // Spread evenly over the lamp's disc, turned by chance (Vogel 1979).
+            // Spread evenly over the lamp's disc, with a random rotation (Vogel 1979).
             let radius = KEY_SIZE * ((*ray as f64 + 0.5) / N_KEY_RAYS as f64).sqrt();
             let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(0, 0.0, std::f64::consts::TAU)).sin_cos();
             let direction = (to_lamp + side * (radius * cos) + across * (radius * sin)).normalize();
@@ -147,7 +148,7 @@ impl Occluders {
             if normal.x.abs() < 0.7 { normal.cross(&Vector3::x()) } else { normal.cross(&Vector3::y()) }.normalize();
         let across = normal.cross(&side);
         let n_free = (0..N_AMBIENT_RAYS).filter(|ray| {
-            // Directions as likely as their cosine to the normal.
+            // Cosine-weighted directions around the normal.
             let square = (*ray as f64 + random.unit(2 + ray)) / N_AMBIENT_RAYS as f64;
             let (sin, cos) = (*ray as f64 * 2.399_963 + random.between(1, 0.0, std::f64::consts::TAU)).sin_cos();
             let direction = normal * (1.0 - square).sqrt() + (side * cos + across * sin) * square.sqrt();
@@ -157,7 +158,7 @@ impl Occluders {
     }
 }
 
-/// Whether a ray meets the unit sphere, or starts inside, before `reach`.
+/// Whether a ray hits the unit sphere, or starts inside it, before `reach`.
 fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> bool {
     let (a, b, c) = (direction.norm_squared(), from.dot(direction), from.norm_squared() - 1.0);
     let inside = b * b - a * c;
@@ -165,11 +166,11 @@ fn hits_sphere(from: &Vector3<f64>, direction: &Vector3<f64>, reach: f64) -> boo
         return false;
     }
     let root = inside.sqrt();
-    // Leaving the sphere after the start, entering it before the reach.
+    // Leaves the sphere after the start and enters it before the reach.
     -b + root > 0.0 && -b - root < reach * a
 }
 
-/// Whether a ray meets a box between its start and `reach`.
+/// Whether a ray hits a box between its start and `reach`.
 fn hits_box(from: &Vector3<f64>, direction: &Vector3<f64>, half_m: &Vector3<f64>, reach: f64) -> bool {
     let (mut enter, mut leave) = (0.0_f64, reach);
     for axis in 0..3 {

@@ -10,41 +10,41 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Images of one camera that wait for a slow caller.
+/// Queue length for the images of one camera.
 const MAX_IMAGES: usize = 8;
-/// Joint readings that wait: one second.
+/// Queue length for joint readings: one second.
 const MAX_READINGS: usize = 1000;
-/// Range scans that wait.
+/// Queue length for range scans.
 const MAX_SCANS: usize = 20;
-/// True images of a camera that wait: they are large.
+/// Queue length for the ground-truth images of a camera, which are large.
 const MAX_TRUTH_IMAGES: usize = 8;
-/// A player that is later than this skips images.
+/// The simulation skips images once it is later than this.
 const MAX_LATE: Duration = Duration::from_millis(50);
 
 /// Simulated devices that deliver in real time.
 pub struct LiveRig {
-    /// Cameras in the order of the configuration, the arm, the base where it moves, scanners.
+    /// Cameras in the order of the configuration, the arm, the base if it moves, scanners.
     pub devices: Devices,
-    /// Ground truth of colour images and base poses; the oldest goes when nobody takes it.
+    /// Ground truth of color images and base poses. The oldest is dropped if nobody takes it.
     pub truth: LiveTruth,
-    /// What the rig is made of.
+    /// True parameters of the rig.
     pub info: RigInfo,
 }
 
-/// Ground truth beside the live devices.
+/// Ground truth of the live devices.
 pub struct LiveTruth {
     simulation: Arc<SimulationThread>,
 }
 
 impl LiveTruth {
-    /// The oldest truth that was not taken yet, without waiting; poses first.
+    /// Returns the oldest truth not taken yet, without waiting; poses first.
     pub fn take(&self) -> Option<Sample> {
         let mut state = self.simulation.shared.lock();
         state.truth_poses.pop_front().or_else(|| state.truth_images.pop_front())
     }
 }
 
-/// The thread that plays; it ends when the last device is dropped.
+/// The simulation thread. It ends when the last device is dropped.
 struct SimulationThread {
     shared: Arc<SharedQueues>,
     thread: Option<JoinHandle<()>>,
@@ -68,17 +68,17 @@ struct SharedQueues {
 
 #[derive(Default)]
 struct QueueState {
-    /// One a camera.
+    /// One queue per camera.
     images: Vec<VecDeque<Image>>,
-    /// Images of a camera lost and not yet told: colour and depth.
+    /// Number of dropped images of each camera not yet reported: color and depth.
     n_dropped: Vec<[u64; 2]>,
     readings: VecDeque<JointState>,
     poses: VecDeque<BasePose>,
-    /// One a scanner.
+    /// One queue per scanner.
     scans: Vec<VecDeque<RangeScan>>,
     truth_images: VecDeque<Sample>,
     truth_poses: VecDeque<Sample>,
-    /// Why there will be no more samples.
+    /// Reason why there are no more samples.
     end: Option<String>,
     stop: bool,
 }
@@ -128,7 +128,7 @@ struct DeviceNames {
     scanners: Vec<String>,
 }
 
-/// Delivers samples when their time comes, until the rig ends or nobody is left.
+/// Delivers samples when they are due, until the rig ends or all devices are dropped.
 fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames, start: Stamp) {
     engine.set_start(start);
     let started = Instant::now();
@@ -142,7 +142,7 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
                     return;
                 }
             }
-            Ok(None) => break "it has played to its end".to_owned(),
+            Ok(None) => break "the simulation reached its end".to_owned(),
             Err(error) => break error.to_string(),
         }
     };
@@ -160,12 +160,12 @@ fn stream_ix(image: &Image) -> usize {
 }
 
 impl SharedQueues {
-    /// The state, also after a thread panicked while it held it: queues are never left half changed.
+    /// Locks the state, even if a thread panicked while it held the lock. Queues are always consistent.
     fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Queues a sample; false when nobody wants it any more.
+    /// Queues a sample. Returns false once all devices are dropped.
     fn deliver(&self, (_, sample): Delivery, names: &DeviceNames) -> bool {
         let mut state = self.lock();
         match sample {
@@ -192,7 +192,7 @@ impl SharedQueues {
         is_running
     }
 
-    /// Waits for `take` to find something; an error tells that nothing came, or will come.
+    /// Waits until `take` returns a value. Returns an error if nothing came in time or the rig has ended.
     fn wait<T>(
         &self,
         timeout: Duration,
@@ -218,7 +218,8 @@ impl SharedQueues {
 }
 
 impl QueueState {
-    /// Queues an image; where there is no room the camera's oldest goes, and the next of its kind tells so.
+    /// Queues an image. If the queue is full, the camera's oldest image is dropped, and the next image of its kind
+    /// reports it.
     fn put_image(&mut self, camera_ix: usize, mut image: Image) {
         let queue = &mut self.images[camera_ix];
         let n_dropped = &mut self.n_dropped[camera_ix];

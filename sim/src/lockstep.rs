@@ -1,10 +1,10 @@
-//! A rig that waits for whoever takes its samples.
+//! A rig that advances only when its samples are taken.
 
 use crate::engine::Engine;
 use crate::rig::RigInfo;
 use drivers::{Sample, Source};
 
-/// Samples of a rig in the order of their delivery; the same bits for the same configuration and machine.
+/// Samples of a rig in delivery order. The same configuration and machine give the same bits.
 pub struct Lockstep {
     engine: Engine,
     info: RigInfo,
@@ -15,7 +15,7 @@ impl Lockstep {
         Self { engine, info }
     }
 
-    /// What the rig is made of.
+    /// True parameters of the rig.
     pub fn info(&self) -> &RigInfo {
         &self.info
     }

@@ -3,7 +3,7 @@
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
-/// Triangles whose corners carry a normal and a texture coordinate.
+/// Triangles whose vertices have a normal and a texture coordinate.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Mesh {
     points_m: Vec<[f32; 3]>,
@@ -12,7 +12,7 @@ pub(crate) struct Mesh {
     faces: Vec<[i32; 3]>,
 }
 
-/// One corner; `texcoord` is `(0, 0)` at the texture's top left.
+/// One vertex; `texcoord` is `(0, 0)` at the texture's top left.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Corner {
     pub(crate) point_m: Point3<f64>,
@@ -27,7 +27,7 @@ pub(crate) type TextureRect = [f64; 4];
 pub(crate) const WHOLE: TextureRect = [0.0, 0.0, 1.0, 1.0];
 
 impl Mesh {
-    /// Adds a corner and returns its index.
+    /// Adds a vertex and returns its index.
     #[expect(clippy::cast_possible_truncation, reason = "the format holds f32 and i32")]
     pub(crate) fn push(&mut self, corner: Corner) -> i32 {
         let Corner { point_m, normal, texcoord } = corner;
@@ -37,12 +37,12 @@ impl Mesh {
         self.points_m.len() as i32 - 1
     }
 
-    /// Adds a triangle, counter-clockwise from outside.
+    /// Adds a triangle, counterclockwise from outside.
     pub(crate) fn triangle(&mut self, corners: [i32; 3]) {
         self.faces.push(corners);
     }
 
-    /// Adds a flat rectangle seen from where `right x up` points, its texture upright.
+    /// Adds a flat rectangle that faces along `right x up`, its texture upright.
     pub(crate) fn rectangle(
         &mut self,
         center: Point3<f64>,
@@ -65,7 +65,7 @@ impl Mesh {
         self.triangle([a, c, d]);
     }
 
-    /// A box around the origin; textures in the order +x, -x, +y, -y, +z, -z.
+    /// A box around the origin; texture rectangles in the order +x, -x, +y, -y, +z, -z.
     pub(crate) fn cuboid(half_m: [f64; 3], textures: &[TextureRect; 6]) -> Self {
         let mut mesh = Self::default();
         for ((outward, right, up), texture) in BOX_FACES.iter().zip(textures) {
@@ -75,8 +75,8 @@ impl Mesh {
         mesh
     }
 
-    /// An ellipsoid given by three perpendicular half axes; `texture_x` tells where in the texture a point looks up its
-    /// colour, by the point and its normal, and `texture_y` is the same for all.
+    /// Adds an ellipsoid given by three perpendicular half axes. `texture_x` maps a point and its normal to the
+    /// horizontal texture coordinate; `texture_y` is the same for all.
     pub(crate) fn add_ellipsoid(
         &mut self,
         center: Point3<f64>,
@@ -109,7 +109,7 @@ impl Mesh {
         }
     }
 
-    /// Point and outward normal of a box's side, by the position in its texture, 0 to 1 from the top left.
+    /// Point and outward normal on a box's side at a position in its texture, 0 to 1 from the top left.
     pub(crate) fn on_cuboid(half_m: [f64; 3], side: usize, u: f64, v: f64) -> (Point3<f64>, Vector3<f64>) {
         let (outward, right, up) = BOX_FACES[side];
         let unit =
@@ -117,7 +117,7 @@ impl Mesh {
         (Point3::from(unit.component_mul(&Vector3::from(half_m))), Vector3::from(outward))
     }
 
-    /// Moves every point.
+    /// Translates every point.
     #[expect(clippy::cast_possible_truncation, reason = "the format holds f32")]
     pub(crate) fn translate(&mut self, by_m: Vector3<f64>) {
         for point in &mut self.points_m {
@@ -125,7 +125,7 @@ impl Mesh {
         }
     }
 
-    /// Adds another mesh, moved.
+    /// Adds another mesh, translated.
     pub(crate) fn append(&mut self, mut other: Self, by_m: Vector3<f64>) {
         other.translate(by_m);
         let first = i32::try_from(self.points_m.len()).expect("meshes stay small");
@@ -135,7 +135,7 @@ impl Mesh {
         self.faces.extend(other.faces.iter().map(|face| face.map(|corner| corner + first)));
     }
 
-    /// Adds another mesh, moved and turned.
+    /// Adds another mesh, transformed.
     pub(crate) fn append_at(&mut self, mut other: Self, self_from_other: &Transform) {
         for (point, normal) in other.points_m.iter_mut().zip(&mut other.normals) {
             *point = (self_from_other.cast::<f32>() * Point3::from(*point)).coords.into();
@@ -144,16 +144,17 @@ impl Mesh {
         self.append(other, Vector3::zeros());
     }
 
-    /// A surface turned about z: from `(radius, z)` to `(radius, z)`, metres, seen from the left of that way, upwards from outside.
+    /// A surface of revolution about z. The profile is a list of `(radius, z)` in meters; the outside is on the right
+    /// of an upward profile.
     ///
-    /// The texture runs once around, its top at the first point; between points that lie on a bend the normals are smooth.
+    /// The texture wraps around once, with its top at the first point. Normals are smooth between points on a bend.
     pub(crate) fn lathe(profile_m: &[[f64; 2]], n_sectors: u32, texture: TextureRect, is_smooth: bool) -> Self {
         let mut mesh = Self::default();
         let [left, top, right, bottom] = texture;
         let n_pieces = profile_m.len() - 1;
         let slope = |piece: usize| {
             let [a, b] = [profile_m[piece], profile_m[piece + 1]];
-            // Outward for a way that goes up outside.
+            // Points outward for a profile that goes up outside.
             Vector3::new(b[1] - a[1], 0.0, a[0] - b[0]).normalize()
         };
         let bend = |piece: usize, end: usize| {
@@ -206,7 +207,7 @@ impl Mesh {
     }
 }
 
-/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides stand upright.
+/// Outward, right and up directions of a box's faces in the order +x, -x, +y, -y, +z, -z; sides are upright.
 pub(crate) const BOX_FACES: [([f64; 3], [f64; 3], [f64; 3]); 6] = [
     ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
     ([-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]),

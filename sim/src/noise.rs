@@ -1,4 +1,4 @@
-//! Noise of colour and depth images, and the holes of depth images.
+//! Noise of color and depth images, and the holes of depth images.
 #![expect(clippy::cast_possible_truncation, reason = "values are clamped before they become integers")]
 
 use crate::config::{DepthConfig, SensorConfig};
@@ -7,7 +7,7 @@ use rayon::prelude::{
     IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice, ParallelSliceMut,
 };
 
-/// Rounds colours to bytes.
+/// Rounds colors to bytes.
 pub(crate) fn to_bytes(colors: &[f32]) -> Vec<u8> {
     colors.iter().map(|color| to_byte(*color)).collect()
 }
@@ -16,7 +16,7 @@ fn to_byte(value: f32) -> u8 {
     (value.clamp(0.0, 255.0) + 0.5) as u8
 }
 
-/// Adds shot and read noise to `[height, width, 3]` colours of 0 to 255.
+/// Adds shot and read noise to `[height, width, 3]` colors of 0 to 255.
 pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: Random) -> Vec<u8> {
     const PIXELS_A_CHUNK: usize = 640;
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
@@ -41,10 +41,10 @@ pub(crate) fn noise_sigma(sensor: &SensorConfig, level: f64) -> f64 {
     sensor.noise_sigma * (1.0 - sensor.shot_frac + sensor.shot_frac * level / MID_GRAY).max(0.0).sqrt()
 }
 
-/// PSNR in dB of bytes against colours rounded to bytes; infinite where they are the same.
+/// PSNR in dB of bytes against colors rounded to bytes; infinite if they are equal.
 pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     const SAMPLES_A_CHUNK: usize = 4096;
-    // Chunks, so that the innermost loop is one over slices.
+    // Chunks, so that the innermost loop runs over slices.
     let squares = bytes.par_chunks(SAMPLES_A_CHUNK).zip(colors.par_chunks(SAMPLES_A_CHUNK)).map(|(bytes, colors)| {
         let squares = bytes.iter().zip(colors).map(|(byte, color)| u32::from(byte.abs_diff(to_byte(*color))).pow(2));
         u64::from(squares.sum::<u32>())
@@ -53,7 +53,7 @@ pub(crate) fn psnr(bytes: &[u8], colors: &[f32]) -> f64 {
     10.0 * (255.0 * 255.0 / mean_square).log10()
 }
 
-/// Turns true depth into counts: noise, range limits, holes, quantisation. 0 is a hole.
+/// Converts true depth to counts: noise, range limits, holes, quantization. 0 is a hole.
 pub(crate) fn depth_counts(
     depth_m: &[f32],
     width: usize,
@@ -79,7 +79,7 @@ pub(crate) fn depth_counts(
     counts
 }
 
-/// Where a stereo camera finds no match: beside depth edges first, then in small clusters.
+/// Pixels at which a stereo camera finds no match: next to depth edges first, then in small clusters.
 struct Holes {
     is_edge: Vec<bool>,
     width: usize,
@@ -88,11 +88,11 @@ struct Holes {
     cluster_share: f64,
 }
 
-/// Most edge pixels that may be holes.
+/// Maximum fraction of edge pixels that become holes.
 const MAX_EDGE_SHARE: f64 = 0.6;
 /// Side of a cluster of holes, pixels.
 const CLUSTER_PX: usize = 4;
-/// Counters of the holes start here, beyond those of the noise.
+/// Start of the hole counters, past those of the noise.
 const HOLE_COUNTERS: u64 = 1 << 40;
 
 impl Holes {
@@ -120,7 +120,7 @@ impl Holes {
     }
 }
 
-/// Marks the pixels of a row where depth jumps within two pixels, where one eye sees what the other does not.
+/// Marks the pixels of a row where depth jumps within two pixels, where only one of the two imagers sees the surface.
 fn mark_edges(is_edge: &mut [bool], depth_m: &[f32]) {
     const EDGE_RADIUS_PX: usize = 2;
     const JUMP_FRAC: f32 = 0.03;
@@ -143,7 +143,7 @@ mod tests {
             let n = bytes.len() as f64;
             let mean = bytes.iter().map(|byte| f64::from(*byte)).sum::<f64>() / n;
             let variance = bytes.iter().map(|byte| (f64::from(*byte) - mean).powi(2)).sum::<f64>() / n;
-            // Rounding to bytes adds a twelfth.
+            // Rounding to bytes adds a variance of 1/12.
             let expected = noise_sigma(&sensor, level).powi(2) + 1.0 / 12.0;
             assert!((variance / expected - 1.0).abs() < 0.03, "{level}: {variance} against {expected}");
             assert!((mean - level).abs() < 0.05);

@@ -1,4 +1,4 @@
-//! What stands in the static-arm scene: meshes, textures with the light painted in, and where everything is.
+//! Objects of the static-arm scene: meshes, textures with baked lighting, and poses.
 
 use crate::light::Occluders;
 use crate::mesh::{BOX_FACES, Mesh, WHOLE};
@@ -7,22 +7,22 @@ use crate::toy;
 use kinematics::Transform;
 use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-/// Height of the table top above the robot's base, metres.
+/// Height of the table top above the robot's base, meters.
 pub const TABLE_Z_M: f64 = 0.12;
-/// Middle of the target area on the table, metres.
+/// Center of the target area on the table, meters.
 pub const TARGET_XY_M: [f64; 2] = [0.74, 0.0];
-/// Half the side of the tag cube, metres.
+/// Half the side of the tag cube, meters.
 pub const CUBE_HALF_M: f64 = 0.03;
-/// Half sizes of the wooden block, metres.
+/// Half sizes of the wooden block, meters.
 pub const BLOCK_HALF_M: [f64; 3] = [0.045, 0.02, 0.025];
 
-/// Half sizes of the table's top along x and y, and its nearest x, metres.
+/// Half sizes of the table's top along x and y, and its nearest x, meters.
 const TABLE_HALF_XY_M: [f64; 2] = [0.40, 0.50];
 const TABLE_FRONT_X_M: f64 = TARGET_XY_M[0] - 0.34;
 const TABLE_HALF_THICKNESS_M: f64 = 0.02;
-/// Half width and half height of a wall, metres.
+/// Half width and half height of a wall, meters.
 const WALL_HALF_M: [f64; 2] = [0.50, 0.50];
-/// The corner where the walls meet, metres.
+/// The corner where the walls meet, meters.
 const CORNER_XY_M: [f64; 2] = [TARGET_XY_M[0] + 0.42, 0.0];
 
 fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
@@ -32,12 +32,12 @@ fn on_table(x_m: f64, y_m: f64, above_m: f64, yaw_degrees: f64) -> Transform {
     )
 }
 
-/// Pose of the tag cube's centre. Its sides +x, -x, +y, -y, +z, -z carry the tags 0 to 5.
+/// Pose of the tag cube's center. Its sides +x, -x, +y, -y, +z, -z have the tags 0 to 5.
 pub fn world_from_cube() -> Transform {
     on_table(-0.035, 0.062, CUBE_HALF_M, 28.0)
 }
 
-/// Pose of a tag on the cube, by its number, 0 to 5: x to the right of the print, y down, z into it.
+/// Pose of a tag on the cube by its id, 0 to 5: x to the right of the print, y down, z into it.
 pub fn world_from_tag(id: usize) -> Transform {
     let (outward, right, up) = BOX_FACES[id];
     let [outward, right, up] = [outward, right, up].map(Vector3::from);
@@ -47,7 +47,7 @@ pub fn world_from_tag(id: usize) -> Transform {
     world_from_cube() * cube_from_tag
 }
 
-/// Pose of the wooden block's centre.
+/// Pose of the wooden block's center.
 pub fn world_from_block() -> Transform {
     on_table(-0.045, -0.058, BLOCK_HALF_M[2], -35.0)
 }
@@ -60,7 +60,8 @@ fn table_center() -> Point3<f64> {
     Point3::new(TABLE_FRONT_X_M + TABLE_HALF_XY_M[0], 0.0, TABLE_Z_M)
 }
 
-/// The wall on the side of +y (1) or -y (-1): x outward to the room, z up. Both run back from the corner at 45 degrees.
+/// The wall on the side of +y (1) or -y (-1): x outward to the room, z up. Both run back from the corner at 45
+/// degrees.
 fn world_from_wall(side: f64) -> Transform {
     let half = WALL_HALF_M[0] * std::f64::consts::FRAC_1_SQRT_2;
     let center = Translation3::new(CORNER_XY_M[0] - half, CORNER_XY_M[1] + side * half, TABLE_Z_M + WALL_HALF_M[1]);
@@ -75,7 +76,7 @@ pub(crate) struct Object {
     pub(crate) world_from_mesh: Transform,
 }
 
-/// Everything but the arm.
+/// All objects except the arm.
 pub(crate) fn objects() -> Vec<Object> {
     let object = |name, material, mesh, world_from_mesh| Object { name, material, mesh, world_from_mesh };
     let occluders = occluders();
@@ -97,7 +98,7 @@ pub(crate) fn objects() -> Vec<Object> {
     ]
 }
 
-/// The textures by name, light included.
+/// The textures by name, with baked lighting.
 pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let occluders = occluders();
     let [mut brick, mut plaster] = [texture::brick_wall(), texture::plaster_wall()];
@@ -138,7 +139,7 @@ pub(crate) fn shade_box(texture: &mut Texture, occluders: &Occluders, half_m: [f
 
 fn occluders() -> Occluders {
     const WALL_HALF_THICKNESS_M: f64 = 0.005;
-    /// Of the size of the objects.
+    /// About the size of the objects.
     const AMBIENT_REACH_M: f64 = 0.25;
     let mut occluders = Occluders::new(AMBIENT_REACH_M);
     occluders.add_box(world_from_cube(), [CUBE_HALF_M; 3]);
@@ -183,7 +184,7 @@ fn frame() -> Mesh {
     let mut mesh = Mesh::default();
     mesh.append(Mesh::cuboid([0.15, 0.15, 0.36], &[WHOLE; 6]), Vector3::new(-0.02, 0.0, -0.365));
     let slab = Mesh::cuboid([TABLE_HALF_XY_M[0], TABLE_HALF_XY_M[1], TABLE_HALF_THICKNESS_M], &[WHOLE; 6]);
-    // A hair's breadth below the top, so that the two do not flicker.
+    // Slightly below the top, to avoid z-fighting.
     mesh.append(slab, table_center().coords - Vector3::new(0.0, 0.0, TABLE_HALF_THICKNESS_M + 1e-4));
     for (x, y) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
         let corner = table_center() + Vector3::new(x * 0.36, y * 0.42, -0.45);

@@ -1,4 +1,4 @@
-//! From a drawn pinhole picture to what the sensor's pixels see: lens, rolling shutter, motion blur.
+//! Converts rendered pinhole images to sensor images: lens, rolling shutter, motion blur.
 #![expect(clippy::cast_possible_truncation, reason = "pixel positions are clamped to the picture before the cast")]
 
 use crate::Error;
@@ -9,23 +9,23 @@ use kinematics::{Intrinsics, Transform};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::{IndexedParallelIterator, ParallelIterator, ParallelSliceMut};
 
-/// The optics of one camera, worked out once.
+/// Precomputed optics of one camera.
 #[derive(Clone, Debug)]
 pub(crate) struct Optics {
     intrinsics: Intrinsics,
     supersample: u32,
     margin_px: u32,
-    /// `[height, width]`: x and y of the point at z = 1 that each pixel's centre sees.
+    /// `[height, width]`: x and y of the point at z = 1 on the ray of each pixel's center.
     rays: Vec<[f32; 2]>,
-    /// Size and pinhole of the pictures to draw: the image and a margin, supersampled.
+    /// Size and pinhole of the images to render: the camera image plus a margin, supersampled.
     view_size_px: [u32; 2],
     view_focal_px: [f64; 2],
     view_principal_px: [f64; 2],
-    /// Focal length and principal point of those pictures again, for single pixels.
+    /// Focal length and principal point of the rendered images.
     drawn_pinhole_px: [[f32; 2]; 2],
 }
 
-/// Pose of the drawn picture as seen by the camera at another instant, in f32.
+/// Pose of the rendered image relative to the camera at another instant, in f32.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RowMotion {
     rotation_matrix: Matrix3<f32>,
@@ -41,9 +41,9 @@ impl RowMotion {
     }
 }
 
-/// Corrections of the pixel position until the depth found there agrees with the ray.
+/// Maximum number of corrections of the pixel position until the depth there matches the ray.
 const MAX_CORRECTIONS: usize = 3;
-/// Depths that agree to this share put a point at the same place within 0.02 pixels at the speeds of the arm.
+/// Relative depth tolerance. Within it, a point's position differs by less than 0.02 pixels at the speeds of the arm.
 const SAME_DEPTH_FRAC: f32 = 0.005;
 
 impl Optics {
@@ -69,7 +69,8 @@ impl Optics {
                 rays.push([point.x as f32, point.y as f32]);
             }
         }
-        // Room for what shear and blur bring in from outside: a few pixels at the speeds of the arm.
+        // Margin for content that rolling shutter and blur bring in from outside: a few pixels at the speeds of the
+        // arm.
         let margin_px = if is_motion_free { 0 } else { 4 + height / 60 };
         let mut optics = Self {
             view_size_px: [0; 2],
@@ -85,7 +86,7 @@ impl Optics {
             let (first, last) = optics.bounds(axis);
             let margin = f64::from(margin_px * supersample);
             optics.view_principal_px[axis] = margin - first * optics.view_focal_px[axis];
-            // Rounding noise must not add a pixel.
+            // Keeps rounding noise from adding a pixel.
             let extent = ((last - first) * optics.view_focal_px[axis] + 2.0 * margin - 1e-2).ceil();
             optics.view_size_px[axis] = extent.clamp(1.0, f64::from(MAX_VIEW_PX)) as u32;
         }
@@ -94,7 +95,7 @@ impl Optics {
         Ok(optics)
     }
 
-    /// Smallest and largest coordinate at z = 1 that the image's pixels cover along an axis.
+    /// Minimum and maximum coordinate at z = 1 that the image's pixels cover along an axis.
     fn bounds(&self, axis: usize) -> (f64, f64) {
         let half_pixel = 0.5 / self.intrinsics.focal_px[axis];
         if self.intrinsics.is_pinhole() {
@@ -106,12 +107,12 @@ impl Optics {
         (first - half_pixel, last + half_pixel)
     }
 
-    /// Size of the pictures to draw.
+    /// Size of the images to render.
     pub(crate) fn view_size_px(&self) -> [u32; 2] {
         self.view_size_px
     }
 
-    /// The picture to draw for a pose.
+    /// The view to render for a pose.
     pub(crate) fn view(&self, world_from_camera: Transform, robot: Option<RobotPose>, light_frac: f64) -> View {
         View {
             size_px: self.view_size_px,
@@ -123,7 +124,7 @@ impl Optics {
         }
     }
 
-    /// What each pixel sees at the picture's own instant: `[height, width, 3]`, 0 to 255.
+    /// Color of each pixel at the instant of the rendered image: `[height, width, 3]`, 0 to 255.
     pub(crate) fn motion_free(&self, picture: &Picture) -> Vec<f32> {
         if self.intrinsics.is_pinhole() {
             return self.expose(|row, colors| self.average_blocks(picture, row, colors));
@@ -135,7 +136,7 @@ impl Optics {
         })
     }
 
-    /// One row of a pinhole's pixels, each of which covers whole pixels of the drawn picture.
+    /// One row of a pinhole camera's pixels, each of which covers whole rendered pixels.
     fn average_blocks(&self, picture: &Picture, row: usize, colors: &mut [[f32; 3]]) {
         let (side, stride) = (self.supersample as usize, 3 * picture.size_px[0] as usize);
         let margin = (self.margin_px * self.supersample) as usize;
@@ -155,17 +156,17 @@ impl Optics {
         }
     }
 
-    /// What each pixel sees when its row is exposed at other instants, of which the mean counts.
+    /// Color of each pixel when its row is exposed at other instants, averaged over them.
     ///
-    /// `row_motions` holds those of the first row, then of the second. A pixel's ray is followed into the drawn picture with
-    /// the depth drawn there, so surfaces land where they belong; only a strip beside a depth edge, as wide as the edge's
-    /// own parallax over the readout, repeats what lies beside it.
+    /// `row_motions` holds the motions of the first row, then of the second. Each pixel's ray is traced into the
+    /// rendered image using the rendered depth, so surfaces have the correct positions. Only a strip next to a depth
+    /// edge, as wide as the edge's parallax over the readout, repeats the adjacent content.
     pub(crate) fn motion_blurred(&self, picture: &Picture, row_motions: &[RowMotion]) -> Vec<f32> {
         let n_samples = row_motions.len() / self.intrinsics.size_px[1] as usize;
         let share = 1.0 / n_samples as f32;
         self.expose(|row, colors| {
             for row_motion in &row_motions[row * n_samples..(row + 1) * n_samples] {
-                // A pixel's neighbour has moved by almost as much: where the search starts.
+                // The search starts at the neighboring pixel's offset, which is almost the same.
                 let mut offset_px = [0.0; 2];
                 for (color, ray) in colors.iter_mut().zip(self.row_of_rays(row)) {
                     let static_px = self.drawn_from_ray(ray);
@@ -185,7 +186,7 @@ impl Optics {
         })
     }
 
-    /// Depth along z at the centre of each pixel, `[height, width]`, metres.
+    /// Depth along z at the center of each pixel, `[height, width]`, meters.
     pub(crate) fn depth_m(&self, picture: &Picture) -> Vec<f32> {
         let [width, height] = self.intrinsics.size_px.map(|side| side as usize);
         let mut depth_m = vec![0.0; width * height];
@@ -209,13 +210,13 @@ impl Optics {
         colors.into_flattened()
     }
 
-    /// Position in the drawn picture of the point `(x, y, 1)`.
+    /// Position of the point `(x, y, 1)` in the rendered image.
     fn drawn_from_ray(&self, ray: &[f32; 2]) -> [f32; 2] {
         let [[focal_x, focal_y], [center_x, center_y]] = self.drawn_pinhole_px;
         [ray[0] * focal_x + center_x, ray[1] * focal_y + center_y]
     }
 
-    /// Where a ray of the shifted camera meets the drawn surface, searched from a first guess.
+    /// Intersects a ray of the moved camera with the rendered surface, starting from an initial guess.
     fn trace_pixel(&self, picture: &Picture, row_motion: &RowMotion, ray: &[f32; 2], guess: [f32; 2]) -> [f32; 2] {
         let direction = row_motion.rotation_matrix * Vector3::new(ray[0], ray[1], 1.0);
         let mut depth = nearest_depth(picture, guess);
@@ -234,7 +235,7 @@ impl Optics {
         drawn
     }
 
-    /// Mean colour of the square of one image pixel around a position in the drawn picture.
+    /// Mean color of one image pixel's square around a position in the rendered image.
     fn color_at(&self, picture: &Picture, at: [f32; 2]) -> [f32; 3] {
         let side = self.supersample as usize;
         if side == 1 {
@@ -265,9 +266,10 @@ impl Optics {
         sum.map(|channel| channel / area)
     }
 
-    /// Depth at a position in the drawn picture: the mean of what surrounds it on one surface, else the nearest of it.
+    /// Depth at a position in the rendered image: the mean of the four surrounding pixels if they lie on one surface,
+    /// else the nearest depth of the four. With odd supersampling, the depth of the closest pixel.
     fn depth_at(&self, picture: &Picture, at: [f32; 2]) -> f32 {
-        /// Neighbours further apart than this share belong to different surfaces.
+        /// Neighbors whose depths differ by more than this fraction belong to different surfaces.
         const SAME_SURFACE_FRAC: f32 = 0.01;
         if self.supersample % 2 == 1 {
             return nearest_depth(picture, at);
@@ -280,7 +282,7 @@ impl Optics {
     }
 }
 
-/// Colour at a position between four pixels' centres.
+/// Bilinear color at a position in the rendered image.
 fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     let [width, height] = picture.size_px;
     let x = (at[0] - 0.5).clamp(0.0, width as f32 - 1.001);
@@ -299,11 +301,11 @@ fn between_pixels(picture: &Picture, at: [f32; 2]) -> [f32; 3] {
     })
 }
 
-/// Larger pictures are not drawn, whatever the lens.
+/// Maximum size of a rendered image.
 const MAX_VIEW_PX: u32 = 8192;
 
 fn nearest_depth(picture: &Picture, at: [f32; 2]) -> f32 {
-    // As u32, which a processor converts to in fewer instructions.
+    // Uses u32 because processors convert to it in fewer instructions.
     let index = |axis: usize| (at[axis].max(0.0) as u32).min(picture.size_px[axis] - 1) as usize;
     picture.depth_m[index(1) * picture.size_px[0] as usize + index(0)]
 }

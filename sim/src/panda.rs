@@ -1,4 +1,4 @@
-//! The Panda: its kinematics, limits, and a body of primitives of our own.
+//! The Panda: its kinematics, limits, and a body of simple primitives.
 //!
 //! Source of the numbers: Franka's published Denavit-Hartenberg table (Craig's convention) and joint limits.
 
@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 
 /// Joint positions, velocities or torques.
 pub(crate) type Joints = SVector<f64, N_JOINTS>;
-/// Velocity of a frame's origin and angular velocity, both along the world's axes, per joint velocity.
+/// Velocity of a frame's origin and angular velocity, both in world axes, per joint velocity.
 pub(crate) type Jacobian = SMatrix<f64, 6, N_JOINTS>;
 
 /// Craig's parameters of a joint: distance a and angle alpha about the previous x axis, offset d along the joint's own axis.
@@ -29,7 +29,7 @@ const LINKS: [Link; N_JOINTS] = [
     Link { a_m: 0.0, alpha_rad: QUARTER, d_m: 0.0 },
     Link { a_m: 0.088, alpha_rad: QUARTER, d_m: 0.0 },
 ];
-/// From the last joint to the flange along its axis, metres.
+/// Distance from the last joint to the flange along its axis, meters.
 const FLANGE_M: f64 = 0.107;
 
 /// Lower limits of the joints, radians.
@@ -42,7 +42,7 @@ pub(crate) const MAX_SPEED_RAD_S: [f64; N_JOINTS] = [2.175, 2.175, 2.175, 2.175,
 pub(crate) const MAX_ACCELERATION_RAD_S2: [f64; N_JOINTS] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
 /// Largest joint jerks, radians per second cubed.
 pub(crate) const MAX_JERK_RAD_S3: [f64; N_JOINTS] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
-/// Largest joint torques, newton metres.
+/// Largest joint torques, newton meters.
 pub(crate) const MAX_TORQUE_NM: [f64; N_JOINTS] = [87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0];
 
 impl Link {
@@ -86,16 +86,16 @@ pub(crate) fn jacobian(position_rad: &Joints, flange_from_tip: &Transform) -> (T
 
 /// A primitive of the arm's body in the frame of its link.
 enum Shape {
-    /// Between two points, metres, with a radius.
+    /// Between two points, meters, with a radius.
     Capsule([f64; 3], [f64; 3], f64),
-    /// Between two points, metres, with a radius.
+    /// Between two points, meters, with a radius.
     Cylinder([f64; 3], [f64; 3], f64),
-    /// Centre and half sizes, metres.
+    /// Center and half sizes, meters.
     Box([f64; 3], [f64; 3]),
 }
 use Shape::{Box, Capsule, Cylinder};
 
-/// Material names of the scene, and a shape.
+/// Material name and shape.
 type Part = (&'static str, Shape);
 
 const BASE: &[Part] = &[
@@ -142,10 +142,10 @@ const BODY: [&[Part]; N_JOINTS] = [
         ("arm_white", Cylinder([0.0, 0.0, 0.099], [0.0, 0.0, 0.107], 0.0315)),
     ],
 ];
-/// Masses of the links, kilograms: those of a Panda, roughly.
+/// Masses of the links, kilograms; approximately those of a Panda.
 const MASS_KG: [f64; N_JOINTS] = [4.5, 2.4, 2.7, 2.2, 3.0, 1.7, 0.8];
 
-/// The arm as MJCF bodies, to be placed in the world body; `on_flange` is added to the flange.
+/// The arm as MJCF bodies for the world body. `on_flange` is added to the flange.
 pub(crate) fn mjcf(on_flange: &str) -> String {
     let mut xml = String::from("<body name=\"panda_link0\" childclass=\"arm\">\n");
     write_parts(&mut xml, BASE);
@@ -178,7 +178,7 @@ fn write_parts(xml: &mut String, parts: &[Part]) {
     }
 }
 
-/// A pose as MJCF attributes, with all digits.
+/// A pose as MJCF attributes, in full precision.
 pub(crate) fn pose_attributes(pose: &Transform) -> String {
     let [x, y, z] = pose.translation.vector.into();
     let q = pose.rotation.coords;

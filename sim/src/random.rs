@@ -1,15 +1,15 @@
-//! Random numbers that depend only on a key and a counter, so that any image can be made again alone.
+//! Random numbers that depend only on a key and a counter, so that any image can be reproduced independently.
 
 use std::sync::LazyLock;
 
-/// Stream of random numbers under one key.
+/// Random number stream of one key.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Random {
     key: u64,
 }
 
 impl Random {
-    /// The stream of a seed and the numbers that name its use, such as camera and image.
+    /// The stream of a seed and the numbers that identify its use, such as camera and image.
     pub(crate) fn new(seed: u64, names: &[u64]) -> Self {
         Self { key: names.iter().fold(mix(seed), |key, name| mix(key ^ mix(*name))) }
     }
@@ -30,7 +30,7 @@ impl Random {
         lower + (upper - lower) * self.unit(counter)
     }
 
-    /// Four standard normal numbers at a counter, out of a table of 4096 quantiles.
+    /// Four standard normal numbers at a counter, from a table of 4096 quantiles.
     pub(crate) fn normals(self, counter: u64) -> [f32; 4] {
         let bits = self.bits(counter);
         let table = &*QUANTILES;

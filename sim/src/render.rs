@@ -1,4 +1,4 @@
-//! Draws the scene on a thread of its own: one OpenGL context for all cameras.
+//! Renders the scene on a separate thread with one OpenGL context for all cameras.
 #![expect(unsafe_code, reason = "the scene's cameras are set through MuJoCo's C structs")]
 #![expect(clippy::cast_possible_truncation, reason = "OpenGL works in f32")]
 
@@ -14,21 +14,21 @@ use nalgebra::Vector3;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// What to draw: a pinhole picture.
+/// A pinhole view to render.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
     pub(crate) size_px: [u32; 2],
     pub(crate) focal_px: [f64; 2],
     pub(crate) principal_px: [f64; 2],
     pub(crate) world_from_camera: Transform,
-    /// Where the robot is; not drawn, and without a shadow, when `None`.
+    /// Pose of the robot. If `None`, the robot is not drawn and casts no shadow.
     pub(crate) robot: Option<RobotPose>,
-    /// Brightness of all lamps; 1 is as built.
+    /// Brightness of all lamps; 1 is nominal.
     pub(crate) light_frac: f64,
 }
 
 impl View {
-    /// A small picture of whatever is at the origin.
+    /// A small view at the origin.
     fn warm_up() -> Self {
         Self {
             size_px: [16, 16],
@@ -41,17 +41,17 @@ impl View {
     }
 }
 
-/// A drawn picture, from the top left.
+/// A rendered image, starting at the top left.
 #[derive(Clone, Debug)]
 pub(crate) struct Picture {
     pub(crate) size_px: [u32; 2],
     /// `[height, width, 3]`, sRGB.
     pub(crate) rgb: Vec<u8>,
-    /// `[height, width]`, metres along z.
+    /// `[height, width]`, meters along z.
     pub(crate) depth_m: Vec<f32>,
 }
 
-/// Hands views to the render thread; dropping it ends the thread.
+/// Sends views to the render thread. Dropping it ends the thread.
 pub(crate) struct Renderer {
     job_sender: Option<Sender<Job>>,
     thread: Option<JoinHandle<()>>,
@@ -63,11 +63,11 @@ struct Job {
     reply: Sender<Picture>,
 }
 
-/// A picture that is being drawn.
+/// An image being rendered.
 pub(crate) struct Pending(Receiver<Picture>);
 
 impl Pending {
-    /// Waits for the picture.
+    /// Waits for the image.
     pub(crate) fn wait(self) -> Result<Picture, Error> {
         self.0.recv().map_err(|_| render_thread_stopped())
     }
@@ -95,12 +95,12 @@ impl Renderer {
         Ok(Self { job_sender: Some(job_sender), thread: Some(thread), name })
     }
 
-    /// What draws, as OpenGL names it.
+    /// The renderer's name as reported by OpenGL.
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Queues a view; the picture is asked for later.
+    /// Queues a view. The caller waits for the result later.
     pub(crate) fn submit(&self, view: View) -> Result<Pending, Error> {
         let (reply, picture) = bounded(1);
         let job_sender = self.job_sender.as_ref().ok_or_else(render_thread_stopped)?;
@@ -113,13 +113,13 @@ impl Drop for Renderer {
     fn drop(&mut self) {
         self.job_sender = None;
         if let Some(thread) = self.thread.take() {
-            // A panic of the thread was reported by the panic hook; there is nothing left to do here.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
 }
 
-/// Draws until the last sender is gone. The context outlives everything that MuJoCo made in it.
+/// Renders until the last sender is dropped. The context outlives everything that MuJoCo created in it.
 fn draw_all(
     current: &HeadlessContext,
     model: &Arc<MjModel>,
@@ -136,13 +136,13 @@ fn draw_all(
         context,
         near_far_m,
     };
-    // Drivers compile their shaders for the first picture: seconds on a busy processor, which no camera shall seem to
-    // be silent for.
+    // Drivers compile their shaders for the first image, which takes seconds on a busy processor. Without the
+    // warm-up, a camera would appear to be silent for that time.
     canvas.draw(&View::warm_up());
-    // A closed channel means that the rig is gone already; `queue` is closed then as well.
+    // A closed channel means that the rig was dropped; `queue` is then closed as well.
     let _ = ready.send(Ok(current.renderer().to_owned()));
     for job in queue {
-        // The asker may have given up; the next one may not.
+        // This requester may have given up; later ones may still be waiting.
         let _ = job.reply.send(canvas.draw(&job.view));
     }
 }
@@ -174,7 +174,7 @@ impl Canvas {
         self.read(view.size_px, &viewport)
     }
 
-    /// Points both of the scene's cameras; MuJoCo draws from their mean.
+    /// Sets both of the scene's cameras; MuJoCo renders from their mean.
     fn set_view(&mut self, view: &View) {
         let [near, far] = self.near_far_m;
         let pose = &view.world_from_camera;
@@ -182,7 +182,7 @@ impl Canvas {
         let [width, height] = view.size_px.map(f64::from);
         let at_near = |pixels: f64, axis: usize| pixels * near / view.focal_px[axis];
         let [left, right] = [at_near(-view.principal_px[0], 0), at_near(width - view.principal_px[0], 0)];
-        // SAFETY: only cameras and flags are written, which hold plain numbers.
+        // SAFETY: only cameras and flags are written, which contain plain numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         for camera in &mut scene.camera {
             camera.pos = in_f32(pose.translation.vector);
@@ -198,9 +198,9 @@ impl Canvas {
         }
     }
 
-    /// Makes all lamps brighter or darker.
+    /// Scales the brightness of all lamps.
     fn scale_lights(&mut self, light_frac: f32) {
-        // SAFETY: only colours of lamps are written, which hold plain numbers.
+        // SAFETY: only colors of lamps are written, which contain plain numbers.
         let scene = unsafe { self.scene.ffi_mut() };
         let n_lamps = usize::try_from(scene.nlight).unwrap_or(0);
         for lamp in scene.lights.iter_mut().take(n_lamps) {
@@ -216,7 +216,7 @@ impl Canvas {
         let mut depth_from_bottom = vec![0.0; width * height];
         self.context
             .read_pixels(Some(&mut from_bottom), Some(&mut depth_from_bottom), viewport)
-            .expect("the buffers have the viewport's size");
+            .expect("the buffers match the viewport's size");
         let mut rgb = Vec::with_capacity(from_bottom.len());
         let mut depth_m = Vec::with_capacity(depth_from_bottom.len());
         for row in (0..height).rev() {
@@ -233,11 +233,11 @@ impl Canvas {
 
 /// Inverts the perspective projection's depth, 0 at the near plane and 1 at the far plane.
 fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
-    let [near, far] = near_far_m.map(|metres| metres as f32);
+    let [near, far] = near_far_m.map(|meters| meters as f32);
     near * far / (far - depth * (far - near))
 }
 
-/// Puts the base of a scene where it moves; nothing where it does not.
+/// Sets the pose of a moving base; does nothing for a fixed one.
 pub(crate) fn place_base<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
     if let Some(place) = data.mocap_pos_mut().first_mut() {
         *place = world_from_base.translation.vector.into();

@@ -1,4 +1,4 @@
-//! Builds a rig and tells what it is made of.
+//! Builds a rig and describes it.
 
 use crate::arm::Arm;
 use crate::base::{BaseMotion, base_from_arm};
@@ -31,13 +31,13 @@ pub(crate) fn urdf_of(scene: Scene) -> &'static str {
     }
 }
 
-/// A rig that is ready to play.
+/// A rig that is ready to run.
 pub struct Rig {
     engine: Engine,
     info: RigInfo,
 }
 
-/// What a rig truly is: what calibration would find.
+/// True parameters of a rig, which calibration should recover.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigInfo {
     /// The cameras in the order of the configuration.
@@ -46,28 +46,28 @@ pub struct RigInfo {
     pub joint_names: Vec<String>,
     /// The scanners in the order of the configuration.
     pub scanner_names: Vec<String>,
-    /// Whether the base tells where it is.
+    /// Whether the base moves and reports its pose.
     pub has_moving_base: bool,
-    /// The robot; its joints keep their own names.
+    /// URDF of the robot, with its own joint names.
     pub urdf: &'static str,
     /// Pose of the robot's base at the start.
     pub world_from_base: Transform,
-    /// What draws, as OpenGL names it.
+    /// The renderer's name as reported by OpenGL.
     pub renderer: String,
 }
 
-/// What a camera truly is.
+/// True parameters of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraInfo {
     /// Name in the rig file.
     pub name: String,
-    /// Lens parameters of colour and depth.
+    /// Lens parameters of color and depth.
     pub intrinsics: Intrinsics,
-    /// What the camera is fixed to.
+    /// Frame that the camera is attached to.
     pub parent: Parent,
-    /// Pose on the parent.
+    /// Camera pose in the parent frame.
     pub parent_from_camera: Transform,
-    /// Images a second.
+    /// Images per second.
     pub rate_hz: f64,
     /// Time from the first row's exposure to the last row's, microseconds.
     pub readout_micros: f64,
@@ -75,7 +75,7 @@ pub struct CameraInfo {
     pub has_depth: bool,
 }
 
-/// Builds the scene and starts its render thread; takes a second or two.
+/// Builds the scene and starts its render thread. Takes one to two seconds.
 pub fn open(config: &Config) -> Result<Rig, Error> {
     config.check()?;
     let cameras = Cameras::new(config)?;
@@ -109,7 +109,7 @@ pub fn open(config: &Config) -> Result<Rig, Error> {
     Ok(Rig { engine, info })
 }
 
-/// The camera that the scan points: the first one on the flange, else where one would sit.
+/// `flange_from_camera` of the camera that the scan aims: the first one on the flange, or a default if there is none.
 fn scanning_camera(config: &Config) -> Transform {
     let on_flange = config.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     on_flange.map_or_else(|| CameraConfig::wrist("wrist").parent_from_camera, |camera| camera.parent_from_camera)
@@ -128,17 +128,17 @@ fn camera_info(camera: &CameraConfig, ideal: bool) -> CameraInfo {
 }
 
 impl Rig {
-    /// What the rig is made of.
+    /// True parameters of the rig.
     pub fn info(&self) -> &RigInfo {
         &self.info
     }
 
-    /// Plays as fast as samples are taken. Simulated time zero has the stamp 0.
+    /// Runs as fast as samples are taken. Simulated time zero has the stamp 0.
     pub fn into_lockstep(self) -> Lockstep {
         Lockstep::new(self.engine, self.info)
     }
 
-    /// Plays in real time. Simulated time zero is now, which is `start` on the caller's clock.
+    /// Runs in real time. Simulated time zero is now, which is `start` on the caller's clock.
     pub fn into_live(self, start: Stamp) -> Result<LiveRig, Error> {
         LiveRig::start(self.engine, self.info, start)
     }

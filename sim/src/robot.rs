@@ -1,28 +1,28 @@
-//! The robot as a whole: where its base is, and what its arm does if it has one.
+//! The whole robot: base motion and, if there is an arm, arm motion.
 
 use crate::arm::{Arm, JointReading, STEP_NANOS};
 use crate::base::BaseMotion;
 use crate::panda::{self, Joints};
 use kinematics::Transform;
 
-/// Where the robot is at one instant.
+/// Pose of the robot at one instant.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RobotPose {
     pub(crate) world_from_base: Transform,
     pub(crate) base_from_arm: Transform,
-    /// `None` where there is no arm.
+    /// Joint positions; `None` without an arm.
     pub(crate) joints_rad: Option<Joints>,
 }
 
 impl RobotPose {
-    /// Pose of the flange; of the arm's place where there is no arm.
+    /// Pose of the flange, or of the arm's mounting point if there is no arm.
     pub(crate) fn world_from_flange(&self) -> Transform {
         let arm_from_flange = self.joints_rad.as_ref().map_or_else(Transform::identity, panda::base_from_flange);
         self.world_from_base * self.base_from_arm * arm_from_flange
     }
 }
 
-/// The robot in motion.
+/// The moving robot.
 pub(crate) struct Robot {
     arm: Option<Arm>,
     motion: BaseMotion,
@@ -39,14 +39,14 @@ impl Robot {
         &self.motion
     }
 
-    /// Moves on by one step; gives the time before it, nanoseconds, and what the arm's joints told then.
+    /// Advances by one step. Returns the time before it, nanoseconds, and the joint reading at that time.
     pub(crate) fn step(&mut self) -> (i64, Option<JointReading>) {
         let nanos = self.n_steps * STEP_NANOS;
         self.n_steps += 1;
         (nanos, self.arm.as_mut().map(Arm::step))
     }
 
-    /// The robot at a time in its recent past; `None` where the arm's readings do not reach.
+    /// The robot at a time in its recent past; `None` if the arm's readings do not cover it.
     pub(crate) fn at(&self, nanos: i64) -> Option<RobotPose> {
         let joints_rad = match &self.arm {
             Some(arm) => Some(arm.position_at(nanos)?),

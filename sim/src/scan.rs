@@ -1,4 +1,4 @@
-//! The scanning motion: where the camera is meant to be over time, and the joint positions that bring it there.
+//! The scanning motion: target camera poses over time, and the joint positions that reach them.
 
 use crate::Error;
 use crate::cabinet_tour::CabinetTour;
@@ -11,16 +11,16 @@ use std::f64::consts::TAU;
 
 /// The tour around the target area.
 ///
-/// Azimuth, elevation, distance, roll and the point looked at swing with periods that have no common multiple, so
-/// the first seconds cover the whole range coarsely and later ones fill the gaps. Every swing goes both ways and its
-/// speed changes all the time, so that a clock offset and a hand-eye error leave different traces.
+/// Azimuth, elevation, distance, roll and look-at point oscillate with periods that have no common multiple, so the
+/// first seconds cover the whole range coarsely and later ones fill the gaps. Every oscillation goes both ways and
+/// its speed changes continuously, so a time offset and a hand-eye error have different effects.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scan {
     speed: f64,
     is_azimuth_only: bool,
 }
 
-/// One swinging quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
+/// One oscillating quantity: mean, amplitude, period in seconds at speed 1, phase in turns.
 struct Oscillation(f64, f64, f64, f64);
 
 impl Oscillation {
@@ -36,15 +36,16 @@ const DISTANCE_M: Oscillation = Oscillation(0.35, 0.10, 9.2, 0.10);
 const ROLL_DEGREES: Oscillation = Oscillation(0.0, 20.0, 8.3, 0.60);
 const LOOK_AT_X_M: Oscillation = Oscillation(0.0, 0.03, 6.3, 0.0);
 const LOOK_AT_Y_M: Oscillation = Oscillation(0.0, 0.04, 7.7, 0.5);
-/// Height of the point looked at above the table, metres.
+/// Height of the look-at point above the table, meters.
 const LOOK_AT_HEIGHT_M: f64 = 0.06;
-/// The motion starts from rest within this time, seconds.
+/// The motion accelerates from rest within this time, seconds.
 const START_SECS: f64 = 0.5;
-/// The speed swings by this share, with this period in seconds.
+/// The speed varies by this fraction, with this period in seconds.
 const SPEED_OSCILLATION: (f64, f64) = (0.35, 4.9);
 
 impl Scan {
-    /// With `is_azimuth_only` all swings but that of the azimuth rest at their means: the camera turns about one axis.
+    /// With `is_azimuth_only`, all quantities except the azimuth stay at their means: the camera rotates about one
+    /// axis.
     pub(crate) fn new(speed: f64, is_azimuth_only: bool) -> Self {
         Self { speed, is_azimuth_only }
     }
@@ -53,17 +54,17 @@ impl Scan {
         if self.is_azimuth_only { oscillation.0 } else { oscillation.at(at) }
     }
 
-    /// Progress along the tour, in seconds at even speed; starts at rest.
+    /// Progress along the tour, in seconds at constant speed; starts at rest.
     fn progress(&self, secs: f64) -> f64 {
         let (share, period_secs) = SPEED_OSCILLATION;
-        // The integral of a ramp from 0 to 1 whose slope is smooth at both ends.
+        // The integral of a smooth ramp from 0 to 1.
         let ramp = (secs / START_SECS).clamp(0.0, 1.0);
         let started = START_SECS * (ramp.powi(3) - 0.5 * ramp.powi(4)) + (secs - START_SECS).max(0.0);
         let uniform_secs = started * self.speed;
         uniform_secs + share * period_secs / TAU * (1.0 - (uniform_secs * TAU / period_secs).cos())
     }
 
-    /// Where the camera should be: x right, y down, z to the point looked at.
+    /// Target pose of the camera: x right, y down, z toward the look-at point.
     pub(crate) fn world_from_camera(&self, secs: f64) -> Transform {
         let at = self.progress(secs);
         let azimuth = AZIMUTH_DEGREES.at(at).to_radians();
@@ -80,24 +81,24 @@ impl Scan {
     }
 }
 
-/// Orientation of an upright camera that looks along a direction: x right, y down, z ahead.
+/// Orientation of an upright camera that looks along a direction: x right, y down, z forward.
 pub(crate) fn looking_along(forward: &Vector3<f64>) -> UnitQuaternion<f64> {
     let right = forward.cross(&Vector3::z()).normalize();
     let axes = Matrix3::from_columns(&[right, forward.cross(&right), *forward]);
     UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes))
 }
 
-/// What an arm's camera does.
+/// Tour of an arm's camera.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Tour {
-    /// Round the target area on the table.
+    /// Around the target area on the table.
     Table(Scan),
-    /// From two stands, and into the cabinet.
+    /// From two stations, and into the cabinet.
     Cabinet(CabinetTour),
 }
 
 impl Tour {
-    /// Where the camera should be, seen from the arm's own base.
+    /// Target pose of the camera in the arm's base frame.
     pub(crate) fn arm_from_camera(&self, secs: f64) -> Transform {
         match self {
             Self::Table(scan) => scan.world_from_camera(secs),
@@ -106,7 +107,7 @@ impl Tour {
     }
 }
 
-/// Follows the scan in joint space by damped least squares, inside the joint limits.
+/// Follows the scan in joint space by damped least squares, within the joint limits.
 #[derive(Clone, Debug)]
 pub(crate) struct Follower {
     scan: Tour,
@@ -116,23 +117,23 @@ pub(crate) struct Follower {
     acceleration_rad_s2: Joints,
 }
 
-/// Where the arm likes to be: far from its limits, elbow up.
+/// Preferred posture: far from the joint limits, elbow up.
 const REST_POSTURE_RAD: [f64; N_JOINTS] = [0.0, -0.3, 0.0, -2.2, 0.0, 2.2, std::f64::consts::FRAC_PI_4];
-/// Distance kept from the joint limits, radians.
+/// Margin to the joint limits, radians.
 const LIMIT_MARGIN_RAD: f64 = 0.05;
-/// Share of the joints' largest speed that the scan uses.
+/// Fraction of the maximum joint speeds that the scan uses.
 const SPEED_LIMIT_FRAC: f64 = 0.5;
-/// Damping of the least squares, in metres and radians.
+/// Damping of the least squares, in meters and radians.
 const DAMPING: f64 = 0.03;
-/// How fast pose errors and discomfort fade, per second.
+/// Rate at which pose errors and posture errors decay, per second.
 const POSE_GAIN_HZ: f64 = 8.0;
 const REST_POSTURE_GAIN_HZ: f64 = 0.6;
-/// The joint velocity follows its wish as a critically damped spring of this frequency, radians per second: what keeps
-/// the motion smooth.
+/// The joint velocity follows the desired velocity as a critically damped spring of this frequency, radians per
+/// second, which keeps the motion smooth.
 const SMOOTHING_RAD_S: f64 = 40.0;
-/// A joint may approach its limit by this share of the remaining distance per second.
+/// A joint may approach its limit by this fraction of the remaining distance per second.
 const LIMIT_APPROACH_HZ: f64 = 3.0;
-/// Share of the arm's largest accelerations and jerks that the scan uses.
+/// Fraction of the arm's maximum accelerations and jerks that the scan uses.
 const DYNAMICS_LIMIT_FRAC: f64 = 0.6;
 
 impl Follower {
@@ -159,7 +160,8 @@ impl Follower {
         Ok(follower)
     }
 
-    /// Tries half a minute of the scan without dynamics: with some camera mounts the arm meets its limits and looks away.
+    /// Simulates half a minute of the scan without dynamics. With some camera extrinsics, the arm reaches its limits
+    /// and the camera looks away.
     fn warn_if_tour_is_unreachable(mut self) {
         const CHECKED_SECS: f64 = 30.0;
         const STEP_SECS: f64 = 0.005;
@@ -174,7 +176,9 @@ impl Follower {
         }
         if worst_rad > TOLERANCE_RAD {
             let degrees = worst_rad.to_degrees();
-            log::warn!("the arm cannot follow the whole scan with this camera mount: up to {degrees:.0} degrees off");
+            log::warn!(
+                "the arm cannot follow the whole scan with these camera extrinsics: off by up to {degrees:.0} degrees"
+            );
         }
     }
 
@@ -186,7 +190,7 @@ impl Follower {
         &self.velocity_rad_s
     }
 
-    /// Moves on to a time, `step_secs` after the previous one.
+    /// Advances to a time `step_secs` after the previous one.
     pub(crate) fn advance(&mut self, secs: f64, step_secs: f64) {
         let target_pose = self.scan.arm_from_camera(secs);
         let before = self.scan.arm_from_camera(secs - step_secs);
@@ -207,7 +211,7 @@ impl Follower {
         self.position_rad = clamp_to_limits(self.position_rad + self.velocity_rad_s * step_secs);
     }
 
-    /// Lowest and highest joint velocity: slower towards a limit the nearer it is.
+    /// Minimum and maximum joint velocity; decreases toward a limit.
     fn allowed_speed_rad_s(&self, ix: usize) -> [f64; 2] {
         let (position, fastest) = (self.position_rad[ix], SPEED_LIMIT_FRAC * panda::MAX_SPEED_RAD_S[ix]);
         let to_lower = position - panda::LOWER_RAD[ix] - LIMIT_MARGIN_RAD;
@@ -216,7 +220,8 @@ impl Follower {
         [-towards(to_lower), towards(to_upper)]
     }
 
-    /// Joint velocity that would bring the camera to the wanted pose, and the free joint motion to a comfortable one.
+    /// Joint velocity that moves the camera to the target pose; the remaining freedom moves the joints to the
+    /// preferred posture.
     fn desired_velocity(&self, target_pose: &Transform, target_twist: &Vector6<f64>) -> Joints {
         let (base_from_camera, jacobian) = panda::jacobian(&self.position_rad, &self.flange_from_camera);
         let twist = target_twist + pose_error(target_pose, &base_from_camera) * POSE_GAIN_HZ;
@@ -232,7 +237,7 @@ fn damped_inverse(jacobian: &Jacobian) -> SMatrix<f64, N_JOINTS, 6> {
     jacobian.transpose() * inverse
 }
 
-/// Translation and rotation from the actual to the wanted pose, along the world's axes.
+/// Translation and rotation from the actual to the target pose, in world axes.
 fn pose_error(target_pose: &Transform, actual: &Transform) -> Vector6<f64> {
     let translation_error = target_pose.translation.vector - actual.translation.vector;
     let rotation_error = (target_pose.rotation * actual.rotation.inverse()).scaled_axis();

@@ -1,4 +1,4 @@
-//! A scene and its robot as a MuJoCo model.
+//! Builds the MuJoCo model of a scene and its robot.
 
 use crate::base;
 use crate::config::{Config, Parent, Scene};
@@ -18,7 +18,7 @@ pub(crate) const ARM_GROUP: usize = 1;
 /// Group of the geometry that light passes through.
 pub(crate) const GLASS_GROUP: usize = 2;
 
-/// Nearest and furthest drawn distance, metres.
+/// Near and far plane, meters.
 pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     match scene {
         Scene::StaticArm | Scene::MobileArm => [0.02, 12.0],
@@ -26,7 +26,7 @@ pub(crate) fn near_far_m(scene: Scene) -> [f64; 2] {
     }
 }
 
-/// Factor on all lamps: rooms whose walls face away from the key lamp need more.
+/// Factor on all lamps. Rooms whose walls face away from the key lamp need more light.
 fn brightness(scene: Scene) -> f64 {
     match scene {
         Scene::StaticArm => 1.0,
@@ -35,7 +35,7 @@ fn brightness(scene: Scene) -> f64 {
     }
 }
 
-/// Builds the model for pictures of up to `largest_px`.
+/// Builds the model for rendered images of up to `largest_px`.
 pub(crate) fn build(config: &Config, largest_px: [u32; 2]) -> Result<MjModel, Error> {
     let mut files = MjVfs::new();
     let mut assets = format!("{MATERIALS}{}", extra_materials(config.scene));
@@ -95,7 +95,7 @@ fn robot(config: &Config) -> String {
     )
 }
 
-/// Body, legs and head of the quadruped, its middle at the origin.
+/// Body, legs and head of the quadruped, centered at the origin.
 const QUADRUPED: &str = "<geom type=\"box\" size=\"0.38 0.13 0.08\" material=\"quadruped\"/>\n\
      <geom type=\"box\" pos=\"0.42 0 0.02\" size=\"0.06 0.09 0.06\" material=\"arm_gray\"/>\n\
      <geom type=\"cylinder\" pos=\"-0.2 0 0.13\" size=\"0.05 0.035\" material=\"arm_gray\"/>\n\
@@ -116,7 +116,7 @@ fn extra_materials(scene: Scene) -> &'static str {
     }
 }
 
-/// What is made once a process, as it takes a second and no configuration changes it.
+/// Assets created once per process: they take a second and do not depend on the configuration.
 struct SceneAssets {
     textures_png: Vec<(&'static str, Vec<u8>)>,
     objects: Vec<Object>,
@@ -153,7 +153,7 @@ fn add_file(files: &mut MjVfs, name: &str, bytes: &[u8]) -> Result<(), Error> {
     files.add_from_buffer(name, bytes).map_err(|error| Error::Scene { reason: format!("{name}: {error}") })
 }
 
-/// Bodies of the cameras on the flange, just behind their optical centres.
+/// Bodies of the cameras on the flange, just behind their optical centers.
 fn brackets(config: &Config) -> String {
     let mut xml = String::new();
     for camera in config.cameras.iter().filter(|camera| camera.parent == Parent::Flange) {

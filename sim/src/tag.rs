@@ -6,7 +6,7 @@
 pub(crate) const CODES: [u64; 6] =
     [0xd_7e00_984b, 0xd_da66_4ca7, 0xd_c4a1_c821, 0xe_17b4_70e9, 0xe_f91d_01b1, 0xf_429c_dd73];
 
-/// Cells along a side, with the black border and the white margin around it.
+/// Cells along a side, including the black border and the white margin around it.
 pub const N_CELLS: usize = 10;
 
 /// Column and row of each bit, most significant first, counted in the 8x8 cells inside the margin (same source).

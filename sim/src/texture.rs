@@ -1,5 +1,5 @@
-//! Pictures painted by noise and simple shapes: walls, table, wood, fur, tags.
-#![expect(clippy::cast_possible_truncation, reason = "colours are clamped before they become bytes")]
+//! Procedural textures made of noise and simple shapes: walls, table, wood, fur, tags.
+#![expect(clippy::cast_possible_truncation, reason = "colors are clamped before they become bytes")]
 
 use crate::random::Random;
 use crate::tag;
@@ -7,17 +7,17 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use rayon::prelude::{IndexedParallelIterator, IntoParallelIterator, ParallelIterator, ParallelSliceMut};
 
-/// Colour, sRGB 0 to 1.
+/// Color, sRGB 0 to 1.
 pub(crate) type Color = [f64; 3];
 
-/// A square picture, sRGB.
+/// A square sRGB image.
 pub(crate) struct Texture {
     side_px: usize,
     rgb: Vec<u8>,
 }
 
 impl Texture {
-    /// Paints every pixel by its position, both coordinates from 0 to 1, from the top left.
+    /// Paints every pixel by its position; both coordinates run from 0 to 1 from the top left.
     pub(crate) fn paint(side_px: usize, color_at: impl Fn(f64, f64) -> Color + Sync) -> Self {
         let at = |ix: usize| (ix as f64 + 0.5) / side_px as f64;
         let mut rgb = vec![0; 3 * side_px * side_px];
@@ -29,12 +29,12 @@ impl Texture {
         Self { side_px, rgb }
     }
 
-    /// Darkens a rectangle (left, top, right, bottom) by shares of light that are told on `n` by `n` points of it.
+    /// Darkens a rectangle (left, top, right, bottom) by light fractions sampled on an `n` x `n` grid.
     ///
-    /// `share_at` takes the position in the rectangle, 0 to 1 from its top left, and a number of its own.
+    /// `share_at` receives the position in the rectangle, 0 to 1 from its top left, and an index of the sample.
     pub(crate) fn shade(&mut self, rectangle: [f64; 4], n: usize, share_at: impl Fn(f64, f64, u64) -> f64 + Sync) {
         let step = 1.0 / (n - 1) as f64;
-        // On the very edge a point may lie inside its neighbour.
+        // On the very edge, a point may lie inside the adjacent object.
         let inside = |at: usize| (at as f64 * step).clamp(EDGE, 1.0 - EDGE);
         let shares: Vec<f64> =
             (0..n * n).into_par_iter().map(|ix| share_at(inside(ix % n), inside(ix / n), ix as u64)).collect();
@@ -81,10 +81,10 @@ impl Texture {
 /// Side of every texture, pixels.
 pub(crate) const SIDE_PX: usize = 1024;
 
-/// How far from a rectangle's edge light is told at the least, as a share of its side.
+/// Minimum distance of light samples from a rectangle's edge, as a fraction of its side.
 const EDGE: f64 = 0.005;
 
-/// Mean of each point of a square grid and its neighbours.
+/// Mean of each point of a square grid and its neighbors.
 fn blurred(grid: &[f64], side: usize) -> Vec<f64> {
     let around = |at: usize| at.saturating_sub(1)..(at + 2).min(side);
     let mean = |ix: usize| {
@@ -108,7 +108,7 @@ pub(crate) fn scale(color: Color, factor: f64) -> Color {
     color.map(|channel| channel * factor)
 }
 
-/// 0 below `lower`, 1 above `upper`, smooth between.
+/// 0 below `lower`, 1 above `upper`, smooth in between.
 pub(crate) fn step(lower: f64, upper: f64, value: f64) -> f64 {
     let share = ((value - lower) / (upper - lower)).clamp(0.0, 1.0);
     share * share * (3.0 - 2.0 * share)
@@ -244,12 +244,12 @@ pub(crate) fn stripes(u: f64, v: f64) -> Color {
 
 /// A brushed metal table with threaded holes every 25 mm.
 ///
-/// * `size_m`: what the texture covers to the right and down.
+/// * `size_m`: size of the area that the texture covers, to the right and down.
 pub(crate) fn metal_table(size_m: [f64; 2]) -> Texture {
     const HOLE_PITCH_M: f64 = 0.025;
     let (brush, blotch, scratch) = (Noise::new(31), Noise::new(32), Noise::new(33));
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
-        // Noise was chosen for a square of 0.8 m.
+        // The noise parameters are chosen for a square of 0.8 m.
         let (x, y) = (x * size_m[0] / 0.8, y * size_m[1] / 0.8);
         let brushed = 0.6 * brush.at(x * 9.0, y * 480.0) + 0.4 * brush.rough(x * 40.0, y * 260.0, 3);
         let worn = blotch.rough(x * 6.0, y * 6.0, 5);
@@ -299,7 +299,7 @@ impl Grain {
     }
 }
 
-/// Fur colours, brighter to the right. Top to bottom of a band: tip to root. Bands: [`FurBand`].
+/// Fur colors, brighter to the right. Each band runs from tip (top) to root. Bands: [`FurBand`].
 pub(crate) fn fur() -> Texture {
     let skin = Noise::new(52);
     Texture::paint(SIDE_PX / 2, |x, y| {
@@ -333,7 +333,7 @@ pub(crate) enum FurBand {
 }
 
 impl FurBand {
-    /// Top and bottom in the texture, a little inside so that mip levels do not mix bands.
+    /// Top and bottom in the texture, slightly inset so that mip levels do not mix bands.
     pub(crate) fn rows(self) -> [f64; 2] {
         let top = f64::from(self as u8) / 4.0;
         [top + 0.02, top + 0.23]
@@ -344,7 +344,7 @@ impl FurBand {
 pub(crate) fn tags() -> Texture {
     let cells: Vec<_> = (0..tag::CODES.len()).map(tag::cells).collect();
     let paper = Noise::new(61);
-    // Larger than the others, so that an edge between cells stays sharp close up.
+    // Larger than the other textures, so that edges between cells stay sharp at close range.
     Texture::paint(3 * SIDE_PX / 2, |x, y| {
         let (across, down) = (x * 3.0, y * 3.0);
         let light = 0.97 + 0.03 * paper.rough(x * 200.0, y * 200.0, 2);

@@ -8,7 +8,7 @@ use nalgebra::{Point3, UnitQuaternion, Vector3};
 /// One part of the body: an ellipsoid, covered with hair or not.
 struct Part {
     center_m: [f64; 3],
-    /// Half sizes along the part's own axes.
+    /// Half sizes along the part's axes.
     half_m: [f64; 3],
     /// Rotation about y, radians: positive tips the part's x axis down.
     pitch_rad: f64,
@@ -43,7 +43,7 @@ impl Part {
     }
 }
 
-/// Halves of the hair numbers below that grow.
+/// Factor on the hair counts below, in units of 1/2.
 const DENSITY: u64 = 3;
 
 /// The toy stands on z = 0, looks along x, and is 0.15 m high.
@@ -77,15 +77,15 @@ const PARTS: [Part; 22] = [
     part([-0.037, -0.016, 0.006], [0.012, 0.011, 0.006], 0.0, 0.0, FurBand::Dark),
 ];
 
-/// Share of the light at a point of the toy, with the normal there and a number of its own.
+/// Fraction of light at a point of the toy, given the normal there and the sample's index.
 pub(crate) type Light<'a> = &'a dyn Fn(&Point3<f64>, &Vector3<f64>, u64) -> f64;
 
-/// The parts that stand in the light's way: centres and half axes.
+/// The parts that block light: centers and half axes.
 pub(crate) fn ellipsoids() -> impl Iterator<Item = (Point3<f64>, [Vector3<f64>; 3])> {
     PARTS.iter().map(|part| (part.center(), part.half_axes()))
 }
 
-/// A sphere around the toy: centre and radius, metres.
+/// A sphere around the toy: center and radius, meters.
 pub(crate) fn bounds() -> (Point3<f64>, f64) {
     (Point3::new(0.02, 0.0, 0.085), 0.115)
 }
@@ -95,7 +95,7 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for part in &PARTS {
         let [tip, root] = part.band.rows();
-        // Skin has the colour of the roots where hair grows, else the whole band's.
+        // Skin has the color of the hair roots if hair grows on it, else the colors of the whole band.
         let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
         let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
             // Patches as small as tufts, so that skin between hairs does not look bare.
@@ -107,7 +107,7 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
     mesh
 }
 
-/// Where the fur texture has a brightness.
+/// Horizontal position in the fur texture for a brightness.
 fn texture_x(brightness: f64) -> f64 {
     ((brightness - FUR_DARKEST) / (1.0 - FUR_DARKEST)).clamp(0.0, 1.0)
 }
@@ -153,7 +153,7 @@ struct Hair {
     band: FurBand,
 }
 
-/// Adds a tapered hair of two pieces that leans back and droops; it uses five counters.
+/// Adds a tapered hair of two segments that leans back and droops. Uses five counters.
 fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, hair: &Hair) {
     let jitter = Vector3::new(
         random.between(counter, -0.45, 0.45),
@@ -175,7 +175,7 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, ha
         side * cos + across * sin
     });
     let row = |share: f64| band_root + (band_tip - band_root) * share;
-    // The skin's normal is blended in, so that a coat is shaded as a whole.
+    // The skin's normal is blended in, so that the coat is shaded as a whole.
     let shade = |outward: &Vector3<f64>| (outward * 0.5 + hair.normal).normalize();
     let mut ring = |center: Point3<f64>, radius: f64, share: f64| {
         corners.map(|outward| {

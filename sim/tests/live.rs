@@ -1,4 +1,4 @@
-//! The simulated rig as live devices.
+//! Tests of the simulated rig as live devices.
 
 use drivers::PixelFormat;
 use kinematics::Stamp;
@@ -22,7 +22,7 @@ fn live_devices_deliver_until_the_rig_ends() {
         newest = state.stamp;
         n_readings += 1;
     }
-    // One second at 1 kHz; only a machine that stands still for a second loses some.
+    // One second at 1 kHz. Readings are dropped only if the machine stalls for a second.
     assert!((500..=1001).contains(&n_readings), "{n_readings} readings");
     assert!(newest > START && newest <= START.plus_secs(1.001));
 
@@ -40,9 +40,12 @@ fn live_devices_deliver_until_the_rig_ends() {
         }
     };
     assert!(matches!(end, drivers::Error::Simulation { .. }), "{end}");
-    assert!(n_color >= 1 && n_depth >= 1, "{n_color} colour, {n_depth} depth");
-    // Nobody took images while the joints were read: what did not fit the queue was counted.
-    assert!(n_color + n_dropped <= 15 && n_color + n_depth <= 8, "{n_color} colour, {n_depth} depth, {n_dropped} lost");
-    let truth = rig.truth.take().expect("truth came along");
+    assert!(n_color >= 1 && n_depth >= 1, "{n_color} color, {n_depth} depth");
+    // Nobody took images while the joints were read: images that did not fit in the queue were counted.
+    assert!(
+        n_color + n_dropped <= 15 && n_color + n_depth <= 8,
+        "{n_color} color, {n_depth} depth, {n_dropped} dropped"
+    );
+    let truth = rig.truth.take().expect("ground truth");
     assert!(matches!(truth, drivers::Sample::Truth(truth) if truth.psnr_ceiling.is_some()));
 }

@@ -1,4 +1,5 @@
-//! The rigs whose base moves, against what is known about them: base poses, scans of the walls, depth of a sensor of its own.
+//! Checks the rigs with a moving base against known values: base poses, scans of the walls, depth of a separate
+//! sensor.
 
 #![expect(clippy::cast_possible_truncation, reason = "pixel positions inside an image become indices")]
 
@@ -11,7 +12,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use sim::layout::{ROOM_HALF_M, ROOM_HEIGHT_M};
 use sim::{CameraConfig, Config, Parent, ScannerConfig, Scene};
 
-/// A small camera ahead, and a scanner.
+/// A small forward camera and a scanner.
 fn mobile_base(rate_hz: f64) -> Config {
     let mut camera = CameraConfig::wrist("front");
     camera.intrinsics = camera.intrinsics.resized([320, 180]);
@@ -31,14 +32,14 @@ fn mobile_base(rate_hz: f64) -> Config {
     }
 }
 
-/// A small wrist camera whose depth has its own lens and place.
+/// A small wrist camera whose depth has its own lens and pose.
 fn mobile_arm(rate_hz: f64) -> Config {
     let mut config = Config { scene: Scene::MobileArm, truth_depth: true, light_inside_frac: 0.6, ..Config::default() };
     config.cameras = vec![CameraConfig::mobile_wrist("wrist")];
     let camera = &mut config.cameras[0];
     camera.intrinsics = camera.intrinsics.resized([320, 180]);
     camera.rate_hz = rate_hz;
-    let sensor = camera.depth.as_mut().and_then(|depth| depth.sensor.as_mut()).expect("a depth sensor of its own");
+    let sensor = camera.depth.as_mut().and_then(|depth| depth.sensor.as_mut()).expect("a separate depth sensor");
     sensor.intrinsics = sensor.intrinsics.resized([160, 120]);
     config
 }
@@ -71,10 +72,10 @@ fn scans_hit_the_walls_within_their_noise() {
                 past_wall_m[0] < 0.15 && past_wall_m[1] < 0.15 && at.z > -0.15 && at.z < ROOM_HEIGHT_M + 0.15,
                 "{at}"
             );
-            // Above all furniture and below the lamps only walls are left.
+            // Only walls remain above all furniture and below the lamps.
             if at.z > 2.15 && at.z < 2.6 {
                 let ray = (at.coords - world_from_scanner.translation.vector).normalize();
-                // The error along the ray of a wall met at an angle.
+                // The error along a ray that hits a wall at an angle.
                 let (axis, off) =
                     if past_wall_m[0] > past_wall_m[1] { (0, past_wall_m[0]) } else { (1, past_wall_m[1]) };
                 squares += (off / ray[axis].abs()).powi(2);
@@ -104,7 +105,7 @@ fn reported_poses_drift_and_ground_truth_is_exact() {
             && distance_m(run.reported_base.len() - 1) < 0.1
     );
     for truth in &run.truth {
-        // Base poses come every 10 ms and images between them: as far as the straight line between poses goes.
+        // Base poses come every 10 ms with images in between; the tolerance covers linear interpolation.
         let ix = run.true_base.partition_point(|pose| pose.stamp < truth.image.stamp).clamp(1, run.true_base.len() - 1);
         let (a, b) = (&run.true_base[ix - 1], &run.true_base[ix]);
         let share = truth.image.stamp.secs_since(a.stamp) / b.stamp.secs_since(a.stamp);
@@ -130,12 +131,12 @@ fn runs_are_deterministic_per_seed() {
 
 #[test]
 fn separate_depth_sensor_matches_color_camera() {
-    const TOLERANCE_FRAC: f64 = 0.01; // A pixel of slanted surface; wrong frames or lenses are ten times further off.
+    const TOLERANCE_FRAC: f64 = 0.01; // A pixel of slanted surface; wrong frames or lenses are off by ten times more.
     let config = Config { ideal: true, n_images: Some(4), ..mobile_arm(1.0) };
     let run = run_rig(&config);
     let color = lens_of(&config);
-    let sensor = config.cameras[0].depth.clone().and_then(|depth| depth.sensor).expect("a sensor of its own");
-    let (mut n_matching, mut n_seen) = (0, 0);
+    let sensor = config.cameras[0].depth.clone().and_then(|depth| depth.sensor).expect("a separate sensor");
+    let (mut n_matching, mut n_valid) = (0, 0);
     for (image, truth) in run.depth.iter().zip(&run.truth) {
         assert_eq!(image.size_px, [160, 120]);
         for (ix, count) in image.data.chunks_exact(2).enumerate() {
@@ -146,13 +147,13 @@ fn separate_depth_sensor_matches_color_camera() {
             let Some([u, v]) = color.project(&in_color.coords).filter(|at| z > 0.0 && color.contains(*at)) else {
                 continue;
             };
-            let seen = f64::from(truth.depth_m[v as usize * 320 + u as usize]);
-            n_seen += 1;
-            n_matching += usize::from((seen / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
+            let depth_m = f64::from(truth.depth_m[v as usize * 320 + u as usize]);
+            n_valid += 1;
+            n_matching += usize::from((depth_m / in_color.z - 1.0).abs() < TOLERANCE_FRAC);
         }
     }
-    // Depth edges, where the two look past each other, are the rest.
-    assert!(n_seen > 20_000 && n_matching as f64 > 0.93 * f64::from(n_seen), "{n_matching} of {n_seen}");
+    // The rest are depth edges, which the two sensors see differently.
+    assert!(n_valid > 20_000 && n_matching as f64 > 0.93 * f64::from(n_valid), "{n_matching} of {n_valid}");
 }
 
 #[test]
@@ -186,7 +187,7 @@ fn mean_image_scores_low_and_noise_ceiling_is_high() {
 fn light_changes_when_camera_enters_cabinet() {
     let run_with_light = |light_inside_frac: f64| {
         let config = mobile_arm(0.25);
-        // Second stand, the camera in the cabinet: 19 s, 9 s outside, 11 s on the way in.
+        // Second station, the camera in the cabinet: 19 s, 9 s outside, 11 s on the way in.
         let config = Config { light_inside_frac, duration_secs: Some(40.0), truth_depth: false, ..config };
         run_rig(&config)
     };

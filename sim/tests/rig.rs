@@ -1,4 +1,4 @@
-//! The simulated rig against what is known about it: poses, pixels, depth, noise, limits, repeatability.
+//! Checks the simulated rig against known values: poses, pixels, depth, noise, limits, repeatability.
 
 #![expect(clippy::cast_possible_truncation, reason = "pixel positions inside an image become indices")]
 
@@ -24,10 +24,10 @@ fn ideal(n_images: u64) -> Config {
 }
 
 fn chain(info: &RigInfo) -> Chain {
-    Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("our URDF is valid")
+    Chain::from_urdf(info.urdf, "panda_link0", "panda_link8").expect("the URDF is valid")
 }
 
-/// Joint positions at a stamp, by a straight line between the neighbouring readings.
+/// Joint positions at a stamp, interpolated linearly between neighboring readings.
 fn joints_at(joints: &[JointState], stamp: Stamp) -> Vec<f64> {
     let after = joints.partition_point(|state| state.stamp < stamp).max(1);
     let (a, b) = (&joints[after - 1], &joints[after]);
@@ -40,7 +40,7 @@ fn gray(image: &Image, column: usize, row: usize) -> f64 {
     image.data[at..at + 3].iter().map(|byte| f64::from(*byte)).sum::<f64>() / 3.0
 }
 
-/// Gray at a position between pixels.
+/// Bilinear gray value at a position.
 fn gray_at(image: &Image, [u, v]: [f64; 2]) -> f64 {
     let (x, y) = (u - 0.5, v - 0.5);
     let (column, row) = (x.floor() as usize, y.floor() as usize);
@@ -49,18 +49,19 @@ fn gray_at(image: &Image, [u, v]: [f64; 2]) -> f64 {
         + (gray(image, column, row + 1) * (1.0 - fx) + gray(image, column + 1, row + 1) * fx) * fy
 }
 
-/// A point on the table, from the middle of the target area.
+/// A point on the table, relative to the center of the target area.
 fn on_table(x_m: f64, y_m: f64) -> Point3<f64> {
     let [target_x, target_y] = sim::layout::TARGET_XY_M;
     Point3::new(target_x + x_m, target_y + y_m, sim::layout::TABLE_Z_M)
 }
 
-/// The middle of the target area, at half the height of its objects.
+/// The center of the target area, at half the height of its objects.
 fn target() -> Point3<f64> {
     on_table(0.0, 0.0) + Vector3::z() * 0.06
 }
 
-/// Position on the tag cube's upper side: `right` and `down` from the tag's top left, 0 to 1. The tag there has the id 4.
+/// Position on the tag cube's upper side: `right` and `down` from the tag's top left, 0 to 1. This side has the tag
+/// with id 4.
 fn on_tag(right: f64, down: f64) -> Point3<f64> {
     let side = 2.0 * sim::layout::CUBE_HALF_M;
     let in_cube = Point3::new((0.5 - down) * side, (0.5 - right) * side, 0.5 * side);
@@ -73,7 +74,7 @@ fn pixel(intrinsics: &Intrinsics, world_from_camera: &Transform, point: &Point3<
 
 #[test]
 fn forward_kinematics_matches_true_camera_pose() {
-    const TOLERANCE_M: f64 = 2e-6; // The straight line between readings 1 ms apart; the motion bends by up to 10 rad/s^2.
+    const TOLERANCE_M: f64 = 2e-6; // Linear interpolation of readings 1 ms apart; the motion accelerates by up to 10 rad/s^2.
     let run = run_rig(&Config { n_images: Some(40), truth: true, ..Config::default() });
     let camera = &run.info.cameras[0];
     let mut worst_m: f64 = 0.0;
@@ -113,8 +114,8 @@ fn scan_stays_within_limits_and_covers_the_target() {
         elevations.push((from_target.z / from_target.norm()).asin().to_degrees());
         distances.push(from_target.norm());
         // The target stays in view.
-        let seen = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &target());
-        assert!(run.info.cameras[0].intrinsics.contains(seen), "{seen:?}");
+        let target_px = pixel(&run.info.cameras[0].intrinsics, &truth.world_from_camera, &target());
+        assert!(run.info.cameras[0].intrinsics.contains(target_px), "{target_px:?}");
     }
     let span = |values: &[f64]| {
         values.iter().fold(f64::MIN, |a, b| a.max(*b)) - values.iter().fold(f64::MAX, |a, b| a.min(*b))
@@ -124,11 +125,11 @@ fn scan_stays_within_limits_and_covers_the_target() {
     assert!(span(&distances) > 0.12, "distance {}", span(&distances));
 }
 
-/// What Franka allows its arm.
+/// Franka's acceleration limits of the arm.
 const MAX_ACCELERATION_RAD_S2: [f64; 7] = [15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0];
 const MAX_JERK_RAD_S3: [f64; 7] = [7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10_000.0, 10_000.0];
 
-/// One image a second, small: for looking at the motion alone.
+/// One small image per second, for tests of the motion only.
 fn slow_camera() -> Config {
     let mut config = Config::default();
     config.cameras[0].rate_hz = 1.0;
@@ -155,12 +156,12 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
     let run = run_rig(&ideal(12));
     let intrinsics = &run.info.cameras[0].intrinsics;
     let n_cells = sim::tag::N_CELLS as f64;
-    let truth = run.truth.last().expect("images came");
+    let truth = run.truth.last().expect("at least one image");
     for (row, cells) in sim::tag::cells(4).iter().enumerate() {
         for (column, white) in cells.iter().enumerate() {
             let center = on_tag((column as f64 + 0.5) / n_cells, (row as f64 + 0.5) / n_cells);
-            let seen = gray_at(&truth.image, pixel(intrinsics, &truth.world_from_camera, &center));
-            assert_eq!(seen > 100.0, *white, "cell {row}, {column} has brightness {seen}");
+            let gray = gray_at(&truth.image, pixel(intrinsics, &truth.world_from_camera, &center));
+            assert_eq!(gray > 100.0, *white, "cell {row}, {column} has brightness {gray}");
         }
     }
 }
@@ -169,11 +170,12 @@ fn tag_on_cube_is_at_its_pose_with_id_4() {
 fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
     const TOLERANCE_PX: f64 = 0.2;
     let mut config = ideal(3);
-    config.cameras[0].sensor.supersample = 4; // Jagged edges would need many of them to average out.
+    config.cameras[0].sensor.supersample = 4; // Averaging out aliased edges would need many of them.
     let run = run_rig(&config);
     let intrinsics = &run.info.cameras[0].intrinsics;
-    let truth = run.truth.last().expect("images came");
-    // Across the four outer edges of the black border, one cell inside the margin: brightness falls to half at the edge.
+    let truth = run.truth.last().expect("at least one image");
+    // Across the four outer edges of the black border, one cell inside the margin: brightness falls to half at the
+    // edge.
     let edges = [
         ([0.5, 0.05], [0.5, 0.15]),
         ([0.5, 0.95], [0.5, 0.85]),
@@ -196,11 +198,11 @@ fn tag_edges_are_accurate_to_a_fifth_of_a_pixel() {
 
 #[test]
 fn depth_matches_table_and_cube() {
-    const TOLERANCE_M: f64 = 1e-4; // Twice the depth image's counts of 0.1 mm would be too lax for the noise-free depth.
+    const TOLERANCE_M: f64 = 1e-4; // Twice the depth image's resolution of 0.1 mm would be too lax for noise-free depth.
     let run = run_rig(&ideal(5));
     let intrinsics = &run.info.cameras[0].intrinsics;
-    let truth = run.truth.last().expect("images came");
-    let depth = run.depth.last().expect("depth came");
+    let truth = run.truth.last().expect("at least one image");
+    let depth = run.depth.last().expect("at least one depth image");
     assert_eq!(depth.stamp, truth.image.stamp);
     let camera_from_world = truth.world_from_camera.inverse();
     let corners = [on_table(-0.10, -0.16), on_table(-0.14, 0.0), on_tag(0.3, 0.6), on_tag(0.7, 0.2)];
@@ -208,7 +210,7 @@ fn depth_matches_table_and_cube() {
         let in_camera = camera_from_world * point;
         let [u, v] = intrinsics.project(&in_camera.coords).expect("in front");
         let ix = v as usize * intrinsics.size_px[0] as usize + u as usize;
-        // The depth of the plane z = point.z along the ray of the pixel's centre.
+        // The depth of the plane z = point.z along the ray through the pixel's center.
         let ray = intrinsics.unproject([u.floor() + 0.5, v.floor() + 0.5]).expect("a pinhole");
         let up_in_camera = camera_from_world.rotation * Vector3::z();
         let expected = up_in_camera.dot(&in_camera.coords) / up_in_camera.dot(&ray);
@@ -230,18 +232,18 @@ fn noise_matches_configuration() {
         assert!(ceiling > 40.0 && ceiling < 44.0, "{ceiling} dB");
     }
     let DepthConfig { noise_sigma_m, hole_frac, .. } = DepthConfig::default();
-    let (mut squares, mut n_seen, mut n_holes) = (0.0, 0.0, 0.0);
+    let (mut squares, mut n_valid, mut n_holes) = (0.0, 0.0, 0.0);
     for (depth, truth) in run.depth.iter().zip(&run.truth) {
         for (count, exact) in counts(depth).into_iter().zip(truth.depth_m.iter().map(|depth| f64::from(*depth))) {
             if count > 0.0 {
                 squares += ((count * 1e-4 - exact) / (exact * exact)).powi(2);
-                n_seen += 1.0;
+                n_valid += 1.0;
             } else {
                 n_holes += 1.0;
             }
         }
     }
-    let (sigma, holes) = (f64::sqrt(squares / n_seen), n_holes / (n_seen + n_holes));
+    let (sigma, holes) = (f64::sqrt(squares / n_valid), n_holes / (n_valid + n_holes));
     assert!((sigma / noise_sigma_m - 1.0).abs() < 0.05, "depth sigma {sigma} m at 1 m");
     assert!((holes - hole_frac).abs() < 0.006, "holes {holes}");
 }
@@ -249,7 +251,7 @@ fn noise_matches_configuration() {
 #[test]
 fn rolling_shutter_uses_the_pose_of_each_row() {
     const TOLERANCE_PX: f64 = 0.3;
-    const READOUT_SECS: f64 = 0.04; // Slower than real ones, so that there is more to see.
+    const READOUT_SECS: f64 = 0.04; // Slower than real sensors, for a larger effect.
     let mut config = Config { n_images: Some(16), ..Config::default() };
     config.cameras[0].rate_hz = 1.3;
     config.cameras[0].depth = None;
@@ -263,18 +265,18 @@ fn rolling_shutter_uses_the_pose_of_each_row() {
     let (intrinsics, chain) = (&run.info.cameras[0].intrinsics, chain(&run.info));
     let mut largest_px: f64 = 0.0;
     for (image, truth) in run.color.iter().zip(&run.truth).skip(1) {
-        // The middle of the lower edge of the black border, found along the tag's middle line.
+        // The middle of the lower edge of the black border, located along the tag's center line.
         let line: Vec<Point3<f64>> = (0..=200).map(|ix| on_tag(0.5, 0.85 + 0.1 * f64::from(ix) / 200.0)).collect();
         let static_pixel = |point: &Point3<f64>| pixel(intrinsics, &truth.world_from_camera, point);
         let rolling_pixel = |point: &Point3<f64>| {
-            let mut seen = static_pixel(point);
+            let mut at_px = static_pixel(point);
             for _ in 0..3 {
-                let share = seen[1] / f64::from(intrinsics.size_px[1]) - 0.5;
+                let share = at_px[1] / f64::from(intrinsics.size_px[1]) - 0.5;
                 let stamp = truth.image.stamp.plus_secs(READOUT_SECS * share);
                 let flange = chain.forward(&joints_at(&run.joints, stamp)).expect("seven joints");
-                seen = pixel(intrinsics, &(flange * run.info.cameras[0].parent_from_camera), point);
+                at_px = pixel(intrinsics, &(flange * run.info.cameras[0].parent_from_camera), point);
             }
-            seen
+            at_px
         };
         if !line.iter().all(|point| static_pixel(point).iter().all(|value| *value > 40.0 && *value < 440.0)) {
             continue;
@@ -326,12 +328,12 @@ fn dropped_images_are_counted_and_samples_are_ordered() {
     config.cameras[0].sensor.dropped_frac = 0.3;
     let mut rig = sim::open(&config).expect("the rig opens").into_lockstep();
     let (mut newest_joints, mut n_dropped, mut images) = (Stamp(0), 0, BTreeMap::new());
-    while let Some(sample) = rig.next_sample().expect("the rig plays") {
+    while let Some(sample) = rig.next_sample().expect("the rig runs") {
         match sample {
             Sample::Joints(state) => newest_joints = state.stamp,
             Sample::Image(image) => {
                 let age = newest_joints.nanos_since(image.stamp);
-                // Half the readout and exposure, one step, 20 ms of latency, and up to one step more.
+                // Half the readout and exposure, one step, 20 ms of latency, and up to one more step.
                 assert!((29_000_000..=30_100_000).contains(&age), "{age} ns");
                 n_dropped += image.n_skipped;
                 images.insert(image.stamp, image.n_skipped);
@@ -344,5 +346,5 @@ fn dropped_images_are_counted_and_samples_are_ordered() {
     let n_periods = (span * 30.0).round() as u64;
     let before_first = images.values().next().expect("images");
     assert_eq!(n_periods + 1, 20 + n_dropped - before_first);
-    assert!(n_dropped > 2, "{n_dropped} lost");
+    assert!(n_dropped > 2, "{n_dropped} dropped");
 }

@@ -1,11 +1,12 @@
-//! Where real data lie that some tests compare with; elsewhere those tests are skipped with a line.
+//! Location of real data that some tests compare with. Tests are skipped, with a message, if it is missing.
 
 use std::path::{Path, PathBuf};
 
-/// A folder of the test data: below `FIELDRIG_TEST_DATA`, or beside the project; none where there is none, which is told.
+/// A folder of the test data, in `FIELDRIG_TEST_DATA` or next to the project. If it is missing, prints a message and
+/// returns `None`.
 pub(crate) fn folder(name: &str) -> Option<PathBuf> {
     let default_folder = || {
-        // The crate's folder is the project's, or in it.
+        // The crate's folder is the project folder or a folder in it.
         let crate_folder = Path::new(env!("CARGO_MANIFEST_DIR"));
         let project = crate_folder.ancestors().find(|folder| folder.join("ARCHITECTURE.md").is_file());
         project.unwrap_or(crate_folder).join("../shared/data")

@@ -165,10 +165,7 @@ fn misconfigured_card_reports_fix_command() {
             "sudo ip link set can0 up type can bitrate 500000 restart-ms 100",
             "its bit rate is 500000, but the rig file requires 1000000",
         ),
-        (
-            "sudo ip link set can0 up type can bitrate 1000000",
-            "it does not restart after it goes off the bus",
-        ),
+        ("sudo ip link set can0 up type can bitrate 1000000", "it does not restart after it goes off the bus"),
         ("sudo ip link set can0 type can bitrate 1000000 restart-ms 100", "it is down"),
     ];
     for (set_up, what) in wrong_setups {
@@ -272,7 +269,10 @@ fn persistent_bus_off_is_reported_as_cause() {
         }
     };
     println!("kvaser: {error}");
-    assert!(error.contains("no frame from the motor for 1s") && error.contains("1 time off the bus, 0 restarts"), "{error}");
+    assert!(
+        error.contains("no frame from the motor for 1s") && error.contains("1 time off the bus, 0 restarts"),
+        "{error}"
+    );
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! What was played on the wire beside what came through the drivers.
+//! Compares the emulated samples with those received by the drivers.
 
 use drivers::recording::{RIG_FILE, Recording};
 use drivers::{Image, Sample, Source};
@@ -6,21 +6,21 @@ use kinematics::{JointHistory, PoseHistory, Stamp};
 use std::path::Path;
 use std::time::Duration;
 
-/// What a recording holds.
+/// Contents of a recording.
 pub(super) struct RecordedSamples {
-    /// Color and depth, in their order.
+    /// Color and depth images, in order.
     pub(super) images: Vec<Image>,
     pub(super) joints: JointHistory,
     pub(super) poses: PoseHistory,
 }
 
-/// How what came through differs from what was played, at the stamps of the images.
+/// Differences between received and emulated samples, at the stamps of the images.
 #[derive(Debug)]
 pub(super) struct Difference {
     pub(super) n_images: usize,
-    /// Of any joint, rad, in the median image and in the worst.
+    /// Largest difference of any joint, rad, in the median image and in the worst one.
     pub(super) joints_rad: [f64; 2],
-    /// Of the base, m.
+    /// Largest difference of the base position, m.
     pub(super) base_m: f64,
 }
 
@@ -40,7 +40,7 @@ pub(super) fn read_samples(path: &Path) -> RecordedSamples {
     read_samples
 }
 
-/// What is added to the stamps of the script when it is played, as the rig file says that was written for it.
+/// Offset added to the script's stamps during playback, from the rig file written for it.
 pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
     let recording = Recording::open(recording).expect("a recording");
     let rig = std::str::from_utf8(recording.attachment(RIG_FILE).expect("its rig")).expect("text").to_owned();
@@ -48,7 +48,7 @@ pub(super) fn clock_offset_nanos(recording: &Path) -> i64 {
     line.trim().parse().expect("a number")
 }
 
-/// Compares at every color image that came through; each must be one of those played, to the pixel.
+/// Compares at every received color image. Each must equal one of the emulated images, to the pixel.
 pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
     let offset_nanos = clock_offset_nanos(wire);
     let (script, wire) = (read_samples(script), read_samples(wire));
@@ -61,8 +61,11 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
         let is_match = |emulated: &&Image| {
             emulated.is_depth() == image.is_depth() && emulated.stamp.0.abs_diff(simulated_stamp.0) < 1000
         };
-        let emulated =
-            script.images.iter().find(is_match).unwrap_or_else(|| panic!("no image was played at {simulated_stamp:?}"));
+        let emulated = script
+            .images
+            .iter()
+            .find(is_match)
+            .unwrap_or_else(|| panic!("no image was emulated at {simulated_stamp:?}"));
         if image.is_depth() {
             assert_eq!(image.data, emulated.data, "depth at {simulated_stamp:?}");
         } else {
@@ -84,12 +87,12 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
             base_m = base_m.max((received.translation.vector - emulated.translation.vector).norm());
         }
     }
-    assert!(!joints_rad.is_empty(), "no image has joints around it");
+    assert!(!joints_rad.is_empty(), "no image has joint readings before and after it");
     joints_rad.sort_by(f64::total_cmp);
     Difference { n_images, joints_rad: [joints_rad[joints_rad.len() / 2], joints_rad[joints_rad.len() - 1]], base_m }
 }
 
-/// How far from its target `fieldrig move --json` says that the arm arrived, rad or m.
+/// Distance from the target at which `fieldrig move --json` reports that the arm arrived, rad or m.
 pub(super) fn error_of_move(received: &str) -> f64 {
     let done = received.lines().find(|line| line.contains("\"event\":\"done\"")).expect("it arrives");
     let (_, rest) = done.split_once("\"error\":").expect("the key");

@@ -1,7 +1,7 @@
 //! Limits open connections: file descriptors must remain for everything else, and connections in use must stay open.
 //!
-//! All peers have loopback addresses, so only their behavior separates a viewer from an idle socket.
-//! At a limit, a new connection replaces the least active one.
+//! All peers have loopback addresses, so viewers and idle sockets differ only in their behavior. At a limit, a new
+//! connection replaces the least active one.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -14,38 +14,38 @@ use tokio::net::TcpStream;
 
 /// Maximum number of open connections; lower if the limit on open files requires it.
 const MAX_CONNECTIONS: usize = 256;
-/// WebSocket clients at a time.
+/// Maximum number of WebSocket clients.
 const MAX_CLIENTS: usize = 32;
 /// Connections use at most this fraction of the files that the process may open.
 const DESCRIPTORS_PER_CONNECTION: usize = 4;
-/// A connection whose peer takes no byte for this long is closed.
+/// A connection whose peer accepts no bytes for this long is closed.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 /// An HTTP connection without a new request for this long is closed.
 const IDLE_TIMEOUT: Duration = Duration::from_secs(10);
-/// A client that answers no ping for this long is disconnected.
+/// A client that does not answer a ping within this time is disconnected.
 const PONG_TIMEOUT: Duration = Duration::from_secs(8);
 /// A client that has not answered a ping for this long may be replaced by a new one.
 const UNRESPONSIVE_AFTER: Duration = Duration::from_secs(1);
-/// A client that has sent no message for this long may be replaced by a new one; the page sends two a second.
+/// A client that has sent no message for this long may be replaced by a new one; the page sends two per second.
 const IDLE_CLIENT_AFTER: Duration = Duration::from_secs(3);
 
-/// How many connections there may be.
+/// Limits on the number of connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Limits {
-    /// Open connections.
+    /// Maximum number of open connections.
     pub(crate) connections: usize,
-    /// WebSocket clients among them.
+    /// Maximum number of WebSocket clients among them.
     pub(crate) clients: usize,
 }
 
 impl Limits {
-    /// The limits for a process that may open this many files.
+    /// The limits of a process that may open this many files.
     pub(crate) fn of_descriptors(n_descriptors: usize) -> Self {
         let connections = (n_descriptors / DESCRIPTORS_PER_CONNECTION).clamp(8, MAX_CONNECTIONS);
         Self { connections, clients: MAX_CLIENTS.min(connections / 2) }
     }
 
-    /// The limits for this process.
+    /// The limits of this process.
     pub(crate) fn of_process() -> Self {
         Self::of_descriptors(max_descriptors())
     }
@@ -84,13 +84,13 @@ pub(crate) struct Connection {
 
 #[derive(Debug)]
 struct ConnectionState {
-    /// Reads and writes fail from now on.
+    /// Once set, reads and writes fail.
     is_closed: bool,
     reader: Option<Waker>,
     writer: Option<Waker>,
-    /// Since when a write has been blocked because the peer does not read.
+    /// Start of the current write that is blocked because the peer does not read.
     blocked_since: Option<Instant>,
-    /// When the last request was complete; `None` before the first.
+    /// Time at which the last request was complete; `None` before the first.
     requested: Option<Instant>,
     opened: Instant,
     /// Set once the connection is accepted as a WebSocket client.
@@ -100,24 +100,24 @@ struct ConnectionState {
 #[derive(Debug)]
 struct Client {
     admitted: Instant,
-    /// When it sent its last message. Pongs do not count, because libraries send them on their own.
+    /// Time of the last message. Pongs do not count, because libraries send them automatically.
     last_message: Option<Instant>,
-    /// When the ping was sent that it has not answered yet.
+    /// Time of the ping that has not been answered yet.
     pinged: Option<Instant>,
-    /// Whether it has ever answered a ping, which shows that it reads.
+    /// Whether the client has ever answered a ping, which shows that it reads.
     has_answered: bool,
 }
 
-/// How dispensable a client is: unresponsive before never used before idle, then by time.
+/// Eviction order of clients: unresponsive first, then never used, then idle; within a group by time.
 type Dispensability = (u8, Duration);
 
 impl Admission {
-    /// No connections yet.
+    /// Creates an admission without connections.
     pub(crate) fn new(limits: Limits) -> Arc<Self> {
         Arc::new(Self { limits, registry: Mutex::default() })
     }
 
-    /// Adds an accepted connection; returns whether another one was closed for it.
+    /// Adds an accepted connection. Returns whether another one was closed to make room.
     pub(crate) fn admit(self: &Arc<Self>, stream: TcpStream) -> (GuardedStream, bool) {
         let has_evicted = self.registry().connections.len() >= self.limits.connections && self.evict();
         let mut registry = self.registry();
@@ -128,7 +128,7 @@ impl Admission {
         (GuardedStream { stream, connection, admission: Arc::clone(self) }, has_evicted)
     }
 
-    /// Closes the connection that has been unused for longest and has no client; half-open requests come first.
+    /// Closes the connection without a client that has been idle longest. Half-open requests come first.
     pub(crate) fn evict(&self) -> bool {
         let registry = self.registry();
         let candidates = registry.connections.values().filter_map(|connection| {
@@ -137,12 +137,12 @@ impl Admission {
             is_candidate.then_some((state.requested.is_some(), state.requested.unwrap_or(state.opened), connection))
         });
         let oldest = candidates.min_by_key(|(has_requested, since, _)| (*has_requested, *since));
-        oldest.inspect(|(.., connection)| connection.close("a new connection replaces it")).is_some()
+        oldest.inspect(|(.., connection)| connection.close("replaced by a new connection")).is_some()
     }
 
     /// Registers a WebSocket client on its connection. At the limit, it replaces the most dispensable client.
     pub(crate) fn admit_client(&self, connection: &Connection) -> bool {
-        // Held until the client is registered, so that two clients never count the same free place.
+        // Held until the client is registered, so that two clients cannot take the same free slot.
         let registry = self.registry();
         let now = Instant::now();
         let admitted = registry.connections.values().filter(|other| other.is_admitted());
@@ -157,7 +157,7 @@ impl Admission {
         }
         if n_admitted >= self.limits.clients {
             let Some((_, other)) = most_dispensable else { return false };
-            other.close("a new client replaces it");
+            other.close("replaced by a new client");
         }
         connection.state().client =
             Some(Client { admitted: now, last_message: None, pinged: None, has_answered: false });
@@ -180,7 +180,8 @@ impl Admission {
         self.registry().connections.len()
     }
 
-    /// The registry holds plain values that are valid after every statement, so it stays usable after a panic elsewhere.
+    /// Locks the registry. It holds plain values that are valid after every statement, so it stays usable after a
+    /// panic elsewhere.
     fn registry(&self) -> MutexGuard<'_, Registry> {
         self.registry.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -200,19 +201,19 @@ impl Connection {
         Self { number, state: Mutex::new(state) }
     }
 
-    /// A complete request has arrived.
+    /// Records that a complete request has arrived.
     pub(crate) fn requested(&self) {
         self.state().requested = Some(Instant::now());
     }
 
-    /// The client has sent a message.
+    /// Records that the client has sent a message.
     pub(crate) fn last_message(&self) {
         if let Some(client) = &mut self.state().client {
             client.last_message = Some(Instant::now());
         }
     }
 
-    /// Whether a ping is due: at most one is unanswered at a time.
+    /// Returns whether a ping is due. At most one ping is unanswered at a time.
     pub(crate) fn start_ping(&self) -> bool {
         match &mut self.state().client {
             Some(client) if client.pinged.is_none() => {
@@ -223,7 +224,7 @@ impl Connection {
         }
     }
 
-    /// The client has answered a ping, so it reads.
+    /// Records that the client has answered a ping, which shows that it reads.
     pub(crate) fn record_pong(&self) {
         if let Some(client) = &mut self.state().client {
             client.pinged = None;
@@ -236,7 +237,7 @@ impl Connection {
         state.client.is_some() && !state.is_closed
     }
 
-    /// `None` for a client that is in use.
+    /// Returns `None` for a client in use.
     fn dispensability(&self, now: Instant) -> Option<Dispensability> {
         let state = self.state();
         let client = state.client.as_ref()?;
@@ -251,7 +252,7 @@ impl Connection {
         }
     }
 
-    /// The reason to close the connection now, if there is one.
+    /// Returns the reason to close the connection now, if any.
     fn timeout_reason(&self, now: Instant) -> Option<&'static str> {
         let state = self.state();
         let is_timed_out = |since: Option<Instant>, timeout| since.is_some_and(|since| now - since > timeout);
@@ -267,13 +268,13 @@ impl Connection {
         }
     }
 
-    /// Makes all reads and writes fail, so that the task that serves the connection drops it.
+    /// Makes all reads and writes fail, so that the task serving the connection drops it.
     fn close(&self, reason: &str) {
         let mut state = self.state();
         if state.is_closed {
             return;
         }
-        log::debug!("connection {} is closed: {reason}", self.number);
+        log::debug!("closed connection {}: {reason}", self.number);
         state.is_closed = true;
         let wakers = [state.reader.take(), state.writer.take()];
         drop(state);
@@ -286,7 +287,7 @@ impl Connection {
     }
 }
 
-/// A TCP stream that [`Admission`] can close; dropping it removes it from the [`Admission`].
+/// A TCP stream that [`Admission`] can close. Dropping it removes it from the [`Admission`].
 #[derive(Debug)]
 pub(crate) struct GuardedStream {
     stream: TcpStream,
@@ -388,7 +389,7 @@ mod tests {
 
     const LIMITS: Limits = Limits { connections: 4, clients: 2 };
 
-    /// An admission, and a port at which both ends of connections are made.
+    /// An admission and a listening port that creates both ends of connections.
     struct Port {
         admission: Arc<Admission>,
         listener: std::net::TcpListener,
@@ -418,7 +419,7 @@ mod tests {
         runtime.expect("a runtime").block_on(test);
     }
 
-    /// Does what a page does as soon as it is connected.
+    /// Sends what a page sends as soon as it is connected.
     fn act_like_page(stream: &GuardedStream) {
         stream.connection().last_message();
         assert!(stream.connection().start_ping());

@@ -1,4 +1,4 @@
-//! Encodes new data once for all clients, outside their sessions.
+//! Encodes new data once for all clients, outside of their sessions.
 
 use crate::Hub;
 use crate::clock::ServerClock;
@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 
-/// How often the hub is checked for new data.
+/// Period of checking the hub for new data.
 const CHECK_PERIOD: Duration = Duration::from_millis(20);
-/// A status is sent at most this often, and so is the image of each camera.
+/// Minimum period between status messages, and between images of one camera.
 const UPDATE_PERIOD: Duration = Duration::from_millis(190);
-/// The list of keyframes is sent at most this often, because it is long and always sent in full.
+/// Minimum period between keyframe lists, which are long and always sent in full.
 const KEYFRAMES_PERIOD: Duration = Duration::from_secs(1);
 
 /// The latest encoded message of each kind.
@@ -45,7 +45,8 @@ pub(crate) struct Received {
 }
 
 impl LatestMessages {
-    /// The next message that a client has not received: short messages first, and live images and keyframes only if `long`.
+    /// The next message that a client has not received: short messages first, live images and keyframes only if
+    /// `long` is set.
     pub(crate) fn next(&self, received: &mut Received, long: bool) -> Option<Message> {
         let newer = |item: &Option<Item>, number: &mut u64| {
             let item = item.as_ref().filter(|item| item.number > *number)?;
@@ -85,11 +86,11 @@ struct ImageEncoding {
     is_running: bool,
 }
 
-/// Encodes new data while there are clients; runs until the server stops.
+/// Encodes new data while clients are connected. Runs until the server stops.
 pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: watch::Sender<LatestMessages>) {
     let (mut scene, mut status, mut keyframes, live_images) =
         (hub.scene(), hub.status(), hub.keyframes(), hub.live_images());
-    // A client may connect before the first check, and it has not seen what was set earlier.
+    // A client may connect before the first check, and it has not received what was set earlier.
     scene.mark_changed();
     status.mark_changed();
     keyframes.mark_changed();
@@ -123,7 +124,7 @@ pub(crate) async fn broadcast(hub: Hub, clock: ServerClock, latest_messages: wat
                 }
                 Err(error) => {
                     log::error!("cannot encode a message for clients: {error}");
-                    // Which one is unknown: everything may be encoded again when it changes.
+                    // The failed message is unknown: everything may be encoded again when it changes.
                     is_encoding_keyframes = false;
                     image_encodings.values_mut().for_each(|image_encodings| image_encodings.is_running = false);
                 }
@@ -201,7 +202,8 @@ fn text(message: &ServerMessage<'_>) -> Message {
     Message::text(message.to_json())
 }
 
-/// The value, if it changed since the last call. An error would mean that the hub is gone, but the hub outlives the server.
+/// Returns the value if it changed since the last call. An error would mean that the hub was dropped, but the hub
+/// outlives the server.
 fn take_if_changed<T: Clone>(receiver: &mut watch::Receiver<T>) -> Option<T> {
     receiver.has_changed().unwrap_or(false).then(|| receiver.borrow_and_update().clone())
 }
@@ -255,7 +257,7 @@ mod tests {
         assert_eq!(next(&latest_messages, &mut received, false), None, "only long messages are left");
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("3"));
         latest_messages.live_images.insert("left".into(), item(6));
-        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera's turn");
+        assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("5"), "the other camera comes next");
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("6"));
         assert_eq!(next(&latest_messages, &mut received, true).as_deref(), Some("2"));
         assert_eq!(next(&latest_messages, &mut received, true), None);

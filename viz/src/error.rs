@@ -1,4 +1,4 @@
-//! What can go wrong when the server starts.
+//! Errors of starting the server.
 
 use std::net::SocketAddr;
 
@@ -6,35 +6,35 @@ use std::net::SocketAddr;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Another program holds the port.
+    /// Another program uses the port.
     #[error(
         "the address {address} is in use by another program: stop that program or choose another port with --listen"
     )]
     AddressInUse {
-        /// What was asked for.
+        /// Requested address.
         address: SocketAddr,
     },
-    /// The address could be reached from other machines, and there is no encryption yet.
+    /// The address is reachable from other machines, and the server does not support encryption yet.
     #[error(
-        "the address {address} can be reached from other machines, which needs TLS that does not exist yet: \
+        "the address {address} can be reached from other machines, but the server does not support TLS yet: \
          listen on a loopback address such as 127.0.0.1:7007"
     )]
     NotLoopback {
-        /// What was asked for.
+        /// Requested address.
         address: SocketAddr,
     },
-    /// The system refuses the address.
+    /// The operating system rejected the address.
     #[error("cannot listen on {address}")]
     Listen {
-        /// What was asked for.
+        /// Requested address.
         address: SocketAddr,
-        /// The system's word.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The system gives no thread or no event loop.
+    /// The operating system could not create a thread or an event loop.
     #[error("cannot start the server thread")]
     Thread {
-        /// The system's word.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }

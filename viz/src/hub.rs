@@ -1,4 +1,4 @@
-//! The meeting place of the training thread and the server; no call of the training thread waits for a client.
+//! Shared state of the training thread and the server. The training thread never waits for a client.
 
 use crate::pose::row_major;
 use crate::protocol::{PictureHeader, ProjectionMessage};
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 use trainer::{Picture, Projection, RenderRequest};
 
-/// Handle shared by the training thread and a [`Server`](crate::Server); clones lead to the same hub.
+/// Handle shared by the training thread and a [`Server`](crate::Server). Clones refer to the same hub.
 #[derive(Clone, Debug, Default)]
 pub struct Hub {
     shared: Arc<Shared>,
@@ -31,22 +31,22 @@ struct Shared {
 }
 
 impl Hub {
-    /// An empty hub.
+    /// Creates an empty hub.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Tells the clients where the run stands.
+    /// Sets the run status that clients receive.
     pub fn set_status(&self, status: Status) {
         self.shared.status.send_replace(Some(Arc::new(status.thinned())));
     }
 
-    /// Replaces the state in the latest status and keeps its numbers, for example the scores while the model is saved.
+    /// Replaces the state in the latest status and keeps its numbers, for example while the model is saved.
     pub fn set_state(&self, state: &str) {
         self.change_status(|status| state.clone_into(&mut status.state));
     }
 
-    /// Reports the result of the run. Clients keep showing it after the server has stopped.
+    /// Sets the result of the run. Clients continue to show it after the server has stopped.
     pub fn set_run_result(&self, ended: RunResult) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);
@@ -62,31 +62,32 @@ impl Hub {
         });
     }
 
-    /// Shows what a camera sees. It is encoded later and elsewhere, and only if somebody looks.
+    /// Sets the latest image of a camera. It is encoded later, on another thread, and only while clients are
+    /// connected.
     pub fn set_live_image(&self, image: LiveImage) {
         self.shared.live_images.send_modify(|images| {
             images.insert(Arc::clone(&image.camera), Arc::new(image));
         });
     }
 
-    /// Says where an operator's view starts.
+    /// Sets the scene extent and the initial view.
     pub fn set_scene_hint(&self, hint: SceneHint) {
         self.shared.scene.send_replace(Some(Arc::new(hint)));
     }
 
-    /// Replaces the frustums that are drawn; call it when the keyframes have changed.
+    /// Replaces the keyframe frustums. Call this when the keyframes have changed.
     pub fn set_keyframes(&self, keyframes: Vec<KeyframePose>) {
         self.shared.keyframes.send_replace(keyframes.into());
     }
 
-    /// How many clients are connected.
+    /// Number of connected clients.
     pub fn n_clients(&self) -> usize {
         self.queue().n_clients()
     }
 
-    /// The next picture to draw, if a client waits for one.
+    /// The next picture to render, if a client waits for one.
     ///
-    /// One call gives one stage of one client; clients are served in turn.
+    /// Each call returns one stage of one client; clients are served in turn.
     pub fn next_request(&self) -> Option<PendingRender> {
         let job = self.queue().take()?;
         Some(PendingRender {
@@ -98,9 +99,9 @@ impl Hub {
         })
     }
 
-    /// Waits until a client asks for a picture, at most `timeout`; says whether one did.
+    /// Waits up to `timeout` until a client requests a picture. Returns whether one did.
     ///
-    /// For a caller that has nothing to train.
+    /// For callers with nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
         let waited = self.shared.work_arrived.wait_timeout_while(self.queue(), timeout, |queue| !queue.has_work());
         waited.unwrap_or_else(PoisonError::into_inner).0.has_work()
@@ -144,16 +145,17 @@ impl Hub {
         self.shared.live_images.subscribe()
     }
 
-    /// The queue holds plain values that are valid after every statement, so a panic elsewhere spoils nothing.
+    /// Locks the queue. It holds plain values that are valid after every statement, so it stays usable after a panic
+    /// elsewhere.
     fn queue(&self) -> MutexGuard<'_, Queue> {
         self.shared.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// One picture that a client waits for; dropped without an answer, the client gets nothing for this stage.
+/// A picture that a client waits for. If dropped without an answer, the client receives nothing for this stage.
 #[derive(Debug)]
 pub struct PendingRender {
-    /// What to draw, at the size of this stage.
+    /// What to render, at the size of this stage.
     pub request: RenderRequest,
     started: Instant,
     hub: Hub,
@@ -162,12 +164,12 @@ pub struct PendingRender {
 }
 
 impl PendingRender {
-    /// Which of several models to draw; the first if `None`. It is the client's word: there may be no such model.
+    /// Requested model; the first if `None`. The name comes from the client and may not exist.
     pub fn method(&self) -> Option<&str> {
         self.job.view_request.method.as_deref()
     }
 
-    /// Sends the drawn picture to the client; encoding happens on the server's side.
+    /// Sends the rendered picture to the client. Encoding happens on the server's threads.
     pub fn deliver(mut self, picture: Picture) {
         let header = self.header(&picture);
         if header.last {
@@ -176,13 +178,13 @@ impl PendingRender {
         self.enqueue_answer(Outgoing::Picture(Box::new((self.job.clone(), header, picture))));
     }
 
-    /// Tells the client in one sentence why this picture could not be drawn.
+    /// Sends the client a one-sentence reason why this picture could not be rendered.
     pub fn fail(mut self, reason: &str) {
         self.enqueue_answer(Outgoing::Failed { id: self.job.view_request.id, reason: reason.to_owned() });
     }
 
     fn enqueue_answer(&mut self, outgoing: Outgoing) {
-        self.is_released = true; // The session settles it once it is sent.
+        self.is_released = true; // The session releases it after sending.
         self.hub.queue().push_outgoing(self.job.client, outgoing);
     }
 

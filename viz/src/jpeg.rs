@@ -3,9 +3,9 @@
 use jpeg_encoder::{ChromaSubsamplingMethod, ColorType, Encoder, SamplingFactor};
 use std::num::NonZero;
 
-/// An image of fewer pixels than this per thread gains nothing from another thread.
+/// Minimum pixels per thread; for smaller images another thread does not help.
 const MIN_STRIP_PX: usize = 96 * 1024;
-/// More threads than this gain little for an image the size of a screen.
+/// Maximum number of threads; more gain little for screen-sized images.
 const MAX_THREADS: usize = 8;
 
 /// Resolution of color relative to brightness.
@@ -13,7 +13,7 @@ const MAX_THREADS: usize = 8;
 pub(crate) enum Chroma {
     /// 4:4:4.
     Full,
-    /// 4:2:0, about twice as fast and half as large; colored edges lose sharpness.
+    /// 4:2:0, about twice as fast and half as large, but colored edges lose sharpness.
     Halved,
 }
 
@@ -37,7 +37,7 @@ pub(crate) struct Pixels<'a> {
     pub(crate) bytes: &'a [u8],
 }
 
-/// Why an image cannot be encoded.
+/// Reason why an image cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum JpegError {
     #[error("a {width} x {height} image needs {needed} values but has {got}")]
@@ -49,7 +49,7 @@ pub(crate) enum JpegError {
 }
 
 impl Layout {
-    /// Bytes of a pixel.
+    /// Bytes per pixel.
     pub(crate) fn n_channels(self) -> usize {
         match self {
             Self::Rgb => 3,
@@ -81,9 +81,9 @@ pub(crate) fn encode(pixels: &Pixels<'_>, quality: u8, chroma: Chroma) -> Result
 
 /// Encodes about `n_strips` strips in parallel.
 ///
-/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte and predicts nothing
-/// from the strip before, exactly as at a restart marker. Joined by these markers, the scans therefore form the scan of
-/// the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
+/// A strip is a separate image with complete rows of blocks. Its scan starts and ends at a byte boundary and does not
+/// depend on the previous strip, exactly as at a restart marker. Joined by these markers, the scans therefore form
+/// the scan of the whole image with a restart interval of one strip (ITU-T T.81, sections B.2.4.4 and F.1.1.5).
 fn encode_in_strips(pixels: &Pixels<'_>, quality: u8, chroma: Chroma, n_strips: usize) -> Result<Vec<u8>, JpegError> {
     pixels.check()?;
     let [width, height] = pixels.size_px;
@@ -195,7 +195,7 @@ fn parts_of(file: &[u8]) -> Parts {
     }
 }
 
-/// Averages squares of `factor` x `factor` pixels; columns and rows that do not fill a square are left out.
+/// Averages squares of `factor` x `factor` pixels. Columns and rows that do not fill a square are dropped.
 pub(crate) fn shrink(pixels: &Pixels<'_>, factor: u32) -> Result<([u32; 2], Vec<u8>), JpegError> {
     pixels.check()?;
     let n_channels = pixels.layout.n_channels();

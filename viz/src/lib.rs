@@ -1,7 +1,7 @@
-//! The operator's window: a render server and its web page.
+//! The web viewer: a render server and its web page.
 //!
-//! The training thread talks to a [`Hub`], which never makes it wait; a [`Server`] passes what lies in the
-//! hub to browsers over one port; `docs/reference/protocol.md` describes the messages.
+//! The training thread publishes to a [`Hub`], which never blocks it. A [`Server`] sends the hub's data to browsers
+//! over one port. `docs/reference/protocol.md` describes the messages.
 
 mod admission;
 mod broadcast;

@@ -1,4 +1,4 @@
-//! The web page inside the binary.
+//! The web page embedded in the binary.
 
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -12,7 +12,7 @@ pub(crate) struct PageFile {
     gzip: &'static [u8],
 }
 
-/// A file that `build.rs` has compressed.
+/// A file compressed by `build.rs`.
 macro_rules! page_file {
     ($path:literal, $content_type:literal, $folder:literal, $name:literal) => {
         PageFile {
@@ -24,7 +24,7 @@ macro_rules! page_file {
     };
 }
 
-/// The page that `scripts/build-web.sh` bundled.
+/// The page bundled by `scripts/build-web.sh`.
 #[cfg(web_bundle)]
 pub(crate) const FILES: &[PageFile] = &[
     page_file!("/", "text/html; charset=utf-8", "../web/dist/", "index.html"),
@@ -32,7 +32,7 @@ pub(crate) const FILES: &[PageFile] = &[
     page_file!("/app.css", "text/css; charset=utf-8", "../web/dist/", "app.css"),
 ];
 
-/// The page of a binary that was built without Node.js.
+/// The page of binaries built without Node.js.
 #[cfg(not(web_bundle))]
 pub(crate) const FILES: &[PageFile] = &[
     page_file!("/", "text/html; charset=utf-8", "", "without_bundle.html"),
@@ -40,7 +40,8 @@ pub(crate) const FILES: &[PageFile] = &[
 ];
 
 impl PageFile {
-    /// The response to a GET request: the file, compressed if the client accepts that, or 304 if the client has this version.
+    /// The response to a GET request: the file, compressed if the client accepts it, or 304 if the client has this
+    /// version.
     pub(crate) fn response(&self, request: &HeaderMap) -> Response {
         let etag = self.etag();
         let shared: [(HeaderName, &str); 3] =
@@ -56,7 +57,8 @@ impl PageFile {
         }
     }
 
-    /// Checksum and size of the file, which are the last bytes of its gzip form. Weak: both encodings share it.
+    /// Checksum and size of the file, taken from the last bytes of its gzip form. The tag is weak because both
+    /// encodings share it.
     fn etag(&self) -> String {
         let trailer = &self.gzip[self.gzip.len() - 8..];
         let hex: String = trailer.iter().map(|byte| format!("{byte:02x}")).collect();

@@ -9,16 +9,16 @@ use trainer::Picture;
 
 /// JPEG quality of the last stage: no visible blocks on textures.
 const QUALITY_LAST: u8 = 92;
-/// JPEG quality of everything that is replaced soon.
+/// JPEG quality of intermediate stages and live images, which are soon replaced.
 const QUALITY_INTERMEDIATE: u8 = 80;
-/// Smaller pictures keep full color resolution: halving it saves little, and they are shown enlarged.
+/// Smaller pictures keep full color resolution: halving it saves little, and the page enlarges them.
 const MIN_HALVED_PX: usize = 256 * 256;
-/// Maximum width of live images as sent; the page shows them smaller still.
+/// Maximum width of live images as sent; the page displays them even smaller.
 const MAX_LIVE_WIDTH_PX: u32 = 640;
-/// Depth of fewer pixels than this per thread gains nothing from another thread.
+/// Minimum depth pixels per thread; for smaller maps another thread does not help.
 const MIN_DEPTH_PX: usize = 128 * 1024;
 
-/// Why a picture cannot be sent.
+/// Reason why a picture cannot be sent.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PackError {
     #[error("a {width} x {height} depth map needs {needed} values but has {got}")]
@@ -31,14 +31,14 @@ pub(crate) enum PackError {
     SizeMismatch { got: [u32; 2], expected: [u32; 2] },
 }
 
-/// The binary message of one drawn stage.
+/// The binary message of one rendered stage.
 pub(crate) fn pack_picture(
     view_request: &ViewRequest,
     mut header: PictureHeader,
     picture: &Picture,
 ) -> Result<Vec<u8>, PackError> {
     let (color, depth) = std::thread::scope(|scope| {
-        // Color and depth in parallel: color takes most of the time and keeps this thread.
+        // Color and depth in parallel: color takes most of the time and runs on this thread.
         let depth = view_request.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
         let color = view_request.color.then(|| pack_color(picture, header.last));
         (color, depth.map(|task| task.join().expect("packing depth does not panic")))
@@ -68,7 +68,7 @@ fn pack_color(picture: &Picture, is_last: bool) -> Result<Vec<u8>, JpegError> {
     encode(&pixels, quality, if is_last || is_small { Chroma::Full } else { Chroma::Halved })
 }
 
-/// The binary message of a live image, shrunk to the size that the page shows.
+/// The binary message of a live image, shrunk to the maximum width.
 pub(crate) fn pack_live_image(image: &LiveImage, clock: ServerClock) -> Result<Vec<u8>, PackError> {
     // A very flat image keeps one row.
     let factor = image.size_px[0].div_ceil(MAX_LIVE_WIDTH_PX).min(image.size_px[1]).max(1);
@@ -99,7 +99,7 @@ fn live_message(image: &LiveImage, size_px: [u32; 2], factor: u32, jpeg: &[u8], 
     frame(&BinaryHeader::LiveImage(&LiveHeader::new(image, size_px, factor, clock)), &[jpeg])
 }
 
-/// Depth as it goes on the wire.
+/// Depth as encoded on the wire.
 struct PackedDepth {
     size_px: [u32; 2],
     meters_per_count: f64,
@@ -127,9 +127,10 @@ fn f32_depth(picture: &Picture) -> PackedDepth {
     PackedDepth { size_px: picture.size_px, meters_per_count: 1.0, bytes }
 }
 
-/// Halves the size, keeping the nearest of each 2x2 pixels so that thin things in front stay; 0 is nothing.
+/// Halves the size, keeping the nearest of each 2x2 pixels so that thin objects in front stay visible; 0 means no
+/// depth.
 ///
-/// The largest depth becomes the largest count, so the step is as fine as 16 bits allow.
+/// The largest depth maps to the largest count, for the finest step that 16 bits allow.
 fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     let width = picture.size_px[0] as usize;
     let size_px = picture.size_px.map(|n| n.div_ceil(2));
@@ -158,9 +159,9 @@ fn half_depth(picture: &Picture, n_threads: usize) -> PackedDepth {
     PackedDepth { size_px, meters_per_count, bytes }
 }
 
-/// Depth of a pixel, or infinity if nothing was seen there.
+/// Depth of a pixel, or infinity if it has none.
 fn depth_or_infinity(depth_m: f32) -> f32 {
-    // False for a NaN.
+    // The comparison is false for NaN.
     if depth_m > 0.0 { depth_m } else { f32::INFINITY }
 }
 
@@ -271,7 +272,7 @@ mod tests {
         }
     }
 
-    /// Prints how long packing takes: `cargo test --release -p viz -- --ignored --nocapture packing`.
+    /// Prints the packing time: `cargo test --release -p viz -- --ignored --nocapture packing`.
     #[test]
     #[ignore = "measures"]
     #[expect(clippy::print_stdout, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a measurement")]

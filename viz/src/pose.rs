@@ -3,10 +3,10 @@
 use kinematics::Transform;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-/// How far a rotation matrix may be from orthonormal: a browser's f32 products stay below 1e-5.
+/// Maximum deviation of a rotation matrix from orthonormal. A browser's f32 products stay below 1e-5.
 const MAX_SKEW: f64 = 1e-3;
 
-/// The 4x4 matrix of a pose, row major.
+/// The row-major 4x4 matrix of a pose.
 pub(crate) fn row_major(pose: &Transform) -> [f64; 16] {
     let rows = pose.to_homogeneous().transpose();
     let mut numbers = [0.0; 16];
@@ -14,11 +14,11 @@ pub(crate) fn row_major(pose: &Transform) -> [f64; 16] {
     numbers
 }
 
-/// The pose of a row-major 4x4 matrix; `None` if that is not a rigid motion.
+/// The pose of a row-major 4x4 matrix; `None` if the matrix is not a rigid transform.
 pub(crate) fn from_row_major(rows: &[f64; 16]) -> Option<Transform> {
     let rotation = Matrix3::new(rows[0], rows[1], rows[2], rows[4], rows[5], rows[6], rows[8], rows[9], rows[10]);
     let skew = (rotation.transpose() * rotation - Matrix3::identity()).amax();
-    // Written so that a NaN is refused.
+    // Written so that NaN is rejected.
     let is_rigid = rows.iter().all(|number| number.is_finite())
         && skew <= MAX_SKEW
         && rotation.determinant() > 0.0

@@ -1,27 +1,27 @@
-//! The messages of `docs/reference/protocol.md` as they are written on the wire.
+//! The messages of `docs/reference/protocol.md` as serialized on the wire.
 
 use crate::clock::ServerClock;
 use crate::pose::row_major;
 use crate::updates::{KeyframePose, LiveImage, SceneHint, Status};
 use serde::{Deserialize, Serialize};
 
-/// Version of the messages; a client that says another one is sent away.
+/// Protocol version. Clients with another version are disconnected.
 pub const PROTOCOL_VERSION: u32 = 3;
 
-/// Longest text message a client may send, bytes.
+/// Maximum length of a client's text message, bytes.
 pub(crate) const MAX_MESSAGE_BYTES: usize = 64 * 1024;
 
-/// What a client may say.
+/// Messages from clients.
 #[derive(Debug, Deserialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum ClientMessage {
-    /// The version the client was written for.
+    /// Protocol version of the client.
     Hello(ClientHello),
-    /// Draw this; replaces what this client asked before.
+    /// Requests a picture and replaces the client's previous request.
     Render(Box<RenderMessage>),
-    /// Asks for the server's time.
+    /// Requests the server's time.
     Ping(ClientPing),
-    /// The client leaves.
+    /// The client disconnects.
     Goodbye(ClientGoodbye),
 }
 
@@ -50,33 +50,33 @@ pub(crate) struct ClientGoodbye {}
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct RenderMessage {
-    /// The client's own number, repeated in the pictures.
+    /// Number chosen by the client and repeated in the pictures.
     pub(crate) id: u64,
-    /// Which of several models; the first if absent.
+    /// Requested model; the first if absent.
     pub(crate) method: Option<String>,
     /// Row major.
     pub(crate) world_from_camera: [f64; 16],
-    /// Full size.
+    /// Full size, at scale 1.
     pub(crate) size_px: [u32; 2],
-    /// How directions map to pixels.
+    /// Projection from directions to pixels.
     pub(crate) projection: ProjectionMessage,
     /// Linear scales of the full size.
     pub(crate) stages: Option<Vec<f64>>,
-    /// Along z.
+    /// Near limit along z.
     pub(crate) near_m: Option<f64>,
-    /// Along z.
+    /// Far limit along z.
     pub(crate) far_m: Option<f64>,
-    /// Only what lies inside is drawn.
+    /// Only the scene inside this box is rendered.
     pub(crate) crop: Option<CropMessage>,
-    /// Wanted outputs.
+    /// Requested outputs.
     pub(crate) outputs: Option<Vec<Output>>,
     /// Only with the output `depth`.
     pub(crate) depth_format: Option<DepthFormat>,
-    /// Behind everything, 0 to 1.
+    /// Background color, 0 to 1.
     pub(crate) background_srgb: Option<[f32; 3]>,
 }
 
-/// How directions map to pixels.
+/// Projection from directions to pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
 pub(crate) enum ProjectionMessage {
@@ -85,14 +85,14 @@ pub(crate) enum ProjectionMessage {
         /// Pixels of the full size.
         #[serde(skip_serializing_if = "Option::is_none")]
         focal_px: Option<[f64; 2]>,
-        /// Pixels of the full size; the middle if absent.
+        /// Pixels of the full size; the center if absent.
         #[serde(skip_serializing_if = "Option::is_none")]
         principal_px: Option<[f64; 2]>,
         /// Angle from the top to the bottom edge, with square pixels.
         #[serde(skip_serializing_if = "Option::is_none")]
         vertical_fov_rad: Option<f64>,
     },
-    /// All directions.
+    /// Covers all directions.
     Equirectangular {},
 }
 
@@ -100,36 +100,36 @@ pub(crate) enum ProjectionMessage {
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct CropMessage {
-    /// Row major; the world's axes if absent.
+    /// Row major; aligned with the world axes if absent.
     pub(crate) world_from_box: Option<[f64; 16]>,
-    /// Smallest corner.
+    /// Minimum corner.
     pub(crate) min_m: [f64; 3],
-    /// Largest corner.
+    /// Maximum corner.
     pub(crate) max_m: [f64; 3],
 }
 
-/// What a picture may hold.
+/// Outputs of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Output {
     /// JPEG.
     Color,
-    /// Metres along z, see [`DepthFormat`].
+    /// Meters along z, see [`DepthFormat`].
     Depth,
 }
 
-/// How depth is packed.
+/// Encoding of depth.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum DepthFormat {
     /// 16-bit counts at half the picture's size; the nearest of each 2x2 pixels.
     #[default]
     U16Half,
-    /// 32-bit floats at the picture's size, as the model gave them.
+    /// 32-bit floats at the picture's size, unchanged from the model.
     F32,
 }
 
-/// What the server says as JSON text.
+/// JSON text messages from the server.
 #[derive(Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum ServerMessage<'a> {
@@ -142,19 +142,19 @@ pub(crate) enum ServerMessage<'a> {
         default_stages: &'a [f64],
         clock_millis: f64,
     },
-    /// Where the run stands.
+    /// Status of the run.
     Status(&'a Status),
-    /// Where the scene is.
+    /// Scene extent and initial view.
     Scene { center_m: [f64; 3], radius_m: f64, world_from_camera: [f64; 16] },
-    /// Poses of all keyframes held.
+    /// Poses of all stored keyframes.
     Keyframes { keyframes: Vec<KeyframeMessage<'a>> },
-    /// What was wrong with a message or a picture.
+    /// Reason why a message was invalid or a picture failed.
     Error { id: Option<u64>, message: &'a str },
-    /// Sent at a fixed rate, so that silence means a broken connection.
+    /// Sent at a fixed rate, so that silence indicates a broken connection.
     Heartbeat { clock_millis: f64 },
     /// Answers a client's `ping`.
     Pong { t: f64, clock_millis: f64 },
-    /// The connection ends.
+    /// Ends the connection.
     Goodbye { reason: &'a str },
 }
 
@@ -194,9 +194,9 @@ impl From<&SceneHint> for ServerMessage<'_> {
 #[derive(Debug, Serialize)]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub(crate) enum BinaryHeader<'a> {
-    /// A drawn picture.
+    /// A rendered picture.
     Picture(&'a PictureHeader),
-    /// What a camera sees.
+    /// The current image of a camera.
     LiveImage(&'a LiveHeader<'a>),
 }
 
@@ -219,7 +219,7 @@ pub(crate) struct PictureHeader {
     pub(crate) depth: Option<DepthPart>,
 }
 
-/// Where the color lies in the payload.
+/// Position of the color in the payload.
 #[derive(Debug, Serialize)]
 pub(crate) struct ColorPart {
     pub(crate) format: &'static str,
@@ -227,7 +227,7 @@ pub(crate) struct ColorPart {
     pub(crate) bytes: usize,
 }
 
-/// Where the depth lies in the payload and how to read it.
+/// Position of the depth in the payload, and its encoding.
 #[derive(Debug, Serialize)]
 pub(crate) struct DepthPart {
     pub(crate) format: DepthFormat,
@@ -251,7 +251,7 @@ pub(crate) struct LiveHeader<'a> {
 }
 
 impl<'a> LiveHeader<'a> {
-    /// The header of an image that is sent at `size_px` after its sides were divided by `factor`.
+    /// The header of an image sent at `size_px`, after dividing its sides by `factor`.
     pub(crate) fn new(image: &'a LiveImage, size_px: [u32; 2], factor: u32, clock: ServerClock) -> Self {
         let scaled_down = |value: f64| value / f64::from(factor);
         Self {

@@ -1,4 +1,4 @@
-//! Who waits for which picture: the newest order of each client, stage by stage, clients in turn.
+//! Render requests by client: the newest request of each client, stage by stage, clients in turn.
 
 use crate::protocol::PictureHeader;
 use crate::view_request::ViewRequest;
@@ -7,13 +7,13 @@ use std::sync::Arc;
 use tokio::sync::Notify;
 use trainer::Picture;
 
-/// Pictures of one client that may be drawn or on their way; a slow client costs no more rendering than this.
+/// Maximum number of a client's pictures being rendered or sent. Limits the rendering for slow clients.
 const MAX_UNSENT: usize = 2;
 
-/// If the full picture is expected to take less time than this, coarser stages would only delay it.
+/// If the full picture is expected to take less time than this, coarser stages are skipped.
 const FAST_MILLIS: f64 = 20.0;
 
-/// All connected clients and what they wait for.
+/// All connected clients and their requests.
 #[derive(Debug, Default)]
 pub(crate) struct Queue {
     clients: BTreeMap<u64, ClientQueue>,
@@ -21,7 +21,7 @@ pub(crate) struct Queue {
     last_served: u64,
 }
 
-/// What one client waits for.
+/// Pending work of one client.
 #[derive(Debug, Default)]
 struct ClientQueue {
     view_request: Option<Arc<ViewRequest>>,
@@ -32,7 +32,7 @@ struct ClientQueue {
     last_full: Option<FullPicture>,
 }
 
-/// How long the last stage of a client's last request took.
+/// Render time of the last stage of a client's last request.
 #[derive(Debug)]
 struct FullPicture {
     method: Option<String>,
@@ -40,28 +40,28 @@ struct FullPicture {
     millis: f64,
 }
 
-/// One stage that the training side shall draw.
+/// One stage to render.
 #[derive(Clone, Debug)]
 pub(crate) struct RenderJob {
-    /// Who asked.
+    /// Requesting client.
     pub(crate) client: u64,
-    /// What was asked.
+    /// The request.
     pub(crate) view_request: Arc<ViewRequest>,
-    /// Which of the order's stages.
+    /// Index of the stage.
     pub(crate) stage: usize,
 }
 
-/// What goes out to a client.
+/// A result to send to a client.
 #[derive(Debug)]
 pub(crate) enum Outgoing {
-    /// A drawn stage, not yet encoded; the header still lacks the payload's parts.
+    /// A rendered stage, not encoded yet. The header lacks the payload's parts.
     Picture(Box<(RenderJob, PictureHeader, Picture)>),
-    /// A stage that could not be drawn.
+    /// A stage that could not be rendered.
     Failed { id: u64, reason: String },
 }
 
 impl Queue {
-    /// Adds a client; the returned handle is notified when something lies in its outbox.
+    /// Adds a client. The returned handle is notified when its outbox has a result.
     pub(crate) fn join(&mut self) -> (u64, Arc<Notify>) {
         self.n_joined += 1;
         let waiting = ClientQueue::default();
@@ -70,17 +70,17 @@ impl Queue {
         (self.n_joined, wake)
     }
 
-    /// Forgets a client and all it waits for.
+    /// Removes a client and its pending work.
     pub(crate) fn leave(&mut self, client: u64) {
         self.clients.remove(&client);
     }
 
-    /// How many clients are connected.
+    /// Number of connected clients.
     pub(crate) fn n_clients(&self) -> usize {
         self.clients.len()
     }
 
-    /// Takes an order in; the stages of the client's older order that nobody has begun are given up.
+    /// Adds a request. Stages of the client's older request that have not been started are dropped.
     ///
     /// Only the last stage is kept if it is expected to be fast.
     pub(crate) fn view_request(&mut self, client: u64, mut view_request: ViewRequest) {
@@ -93,12 +93,12 @@ impl Queue {
         }
     }
 
-    /// Whether [`take`](Self::take) would give something.
+    /// Whether [`take`](Self::take) would return a stage.
     pub(crate) fn has_work(&self) -> bool {
         self.clients.values().any(ClientQueue::is_ready)
     }
 
-    /// The next stage to draw: clients in turn, each client's stages in order.
+    /// The next stage to render: clients in turn, each client's stages in order.
     pub(crate) fn take(&mut self) -> Option<RenderJob> {
         let after = self.clients.range(self.last_served + 1..).find(|(_, waiting)| waiting.is_ready());
         let (&client, _) = after.or_else(|| self.clients.iter().find(|(_, waiting)| waiting.is_ready()))?;
@@ -106,7 +106,7 @@ impl Queue {
         self.clients.get_mut(&client)?.take(client)
     }
 
-    /// Records how long the last stage of an order took to draw.
+    /// Records the render time of the last stage of a request.
     pub(crate) fn record_render_time(&mut self, job: &RenderJob, millis: f64) {
         if let Some(waiting) = self.clients.get_mut(&job.client) {
             let (method, n_px) = (job.view_request.method.clone(), n_px_of_last_stage(&job.view_request));
@@ -114,7 +114,7 @@ impl Queue {
         }
     }
 
-    /// Puts a result into a client's outbox and wakes it.
+    /// Puts a result into a client's outbox and wakes the client's session.
     pub(crate) fn push_outgoing(&mut self, client: u64, outgoing: Outgoing) {
         if let Some(waiting) = self.clients.get_mut(&client) {
             waiting.outbox.push_back(outgoing);
@@ -122,12 +122,12 @@ impl Queue {
         }
     }
 
-    /// The oldest result in a client's outbox.
+    /// Takes the oldest result from a client's outbox.
     pub(crate) fn collect(&mut self, client: u64) -> Option<Outgoing> {
         self.clients.get_mut(&client)?.outbox.pop_front()
     }
 
-    /// One stage of a client is sent, or will never be drawn.
+    /// Records that a stage was sent or will never be rendered.
     pub(crate) fn release(&mut self, client: u64) {
         if let Some(waiting) = self.clients.get_mut(&client) {
             waiting.n_unsent = waiting.n_unsent.saturating_sub(1);
@@ -153,7 +153,8 @@ impl ClientQueue {
 }
 
 impl FullPicture {
-    /// Expected time of the last stage of an order: that of the last picture, scaled up if the order has more pixels.
+    /// Expected render time of the last stage of a request: the time of the previous picture, scaled up if the
+    /// request has more pixels.
     fn expected_millis(&self, view_request: &ViewRequest) -> f64 {
         if self.method != view_request.method {
             return f64::INFINITY;
@@ -182,7 +183,7 @@ mod tests {
         ViewRequest::check(&message).expect("valid")
     }
 
-    /// Takes and settles at once, as with a fast client.
+    /// Takes and releases all stages at once, like a fast client.
     fn drain(queue: &mut Queue) -> Vec<(u64, u64, usize)> {
         std::iter::from_fn(|| {
             let job = queue.take()?;
@@ -208,7 +209,7 @@ mod tests {
         let mut queue = Queue::default();
         let (a, _) = queue.join();
         queue.view_request(a, view_request(1));
-        let first = queue.take().expect("an order waits");
+        let first = queue.take().expect("a request is pending");
         assert_eq!((first.view_request.id, first.stage), (1, 0));
         queue.view_request(a, view_request(2));
         queue.release(a);

@@ -1,4 +1,4 @@
-//! One port for the page, the status and the WebSocket, on its own thread.
+//! Serves the page, the status and the WebSocket on one port, on a separate thread.
 
 use crate::admission::{Admission, Connection, GuardedStream, Limits};
 use crate::broadcast::broadcast;
@@ -24,30 +24,31 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use tokio::sync::watch;
 
-/// How long a stopping server waits for its clients to be told.
+/// Maximum time that a stopping server waits until its clients have received the goodbye.
 const GOODBYE_TIMEOUT: Duration = Duration::from_millis(500);
-/// A connection is closed if the headers of a request, or the next request, take longer than this.
+/// A connection is closed if a request's headers, or the next request, take longer than this.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(3);
-/// Longest request with all its headers, bytes.
+/// Maximum size of a request including its headers, bytes.
 const MAX_REQUEST_BYTES: usize = 32 * 1024;
-/// How often connections are checked for timeouts.
+/// Period of checking connections for timeouts.
 const SWEEP_PERIOD: Duration = Duration::from_millis(250);
 /// Pause after a failed accept.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// Bytes that the kernel may buffer for a client that reads slowly; Linux doubles it. More data would only get old there.
+/// Size of the kernel's send buffer for slow clients, bytes; Linux doubles it. More data would only become stale
+/// there.
 #[cfg(unix)]
 const SEND_BUFFER_BYTES: usize = 64 * 1024;
-/// Connections that may wait to be accepted.
+/// Maximum number of connections waiting to be accepted.
 #[cfg(unix)]
 const BACKLOG: i32 = 1024;
-/// Which sources the page may load, and which sites may embed it.
+/// Sources that the page may load, and sites that may embed it.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; \
      form-action 'none'; frame-ancestors 'none'";
 
-/// Where to listen.
+/// Address to listen on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServerConfig {
-    /// A loopback address; port 0 takes any free one.
+    /// A loopback address; port 0 selects a free port.
     pub listen: SocketAddr,
 }
 
@@ -57,7 +58,7 @@ impl Default for ServerConfig {
     }
 }
 
-/// A running server; dropped, it says goodbye to its clients and frees the port.
+/// A running server. Dropping it sends a goodbye to all clients and frees the port.
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
@@ -66,7 +67,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens, and serves what lies in the hub until dropped.
+    /// Starts listening, and serves the hub's data until dropped.
     pub fn start(config: ServerConfig, hub: Hub) -> Result<Self, Error> {
         let listen_address = config.listen;
         if !listen_address.ip().is_loopback() {
@@ -84,19 +85,19 @@ impl Server {
                 if let Err(error) = runtime.block_on(serve(listener, hub, stopped)) {
                     log::error!("the server on {address} stopped: {error}");
                 }
-                // A picture that is still being encoded is not waited for.
+                // Does not wait for pictures that are still being encoded.
                 runtime.shutdown_background();
             })
             .map_err(|source| Error::Thread { source })?;
         Ok(Self { address, stop, thread: Some(thread) })
     }
 
-    /// Where the server really listens.
+    /// The actual address, with the selected port.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// What to open in a browser.
+    /// The URL to open in a browser.
     pub fn url(&self) -> String {
         format!("http://{}/", self.address)
     }
@@ -144,12 +145,12 @@ async fn serve(listener: TcpListener, hub: Hub, mut stopped: watch::Receiver<boo
         }
     };
     if tokio::time::timeout(GOODBYE_TIMEOUT, all_disconnected).await.is_err() {
-        log::debug!("{} clients did not take leave in time", hub.n_clients());
+        log::debug!("{} clients did not disconnect in time", hub.n_clients());
     }
     Ok(())
 }
 
-/// Sets options that accepted sockets inherit; if that fails, only latency suffers.
+/// Sets options that accepted sockets inherit. A failure affects only latency.
 #[cfg(unix)]
 fn set_socket_options(listener: &TcpListener) {
     let tuned = rustix::net::sockopt::set_socket_send_buffer_size(listener, SEND_BUFFER_BYTES)
@@ -159,14 +160,14 @@ fn set_socket_options(listener: &TcpListener) {
     }
 }
 
-/// Accepts connections and serves each in a task of its own; never returns.
+/// Accepts connections and serves each in a separate task. Never returns.
 async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, app: &TowerToHyperService<Router>) {
     let mut is_failing = false;
     loop {
         match listener.accept().await {
             Ok((stream, _)) => {
                 is_failing = false;
-                // Small messages must not wait until large ones are acknowledged; if this fails, only latency suffers.
+                // Small messages must not wait for the acknowledgment of large ones. A failure affects only latency.
                 if let Err(error) = stream.set_nodelay(true) {
                     log::debug!("cannot disable Nagle's algorithm: {error}");
                 }
@@ -192,7 +193,7 @@ async fn accept(listener: &tokio::net::TcpListener, admission: &Arc<Admission>, 
     }
 }
 
-/// Enforces the time limits of connections; never returns.
+/// Enforces the time limits of connections. Never returns.
 async fn sweep(admission: &Admission) {
     loop {
         tokio::time::sleep(SWEEP_PERIOD).await;
@@ -220,7 +221,7 @@ async fn serve_connection(stream: GuardedStream, app: TowerToHyperService<Router
     }
 }
 
-/// What the handlers share.
+/// State shared by the handlers.
 #[derive(Clone)]
 struct AppState {
     server_context: ServerContext,
@@ -277,7 +278,7 @@ async fn add_security_headers(request: Request, next: Next) -> Response {
     response
 }
 
-/// Only pages of this server may use it: other web sites open in the same browser reach loopback too.
+/// Allows only pages of this server: other web sites in the same browser can also reach loopback addresses.
 async fn reject_foreign_origins(request: Request, next: Next) -> Response {
     if is_same_origin(request.headers()) {
         next.run(request).await

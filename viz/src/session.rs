@@ -1,4 +1,4 @@
-//! One connected client, from hello to goodbye: a reader and a writer that never wait for each other.
+//! The session of one client, from hello to goodbye: a reader and a writer that never wait for each other.
 
 use crate::Hub;
 use crate::admission::Connection;
@@ -19,13 +19,13 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::MissedTickBehavior;
 
-/// Period of heartbeats, short enough that a page notices silence soon.
+/// Period of heartbeats; short enough for pages to detect silence quickly.
 const HEARTBEAT_PERIOD: Duration = Duration::from_millis(250);
-/// Period of WebSocket pings; the next one is sent only if the last one was answered.
+/// Period of WebSocket pings. The next one is sent only if the last one was answered.
 const PING_PERIOD: Duration = Duration::from_secs(1);
-/// Maximum number of answers that wait for a client to read; a client that requests more is disconnected.
+/// Maximum number of unread replies. A client that causes more is disconnected.
 const MAX_REPLIES: usize = 64;
-/// Pictures are sent before live images and keyframe lists, but delay them by at most this long.
+/// Pictures take precedence over live images and keyframe lists, but delay them by at most this time.
 const MAX_UPDATE_DELAY: Duration = Duration::from_millis(500);
 
 /// Shared by all sessions.
@@ -41,7 +41,7 @@ pub(crate) struct ServerContext {
     pub(crate) stopped: watch::Receiver<bool>,
 }
 
-/// Talks with one client until either side leaves.
+/// Serves one client until either side disconnects.
 pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server_context: ServerContext) {
     let (client, wake) = server_context.hub.join();
     let client_guard = ClientGuard { hub: &server_context.hub, client };
@@ -55,10 +55,10 @@ pub(crate) async fn serve(socket: WebSocket, connection: Arc<Connection>, server
         _ = writer.run(&wake, waiting_replies) => {}
     }
     drop(client_guard);
-    log::info!("client {client} left");
+    log::info!("client {client} disconnected");
 }
 
-/// Takes a client out of the hub however its session ends.
+/// Removes a client from the hub however its session ends.
 struct ClientGuard<'a> {
     hub: &'a Hub,
     client: u64,
@@ -106,7 +106,7 @@ impl Reader<'_> {
             let Some(reply) = reply else { continue };
             let is_last = matches!(reply, Reply::Goodbye { .. });
             if self.replies.try_send(reply).is_err() {
-                log::info!("client {} is disconnected: it left {MAX_REPLIES} answers unread", self.client);
+                log::info!("client {} disconnected: it left {MAX_REPLIES} replies unread", self.client);
                 return;
             }
             if is_last {
@@ -124,7 +124,9 @@ impl Reader<'_> {
             }
             Ok(ParsedMessage::SameVersion) => None,
             Ok(ParsedMessage::OtherVersion(client_version)) => Some(Reply::Goodbye {
-                reason: format!("the client speaks protocol {client_version}, this server {PROTOCOL_VERSION}"),
+                reason: format!(
+                    "the client uses protocol version {client_version}, this server version {PROTOCOL_VERSION}"
+                ),
             }),
             Ok(ParsedMessage::Ping { t }) => Some(Reply::Pong { t }),
             Ok(ParsedMessage::Goodbye) => Some(Reply::Goodbye { reason: "the client disconnected".to_owned() }),
@@ -133,7 +135,7 @@ impl Reader<'_> {
     }
 }
 
-/// Whether the session goes on.
+/// Whether the session continues.
 type SessionFlow = ControlFlow<()>;
 
 struct Writer<'a> {
@@ -143,14 +145,14 @@ struct Writer<'a> {
     connection: &'a Connection,
 }
 
-/// A picture that is being encoded.
+/// A picture being encoded.
 struct EncodingTask {
     id: u64,
     task: JoinHandle<Result<Vec<u8>, PackError>>,
 }
 
 impl Writer<'_> {
-    /// Sends until the connection fails or a goodbye is sent; pictures go before other messages.
+    /// Sends until the connection fails or a goodbye is sent. Pictures take precedence over other messages.
     async fn run(mut self, wake: &tokio::sync::Notify, mut replies: mpsc::Receiver<Reply>) -> SessionFlow {
         let mut stopped = self.server_context.stopped.clone();
         let mut latest_messages = self.server_context.latest_messages.clone();
@@ -236,7 +238,7 @@ impl Writer<'_> {
         }
     }
 
-    /// Sends the last status, which holds the result of the run, then a goodbye.
+    /// Sends the last status, which contains the result of the run, then a goodbye.
     async fn send_goodbye_when_stopped(&mut self) -> SessionFlow {
         let latest = self.server_context.hub.status().borrow().clone();
         if let Some(status) = latest {
@@ -282,7 +284,7 @@ fn pack(rendered: Box<(crate::queue::RenderJob, crate::protocol::PictureHeader, 
     EncodingTask { id, task }
 }
 
-/// Waits for the picture that is being encoded; forever if there is none.
+/// Waits for the picture being encoded; forever if there is none.
 async fn finished(encoding: &mut Option<EncodingTask>) -> EncodingResult {
     match encoding {
         Some(encoding) => (&mut encoding.task).await,
@@ -307,7 +309,7 @@ async fn next_update(
     }
 }
 
-/// What a client's text means.
+/// A parsed client message.
 enum ParsedMessage {
     SameVersion,
     OtherVersion(u32),
@@ -326,7 +328,7 @@ fn parse_message(text: &str) -> Result<ParsedMessage, InvalidRequest> {
     })
 }
 
-/// The number of a message that is otherwise wrong, so that its sender knows which one it was.
+/// The id in a message that is otherwise invalid, so that the sender can identify it.
 fn id_of(text: &str) -> Option<u64> {
     #[derive(Deserialize)]
     struct Numbered {

@@ -1,4 +1,4 @@
-//! What the training side tells the operators: plain values, the latest of each counts.
+//! Data that the training side publishes to viewers: plain values, of which only the latest counts.
 
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
@@ -6,26 +6,26 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Points of the accuracy curve that are kept for the page; a longer curve is thinned evenly.
+/// Maximum number of points of the accuracy curve on the page. Longer curves are thinned evenly.
 const MAX_HISTORY: usize = 512;
 
-/// Where a run stands.
+/// Status of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Status {
     /// One or two words for the operator, such as `waiting for images` or `training`.
     pub state: String,
     /// Wall time since the first image, seconds.
     pub seconds: f64,
-    /// Keyframes accepted and held.
+    /// Number of stored keyframes.
     pub keyframes: u64,
-    /// Images refused as keyframes, by reason.
+    /// Number of images rejected as keyframes, by reason.
     pub refused: BTreeMap<String, u64>,
-    /// The model that is drawn for who does not say which.
+    /// The model rendered for clients that do not choose one.
     #[serde(flatten)]
     pub model: ModelStatus,
-    /// The models that learn beside it; empty where there is one.
+    /// The models trained in parallel with it; empty if there is only one.
     pub others: Vec<ModelStatus>,
-    /// Sentences that an operator should read, such as a lost camera.
+    /// Messages that the operator should read, for example that a camera disconnected.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
     pub ended: Option<RunResult>,
@@ -42,27 +42,27 @@ pub struct RunResult {
     pub seconds: f64,
 }
 
-/// Where a model stands.
+/// Status of a model.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ModelStatus {
     /// `splat`, `nerf` or `tsdf`.
     pub method: String,
-    /// Optimiser updates so far.
+    /// Number of optimizer steps so far.
     pub step: u64,
-    /// GPU time of a step, milliseconds, smoothed; `None` before the first.
+    /// GPU time of a step, milliseconds, smoothed; `None` before the first step.
     pub step_millis: Option<f64>,
-    /// Splats, voxel blocks or table entries.
+    /// Number of splats, voxel blocks or table entries.
     pub primitives: u64,
-    /// Bytes of GPU memory the model holds.
+    /// GPU memory used by the model, bytes.
     pub bytes: u64,
-    /// Mean over the test keyframes, decibel; `None` before the first evaluation.
+    /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.
     pub psnr: Option<f64>,
     /// `(seconds, psnr)` of every evaluation so far, in order.
     pub psnr_history: Vec<(f64, f64)>,
 }
 
 impl Status {
-    /// The same status with curves short enough to send several times a second; first and last points stay.
+    /// The same status with curves short enough to send several times per second. Keeps the first and last points.
     pub(crate) fn thinned(mut self) -> Self {
         for model in std::iter::once(&mut self.model).chain(&mut self.others) {
             let n = model.psnr_history.len();
@@ -76,18 +76,18 @@ impl Status {
     }
 }
 
-/// Where the scene is and where an operator's view starts.
+/// Scene extent and initial view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneHint {
-    /// What to look at and turn around, in world, metres.
+    /// Center of the orbit, in world, meters.
     pub center_m: [f64; 3],
-    /// Distance from the center that holds what matters, metres.
+    /// Radius around the center that contains the relevant scene, meters.
     pub radius_m: f64,
-    /// First view.
+    /// Initial view.
     pub world_from_camera: Transform,
 }
 
-/// Pose and lens of an accepted keyframe, to be drawn as a frustum.
+/// Pose and lens of an accepted keyframe, drawn as a frustum.
 #[derive(Clone, Debug, PartialEq)]
 pub struct KeyframePose {
     /// Name of the camera.
@@ -113,22 +113,22 @@ pub enum LivePixels {
     Rgba(Arc<[u8]>),
 }
 
-/// What a camera sees now.
+/// The current image of a camera.
 #[derive(Clone, Debug)]
 pub struct LiveImage {
     /// Name of the camera.
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// The same moment on this process's clock, for the image's age.
+    /// The same moment on this process's clock, from which the image's age is computed.
     ///
-    /// Recordings and simulations stamp with other clocks; for them, pass the time at which the image was read.
+    /// Recordings and simulations stamp with other clocks. For them, pass the time at which the image was read.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
     /// The image.
     pub pixels: LivePixels,
-    /// Pose at the stamp, where known.
+    /// Pose at the stamp, if known.
     pub world_from_camera: Option<Transform>,
     /// Focal length, pixels.
     pub focal_px: [f64; 2],

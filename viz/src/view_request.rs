@@ -1,29 +1,31 @@
-//! A client's checked wish for a picture, and its stages.
+//! A validated render request of a client, and its stages.
 
 use crate::pose::from_row_major;
 use crate::protocol::{CropMessage, DepthFormat, Output, ProjectionMessage, RenderMessage};
 use kinematics::Transform;
 use trainer::{Aabb, Projection, RenderRequest};
 
-/// Largest width and height a client may ask for, pixels.
+/// Maximum width and height that a client may request, pixels.
 pub(crate) const MAX_SIZE_PX: u32 = 4096;
-/// Most stages of one request.
+/// Maximum number of stages of a request.
 const MAX_STAGES: usize = 8;
-/// Shares of the full width and height that are drawn one after the other if the client does not say.
+/// Default stages: fractions of the full width and height, rendered in order.
 pub(crate) const DEFAULT_STAGES: [f64; 3] = [0.1, 0.5, 1.0];
-/// Nearest drawn depth if the client does not say, metres.
+/// Default near limit, meters.
 const DEFAULT_NEAR_M: f64 = 0.01;
-/// Furthest drawn depth if the client does not say, metres.
+/// Default far limit, meters.
 const DEFAULT_FAR_M: f64 = 100.0;
 
-/// What is wrong with a message; shown to the client.
+/// Reason why a message is invalid; sent to the client.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum InvalidRequest {
-    #[error("the message is not understood: {0}")]
+    #[error("cannot parse the message: {0}")]
     Json(#[from] serde_json::Error),
-    #[error("{field} is not a rigid motion: 16 numbers row major, orthonormal rotation, last row 0 0 0 1")]
+    #[error(
+        "{field} is not a rigid transform; expected 16 numbers, row major, with an orthonormal rotation and last row 0 0 0 1"
+    )]
     NotRigid { field: &'static str },
-    #[error("size_px is {got:?}, allowed are 1 to {MAX_SIZE_PX} each")]
+    #[error("size_px is {got:?}, each side must be 1 to {MAX_SIZE_PX}")]
     Size { got: [u32; 2] },
     #[error("stages must be 1 to {MAX_STAGES} scales above 0 and at most 1")]
     Stages,
@@ -41,25 +43,25 @@ pub(crate) enum InvalidRequest {
     Background,
 }
 
-/// A checked render message.
+/// A validated render message.
 #[derive(Clone, Debug)]
 pub(crate) struct ViewRequest {
-    /// The client's own number.
+    /// Number chosen by the client.
     pub(crate) id: u64,
-    /// Which of several models; the first if `None`.
+    /// Requested model; the first if `None`.
     pub(crate) method: Option<String>,
-    /// At full size.
+    /// The request at full size.
     pub(crate) request: RenderRequest,
-    /// Linear scales, in the order they are drawn.
+    /// Linear scales, in rendering order.
     pub(crate) stages: Vec<f64>,
-    /// Whether color is wanted.
+    /// Whether color is requested.
     pub(crate) color: bool,
-    /// Whether and how depth is wanted.
+    /// Whether depth is requested, and its encoding.
     pub(crate) depth: Option<DepthFormat>,
 }
 
 impl ViewRequest {
-    /// Checks what a client sent.
+    /// Validates a client's message.
     pub(crate) fn check(message: &RenderMessage) -> Result<Self, InvalidRequest> {
         let outputs = message.outputs.as_deref().unwrap_or(&[Output::Color]);
         if outputs.is_empty() {

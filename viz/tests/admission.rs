@@ -1,6 +1,6 @@
 //! Unresponsive clients: half-open requests, clients that never read, more clients than the limit.
 
-#[expect(dead_code, reason = "the tests of the protocol use all of it")]
+#[expect(dead_code, reason = "the tests of the protocol use all of them")]
 mod client;
 
 use client::{Client, Received};
@@ -14,9 +14,9 @@ use std::time::{Duration, Instant};
 use trainer::Picture;
 use viz::{Hub, LiveImage, LivePixels, ModelStatus, RunResult, Server, ServerConfig, Status};
 
-/// Far more than loopback needs; a test that waits this long has failed.
+/// Far more than loopback needs. A test that waits this long fails.
 const TIMEOUT: Duration = Duration::from_secs(20);
-/// A new viewer gets the page and is connected within this time, whatever else is connected.
+/// A new viewer receives the page and connects within this time, regardless of other connections.
 const VIEWER_TIMEOUT: Duration = Duration::from_secs(1);
 /// A half-open request is closed after 3 s; on two busy cores it may take longer.
 const HALF_OPEN_SECS: std::ops::Range<f64> = 2.0..8.0;
@@ -45,7 +45,7 @@ fn get(address: SocketAddr, path: &str, headers: &str) -> (String, Vec<u8>) {
     (String::from_utf8_lossy(&answer[..at]).to_lowercase(), answer[at + 4..].to_vec())
 }
 
-/// Sends a WebSocket handshake and never anything else.
+/// Sends a WebSocket handshake and nothing else.
 fn upgrade_only(address: SocketAddr) -> TcpStream {
     let mut stream = connect(address);
     write!(
@@ -60,13 +60,13 @@ fn upgrade_only(address: SocketAddr) -> TcpStream {
 fn wait_until(is_done: impl Fn() -> bool) -> f64 {
     let started = Instant::now();
     while !is_done() {
-        assert!(started.elapsed() < TIMEOUT, "waited in vain");
+        assert!(started.elapsed() < TIMEOUT, "timed out");
         std::thread::sleep(Duration::from_millis(5));
     }
     started.elapsed().as_secs_f64()
 }
 
-/// Time until the other side closes.
+/// Seconds until the other side closes the connection.
 fn secs_until_closed(stream: &mut TcpStream) -> f64 {
     let started = Instant::now();
     let mut rest = Vec::new();
@@ -88,7 +88,7 @@ fn raise_descriptor_limit(n_descriptors: u64) {
     }
 }
 
-/// A client on a thread of its own that stays in use, as a page does.
+/// A client on a separate thread that stays in use, like a page.
 struct Viewer {
     stop: Arc<AtomicBool>,
     thread: std::thread::JoinHandle<bool>,
@@ -112,14 +112,14 @@ impl Viewer {
         Self { stop, thread }
     }
 
-    /// Stops it; returns whether it stayed connected throughout.
+    /// Stops the client. Returns whether it stayed connected throughout.
     fn stop(self) -> bool {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().unwrap_or(false)
     }
 }
 
-/// Opens the page and a client as a browser would; returns the client after its `hello`.
+/// Opens the page and a client like a browser. Returns the client after its `hello`.
 ///
 /// Other tests keep the cores busy, so only the fastest of a few viewers counts.
 fn open_viewer(address: SocketAddr) -> Client {
@@ -163,7 +163,7 @@ fn viewer_connects_despite_idle_sockets() {
     message["stages"] = json!([1.0]);
     other.send_json(&message);
     assert!(hub.wait_for_request(TIMEOUT));
-    let pending = hub.next_request().expect("a request waits");
+    let pending = hub.next_request().expect("a request is pending");
     let picture = Picture { size_px: [64, 48], rgba_srgb: vec![9; 64 * 48 * 4], depth_m: vec![0.0; 64 * 48] };
     pending.deliver(picture);
     assert_eq!(other.binary_of("picture").0["id"], json!(1));
@@ -230,7 +230,7 @@ fn requests_are_read_while_a_picture_waits_for_the_client() {
     message["depth_format"] = json!("f32");
     client.send_json(&message);
     assert!(hub.wait_for_request(TIMEOUT));
-    let pending = hub.next_request().expect("a request waits");
+    let pending = hub.next_request().expect("a request is pending");
     let n_px = (SIZE_PX[0] * SIZE_PX[1]) as usize;
     // Almost 16 MiB, more than the sockets hold.
     pending.deliver(Picture { size_px: SIZE_PX, rgba_srgb: vec![0; 4 * n_px], depth_m: vec![1.0; n_px] });
@@ -272,7 +272,7 @@ fn the_age_of_a_live_image_comes_from_its_capture() {
     hub.set_live_image(LiveImage {
         camera: "wrist".into(),
         stamp: kinematics::Stamp(5),
-        captured_at: Instant::now().checked_sub(AGE).expect("the computer runs for longer"),
+        captured_at: Instant::now().checked_sub(AGE).expect("the computer has been up for longer"),
         size_px: [8, 8],
         pixels: LivePixels::Rgb(vec![0; 192].into()),
         world_from_camera: None,

@@ -1,6 +1,6 @@
-//! Opens the bundled page in a real browser and compares what it shows with the exact scene.
+//! Opens the bundled page in a real browser and compares it with the exact scene.
 //!
-//! Skipped, and said so, where Chromium or the bundle (`make web`) is missing.
+//! Skipped, with a message, if Chromium or the bundle (`make web`) is missing.
 
 mod analytic_scene;
 mod browser;
@@ -25,53 +25,65 @@ const DESKTOP_PX: [u32; 2] = [1280, 800];
 const PHONE_PX: [u32; 2] = [390, 844];
 /// The page shows a lost connection within this time.
 const MAX_LOSS_DISPLAY_MILLIS: f64 = 1000.0;
-/// Added to the time of each picture: if pictures were faster than 20 ms, the server would leave out the coarse stages.
+/// Added to the render time of each picture. If pictures took less than 20 ms, the server would skip the coarse
+/// stages.
 const DRAWING: Duration = Duration::from_millis(25);
-/// How long the link is cut.
+/// Duration of the interruption.
 const CUT: Duration = Duration::from_secs(25);
 /// Far more than two busy cores need to draw the page in software.
 const TIMEOUT: Duration = Duration::from_secs(60);
-/// Whether a pixel has a share of the page's `--accent`, the color of live cameras; nothing else here is blue-green.
+/// Whether a pixel contains some of the page's `--accent`, the color of live cameras. Nothing else in this scene is
+/// blue-green.
 fn is_accent([red, green, blue]: [u8; 3]) -> bool {
     green >= red.saturating_add(30) && blue >= red.saturating_add(18)
 }
 
-/// A request, and the model that it is for.
-type Asked = (RenderRequest, Option<String>);
+/// A request and its model.
+type ReceivedRequest = (RenderRequest, Option<String>);
 
-/// Draws requests on its own thread and keeps them, as a training thread would serve them.
+/// Renders requests on a separate thread, like a training thread, and records them.
 struct RenderThread {
-    requests_seen: Arc<Mutex<Vec<Asked>>>,
+    received_requests: Arc<Mutex<Vec<ReceivedRequest>>>,
     stop: Arc<AtomicBool>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
 impl RenderThread {
     fn start(hub: Hub) -> Self {
-        let requests_seen: Arc<Mutex<Vec<Asked>>> = Arc::default();
+        let received_requests: Arc<Mutex<Vec<ReceivedRequest>>> = Arc::default();
         let stop: Arc<AtomicBool> = Arc::default();
-        let (seen, stopped) = (Arc::clone(&requests_seen), Arc::clone(&stop));
+        let (received, stopped) = (Arc::clone(&received_requests), Arc::clone(&stop));
         let thread = std::thread::spawn(move || {
             while !stopped.load(Ordering::Relaxed) {
                 hub.wait_for_request(Duration::from_millis(50));
                 if let Some(pending) = hub.next_request() {
                     let order = (pending.request.clone(), pending.method().map(str::to_owned));
-                    seen.lock().expect("no panic holds it").push(order);
+                    received.lock().expect("no thread panicked while holding the lock").push(order);
                     let picture = draw(&pending.request);
                     std::thread::sleep(DRAWING);
                     pending.deliver(picture);
                 }
             }
         });
-        Self { requests_seen, stop, thread: Some(thread) }
+        Self { received_requests, stop, thread: Some(thread) }
     }
 
     fn requests(&self) -> Vec<RenderRequest> {
-        self.requests_seen.lock().expect("no panic holds it").iter().map(|(request, _)| request.clone()).collect()
+        self.received_requests
+            .lock()
+            .expect("no thread panicked while holding the lock")
+            .iter()
+            .map(|(request, _)| request.clone())
+            .collect()
     }
 
     fn methods(&self) -> Vec<Option<String>> {
-        self.requests_seen.lock().expect("no panic holds it").iter().map(|(_, method)| method.clone()).collect()
+        self.received_requests
+            .lock()
+            .expect("no thread panicked while holding the lock")
+            .iter()
+            .map(|(_, method)| method.clone())
+            .collect()
     }
 }
 
@@ -79,12 +91,12 @@ impl Drop for RenderThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            assert!(thread.join().is_ok() || std::thread::panicking(), "the painter panicked");
+            assert!(thread.join().is_ok() || std::thread::panicking(), "the render thread panicked");
         }
     }
 }
 
-/// A camera that stands beside the scene, so that its frustum is seen from the first view.
+/// A camera next to the scene, so that its frustum is visible from the first view.
 fn side_camera() -> KeyframePose {
     let eye = Point3::new(-0.8, -0.3, 0.6);
     let rotation = UnitQuaternion::face_towards(&(Point3::new(0.0, 0.2, 0.1) - eye), &-Vector3::z());
@@ -97,7 +109,7 @@ fn side_camera() -> KeyframePose {
     }
 }
 
-/// An image of the camera beside the scene, captured now.
+/// An image of the camera next to the scene, captured now.
 fn live_image(rgba: Arc<[u8]>) -> LiveImage {
     let camera = side_camera();
     LiveImage {
@@ -198,14 +210,14 @@ fn page_renders_scene_and_overlays_correctly() {
     std::fs::remove_dir_all(&profile).expect("the browser has left its profile");
 }
 
-/// Another model's button asks for its pictures and shows its figures.
+/// Clicking another model's button requests its pictures and shows its values.
 fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     let press = |browser: &mut Browser, method: &str| {
         browser.evaluate(&format!("document.querySelector('#models button[data-method={method}]').click()"));
     };
-    assert!(render_thread.methods().iter().all(Option::is_none), "nobody chose");
+    assert!(render_thread.methods().iter().all(Option::is_none), "no model was chosen");
     press(browser, "tsdf");
-    wait_for(browser, "the other model's figures", |browser| browser.text("primitives-name") == "Voxel blocks");
+    wait_for(browser, "the other model's values", |browser| browser.text("primitives-name") == "Voxel blocks");
     wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
     press(browser, "splat");
     wait_for(browser, "the first model's picture", |_| {
@@ -215,12 +227,12 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     assert_eq!(browser.text("primitives-name"), "Splats");
 }
 
-/// The live camera's frustum is drawn where the request's projection puts it.
+/// The live camera's frustum is drawn according to the request's projection.
 fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     const REACH_PX: i64 = 2; // Rounding to pixels, and lines one pixel wide.
     let shot = canvas_shot(browser);
     let camera = side_camera();
-    let depth = 1.6 * 0.12 * 0.8; // Of the drawn frustum: see web/src/overlays.ts.
+    let depth = 1.6 * 0.12 * 0.8; // Depth of the drawn frustum: see web/src/overlays.ts.
     let corner = |u: f64, v: f64| {
         let at = |pixel: f64, focal: f64, principal: f64| (pixel - principal) / focal * depth;
         camera.world_from_camera
@@ -242,7 +254,7 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     }
 }
 
-/// With the lines off, the view is the picture of the request, pixel for pixel but for JPEG.
+/// With the lines off, the view equals the requested picture pixel for pixel, except for JPEG compression.
 fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     browser.click("toggle-grid");
     let shot = canvas_shot(browser);
@@ -250,7 +262,7 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     assert_eq!([shot.width(), shot.height()], expected.size_px);
     let off_by = |dx: i64| {
         let (mut sum, mut n) = (0.0, 0.0);
-        // Away from the edges, where toolbar and inset lie over the view.
+        // Away from the edges, which the toolbar and the inset cover.
         for y in 80..i64::from(shot.height()) - 240 {
             for x in (4..i64::from(shot.width()) - 4).step_by(3) {
                 let ix = usize::try_from(y * i64::from(shot.width()) + x).expect("inside") * 4;
@@ -267,11 +279,14 @@ fn check_picture(browser: &mut Browser, request: &RenderRequest) {
     };
     let (there, left, right) = (off_by(0), off_by(-2), off_by(2));
     assert!(there < 3.0, "the view differs from the scene by {there} of 255 on average");
-    assert!(there < 0.7 * left && there < 0.7 * right, "a shift by 2 pixels must show: {there}, {left}, {right}");
+    assert!(
+        there < 0.7 * left && there < 0.7 * right,
+        "a shift by 2 pixels must be detected: {there}, {left}, {right}"
+    );
     browser.click("toggle-grid");
 }
 
-/// Dragging asks for small pictures, resting for full ones, and the camera turns about the center.
+/// While dragging, the page requests small pictures; at rest, full ones. The camera rotates around the center.
 fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &RenderRequest) -> RenderRequest {
     let n_before = render_thread.requests().len();
     browser.mouse("mousePressed", [300, 300]);
@@ -296,7 +311,7 @@ fn check_drag(browser: &mut Browser, render_thread: &RenderThread, before: &Rend
     after.clone()
 }
 
-/// The page tells that the server is gone and comes back by itself.
+/// The page shows that the server has stopped, and reconnects automatically.
 fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     let listen = server.address();
     drop(server);
@@ -306,7 +321,7 @@ fn check_reconnect(browser: &mut Browser, server: Server, hub: &Hub) {
     drop(server);
 }
 
-/// Runs the page through a proxy that cuts the connection, as a wireless link would, up to the end of the run.
+/// Runs the page through a proxy that interrupts the connection, like a wireless link, up to the end of the run.
 #[test]
 fn page_shows_connection_loss_and_run_result() {
     let bundle = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("web/dist/app.js");
@@ -346,7 +361,7 @@ fn page_shows_connection_loss_and_run_result() {
     assert_eq!(browser.text("banner"), "");
     let shown_after = browser.evaluate("record.shownAfter").as_f64().expect("the loss was shown");
     assert!(shown_after < MAX_LOSS_DISPLAY_MILLIS, "the lost connection was shown after {shown_after} ms");
-    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was called live");
+    assert_eq!(browser.evaluate("record.isLive"), false, "an image from before the cut was labeled live");
     assert!(label(&mut browser).contains("old"), "{}", label(&mut browser));
     let camera = Camera::start(hub.clone());
     wait_for(&mut browser, "a live image", |browser| label(browser) == "live");
@@ -425,7 +440,7 @@ impl Camera {
 fn wait_for(browser: &mut Browser, what: &str, mut is_there: impl FnMut(&mut Browser) -> bool) {
     let started = Instant::now();
     while !is_there(browser) {
-        assert!(started.elapsed() < TIMEOUT, "waited in vain for {what}");
+        assert!(started.elapsed() < TIMEOUT, "timed out waiting for {what}");
         std::thread::sleep(Duration::from_millis(50));
     }
 }
@@ -442,11 +457,11 @@ fn canvas_shot(browser: &mut Browser) -> image::RgbImage {
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a window")]
 fn pixel_of(request: &RenderRequest, point: Point3<f64>) -> (i64, i64) {
     let Projection::Pinhole { focal_px, principal_px } = request.projection else {
-        panic!("the page asks for a pinhole")
+        panic!("the page requests a pinhole projection")
     };
-    let seen = request.world_from_camera.inverse_transform_point(&point);
-    let u = focal_px[0] * seen.x / seen.z + principal_px[0];
-    let v = focal_px[1] * seen.y / seen.z + principal_px[1];
+    let point_in_camera = request.world_from_camera.inverse_transform_point(&point);
+    let u = focal_px[0] * point_in_camera.x / point_in_camera.z + principal_px[0];
+    let v = focal_px[1] * point_in_camera.y / point_in_camera.z + principal_px[1];
     (u.floor() as i64, v.floor() as i64)
 }
 

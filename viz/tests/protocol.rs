@@ -1,4 +1,4 @@
-//! Drives the real server over loopback as a stranger's program would, by `docs/reference/protocol.md`.
+//! Tests the real server over loopback with an independent client that follows `docs/reference/protocol.md`.
 
 mod analytic_scene;
 mod client;
@@ -17,7 +17,7 @@ use viz::{
     Status,
 };
 
-/// Far more than loopback needs; a test that waits this long has failed.
+/// Far more than loopback needs. A test that waits this long fails.
 const TIMEOUT: Duration = Duration::from_secs(20);
 
 fn start() -> (Hub, Server) {
@@ -35,11 +35,11 @@ fn render_message(id: u64) -> Value {
 }
 
 fn next(hub: &Hub) -> PendingRender {
-    assert!(hub.wait_for_request(TIMEOUT), "no request came");
-    hub.next_request().expect("a request waits")
+    assert!(hub.wait_for_request(TIMEOUT), "no request arrived");
+    hub.next_request().expect("a request is pending")
 }
 
-/// Draws and delivers every waiting stage.
+/// Renders and delivers every pending stage.
 fn draw_all(hub: &Hub, n_stages: usize) {
     for _ in 0..n_stages {
         let pending = next(hub);
@@ -92,7 +92,7 @@ fn client_receives_hello_then_current_state() {
     assert_eq!((&status["step"], &status["others"]), (&json!(1300), &json!([])));
 }
 
-/// A model that made so many steps.
+/// A model after `step` steps.
 fn model_status(method: &str, step: u64) -> ModelStatus {
     ModelStatus { method: method.to_owned(), step, ..ModelStatus::default() }
 }
@@ -106,7 +106,7 @@ fn client_selects_the_model() {
     client.send_json(&message);
     let pending = next(&hub);
     assert_eq!(pending.method(), None, "the first");
-    pending.fail("nothing was seen yet");
+    pending.fail("no images received yet");
     assert_eq!(client.text_of("error")["id"], json!(1));
     message["id"] = json!(2);
     message["method"] = json!("tsdf");
@@ -128,7 +128,7 @@ fn stages_stream_and_show_the_scene() {
     client.send_json(&message);
     let mut sizes = Vec::new();
     for stage in 0..3 {
-        draw_all(&hub, 1); // The stage arrives before the next one is drawn.
+        draw_all(&hub, 1); // The stage arrives before the next one is rendered.
         let (header, payload) = client.binary_of("picture");
         assert_eq!((&header["id"], &header["stage"]), (&json!(9), &json!(stage)));
         assert_eq!(header["last"], json!(stage == 2));
@@ -144,7 +144,7 @@ fn stages_stream_and_show_the_scene() {
     assert!(hub.next_request().is_none(), "all stages are drawn");
 }
 
-/// The server keeps a quaternion, so that a matrix comes back with a few roundings.
+/// The server stores a quaternion, so a matrix returns with rounding errors.
 fn check_same_pose(sent: &Value, returned: &Value) {
     let numbers =
         |value: &Value| value.as_array().map(|rows| rows.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
@@ -153,7 +153,7 @@ fn check_same_pose(sent: &Value, returned: &Value) {
     assert!(sent.iter().zip(&returned).all(|(a, b)| (a - b).abs() < 1e-12), "{sent:?} became {returned:?}");
 }
 
-/// The request of a stage as its header tells it, through nothing but the wire.
+/// The request of a stage as described by its header, using only data from the wire.
 fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
     let numbers =
         |value: &Value| value.as_array().map(|list| list.iter().filter_map(Value::as_f64).collect::<Vec<_>>());
@@ -181,7 +181,7 @@ fn request_of_stage(message: &Value, header: &Value) -> trainer::RenderRequest {
 
 fn check_against_scene(request: &trainer::RenderRequest, picture: &image::RgbImage, depth: &[u8]) {
     let expected = draw(request);
-    // JPEG at these qualities; a picture that is mirrored, shifted or of another stage is off by tens.
+    // JPEG at these qualities. A mirrored or shifted picture, or one of another stage, is off by tens.
     const MEAN_ABS: f64 = 6.0;
     let colors = expected.rgba_srgb.chunks_exact(4).flat_map(|pixel| &pixel[..3]);
     let off: f64 = colors.zip(picture.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
@@ -190,7 +190,7 @@ fn check_against_scene(request: &trainer::RenderRequest, picture: &image::RgbIma
     let depth: Vec<f32> = depth.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
     assert_eq!(depth.len(), expected.depth_m.len());
     let worst = depth.iter().zip(&expected.depth_m).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    // The focal length travelled as text and was scaled once more: nothing but rounding may differ.
+    // The focal length was sent as text and scaled once more, so only rounding may differ.
     assert!(worst < 1e-5, "depths differ by up to {worst} m");
 }
 
@@ -224,7 +224,7 @@ fn clients_alternate_and_disconnected_ones_are_skipped() {
     first.settle();
     second.settle();
     assert_eq!(hub.n_clients(), 2);
-    draw_all(&hub, 2); // One stage each, whoever asked first.
+    draw_all(&hub, 2); // One stage each, regardless of the order of requests.
     assert_eq!(first.binary_of("picture").0["id"], json!(10));
     assert_eq!(second.binary_of("picture").0["id"], json!(20));
     drop(first);
@@ -232,7 +232,7 @@ fn clients_alternate_and_disconnected_ones_are_skipped() {
     draw_all(&hub, 2);
     assert_eq!(second.binary_of("picture").0["stage"], json!(1));
     assert_eq!(second.binary_of("picture").0["stage"], json!(2));
-    assert!(hub.next_request().is_none(), "nobody waits for the rest of the leaver's stages");
+    assert!(hub.next_request().is_none(), "the remaining stages of the disconnected client are dropped");
 }
 
 #[test]
@@ -244,8 +244,8 @@ fn malformed_message_gets_error_and_connection_stays() {
     let mut wrong_pose = render_message(32);
     wrong_pose["world_from_camera"] = json!(vec![0; 16]);
     let cases = [
-        ("{".to_owned(), Value::Null, "not understood"),
-        ("[]".to_owned(), Value::Null, "not understood"),
+        ("{".to_owned(), Value::Null, "cannot parse"),
+        ("[]".to_owned(), Value::Null, "cannot parse"),
         (json!({"type": "dance"}).to_string(), Value::Null, "dance"),
         (json!({"type": "render", "id": 30}).to_string(), json!(30), "missing field"),
         (render_message(33).to_string().replace("-2.0", "1e999"), json!(33), "number out of range"),
@@ -279,7 +279,7 @@ fn failed_render_sends_error_message() {
     picture.rgba_srgb.truncate(7);
     pending.deliver(picture);
     assert!(client.text_of("error")["message"].as_str().is_some_and(|text| text.contains("has 7")));
-    drop(next(&hub)); // Given up silently: the client's later requests are served all the same.
+    drop(next(&hub)); // Dropped without an answer: the client's later requests are still served.
     client.send_json(&render_message(6));
     draw_all(&hub, 3);
     assert_eq!(client.binary_of("picture").0["id"], json!(6));
@@ -364,7 +364,7 @@ fn one_of_each() -> Vec<Value> {
     messages
 }
 
-/// The part of the docs about a message of the server.
+/// The part of the docs about a message from the server.
 fn section_of<'a>(docs: &'a str, kind: &str) -> &'a str {
     let from_server = &docs[docs.find("## From the server").expect("the chapter")..];
     let section = from_server.split("\n### ").find(|section| section.starts_with(&format!("`{kind}`")));
@@ -432,7 +432,7 @@ fn get(address: SocketAddr, path: &str, host: &str) -> String {
 fn wait_until(is_done: impl Fn() -> bool) {
     let started = Instant::now();
     while !is_done() {
-        assert!(started.elapsed() < TIMEOUT, "waited in vain");
+        assert!(started.elapsed() < TIMEOUT, "timed out");
         std::thread::sleep(Duration::from_millis(2));
     }
 }

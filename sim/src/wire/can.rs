@@ -1,4 +1,4 @@
-//! Motors on CAN buses whose shafts follow a script until a client switches one on: a thread a bus.
+//! Emulates motors on CAN buses, one thread per bus. Shafts follow a script until a client enables a motor.
 
 use super::JointTrack;
 use drivers::can::emulated::{EmulatedMotor, State};
@@ -11,29 +11,29 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// What the counts of Damiao motors cover: rad, rad/s and Nm, as a DM4310's do.
+/// Ranges of the Damiao counts: rad, rad/s and Nm, those of a DM4310.
 const DAMIAO_LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
-/// How long a bus is listened to before motors that report by themselves are looked after.
+/// Time to wait for messages on a bus before servicing motors that report periodically.
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(1);
 
-/// Motors that answer until they are dropped.
+/// Motors that respond until they are dropped.
 #[derive(Debug)]
 pub struct EmulatedMotors {
     flags: Arc<SharedFlags>,
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What the threads of an arm tell each other.
+/// State shared by the threads of an arm.
 #[derive(Debug, Default)]
 struct SharedFlags {
     stop: AtomicBool,
-    /// A client has switched a motor on.
+    /// Whether a client has enabled a motor.
     is_client_controlled: AtomicBool,
 }
 
 impl EmulatedMotors {
-    /// Opens the buses, which must be up, and plays every motor of the arm; the track's joints are in the order of the motors.
-    /// Once a client has switched one on, all of them stay with what clients want.
+    /// Opens the buses, which must be up, and emulates all motors of the arm. The track's joints are in the order of
+    /// the motors. Once a client has enabled a motor, all motors follow client commands only.
     pub fn start(track: &JointTrack, arm: &ArmConfig) -> Result<Self, Error> {
         let mut motors = Self { flags: Arc::default(), threads: Vec::new() };
         for (bus_ix, bus) in arm.buses.iter().enumerate() {
@@ -45,7 +45,7 @@ impl EmulatedMotors {
             });
             let (bus, joints_of_bus, track) = (Bus::open(bus)?, joints_of_bus.collect(), track.clone());
             let flags = Arc::clone(&motors.flags);
-            let device = format!("played motors on {}", bus.config().interface);
+            let device = format!("emulated motors on {}", bus.config().interface);
             let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
                 if let Err(error) = run_bus(&bus, joints_of_bus, &track, &flags) {
                     log::error!("{error}");
@@ -61,7 +61,7 @@ impl Drop for EmulatedMotors {
     fn drop(&mut self) {
         self.flags.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // A thread that panicked has said so.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
@@ -75,7 +75,7 @@ struct EmulatedJoint {
 }
 
 impl EmulatedJoint {
-    /// Turns it to where its joint is.
+    /// Moves the motor to the position of its joint.
     fn follow(&mut self, joints: &JointState) {
         let MotorConfig { gear_ratio, is_reversed, offset_rad, .. } = self.config;
         let motor_per_joint = gear_ratio * if is_reversed { -1.0 } else { 1.0 };
@@ -114,7 +114,7 @@ fn run_bus(
             }
             if emulated_joint.motor.state() != State::Free && !flags.is_client_controlled.swap(true, Ordering::Relaxed)
             {
-                log::info!("a client moves the arm: from now on it stays where clients want it");
+                log::info!("a client controls the arm: it no longer follows the script");
             }
         }
     }

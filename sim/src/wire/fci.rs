@@ -1,15 +1,15 @@
-//! A Franka controller whose arm follows a script until a client moves it.
+//! Emulates a Franka controller whose arm follows a script until a client moves it.
 
 use super::JointTrack;
 use drivers::Error;
 use drivers::franka::emulated::{EmulatedRobot, Joints, RobotConfig};
 
-/// Takes clients until it is dropped. Once a client has moved the arm it stays with what clients want.
+/// Accepts clients until it is dropped. Once a client has moved the arm, it follows client commands only.
 pub fn emulate_fci(track: JointTrack, config: RobotConfig) -> Result<EmulatedRobot, Error> {
     let mut is_client_controlled = false;
     let joint_simulator = move |now, client_target: &drivers::franka::emulated::CommandedJoints| {
         if client_target.is_moving && !std::mem::replace(&mut is_client_controlled, true) {
-            log::info!("a client moves the arm: from now on it stays where clients want it");
+            log::info!("a client controls the arm: it no longer follows the script");
         }
         if is_client_controlled {
             let (position_rad, velocity_rad_s) = (client_target.position_rad, client_target.velocity_rad_s);

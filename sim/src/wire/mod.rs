@@ -1,7 +1,7 @@
-//! Plays what a rig said as its devices would say it, on the wire: a Franka controller, motors on CAN buses, datagrams.
+//! Emulates the devices of a recorded rig on the wire: a Franka controller, motors on CAN buses, datagrams.
 //!
-//! A rig that was simulated before is a [`DeviceScript`]; [`PlaybackClock`] says when each instant of it is played. Images are not played
-//! here: a recording of the camera's own library is.
+//! A previously simulated rig is a [`DeviceScript`]. [`PlaybackClock`] maps its stamps to playback times. Images are
+//! not played back here; use a recording of the camera vendor's library.
 
 #[cfg(target_os = "linux")]
 mod can;
@@ -19,22 +19,22 @@ use drivers::{BasePose, RangeScan, Sample};
 use kinematics::{HistoryError, JointHistory, JointState, Stamp};
 use std::time::Duration;
 
-/// Joint readings of a script further apart than this are no motion.
+/// Joint readings of a script farther apart than this are not interpolated.
 const MAX_GAP: Duration = Duration::from_secs(1);
 
-/// What the devices of a rig said, but for its cameras, each in the order of its stamps.
+/// Samples of the devices of a rig, except its cameras, each in stamp order.
 #[derive(Clone, Debug, Default)]
 pub struct DeviceScript {
     /// Joint readings.
     pub joints: Vec<JointState>,
     /// Poses of the base.
     pub poses: Vec<BasePose>,
-    /// Turns of scanners.
+    /// Scanner revolutions.
     pub scans: Vec<RangeScan>,
 }
 
 impl DeviceScript {
-    /// Takes what is played here; images and truths are not.
+    /// Adds a sample. Ignores images and ground truth.
     pub fn take(&mut self, sample: Sample) {
         match sample {
             Sample::Joints(state) => self.joints.push(state),
@@ -45,28 +45,28 @@ impl DeviceScript {
     }
 }
 
-/// When a script is played.
+/// Time mapping between a script and its playback.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PlaybackClock {
     /// An instant of the script.
     pub scripted: Stamp,
-    /// When that is, on the monotonic clock.
+    /// The playback time of that instant, on the monotonic clock.
     pub emulated: Stamp,
 }
 
 impl PlaybackClock {
-    /// The instant of the script that is played at `now`.
+    /// The instant of the script played back at `now`.
     pub fn script_stamp_at(&self, now: Stamp) -> Stamp {
         Stamp(now.0.saturating_sub(self.emulated.0).saturating_add(self.scripted.0))
     }
 
-    /// When an instant of the script is played.
+    /// The playback time of an instant of the script.
     pub fn playback_stamp_of(&self, scripted: Stamp) -> Stamp {
         Stamp(scripted.0.saturating_sub(self.scripted.0).saturating_add(self.emulated.0))
     }
 }
 
-/// How joints move; before and after the script they stand still at its ends.
+/// Motion of the joints. Before and after the script, they rest at its first and last position.
 #[derive(Clone, Debug)]
 pub struct JointTrack {
     history: JointHistory,
@@ -75,7 +75,7 @@ pub struct JointTrack {
 }
 
 impl JointTrack {
-    /// Readings out of order, or without numbers, are errors, and so is a script without any.
+    /// Fails if readings are out of order or non-finite, or if the script is empty.
     pub fn new(readings: &[JointState], playback_clock: PlaybackClock) -> Result<Self, HistoryError> {
         let (Some(first), Some(last)) = (readings.first(), readings.last()) else {
             return Err(HistoryError::NotYet { newest: None, asked: playback_clock.scripted });
@@ -86,14 +86,14 @@ impl JointTrack {
         Ok(Self { history, end_states: [at_rest(first), at_rest(last)], playback_clock })
     }
 
-    /// The joints as they are played at `now`, which is the stamp of what is returned.
+    /// The joints at playback time `now`, which is the stamp of the result.
     pub fn at(&self, now: Stamp) -> JointState {
         let [first, last] = &self.end_states;
         let scripted = self.playback_clock.script_stamp_at(now);
         let state = match self.history.at(scripted) {
             Ok(state) => state,
             Err(_) if scripted < first.stamp => first.clone(),
-            // Past the end, or in a gap, which a simulation does not leave.
+            // Past the end, or in a gap, which a simulation does not have.
             Err(_) => last.clone(),
         };
         JointState { stamp: now, ..state }
@@ -120,7 +120,7 @@ mod tests {
         assert!((at(33).position[0] - 0.0665).abs() < 1e-12);
         assert!((at(33).velocity[0] - 0.5).abs() < 1e-9);
         assert_eq!((&at(500).position[..], &at(500).velocity[..]), (&[0.1][..], &[0.0][..]));
-        assert_eq!(at(33).stamp, Stamp(7_033_000_000), "stamped when it is played");
+        assert_eq!(at(33).stamp, Stamp(7_033_000_000), "stamped with the playback time");
         assert_eq!(playback_clock.script_stamp_at(playback_clock.playback_stamp_of(Stamp(123))), Stamp(123));
         assert!(JointTrack::new(&[], playback_clock).is_err());
     }

@@ -1,4 +1,4 @@
-//! Joint states, base poses and range scans as datagrams, each when it was said.
+//! Sends joint states, base poses and range scans as datagrams at the times of the script.
 
 use super::{DeviceScript, PlaybackClock};
 use drivers::clock;
@@ -13,21 +13,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-/// Echoes in one datagram: as JSON they take about 60 bytes each, and 65 507 fit.
+/// Maximum echoes per datagram. As JSON, each takes about 60 bytes, and 65 507 bytes fit.
 const MAX_POINTS: usize = 1000;
-/// How often it is told that nothing moves.
+/// Period at which the state at rest is resent.
 const RESEND_PERIOD: Duration = Duration::from_millis(20);
-/// How soon the thread notices that it is to stop.
+/// Period at which the thread checks whether to stop.
 const STOP_CHECK_PERIOD: Duration = Duration::from_millis(50);
 
-/// Who listens to what.
+/// Receivers of the datagrams.
 #[derive(Clone, Debug, Default)]
 pub struct DatagramTargets {
-    /// To the joints of these names.
+    /// Address for the joints, and their names.
     pub joints: Option<(SocketAddr, Vec<String>)>,
-    /// To the base's poses.
+    /// Address for the base's poses.
     pub base: Option<SocketAddr>,
-    /// To scanners, by name.
+    /// Names and addresses of the scanners.
     pub scanners: Vec<(String, SocketAddr)>,
 }
 
@@ -39,13 +39,14 @@ pub struct EmulatedSenders {
 }
 
 impl EmulatedSenders {
-    /// Begins to send: the script when it is played, and before and after it that joints and base stand still at its ends.
+    /// Starts sending: the script during playback; before and after it, joints and base at rest at its first and last
+    /// state.
     pub fn start(
         script: &DeviceScript,
         playback_clock: PlaybackClock,
         datagram_targets: DatagramTargets,
     ) -> Result<Self, Error> {
-        let device = "played datagrams".to_owned();
+        let device = "emulated datagrams".to_owned();
         let any = SocketAddr::from((Ipv4Addr::UNSPECIFIED, 0));
         let socket = UdpSocket::bind(any);
         let socket = socket.map_err(|source| Error::Listen { device: device.clone(), address: any, source })?;
@@ -70,18 +71,18 @@ impl Drop for EmulatedSenders {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A thread that panicked has said so.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
 }
 
-/// One sample of the script, by its place.
+/// One sample of the script, by its index.
 #[derive(Clone, Copy)]
 enum ScriptEntry {
     Joints(usize),
     Pose(usize),
-    /// And which scanner's it is.
+    /// Scanner index and scan index.
     Scan(usize, usize),
 }
 
@@ -92,7 +93,7 @@ struct Sender {
     socket: UdpSocket,
     n_joints_sent: u64,
     n_poses_sent: u64,
-    /// Of each scanner.
+    /// Datagrams sent per scanner.
     n_sent: Vec<u64>,
     stop: Arc<AtomicBool>,
 }
@@ -116,7 +117,7 @@ impl Sender {
         self.resend_end_state(usize::MAX, Stamp(i64::MAX));
     }
 
-    /// The script in the order in which it is sent: scans once they are whole.
+    /// The script in the order in which it is sent. Scans are sent when complete.
     fn script_entries(&self) -> Vec<(Stamp, ScriptEntry)> {
         let DeviceScript { joints, poses, scans } = &self.script;
         let at = |stamp: Stamp| self.playback_clock.playback_stamp_of(stamp);
@@ -139,7 +140,7 @@ impl Sender {
         script_entries
     }
 
-    /// Tells again and again, until shortly before a time, that joints and base are where one end of the script has them.
+    /// Repeatedly sends the joints and base at one end of the script, until shortly before a time.
     fn resend_end_state(&mut self, end: usize, until: Stamp) {
         let last = |n: usize| n.checked_sub(1).map(|last| last.min(end));
         let (joints_ix, pose_ix) = (last(self.script.joints.len()), last(self.script.poses.len()));
@@ -158,7 +159,7 @@ impl Sender {
         }
     }
 
-    /// Waits for a time; false where it is to stop.
+    /// Waits until a time. Returns false if the thread should stop.
     fn wait(&self, due_stamp: Stamp) -> bool {
         loop {
             if self.stop.load(Ordering::Relaxed) {
@@ -207,7 +208,7 @@ impl Sender {
     }
 
     fn send(&self, bytes: &[u8], to: SocketAddr) {
-        // Nobody may listen yet, or any more.
+        // There may be no receiver yet, or no longer.
         let _ = self.socket.send_to(bytes, to);
     }
 }
@@ -257,7 +258,7 @@ mod tests {
         let wait = Duration::from_secs(5);
         let at_rest_state = arm.read(wait).expect("joints");
         assert_eq!(at_rest_state.position, script.joints[0].position);
-        assert!(at_rest_state.stamp < playback_clock.playback_stamp_of(Stamp(0)), "told before it is played");
+        assert!(at_rest_state.stamp < playback_clock.playback_stamp_of(Stamp(0)), "sent before playback starts");
         let mut joints = at_rest_state;
         while joints.stamp < playback_clock.playback_stamp_of(Stamp(0)) {
             joints = arm.read(wait).expect("joints");

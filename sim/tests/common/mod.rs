@@ -1,10 +1,10 @@
-//! Plays a rig to its end, for the tests beside this folder.
+//! Runs a rig to its end, for the tests in the parent folder.
 
 use drivers::{BasePose, Image, PixelFormat, RangeScan, Sample, Source, TruthImage};
 use kinematics::JointState;
 use sim::{Config, RigInfo};
 
-/// Everything a short run delivered.
+/// All samples of a short run.
 #[derive(PartialEq)]
 pub(crate) struct Run {
     pub(crate) info: RigInfo,
@@ -29,7 +29,7 @@ pub(crate) fn run_rig(config: &Config) -> Run {
         true_base: vec![],
         scans: vec![],
     };
-    while let Some(sample) = rig.next_sample().expect("the rig plays") {
+    while let Some(sample) = rig.next_sample().expect("the rig runs") {
         match sample {
             Sample::Image(image) if image.format == PixelFormat::Rgb8 => run.color.push(image),
             Sample::Image(image) => run.depth.push(image),

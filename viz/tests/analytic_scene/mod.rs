@@ -1,22 +1,22 @@
-//! Ray casts a checkered floor and three balls, exactly, so that the wire and the page can be checked against it.
+//! Ray casts a checkered floor and three balls exactly, as the reference for wire and page.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use trainer::{Picture, Projection, RenderRequest};
 
-/// A ball: center and radius in metres, sRGB color.
+/// A ball: center and radius in meters, sRGB color.
 struct Ball {
     center: Point3<f64>,
     radius_m: f64,
     color: [f64; 3],
 }
 
-/// Red on the x axis, green on the y axis, blue above the origin: a mirrored or turned picture shows.
+/// Red on the x axis, green on the y axis, blue above the origin, so that mirrored or rotated pictures are detected.
 const BALLS: [Ball; 3] = [
     Ball { center: Point3::new(0.5, 0.0, 0.15), radius_m: 0.15, color: [0.85, 0.2, 0.15] },
     Ball { center: Point3::new(0.0, 0.5, 0.15), radius_m: 0.15, color: [0.2, 0.7, 0.25] },
     Ball { center: Point3::new(0.0, 0.0, 0.5), radius_m: 0.12, color: [0.2, 0.35, 0.9] },
 ];
-/// The floor ends here, so that there is background to see.
+/// Half size of the floor. Beyond it, background is visible.
 const FLOOR_HALF_M: f64 = 1.0;
 
 /// A camera at (0, -2, 0.5) that looks along the world's y axis.
@@ -25,11 +25,11 @@ pub(crate) fn looking_along_y() -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::new(0.0, -2.0, 0.5), UnitQuaternion::from_rotation_matrix(&rotation))
 }
 
-/// Draws what the request asks for.
+/// Renders a request.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
-    reason = "colors are between 0 and 1, depths are metres"
+    reason = "colors are between 0 and 1, depths are meters"
 )]
 pub(crate) fn draw(request: &RenderRequest) -> Picture {
     let [width, height] = request.size_px;

@@ -19,7 +19,7 @@ pub(crate) struct Browser {
     n_calls: u64,
 }
 
-/// Where Chromium is, if it is installed.
+/// Path of Chromium, if it is installed.
 pub(crate) fn chromium() -> Option<PathBuf> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
     let folders: Vec<PathBuf> = std::env::split_paths(&std::env::var_os("PATH")?).collect();
@@ -47,8 +47,8 @@ impl Browser {
             .by_ref()
             .map_while(Result::ok)
             .find_map(|line| line.strip_prefix("DevTools listening on ").map(str::to_owned))
-            .expect("chromium tells its debugging address");
-        // The pipe is kept empty, else the browser would stop when it is full.
+            .expect("chromium prints its debugging address");
+        // The pipe is drained, because the browser would block once it is full.
         std::thread::spawn(move || lines.map_while(Result::ok).for_each(drop));
         let host = address.trim_start_matches("ws://").split('/').next().expect("a host");
         let stream = TcpStream::connect(host).expect("chromium listens");
@@ -94,7 +94,7 @@ impl Browser {
         result["result"]["value"].clone()
     }
 
-    /// Waits until all that has happened so far is on screen.
+    /// Waits until all events so far are on screen.
     pub(crate) fn next_frame(&mut self) {
         let frames = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))";
         self.call("Runtime.evaluate", json!({"expression": frames, "awaitPromise": true}));
@@ -117,7 +117,7 @@ impl Browser {
         self.call("Input.dispatchMouseEvent", event);
     }
 
-    /// What the page looks like, as PNG.
+    /// Screenshot of the page as PNG.
     pub(crate) fn screenshot(&mut self) -> Vec<u8> {
         let shot = self.call("Page.captureScreenshot", json!({"format": "png"}));
         bytes_from_base64(shot["data"].as_str().expect("base64"))

@@ -10,7 +10,7 @@ pub(crate) struct Client {
     socket: WebSocket<TcpStream>,
 }
 
-/// One message of the server.
+/// One message from the server.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Received {
     /// JSON text.
@@ -37,7 +37,7 @@ impl Client {
         self.socket.send(message).expect("sent");
     }
 
-    /// Waits until the server has read all that was said so far.
+    /// Waits until the server has read all messages sent so far.
     pub(crate) fn settle(&mut self) {
         self.send_raw(Message::text("settle?"));
         self.text_of("error");
@@ -60,7 +60,7 @@ impl Client {
     pub(crate) fn text(&mut self) -> Value {
         match self.receive() {
             Received::Text(value) => value,
-            other => panic!("text was expected, not {other:?}"),
+            other => panic!("expected text, got {other:?}"),
         }
     }
 
@@ -68,7 +68,7 @@ impl Client {
     pub(crate) fn text_of(&mut self, kind: &str) -> Value {
         self.receive_until(|received| match received {
             Received::Text(value) if value["type"] == kind => Some(value),
-            Received::End => panic!("the connection ended before a {kind:?} came"),
+            Received::End => panic!("the connection ended before a {kind:?} message arrived"),
             _ => None,
         })
     }
@@ -78,7 +78,7 @@ impl Client {
         self.receive_until(|received| match received {
             Received::Binary(header, payload) if header["type"] == kind => Some((header, payload)),
             Received::Text(value) if value["type"] == "error" => panic!("{value}"),
-            Received::End => panic!("the connection ended before a {kind:?} came"),
+            Received::End => panic!("the connection ended before a {kind:?} message arrived"),
             _ => None,
         })
     }
@@ -90,7 +90,7 @@ impl Client {
                 return found;
             }
         }
-        panic!("the expected message did not come");
+        panic!("the expected message did not arrive");
     }
 }
 

@@ -54,7 +54,7 @@ fn pump(mut from: TcpStream, mut to: TcpStream, is_cut: &AtomicBool) {
             std::thread::sleep(Duration::from_millis(5));
         }
         if n == 0 || to.write_all(&bytes[..n]).is_err() {
-            // Fails if the other side has already closed this end, which is fine.
+            // Fails if the other side has already closed this end, which is harmless.
             let _ = to.shutdown(Shutdown::Both);
             return;
         }

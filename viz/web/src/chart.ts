@@ -112,7 +112,7 @@ function line(context: CanvasRenderingContext2D, points: readonly (readonly [num
   context.stroke();
 }
 
-/** Range of the values with a little air, not narrower than a noisy flat curve needs. */
+/** Range of the values with some padding; wide enough that a flat, noisy curve looks flat. */
 function spanOf(values: number[]): [number, number] {
   const min = Math.min(...values);
   const max = Math.max(...values);
@@ -130,7 +130,7 @@ function ticks(min: number, max: number, n: number): number[] {
   return found;
 }
 
-/** Seconds as a person says them. */
+/** Duration as readable text. */
 export function timeText(seconds: number): string {
   if (seconds < 120) return `${Number(seconds.toFixed(seconds < 10 ? 1 : 0))} s`;
   const minutes = Math.floor(seconds / 60);

@@ -1,4 +1,4 @@
-// The WebSocket: opens it, detects silence, reopens it after a failure, and passes messages on.
+// The WebSocket: opens it, detects silence, reconnects after a failure, and forwards messages.
 
 import { type BinaryHeader, type ClientMessage, PROTOCOL_VERSION, type TextMessage, unframe } from "./protocol";
 import { ServerClock } from "./server_clock";
@@ -9,11 +9,11 @@ const PING_MILLIS = 500;
 const SILENT_MILLIS = 800;
 /** After this much silence, the page reconnects. */
 const GIVE_UP_MILLIS = 4000;
-/** An attempt that brings no message within this time is abandoned. */
+/** An attempt that receives no message within this time is abandoned. */
 const ATTEMPT_MILLIS = 2000;
 /** Pauses before the next attempts. A server on this computer or behind a tunnel is usually back within a second. */
 const RETRY_MILLIS = [250, 500, 1000];
-/** If a check is this late, messages that prove the server alive may be queued; they are handled first. */
+/** If a check is this late, messages from the server may be queued; they are handled first. */
 const LATE_MILLIS = 400;
 /** If a check is this late, the page or the computer was suspended. */
 const SUSPENDED_MILLIS = 5000;
@@ -59,7 +59,7 @@ export class Connection {
   private open(): void {
     const socket = new WebSocket(this.url);
     socket.binaryType = "arraybuffer";
-    // A first message shows the server that the client is in use: silent clients are replaced by new ones.
+    // A first message shows the server that the client is in use. The server replaces silent clients.
     socket.onopen = () => this.ping();
     socket.onmessage = (event) => {
       if (socket === this.socket) this.receive(event.data as string | ArrayBuffer);

@@ -1,6 +1,6 @@
 // Elements of index.html by id.
 
-/** The element with this id; index.html holds all that are asked for. */
+/** The element with this id; index.html contains all requested elements. */
 export function element(id: string): HTMLElement;
 export function element<T extends HTMLElement>(id: string, kind: new () => T): T;
 export function element(id: string, kind: new () => HTMLElement = HTMLElement): HTMLElement {

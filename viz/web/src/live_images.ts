@@ -1,4 +1,4 @@
-// What the cameras see now, as small pictures in the corner.
+// The current camera images, as thumbnails in the corner.
 
 import { element } from "./element";
 import type { LiveImageHeader } from "./protocol";
@@ -45,7 +45,7 @@ export class LiveImages {
         slot.canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
         bitmap.close();
       } catch {
-        // The caption shows that the image is getting old.
+        // The caption shows that the image is outdated.
       }
       this.showAges();
     }

@@ -1,4 +1,4 @@
-// The operator's page: joins the connection, the view and the readouts.
+// The operator's page: connects the connection, the view and the readouts.
 
 import { Banner } from "./banner";
 import { Connection } from "./connection";
@@ -26,7 +26,7 @@ const connection = new Connection(`ws://${location.host}/ws`, {
     const hasEnded = state === "lost" && banner.isFinished;
     shown.dataset.state = hasEnded ? "ended" : state;
     shown.textContent = hasEnded ? "the server has stopped" : text;
-    // Whoever steers by the picture must see that it stands still.
+    // Operators who control the robot by the picture must see that it is frozen.
     banner.setConnection(state, text);
     view.overlays.setLive(state === "open");
     if (state === "open" && !wasOpen) {

@@ -1,4 +1,4 @@
-// The switch between models that learn at once; there is nothing to see of it where there is one.
+// The switch between models trained in parallel; hidden if there is only one.
 
 import { element } from "./element";
 import type { ModelStatus, Status } from "./protocol";
@@ -10,17 +10,17 @@ export class ModelSwitch {
 
   constructor(private readonly changed: () => void) {}
 
-  /** The method to ask pictures of; the server's first where nobody chose. */
+  /** The method to request pictures from; undefined selects the server's first. */
   get method(): string | undefined {
     return this.chosen;
   }
 
-  /** The model to look at. */
+  /** The selected model. */
   shown(status: Status): ModelStatus {
     return status.others.find((model) => model.method === this.chosen) ?? status;
   }
 
-  /** Lists the models there are now. */
+  /** Updates the list of models. */
   list(status: Status): void {
     const methods = [status, ...status.others].map((model) => model.method);
     if (methods.join() === this.listed) return;
@@ -35,7 +35,7 @@ export class ModelSwitch {
     const button = document.createElement("button");
     button.textContent = method;
     button.dataset.method = method;
-    button.title = `Look at the model of the method ${method}`;
+    button.title = `Show the model of the method ${method}`;
     button.addEventListener("click", () => this.choose(method));
     return button;
   }

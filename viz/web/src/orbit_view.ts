@@ -1,4 +1,4 @@
-// The big view: free camera, newest picture, lines over it.
+// The main view: free camera, newest picture, lines on top.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -9,9 +9,9 @@ import type { Scene } from "./protocol";
 import type { View } from "./render_scheduler";
 
 const VERTICAL_FOV_DEGREES = 50;
-/** Larger windows are drawn at this width and stretched. */
+/** Larger windows are rendered at this width and upscaled. */
 const MAX_PICTURE_WIDTH_PX = 1280;
-/** Like --ground in app.css. */
+/** The color --ground in app.css. */
 export const BACKGROUND: [number, number, number] = [0x0b / 255, 0x0e / 255, 0x13 / 255];
 
 export class OrbitView {
@@ -27,7 +27,7 @@ export class OrbitView {
 
   constructor(private readonly canvas: HTMLCanvasElement, onMove: () => void) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
-    // Colors arrive as sRGB and leave as they are.
+    // Colors arrive as sRGB and are output unchanged.
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     THREE.ColorManagement.enabled = false;
     this.renderer.setClearColor(new THREE.Color(...BACKGROUND));
@@ -48,7 +48,7 @@ export class OrbitView {
     this.fit();
   }
 
-  /** Adopts a scene; the camera goes to its first view unless somebody has steered already. */
+  /** Adopts a scene; the camera moves to its initial view unless the user has moved it. */
   setScene(scene: Scene): void {
     const isNew = JSON.stringify(scene) !== JSON.stringify(this.scene);
     this.scene = scene;
@@ -63,12 +63,12 @@ export class OrbitView {
     if (!this.hasUserMoved) this.reset();
   }
 
-  /** Back to the scene's first view. */
+  /** Returns to the scene's initial view. */
   reset(): void {
     if (this.scene) this.lookFrom(this.scene.world_from_camera);
   }
 
-  /** Looks along a camera's axis, upright, and turns about the point on it that is nearest to the scene's center. */
+  /** Looks along a camera's axis, upright, and orbits the point on it that is closest to the scene's center. */
   lookFrom(rowMajor: number[]): void {
     const pose = worldFromCamera(rowMajor);
     const eye = new THREE.Vector3().setFromMatrixPosition(pose);
@@ -80,7 +80,7 @@ export class OrbitView {
     this.controls.update();
   }
 
-  /** What the camera sees now. */
+  /** The current view. */
   view(): View {
     const scale = Math.min(1, MAX_PICTURE_WIDTH_PX / this.canvas.width);
     const size_px: [number, number] = [
@@ -101,12 +101,12 @@ export class OrbitView {
     return 0.9 * this.camera.far;
   }
 
-  /** Something in the view has changed. */
+  /** Marks the view as changed. */
   changed(): void {
     this.isStale = true;
   }
 
-  /** Draws if something has changed: on a robot's computer the page shares its cores with everything else. */
+  /** Draws only if something has changed: on a robot's computer the page shares the cores with other programs. */
   draw(): void {
     if (!this.isStale) return;
     this.isStale = false;

@@ -1,4 +1,4 @@
-// Lines over the picture: the floor grid, the world's axes, frustums of keyframes and live cameras.
+// Lines over the picture: the floor grid, the world axes, frustums of keyframes and live cameras.
 
 import * as THREE from "three";
 import { worldFromCamera } from "./convention";
@@ -16,7 +16,7 @@ export class Overlays {
   private frustumDepth = 0.06;
 
   constructor() {
-    this.keyframes.visible = false; // Hundreds of them hide the scene.
+    this.keyframes.visible = false; // Hundreds of them would hide the scene.
     this.root.add(this.ground, this.cameras, this.keyframes);
   }
 
@@ -30,10 +30,10 @@ export class Overlays {
     this.keyframes.visible = visible;
   }
 
-  /** Lays grid and axes for a scene of this size. */
+  /** Creates grid and axes for a scene of this size. */
   setScene(scene: Scene): void {
     this.frustumDepth = 0.12 * scene.radius_m;
-    // A round cell size near a fifth of the radius.
+    // A round cell size close to a fifth of the radius.
     const cell = 10 ** Math.round(Math.log10(scene.radius_m / 5));
     const nCells = 2 * Math.ceil((1.6 * scene.radius_m) / cell);
     for (const child of this.ground.children) (child as THREE.LineSegments).geometry.dispose();

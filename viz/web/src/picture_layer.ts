@@ -1,7 +1,8 @@
-// The newest picture as a surface in the world: a grid of points pushed out to the picture's depth.
+// The newest picture as a surface in the world: a grid of points displaced by the picture's depth.
 //
-// Seen from the pose it was drawn for, it is the picture, pixel for pixel. Seen from elsewhere, while the next picture
-// is on its way, it moves as the scene would. It also fills the depth buffer, so that lines hide behind the model.
+// Viewed from its own pose, the surface reproduces the picture pixel for pixel. Viewed from another pose, while the
+// next picture is pending, it moves like the scene. It also fills the depth buffer, so that the model hides lines
+// behind it.
 
 import * as THREE from "three";
 import { worldFromCamera } from "./convention";
@@ -26,8 +27,8 @@ const VERTEX = /* glsl */ `
     gl_Position = projectionMatrix * viewMatrix * worldFromPicture * vec4(pointInPicture, 1.0);
   }`;
 
-// Colors are looked up by projection, not by the grid's own coordinates: where a triangle spans a jump in depth,
-// the picture still is the picture when seen from its own pose.
+// Colors are looked up by projection, not by the grid's own coordinates, so that the view from the picture's pose is
+// exact even where a triangle spans a depth discontinuity.
 const FRAGMENT = /* glsl */ `
   uniform sampler2D colorMap;
   uniform vec2 sizePx;
@@ -57,7 +58,7 @@ export class PictureLayer {
         emptyDepth: { value: 1 },
       },
       side: THREE.DoubleSide,
-      // Lines that lie on a surface shall be seen.
+      // Lines that lie on a surface must be visible.
       polygonOffset: true,
       polygonOffsetFactor: 1,
       polygonOffsetUnits: 64,
@@ -68,12 +69,12 @@ export class PictureLayer {
     this.mesh.visible = false;
   }
 
-  /** Whether the model hides lines behind it; if not, lines are always in front. */
+  /** Whether the model hides lines behind it; otherwise lines are always in front. */
   set occludes(occludes: boolean) {
     this.mesh.material.depthWrite = occludes;
   }
 
-  /** Shows a picture unless a newer one is shown already; says whether it did. */
+  /** Shows a picture unless a newer one is already shown. Returns whether it did. */
   async show(header: PictureHeader, payload: Uint8Array<ArrayBuffer>, emptyDepth: number): Promise<boolean> {
     if (header.projection.kind !== "pinhole" || !header.color) return false;
     const { offset, bytes } = header.color;
@@ -96,7 +97,7 @@ export class PictureLayer {
     return true;
   }
 
-  /** A new server counts from the start. */
+  /** Resets the numbering, because a new server counts from the start. */
   forget(): void {
     this.shown = null;
   }

@@ -1,6 +1,6 @@
-// The messages of docs/reference/protocol.md, version 2.
+// The messages of docs/reference/protocol.md.
 
-/** Version this page was written for. */
+/** Protocol version of this page. */
 export const PROTOCOL_VERSION = 3;
 
 export interface Pinhole {
@@ -19,7 +19,7 @@ export interface Hello {
   clock_millis: number;
 }
 
-/** Where a model stands. */
+/** Status of a model. */
 export interface ModelStatus {
   method: string;
   step: number;
@@ -30,7 +30,7 @@ export interface ModelStatus {
   psnr_history: [number, number][];
 }
 
-/** Where the run stands, and its first model. */
+/** Status of the run and of its first model. */
 export interface Status extends ModelStatus {
   type: "status";
   state: string;

@@ -1,4 +1,4 @@
-// Numbers of the run as text.
+// Text readouts of the run's values.
 
 import { Chart, timeText } from "./chart";
 import { element } from "./element";
@@ -11,7 +11,7 @@ export class Readouts {
 
   show(status: Status, model: ModelStatus): void {
     text("state", status.state);
-    text("method", status.others.length === 0 ? model.method : ""); // Else the switch says it.
+    text("method", status.others.length === 0 ? model.method : ""); // Otherwise the switch shows the method.
     text("psnr", model.psnr === null ? "–" : model.psnr.toFixed(2));
     text("seconds", timeText(status.seconds));
     text("step", count(model.step));

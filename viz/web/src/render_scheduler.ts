@@ -1,12 +1,12 @@
-// Decides which picture to ask for and when.
+// Decides which picture to request and when.
 //
-// While the view moves: one small picture at a time, as large as comes back quickly. When it rests: the finer stages.
-// While the model learns: the full picture again from time to time.
+// While the view moves: one small picture at a time, as large as the latency allows. At rest: the finer stages. While
+// the model trains: a periodic refresh of the full picture.
 
 import type { Connection } from "./connection";
 import type { PictureHeader, Pinhole, RenderMessage } from "./protocol";
 
-/** What the page looks at now. */
+/** The current view of the page. */
 export interface View {
   world_from_camera: number[];
   size_px: [number, number];
@@ -17,12 +17,12 @@ export interface View {
 
 const REST_MILLIS = 180;
 const REFRESH_MILLIS = 700;
-/** A refresh takes at most this share of the time. */
+/** Maximum fraction of the time spent on refreshes. */
 const REFRESH_SHARE = 0.25;
-/** A moving picture that takes longer is asked for smaller, one that takes less than a third of it larger. */
+/** While moving, pictures that take longer than this are requested smaller, and pictures that take less than a third of it larger. */
 const MOVING_MILLIS = 110;
 const MOVING_SCALES = [0.1, 0.15, 0.25, 0.35, 0.5, 0.7, 1];
-/** An answer that does not come within this time is not waited for, while moving and at rest. */
+/** Timeouts for answers, while moving and at rest. */
 const TIMEOUT_MILLIS = { moving: 3000, resting: 30_000 };
 
 export class RenderScheduler {
@@ -32,7 +32,7 @@ export class RenderScheduler {
   private lastMillis = 0;
   private movedAt = -Infinity;
   private movingIx = 0;
-  /** Scale of the newest picture of the moving view; what comes after it is not coarser. */
+  /** Scale of the newest picture of the moving view; later pictures are not coarser. */
   private movingScale = 0;
   private isWaiting = false;
   private isResting = false;
@@ -46,26 +46,26 @@ export class RenderScheduler {
     private readonly method: () => string | undefined,
   ) {}
 
-  /** The view has changed. */
+  /** Called when the view has changed. */
   moved(): void {
     this.movedAt = performance.now();
-    // A full picture of the old view is not waited for: the next request replaces it.
+    // Does not wait for a full picture of the old view: the next request replaces it.
     if (this.isResting) this.isWaiting = false;
     this.isResting = false;
   }
 
-  /** The model has changed. */
+  /** Called when the model has changed. */
   modelChanged(): void {
     this.hasUpdate = true;
   }
 
-  /** Nothing asked before will be answered. */
+  /** Discards pending requests, which will not be answered. */
   restart(): void {
     this.isWaiting = false;
     this.isResting = false;
   }
 
-  /** A picture came; says how long after it was asked for, milliseconds. */
+  /** Called when a picture arrives. Returns the time since its request, milliseconds. */
   answered(header: PictureHeader): number {
     const millis = performance.now() - this.requestedAt;
     if (header.id !== this.id || !header.last) return millis;
@@ -79,12 +79,12 @@ export class RenderScheduler {
     return millis;
   }
 
-  /** The asked picture will not come. */
+  /** Called when the requested picture will not arrive. */
   failed(id: number | null): void {
     if (id === this.id) this.isWaiting = false;
   }
 
-  /** Called for every frame on screen. */
+  /** Called for every display refresh. */
   tick(): void {
     if (!this.connection.isOpen) return;
     const now = performance.now();
@@ -94,7 +94,7 @@ export class RenderScheduler {
       this.isResting = true;
       const finer = this.stages().filter((scale) => scale > this.movingScale);
       this.movingScale = 0;
-      this.request(finer.length > 0 ? finer : [1]); // Replaces whatever is on its way.
+      this.request(finer.length > 0 ? finer : [1]); // Replaces any pending request.
     } else if (!this.isResting && !this.isWaiting) {
       this.request([MOVING_SCALES[this.movingIx]!]);
     } else if (this.isResting && !this.isWaiting && this.hasUpdate) {
@@ -111,7 +111,7 @@ export class RenderScheduler {
     const message: RenderMessage = {
       type: "render",
       id: this.id,
-      method: this.method(), // Left out of the message where undefined.
+      method: this.method(), // Omitted from the message if undefined.
       ...this.view(),
       stages,
       outputs: ["color", "depth"],

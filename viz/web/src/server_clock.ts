@@ -1,10 +1,10 @@
-// Estimates the server's clock. The estimate errs so that no age is understated.
+// Estimates the server's clock, conservatively: ages are never understated.
 
-/** Samples are used for this long, because clocks drift apart. */
+/** Maximum age of samples, because clocks drift. */
 const MAX_SAMPLE_AGE_MILLIS = 30_000;
 
 export class ServerClock {
-  /** When each ping was sent, and by how much the server's clock was ahead of that time when the server answered. */
+  /** Send time of each ping, and the server's clock minus that time when the server answered. */
   private samples: { sentAt: number; ahead: number }[] = [];
 
   /** Adds the answer to a ping. The server read its clock after the ping was sent, so it is ahead by at most this much. */
