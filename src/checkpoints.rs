@@ -4,13 +4,14 @@ use crate::exit::BadArgument;
 use crate::run_folder::{CHECKPOINT, expect_one_model};
 use crate::stored_keyframes::StoredKeyframes;
 use anyhow::Context;
+use keyframe::Keyframe;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
+use trainer::Method;
 use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
-use trainer::{Keyframe, Method};
 
 /// Default time between two checkpoints.
 const DEFAULT_PERIOD: Duration = Duration::from_secs(60);

@@ -3,11 +3,11 @@
 use crate::config::{Camera, Rig, TimeOffset};
 use crate::exit::BadArgument;
 use anyhow::Context;
+use calibration::CameraCorrection;
+use calibration::{Alignment, Estimate};
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
-use trainer::align::{Alignment, Estimate};
-use trainer::splat::CameraCorrection;
 
 /// Value of `source` for a corrected time offset.
 const SOURCE: &str = "train --write-rig";
@@ -110,8 +110,8 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
 #[cfg(test)]
 mod tests {
     use super::*;
+    use calibration::ScalarEstimate;
     use std::collections::BTreeMap;
-    use trainer::align::ScalarEstimate;
 
     const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
 

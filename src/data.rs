@@ -11,12 +11,12 @@ use crate::open::{self, Opened};
 use crate::stations::{StationReport, Stations};
 use crate::{downscale, print};
 use anyhow::ensure;
+use keyframe::{Keyframe, Split};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-use trainer::{Keyframe, Split};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";

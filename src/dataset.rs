@@ -5,11 +5,11 @@ use crate::holdout::Holdout;
 use crate::print::counted;
 use anyhow::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
+use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
-use trainer::{DepthMap, Keyframe, Split};
 
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";

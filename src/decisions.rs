@@ -7,6 +7,7 @@ use crate::exit::BadArgument;
 use crate::fingerprint;
 use crate::join::{split_from_name, split_name};
 use anyhow::{Context, anyhow};
+use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
@@ -17,7 +18,6 @@ use std::sync::Arc;
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Split};
 
 const VERSION: u64 = 2;
 /// Name of the log in the run folder.

@@ -4,12 +4,13 @@ use crate::evaluate::{CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::{evaluate, method, print, run_folder};
 use anyhow::Context;
+use keyframe::{DepthMap, Keyframe, Split};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::gpu::Gpu;
-use trainer::{DepthMap, Keyframe, Method, Picture, Split};
+use trainer::{Method, Picture};
 
 /// A saved model from which depth is rendered.
 #[derive(Clone, Debug)]

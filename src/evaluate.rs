@@ -4,14 +4,15 @@
 
 use crate::print;
 use anyhow::Context;
+use calibration::CalibratedCamera;
+use keyframe::{DepthMap, Keyframe};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
-use trainer::splat::CalibratedCamera;
-use trainer::{DepthMap, Keyframe, Method, Picture, Projection, RenderRequest};
+use trainer::{Method, Picture, Projection, RenderRequest};
 
 /// Environment variable with the path of the LPIPS weights, used if no flag gives one.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";

@@ -4,11 +4,11 @@ use crate::partial::Partial;
 use anyhow::{Context, bail, ensure};
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
+use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Transform, transform};
 use serde_json::{Map, Value, json};
 use std::path::Path;
 use std::sync::Arc;
-use trainer::{DepthMap, Keyframe, Split};
 
 /// Depth unit that readers assume if the file does not specify one: millimeters.
 const METERS_PER_COUNT: f64 = 0.001;

@@ -7,6 +7,7 @@ use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,7 +15,6 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::Keyframe;
 use viz::{Hub, LiveImage, LivePixels};
 
 /// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live

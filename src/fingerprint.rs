@@ -1,7 +1,7 @@
 //! Fingerprint of the keyframe data that affect a model: a different fingerprint means a different model.
 
+use keyframe::{DepthMap, Keyframe};
 use kinematics::Twist;
-use trainer::{DepthMap, Keyframe};
 
 /// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists. The split and ground truth of a simulator
 /// are excluded.
@@ -64,8 +64,8 @@ impl Hash {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use keyframe::Split;
     use kinematics::{Stamp, Transform};
-    use trainer::Split;
 
     fn keyframe() -> Keyframe {
         let depth = DepthMap {

@@ -2,8 +2,8 @@
 
 use crate::exit::BadArgument;
 use anyhow::ensure;
+use keyframe::Split;
 use std::path::Path;
-use trainer::Split;
 
 /// How test photos are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -6,9 +6,9 @@ use crate::render_budget::RenderBudget;
 use crate::scene_hint;
 use crate::session::Session;
 use crate::time_slices;
+use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Keyframe, Split};
 use viz::{Hub, KeyframePose, ModelStatus, Status};
 
 /// Period of status messages.

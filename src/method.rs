@@ -12,14 +12,16 @@ use crate::model_bounds::Bounds;
 use crate::run_folder::{expect_model, expect_one_model};
 use crate::splat_file;
 use anyhow::Context;
+use calibration::CameraRefinement;
+use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::nerf::{NerfModel, NerfOptions};
-use trainer::splat::{CameraRefinement, SplatOptions, SplatTrainer};
+use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Aligned, Keyframe, Method, Restartable};
+use trainer::{Aligned, Method, Restartable};
 
 /// Names of kinds as prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub(crate) fn describe(kinds: &[ModelKind]) -> String {

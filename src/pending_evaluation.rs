@@ -1,10 +1,10 @@
 //! An evaluation that scores one test image at a time, so that pictures can be drawn in between.
 
 use crate::evaluate::ImageScores;
+use keyframe::Keyframe;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::Keyframe;
 
 /// Time limit for scoring: if drawing is slow, fewer images are scored. On a CPU, a neural field takes seconds per
 /// image.

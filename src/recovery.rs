@@ -6,11 +6,11 @@ use crate::method::ModelSpec;
 use crate::run_folder::CHECKPOINT;
 use crate::session::Session;
 use anyhow::Context;
+use keyframe::Keyframe;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once, OnceLock};
 use std::time::{Duration, Instant};
-use trainer::Keyframe;
 use trainer::gpu::Gpu;
 
 /// How many times a run tries to reopen the GPU.

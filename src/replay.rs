@@ -9,12 +9,12 @@ use crate::join::KeyframeList;
 use crate::method::{ModelKind, ModelSpec};
 use crate::session::Session;
 use crate::stop::Stop;
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
-use trainer::Keyframe;
 
 /// A decision log to replay.
 pub(crate) struct Replay {

@@ -6,13 +6,14 @@ use crate::exit::{self, BadArgument, Exit};
 use crate::method::ModelKind;
 use crate::splat_file;
 use anyhow::{Context, bail, ensure};
+use keyframe::Keyframe;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::{Keyframe, Method};
+use trainer::Method;
 
 /// The files of a saved model, in the order in which `checkpoint_sha256` covers them.
 const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", SPLATS];

@@ -15,17 +15,19 @@ use crate::stop::Stop;
 use crate::time_slices::TIME_SLICE;
 use crate::{camera_list, checkpoints, exit, print, report, run_folder};
 use anyhow::Context;
+use calibration::Alignment;
+use calibration::CalibratedCamera;
+use calibration::TrialReport;
 use indicatif::ProgressBar;
+use keyframe::{DepthMap, Keyframe, Split};
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::align::Alignment;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::splat::CalibratedCamera;
-use trainer::{DepthMap, Keyframe, Method, Picture, Progress, RenderRequest, Split, TrialReport};
+use trainer::{Method, Picture, Progress, RenderRequest};
 
 /// Number of steps in a profile, which reports medians.
 const N_PROFILED: usize = 21;

@@ -2,20 +2,20 @@
 //!
 //! Keyframes pass through on their way from the join to the trainer. Those of the first station pass unchanged. After
 //! that, keyframes taken while the base moves and the first ones of the next station are queued until the station can
-//! be registered with earlier ones ([`trainer::align::register_station`]). Then they and all later ones pass with the
+//! be registered with earlier ones ([`calibration::register_station`]). Then they and all later ones pass with the
 //! correction. The result depends only on the keyframes and their order, so that a run, its recording and the replay of
 //! that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::feed::Change;
+use calibration::{StationCorrection, register_station};
+use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use trainer::align::{self, StationCorrection};
-use trainer::{BaseState, Keyframe, Split};
 
 /// Number of keyframes with depth, excluding test keyframes, for registering a station. A few seconds of scanning give
 /// them.
@@ -275,7 +275,7 @@ impl Stations {
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
             let found =
-                align::run_in_background_pool(|| align::register_station(&reference_keyframes, &new, &world_from_base));
+                align::run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
             SearchResult { found, took: started.elapsed() }
         }));
     }
@@ -424,8 +424,8 @@ impl std::fmt::Display for StationReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use keyframe::DepthMap;
     use nalgebra::Vector3;
-    use trainer::DepthMap;
 
     /// A room corner with marks on its walls, rendered from a camera pose: brightness and depth.
     fn render_room(pose: &Transform) -> (Vec<u8>, Vec<f32>) {

@@ -7,6 +7,7 @@ use crate::join::{split_from_name, split_name};
 use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
+use keyframe::{BaseState, DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -14,7 +15,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
-use trainer::{BaseState, DepthMap, Keyframe};
 
 /// Name of the folder in the folder of a run.
 pub(crate) const FOLDER: &str = "keyframes";
@@ -238,7 +238,7 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 mod tests {
     use super::*;
     use crate::fingerprint;
-    use trainer::Split;
+    use keyframe::Split;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
         let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));

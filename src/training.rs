@@ -9,10 +9,10 @@ use crate::session::{Evaluators, Limits, OutputMode, Session};
 use crate::stop::Stop;
 use crate::time_slices;
 use crate::training_args::{AvailableData, CountArg, Refine, RefineSettings, TrainingArgs};
+use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::Keyframe;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 

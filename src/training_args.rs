@@ -3,9 +3,10 @@
 use crate::config::{self, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, SEED_RANGE};
 use crate::exit::BadArgument;
 use crate::method::{self, ModelKind};
+use calibration::align;
+use calibration::{CameraRefinement, ParamSet};
 use clap::{ValueEnum, value_parser};
-use trainer::align;
-use trainer::splat::{CameraRefinement, CountPolicy, ParamSet};
+use trainer::splat::CountPolicy;
 
 /// The rig file key that `--refine` sets.
 pub(crate) const REALIGN: &str = "base.realign";

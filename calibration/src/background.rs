@@ -1,9 +1,9 @@
 //! Alignment in parallel with training: starts with the first step on its own thread; the result is applied at a
 //! fixed step.
 
-use super::{Alignment, align};
-use crate::splat::{CalibratedCamera, CameraCorrection, CameraRefinement};
-use crate::{Error, Keyframe};
+use crate::registration::{Alignment, align};
+use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
+use keyframe::Keyframe;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
@@ -13,23 +13,25 @@ const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
 /// Step at which the result is applied.
-pub(crate) fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
+pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     let default_step = if is_software { SOFTWARE_ALIGNMENT_STEP } else { ALIGNMENT_STEP };
     default_step.min(n_planned_steps / 4).max(1)
 }
 
 /// State of the alignment.
 #[derive(Debug)]
-pub(crate) enum AlignmentTask {
+pub enum AlignmentTask {
     /// Starts with the next step.
     Requested,
+    /// Runs on its own thread.
     Running(JoinHandle<Option<Alignment>>),
     /// Finished, with the result if alignment was possible.
     Done(Option<Alignment>),
 }
 
 impl AlignmentTask {
-    pub(crate) fn new(choice: &CameraRefinement) -> Self {
+    /// Requests alignment unless `choice` selects no parameter.
+    pub fn new(choice: &CameraRefinement) -> Self {
         let is_requested = match choice {
             CameraRefinement::Always(params) => params.any(),
             CameraRefinement::Try(candidates) => !candidates.is_empty(),
@@ -37,29 +39,32 @@ impl AlignmentTask {
         if is_requested { Self::Requested } else { Self::Done(None) }
     }
 
-    pub(crate) fn result(&self) -> Option<&Alignment> {
+    /// The result; `None` before the end, or if alignment was not possible.
+    pub fn result(&self) -> Option<&Alignment> {
         match self {
             Self::Done(result) => result.as_ref(),
             Self::Requested | Self::Running(_) => None,
         }
     }
 
-    pub(crate) fn is_requested(&self) -> bool {
+    /// Whether alignment has not started yet.
+    pub fn is_requested(&self) -> bool {
         matches!(self, Self::Requested)
     }
 
-    pub(crate) fn is_done(&self) -> bool {
+    /// Whether alignment has ended or was not requested.
+    pub fn is_done(&self) -> bool {
         matches!(self, Self::Done(_))
     }
 
     /// Starts alignment on its own thread.
-    pub(crate) fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
+    pub fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
         let choice = choice.clone();
         *self = Self::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
 
     /// Waits for the result. Returns whether keyframes must be corrected.
-    pub(crate) fn finish(&mut self) -> Result<bool, Error> {
+    pub fn finish(&mut self) -> Result<bool, Error> {
         let Self::Running(thread) = std::mem::replace(self, Self::Done(None)) else { return Ok(false) };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
         for line in result.iter().flat_map(Alignment::lines) {
@@ -75,7 +80,7 @@ impl AlignmentTask {
     }
 
     /// The keyframe with the corrections of alignment, if there are any.
-    pub(crate) fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
+    pub fn corrected(&self, keyframe: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.correction(&keyframe.camera) {
             Some(correction) => Arc::new(correction.corrected(keyframe)),
             None => keyframe.clone(),
@@ -83,11 +88,7 @@ impl AlignmentTask {
     }
 
     /// The camera of a keyframe with the corrections of alignment, then those estimated with the splats.
-    pub(crate) fn calibrated_camera(
-        &self,
-        keyframe: &Keyframe,
-        learned: Option<&CameraCorrection>,
-    ) -> CalibratedCamera {
+    pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
         let posed = |keyframe: &Keyframe| {
             learned.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
         };

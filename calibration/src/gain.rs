@@ -1,21 +1,24 @@
 //! Gain of a part of a model on validation images, and its statistical significance.
 
 /// Minimum gain for keeping a part, dB.
-pub(crate) const MIN_GAIN_DB: f64 = 0.05;
+pub const MIN_GAIN_DB: f64 = 0.05;
 /// Minimum gain in standard errors.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// Mean gain over the same images with a variant and without it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Gain {
-    pub(crate) mean_db: f64,
-    pub(crate) standard_error_db: f64,
-    pub(crate) n_images: usize,
+pub struct Gain {
+    /// Mean gain, dB.
+    pub mean_db: f64,
+    /// Standard error of the mean, dB.
+    pub standard_error_db: f64,
+    /// Number of images.
+    pub n_images: usize,
 }
 
 impl Gain {
     /// Computes the gain from those of single images, dB.
-    pub(crate) fn of(gains_db: &[f64]) -> Self {
+    pub fn of(gains_db: &[f64]) -> Self {
         let n = gains_db.len().max(1) as f64;
         let mean_db = gains_db.iter().sum::<f64>() / n;
         let variance = gains_db.iter().map(|gain| (gain - mean_db).powi(2)).sum::<f64>() / f64::max(n - 1.0, 1.0);
@@ -23,7 +26,7 @@ impl Gain {
     }
 
     /// Whether the gain is above both `min_db` and its own uncertainty.
-    pub(crate) fn is_significant(&self, min_db: f64) -> bool {
+    pub fn is_significant(&self, min_db: f64) -> bool {
         self.mean_db > f64::max(min_db, MIN_STANDARD_ERRORS * self.standard_error_db)
     }
 }

@@ -78,16 +78,17 @@ impl Keyframe {
     }
 
     /// Fails if the length of an array does not match its size in pixels.
-    pub(crate) fn check(&self) -> Result<(), Error> {
+    pub fn check(&self) -> Result<(), Error> {
         let [width, height] = self.size_px;
-        let expected = 4 * width as usize * height as usize;
-        if self.rgba_srgb.len() != expected {
-            return Err(Error::PictureBytes { what: "keyframe", width, height, got: self.rgba_srgb.len(), expected });
+        let (got, expected) = (self.rgba_srgb.len(), 4 * width as usize * height as usize);
+        if got != expected {
+            return Err(Error::ImageBytes { width, height, got, expected });
         }
         let Some(depth) = &self.depth else { return Ok(()) };
-        let expected = depth.size_px[0] as usize * depth.size_px[1] as usize;
-        if depth.depth_m.len() != expected {
-            return Err(Error::DepthSizeMismatch { rendered: depth.depth_m.len(), truth: expected });
+        let [width, height] = depth.size_px;
+        let (got, expected) = (depth.depth_m.len(), width as usize * height as usize);
+        if got != expected {
+            return Err(Error::DepthPixels { width, height, got, expected });
         }
         Ok(())
     }

@@ -1,27 +1,33 @@
 //! Scenes of known shapes, and exact keyframes of them.
 
-use crate::gpu::f32_of;
-use crate::tsdf::TsdfOptions;
-use crate::{DepthMap, Keyframe, Projection, RenderRequest, Split};
-use kinematics::{Stamp, Transform};
+use crate::{DepthMap, Keyframe, Split};
+use kinematics::{Stamp, Transform, f32_of};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-pub(crate) const SIZE_PX: [u32; 2] = [96, 80];
-pub(crate) const FOCAL_PX: [f64; 2] = [90.0, 88.0];
-pub(crate) const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
+/// Size of the depth images, pixels.
+pub const SIZE_PX: [u32; 2] = [96, 80];
+/// Focal length of the depth camera, pixels.
+pub const FOCAL_PX: [f64; 2] = [90.0, 88.0];
+/// Principal point of the depth camera, pixels.
+pub const PRINCIPAL_PX: [f64; 2] = [47.0, 41.5];
 
 /// A shape with a surface.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum TestShape {
+pub enum TestShape {
+    /// A sphere.
     Sphere {
+        /// Center in world, meters.
         center_m: Point3<f64>,
+        /// Radius, meters.
         radius_m: f64,
     },
     /// Points whose dot product with the unit normal is the offset.
     Plane {
+        /// Unit normal.
         normal: Vector3<f64>,
+        /// Offset along the normal, meters.
         offset_m: f64,
     },
 }
@@ -42,7 +48,7 @@ impl TestShape {
     }
 
     /// Distance to the surface: signed and positive outside for spheres, unsigned for planes.
-    pub(crate) fn distance_m(&self, point: &Point3<f64>) -> f64 {
+    pub fn distance_m(&self, point: &Point3<f64>) -> f64 {
         match self {
             Self::Sphere { center_m, radius_m } => (point - center_m).norm() - radius_m,
             Self::Plane { normal, offset_m } => (normal.dot(&point.coords) - offset_m).abs(),
@@ -51,18 +57,18 @@ impl TestShape {
 }
 
 /// Color of the world at a point.
-pub(crate) fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
+pub fn color_srgb(point: &Point3<f64>) -> [f64; 3] {
     [0, 1, 2].map(|axis| 0.5 + 0.4 * (3.0 * point[axis] + axis as f64).sin())
 }
 
 /// Pose of a camera at `eye` that faces `target`, z up.
-pub(crate) fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
+pub fn look_at(eye: Point3<f64>, target: Point3<f64>) -> Transform {
     let up = if (target - eye).xy().norm() < 1e-9 { Vector3::y() } else { Vector3::z() };
     Transform::face_towards(&eye, &target, &up) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), PI)
 }
 
 /// A keyframe of the shapes with exact depth and color.
-pub(crate) fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
+pub fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
     // The color camera is 4 cm to the side of the depth camera and has a different size.
     let color_pose = world_from_camera * Transform::translation(0.04, 0.0, 0.0);
     let depth_m: Vec<f32> = cast_pixels(shapes, &world_from_camera, SIZE_PX, FOCAL_PX, PRINCIPAL_PX)
@@ -101,7 +107,7 @@ pub(crate) fn keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transfo
 }
 
 /// Like [`keyframe`], in the size of a depth camera's images.
-pub(crate) fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
+pub fn large_keyframe(ix: i64, shapes: &[TestShape], world_from_camera: Transform) -> Keyframe {
     let (size_px, focal_px, principal_px) = ([640, 480], [525.0; 2], [320.0, 240.0]);
     let mut keyframe = keyframe(ix, shapes, world_from_camera);
     let hits: Vec<_> = cast_pixels(shapes, &world_from_camera, size_px, focal_px, principal_px).collect();
@@ -141,53 +147,34 @@ fn cast_pixels(
 }
 
 /// A ball with a radius of 30 cm, centered at `at`.
-pub(crate) fn ball(at: Point3<f64>) -> TestShape {
+pub fn ball(at: Point3<f64>) -> TestShape {
     TestShape::Sphere { center_m: at, radius_m: 0.3 }
 }
 
 /// The floor below a ball at the origin.
-pub(crate) fn floor() -> TestShape {
+pub fn floor() -> TestShape {
     TestShape::Plane { normal: Vector3::z(), offset_m: -0.3 }
 }
 
 /// `n` views of a point from all sides, evenly distributed over the sphere (Vogel 1979).
-pub(crate) fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub fn all_around(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
             let height = 1.0 - (2 * ix + 1) as f64 / n as f64;
             let (angle, radius) = (ix as f64 * 2.399_963, (1.0 - height * height).sqrt());
             let eye = target + 1.0 * Vector3::new(radius * angle.cos(), radius * angle.sin(), height);
-            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, look_at(eye, target)))
+            Arc::new(keyframe(i64::try_from(ix).expect("few images"), shapes, look_at(eye, target)))
         })
         .collect()
 }
 
 /// Views from a part of a ring above the floor.
-pub(crate) fn ring(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
+pub fn ring(shapes: &[TestShape], target: Point3<f64>, n: usize) -> Vec<Arc<Keyframe>> {
     (0..n)
         .map(|ix| {
             let angle = 0.35 * ix as f64;
             let eye = target + Vector3::new(1.1 * angle.cos(), 1.1 * angle.sin(), 0.5);
-            Arc::new(keyframe(i64::try_from(ix).unwrap(), shapes, look_at(eye, target)))
+            Arc::new(keyframe(i64::try_from(ix).expect("few images"), shapes, look_at(eye, target)))
         })
         .collect()
-}
-
-pub(crate) fn options() -> TsdfOptions {
-    TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() }
-}
-
-pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
-    RenderRequest {
-        world_from_camera,
-        size_px: SIZE_PX,
-        projection: Projection::Pinhole { focal_px: FOCAL_PX, principal_px: PRINCIPAL_PX },
-        shutter: None,
-        near_m: 0.01,
-        far_m: 100.0,
-        crop: None,
-        background_srgb: [0.0, 0.5, 1.0],
-        appearance_of: None,
-        depth: true,
-    }
 }

@@ -1,4 +1,4 @@
-//! The only place where f64 is converted to f32 for the GPU.
+//! The only place where f64 is converted to f32, for images and the GPU.
 #![expect(clippy::cast_possible_truncation, reason = "rounding to f32 is the purpose of this file")]
 
 /// Rounds to the nearest f32.

@@ -8,12 +8,12 @@
 //! the size free of extra noise.
 
 use crate::bench::statistics::Interpolation;
+use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use trainer::{Keyframe, Split};
 
 /// Kinds of disturbances.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -266,7 +266,7 @@ mod tests {
                 focal_px: [1.0; 2],
                 principal_px: [1.0, 0.5],
                 rgba_srgb: [0, 128, 250, 255, 10, 20, 30, 0].into(),
-                depth: Some(trainer::DepthMap {
+                depth: Some(keyframe::DepthMap {
                     size_px: [1, 1],
                     focal_px: [1.0; 2],
                     principal_px: [0.5; 2],

@@ -12,13 +12,13 @@ use crate::training::{self, TrainingPlan};
 use crate::training_args::TrainingArgs;
 use crate::{print, run_folder};
 use anyhow::{Context, bail};
+use keyframe::{Keyframe, Split};
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Split};
 
 /// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";

@@ -1,6 +1,7 @@
 //! Variants of the training options that benches compare.
 
-use trainer::splat::{CameraRefinement, SplatOptions};
+use calibration::CameraRefinement;
+use trainer::splat::SplatOptions;
 
 /// A named change of the training options.
 pub(crate) struct Variant {

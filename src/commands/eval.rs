@@ -6,10 +6,10 @@ use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
 use crate::exit::{self, Exit};
 use crate::join::KeyframeList;
 use crate::{method, print};
+use keyframe::{Keyframe, Split};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::{Keyframe, Split};
 
 /// Flags of `eval`.
 #[derive(Debug, clap::Args)]

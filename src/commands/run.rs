@@ -23,6 +23,7 @@ use crate::training_args::{AvailableData, CountArg, REALIGN, Refine, TrainingArg
 use crate::viewer::{ModelViewer, ServedModel};
 use anyhow::Context;
 use drivers::Source;
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -34,7 +35,6 @@ use std::time::Duration;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Split};
 use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.

@@ -20,15 +20,15 @@ use crate::stations::StationReport;
 use crate::stop::Stop;
 use crate::training;
 use crate::training_args::{REALIGN, TrainingArgs};
+use calibration::Alignment;
+use keyframe::{Keyframe, Split};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::align::Alignment;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::{Keyframe, Split};
 
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;

@@ -6,9 +6,9 @@ use crate::downscale;
 use crate::exit::BadArgument;
 use anyhow::Context;
 use drivers::{Image, TruthImage};
+use keyframe::{DepthMap, Truth};
 use kinematics::{Intrinsics, Undistortion};
 use std::sync::Arc;
-use trainer::{DepthMap, Truth};
 
 /// Undistorts and scales the images of one camera. The maps are computed once.
 pub(super) struct Undistorter {

@@ -2,12 +2,12 @@
 
 use crate::exit::InsufficientData;
 use anyhow::{Context, bail};
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::{Keyframe, Split};
 
 const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "selection"), (Split::Test, "test")];
 

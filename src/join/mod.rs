@@ -27,12 +27,12 @@ use accept::Acceptance;
 use anyhow::Context;
 use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
+use keyframe::{Keyframe, RangePoints, Split};
 use kinematics::{HistoryError, Stamp, Transform};
 use ranges::RangeScans;
 use spacing::Spacing;
 use std::sync::Arc;
 use store::KeyframeStore;
-use trainer::{Keyframe, RangePoints, Split};
 use waiting::{Partner, Waiting};
 
 /// Converts samples to keyframes.
@@ -419,7 +419,7 @@ impl CameraState {
     }
 
     /// If depth does not decode, the keyframe is kept without depth.
-    fn depth_of(&mut self, ready: &ReadyImage) -> Option<trainer::DepthMap> {
+    fn depth_of(&mut self, ready: &ReadyImage) -> Option<keyframe::DepthMap> {
         let (image, camera_pose) = ready.depth.as_ref()?;
         let map =
             assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_undistorter.as_ref()?, camera_pose);

@@ -4,11 +4,11 @@ use super::station_detector::StationDetector;
 use crate::config::{self, BaseDriver, Parent, Rig};
 use anyhow::Context;
 use drivers::BasePose;
+use keyframe::BaseState;
 use kinematics::{Chain, HistoryError, Intrinsics, JointHistory, JointState, PoseHistory, Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Duration;
-use trainer::BaseState;
 
 /// Maximum number of readings kept: 20 s at 1 kHz, longer than any image waits.
 const MAX_READINGS: usize = 20_000;

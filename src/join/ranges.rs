@@ -3,11 +3,11 @@
 use super::motion::Motion;
 use crate::config::{Rig, Scanner};
 use drivers::RangeScan;
+use keyframe::{DepthMap, Keyframe, RangePoints};
 use kinematics::{HistoryError, Stamp};
 use nalgebra::Point3;
 use std::collections::VecDeque;
 use std::sync::Arc;
-use trainer::{DepthMap, Keyframe, RangePoints};
 
 /// Maximum number of scans that wait for base poses; beyond it, the oldest are dropped.
 const MAX_WAITING: usize = 64;
@@ -156,8 +156,8 @@ impl RangeScans {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use keyframe::Split;
     use kinematics::Transform;
-    use trainer::Split;
 
     fn keyframe(stamp: Stamp) -> Keyframe {
         Keyframe {

@@ -5,9 +5,9 @@
 //! split, the keyframe nearest to another one of its camera is evicted, and of two equally near ones the older.
 
 use super::spacing::Spacing;
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use std::sync::Arc;
-use trainer::{Keyframe, Split};
 
 /// Shares of the splits: every 8th keyframe is for testing, every 8th for validation.
 const SHARES: [(Split, f64); 3] = [(Split::Train, 6.0), (Split::Validation, 1.0), (Split::Test, 1.0)];

@@ -4,12 +4,12 @@ use super::{Join, JoinEvent, KeyframeList, Refusal, keyframe_list};
 use crate::config::{Override, Rig};
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
+use keyframe::{Keyframe, Split};
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::f64::consts::TAU;
 use std::path::Path;
 use std::sync::Arc;
 use toml::Value;
-use trainer::{Keyframe, Split};
 
 const SIZE_PX: [u32; 2] = [64, 48];
 const CENTER_RAD: [f64; 7] = [0.1, -0.3, 0.2, -2.0, 0.1, 1.8, 0.6];

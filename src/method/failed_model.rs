@@ -1,13 +1,15 @@
 //! Placeholder for a model whose GPU failed.
 
+use calibration::Alignment;
+use calibration::CalibratedCamera;
+use calibration::TrialReport;
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::align::Alignment;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::PassTiming;
-use trainer::splat::CalibratedCamera;
-use trainer::{Error, Keyframe, Method, Picture, Progress, RenderRequest, TrialReport};
+use trainer::{Error, Method, Picture, Progress, RenderRequest};
 
 /// Every operation returns [`Error::DeviceLost`].
 pub(crate) struct FailedModel;

@@ -7,6 +7,7 @@ use crate::stations::Stations;
 use drivers::tags::{Family, TagDetector};
 use drivers::wire::datagram::{Clock, DatagramHeader, PoseDatagram, ScanPart, encode_pose, encode_scan};
 use drivers::{RangePoint, Sample};
+use keyframe::Keyframe;
 use kinematics::Transform;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
@@ -14,7 +15,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use toml::Value;
-use trainer::Keyframe;
 
 /// A rig with a quarter of the resolution, in lockstep.
 fn small(name: &str, overrides: &[Override]) -> Rig {

@@ -5,9 +5,10 @@ use crate::evaluate;
 use anyhow::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
+use keyframe::Keyframe;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{Keyframe, Method, Picture};
+use trainer::{Method, Picture};
 
 /// Maximum number of test images shown.
 const MAX_IMAGES: usize = 12;

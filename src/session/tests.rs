@@ -1,11 +1,11 @@
 //! Scoring image by image gives the same result as scoring all at once.
 
 use super::*;
+use calibration::CalibratedCamera;
 use kinematics::{Stamp, Transform};
 use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::GpuOptions;
-use trainer::splat::CalibratedCamera;
 
 const SIZE_PX: [u32; 2] = [4, 2];
 const N_TESTS: u8 = 5;

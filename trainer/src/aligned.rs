@@ -3,11 +3,14 @@
 //! Alignment runs in parallel with training. If it keeps corrections, the model restarts with corrected keyframes.
 //! Splats, which support more trials of camera parameters, implement alignment separately.
 
-use crate::align::{Alignment, AlignmentTask, alignment_step};
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
-use crate::splat::{CalibratedCamera, CameraCorrection, CameraRefinement, read_metadata};
-use crate::{Error, Keyframe, Method, Picture, Progress, RenderRequest, TrialReport};
+use crate::splat::read_metadata;
+use crate::{Error, Method, Picture, Progress, RenderRequest};
+use calibration::TrialReport;
+use calibration::{Alignment, AlignmentTask, alignment_step};
+use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -265,12 +268,13 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::align::tests::{Miscalibration, capture, remaining, wrong_extrinsics};
     use crate::gpu::{Gpu, GpuOptions};
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
-    use crate::splat::ParamSet;
+    use crate::test_scenes as scenes;
     use crate::tsdf::{TsdfModel, TsdfOptions};
-    use crate::{Split, test_scenes as scenes};
+    use calibration::ParamSet;
+    use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+    use keyframe::Split;
 
     /// The step at which the result is applied.
     const ALIGNMENT_STEP: u64 = 6;

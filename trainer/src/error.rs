@@ -6,9 +6,12 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// A bug: the alignment thread panicked.
-    #[error("internal error: the alignment thread ended without a result")]
-    AlignmentPanicked,
+    /// Calibration failed.
+    #[error(transparent)]
+    Calibration(#[from] calibration::Error),
+    /// A keyframe is inconsistent.
+    #[error(transparent)]
+    Keyframe(#[from] keyframe::Error),
     /// No GPU adapter, real or software, was found.
     #[error("no GPU adapter found: install a Vulkan driver (software: the package mesa-vulkan-drivers)")]
     NoAdapter,
@@ -96,7 +99,7 @@ pub enum Error {
     /// A picture does not have four bytes per pixel.
     #[error("{what} picture of {width}x{height} pixels: got {got} bytes, expected {expected}")]
     PictureBytes {
-        /// Which picture: `rendered`, `true` or `keyframe`.
+        /// Which picture: `rendered` or `true`.
         what: &'static str,
         /// Width, pixels.
         width: u32,

@@ -1,6 +1,7 @@
 //! Signatures of keyframes that a model was trained on: identify and verify them without their pixels.
 
-use crate::{Error, Keyframe, Split};
+use crate::Error;
+use keyframe::{Keyframe, Split};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -1,13 +1,10 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
 
-pub mod align;
 mod aligned;
 pub mod checkpoint;
 mod error;
 pub mod eval;
-mod gain;
 pub mod gpu;
-pub mod keyframe;
 mod keyframe_signature;
 pub mod loss;
 pub mod method;
@@ -16,7 +13,6 @@ mod mismatches;
 pub mod nerf;
 pub mod optim;
 pub mod ply;
-mod range_points;
 pub mod request;
 pub mod sort;
 pub mod splat;
@@ -32,7 +28,5 @@ pub mod tsdf;
 
 pub use aligned::{Aligned, Restartable, ResumedModel};
 pub use error::Error;
-pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
-pub use method::{Method, Progress, TrialReport};
-pub use range_points::RangePoints;
-pub use request::{Aabb, Picture, Projection, RenderRequest, Shutter};
+pub use method::{Method, Progress};
+pub use request::{Aabb, Picture, Projection, RenderRequest};

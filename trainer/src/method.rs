@@ -1,10 +1,11 @@
 //! The interface of all scene models.
 
-use crate::align::Alignment;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
-use crate::splat::CalibratedCamera;
-use crate::{Error, Keyframe, Picture, RenderRequest};
+use crate::{Error, Picture, RenderRequest};
+use calibration::Alignment;
+use calibration::CalibratedCamera;
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
@@ -20,21 +21,6 @@ pub struct Progress {
     pub bytes: u64,
     /// GPU time of a step, milliseconds, smoothed.
     pub step_millis: f64,
-}
-
-/// Result of a trial of one part of a model, on validation images.
-#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct TrialReport {
-    /// Description of the part.
-    pub part: String,
-    /// Mean PSNR with the part minus that without it, dB.
-    pub gain_db: f64,
-    /// Standard error of the mean, dB.
-    pub standard_error_db: f64,
-    /// Number of validation images.
-    pub n_images: usize,
-    /// Whether the part was kept.
-    pub kept: bool,
 }
 
 /// Maximum GPU time of a training submit. Short enough that checkpoints, keyframes and Ctrl-C are handled soon.

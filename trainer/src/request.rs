@@ -30,15 +30,6 @@ pub enum Projection {
     Equirectangular,
 }
 
-/// Motion of a camera with a rolling shutter.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shutter {
-    /// Velocity of the camera in its own axes.
-    pub twist: Twist,
-    /// Time from the first row's exposure to the last row's, seconds.
-    pub readout_secs: f64,
-}
-
 /// A request for a picture.
 #[derive(Clone, Debug)]
 pub struct RenderRequest {

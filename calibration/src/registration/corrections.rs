@@ -3,7 +3,7 @@
 use super::layout::{CalibrationParam, Layout};
 use super::prepared_image::PreparedImage;
 use super::view::CorrectedView;
-use crate::splat::{CameraCorrection, rigid_transform};
+use crate::{CameraCorrection, rigid_transform};
 use kinematics::{Transform, Twist, transform};
 use nalgebra::{DVector, Vector3};
 use rayon::prelude::*;

@@ -1,7 +1,7 @@
 //! The parameters to estimate, their order, and their scales.
 
 use super::prepared_image::PreparedImage;
-use crate::splat::ParamSet;
+use crate::ParamSet;
 
 /// Typical magnitudes of calibration errors. The solver damps with these scales, and they determine whether a
 /// direction counts as observable.

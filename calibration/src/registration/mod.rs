@@ -9,7 +9,6 @@
 //! All functions are pure functions of keyframes: no clock, no I/O, and sums in a fixed order for any number of
 //! threads.
 
-mod background;
 mod corrections;
 mod fit;
 mod layout;
@@ -26,15 +25,13 @@ pub(crate) mod tests;
 mod validation;
 mod view;
 
-pub use background::run_in_background_pool;
-pub(crate) use background::{AlignmentTask, alignment_step};
 pub use report::{Alignment, Estimate, PoseEstimate, ScalarEstimate, Unobservable};
 pub use station::{StationCorrection, register_station};
 
-use crate::splat::{CameraRefinement, Candidate, ParamSet, Trial};
-use crate::{Keyframe, Split};
+use crate::{CameraRefinement, Candidate, ParamSet, Trial};
 use corrections::Corrections;
 use fit::Fit;
+use keyframe::{Keyframe, Split};
 use layout::Layout;
 use pairs::Pair;
 use prepared_image::PreparedImage;

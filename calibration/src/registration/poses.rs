@@ -9,7 +9,7 @@ use super::residual::Side;
 use super::solve::INFLATION;
 use super::sums::{self, PairSums, PixelSubset, ResidualOptions};
 use super::view::CorrectedView;
-use crate::splat::{CameraCorrection, drift_weight, rigid_transform};
+use crate::{CameraCorrection, drift_weight, rigid_transform};
 use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
 use std::collections::BTreeMap;

@@ -5,8 +5,8 @@
     reason = "coordinates in images are rounded down on purpose, after a check that they are inside"
 )]
 
-use crate::splat::shares_lens;
-use crate::{DepthMap, Keyframe};
+use crate::shares_lens;
+use keyframe::{DepthMap, Keyframe};
 use nalgebra::Vector3;
 use std::sync::Arc;
 

@@ -4,7 +4,7 @@ use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::splat::{CameraCorrection, Candidate, Trial};
+use crate::{CameraCorrection, Candidate, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -162,11 +162,9 @@ fn estimate(
     let number = |camera: usize, value: f64| ScalarEstimate { camera: name(camera), value, sigma: solution.sigma(ix) };
     Some(match param {
         CalibrationParam::Extrinsics(camera, 0) => {
-            let wrong_extrinsics = crate::splat::rigid_transform(
-                correction(camera).rotation_rad.into(),
-                correction(camera).translation_m.into(),
-            )
-            .inverse();
+            let wrong_extrinsics =
+                crate::rigid_transform(correction(camera).rotation_rad.into(), correction(camera).translation_m.into())
+                    .inverse();
             Estimate::HandEye(pose_estimate(
                 name(camera),
                 wrong_extrinsics.rotation.scaled_axis(),

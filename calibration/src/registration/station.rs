@@ -15,8 +15,8 @@ use super::sums::{self, Noise, PixelSubset, ResidualOptions};
 use super::validation;
 use super::view::CorrectedView;
 use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, MIN_VALIDATION_IMAGES, PARTNERS_PER_IMAGE};
-use crate::splat::{Candidate, ParamSet, Trial};
-use crate::{Keyframe, Split};
+use crate::{Candidate, ParamSet, Trial};
+use keyframe::{Keyframe, Split};
 use kinematics::Transform;
 use nalgebra::{DVector, UnitQuaternion, Vector3};
 use rayon::prelude::*;
@@ -279,7 +279,7 @@ fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::align::tests::{Miscalibration, capture};
+    use crate::scenes::{Miscalibration, capture};
 
     /// Reported pose of the base at the second station.
     fn reported_base() -> Transform {
@@ -367,7 +367,7 @@ mod tests {
 
     #[test]
     fn textureless_wall_leaves_in_plane_motion_unobservable() {
-        use crate::test_scenes::{TestShape, keyframe, look_at};
+        use keyframe::scenes::{TestShape, keyframe, look_at};
         use nalgebra::Point3;
         let wall = [TestShape::Plane { normal: Vector3::x(), offset_m: 1.5 }];
         let at = |ix: i64| {

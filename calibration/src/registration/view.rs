@@ -2,7 +2,7 @@
 
 use super::layout::Layout;
 use super::prepared_image::PreparedImage;
-use crate::splat::CameraCorrection;
+use crate::CameraCorrection;
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Vector3};
 

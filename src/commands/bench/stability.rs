@@ -11,12 +11,12 @@ use crate::method::ModelSpec;
 use crate::session::Limits;
 use crate::training;
 use anyhow::ensure;
+use keyframe::{Keyframe, Split};
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 use trainer::splat::SplatOptions;
-use trainer::{Keyframe, Split};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;

@@ -1,6 +1,7 @@
 //! Error of rendered depth.
 
-use crate::{DepthMap, Error};
+use crate::Error;
+use keyframe::DepthMap;
 
 /// Root mean squared difference of two depth images in meters, over pixels where both have a depth above 0.
 ///

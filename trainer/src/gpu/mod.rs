@@ -3,13 +3,12 @@
 mod device;
 mod passes;
 mod pipeline;
-mod pod;
 mod requirements;
 mod wgsl;
 
 pub use device::{Buffer, Gpu, GpuOptions, PendingRead};
+pub use kinematics::{f32_of, f32s_of};
 pub use passes::{PassTiming, Passes};
 pub use pipeline::{Kernel, Pipeline};
-pub use pod::{f32_of, f32s_of};
 pub use requirements::Optional;
 pub use wgsl::{Source, reflect, resolve};

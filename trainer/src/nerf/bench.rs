@@ -11,7 +11,7 @@ use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
-use crate::splat::ParamSet;
+use calibration::ParamSet;
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;

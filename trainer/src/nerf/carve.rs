@@ -3,7 +3,7 @@
 use super::extent::Extent;
 use super::reference::march::March;
 use super::reference::space::largest;
-use crate::{DepthMap, Keyframe};
+use keyframe::{DepthMap, Keyframe};
 use kinematics::Transform;
 use nalgebra::Vector3;
 use rayon::prelude::*;

@@ -1,7 +1,8 @@
 //! Extent of the scene, estimated from the keyframes.
 
+use crate::Aabb;
 use crate::splat::Camera;
-use crate::{Aabb, Keyframe, Shutter};
+use keyframe::{Keyframe, Shutter};
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};

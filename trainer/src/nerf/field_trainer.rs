@@ -14,8 +14,9 @@ use super::rays::{mix_hash, unit};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::splat::{Camera, EMBEDDING_DIM, ParamSet};
+use crate::splat::Camera;
 use crate::{Error, Picture};
+use calibration::{EMBEDDING_DIM, ParamSet};
 use rayon::prelude::*;
 use std::sync::Arc;
 

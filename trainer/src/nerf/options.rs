@@ -1,6 +1,6 @@
 //! Training options of a neural field.
 
-use crate::splat::CameraRefinement;
+use calibration::CameraRefinement;
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::NerfModel`].

@@ -3,7 +3,8 @@
 use super::extent::{Extent, pixel_size_m};
 use super::options::{NerfBudget, NerfOptions};
 use super::reference::grid::GridShape;
-use crate::{DepthMap, Error, Keyframe};
+use crate::Error;
+use keyframe::{DepthMap, Keyframe};
 use serde::{Deserialize, Serialize};
 
 /// Cells of the coarsest level along an axis.

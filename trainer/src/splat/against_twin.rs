@@ -3,7 +3,7 @@
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::camera_params::{CameraParams, ParamSet};
+use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
@@ -11,7 +11,8 @@ use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
 use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of};
 use crate::loss::reference as loss_reference;
 use crate::mismatches::Mismatches;
-use crate::{Keyframe, Shutter, Split};
+use calibration::ParamSet;
+use keyframe::{Keyframe, Shutter, Split};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::Vector3;
 use std::sync::Arc;

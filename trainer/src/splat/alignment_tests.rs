@@ -2,10 +2,12 @@
 //! bit-exact.
 
 use super::training_tests::train;
-use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer};
-use crate::align::tests::{Miscalibration, capture, remaining, wrong_extrinsics};
+use super::{SplatOptions, SplatTrainer};
+use crate::Method;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::{Keyframe, Method, Split};
+use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
+use calibration::{CameraRefinement, ParamSet};
+use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
 fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {

@@ -4,7 +4,8 @@ use super::training_tests::{keyframes, options, train};
 use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::{Error, Keyframe, Method};
+use crate::{Error, Method};
+use keyframe::Keyframe;
 use std::sync::Arc;
 
 /// Stops before the first change of the splat count and of the degree, and between later changes.

@@ -3,8 +3,9 @@
 use super::SplatTrainer;
 use super::cloud::synthetic_cloud;
 use super::training_tests::{keyframes, options, test_psnr, train};
+use crate::Method;
 use crate::gpu::{Gpu, GpuOptions, f32_of};
-use crate::{DepthMap, Keyframe, Method};
+use keyframe::{DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;

@@ -1,6 +1,7 @@
 //! Options of the splat model.
 
-use super::trials::{CameraRefinement, CountPolicy};
+use super::trials::CountPolicy;
+use calibration::CameraRefinement;
 use serde::{Deserialize, Serialize};
 
 /// Settings of a [`super::SplatTrainer`].

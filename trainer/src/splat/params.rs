@@ -1,7 +1,8 @@
 //! Small structs that the kernels read, with the layouts of their WGSL counterparts.
 
 use crate::gpu::{f32_of, f32s_of};
-use crate::{Aabb, RenderRequest, Shutter};
+use crate::{Aabb, RenderRequest};
+use keyframe::Shutter;
 use kinematics::Transform;
 
 /// Edge of a tile, pixels.

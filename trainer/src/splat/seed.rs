@@ -6,8 +6,8 @@
 
 use super::arrays::SplatArrays;
 use super::views::FAR_M;
-use crate::Keyframe;
 use crate::gpu::{f32_of, f32s_of};
+use keyframe::Keyframe;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::HashSet;
@@ -380,7 +380,7 @@ impl Random {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::DepthMap;
+    use keyframe::DepthMap;
     use kinematics::{Stamp, Transform};
 
     const WALL_M: f64 = 2.0;
@@ -407,7 +407,7 @@ mod tests {
             readout_secs: 0.0,
             joint_twists: [].into(),
             base: None,
-            split: crate::Split::Train,
+            split: keyframe::Split::Train,
             truth: None,
         }
     }

@@ -8,21 +8,23 @@ mod scoring;
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
-use super::camera_params::{CalibratedCamera, CameraCorrection, CameraParams, ParamSet};
+use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, LearnPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
-use super::trials::{
-    CameraRefinement, Candidate, Due, SecondHalf, SplatTrials, Trial, TrialContext, TrialEnd, ValidationImage,
-};
+use super::trials::{Due, SecondHalf, SplatTrials, TrialContext, TrialEnd, ValidationImage};
 use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
-use crate::align::{Alignment, AlignmentTask};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
 use crate::method::submit_millis;
-use crate::{Error, Keyframe, Method, Picture, Progress, Projection, RenderRequest, Split, TrialReport, ply};
+use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, ply};
+use calibration::TrialReport;
+use calibration::{Alignment, AlignmentTask};
+use calibration::{CalibratedCamera, CameraCorrection, ParamSet};
+use calibration::{CameraRefinement, Candidate, Trial};
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};

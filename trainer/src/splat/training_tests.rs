@@ -2,10 +2,12 @@
 
 use super::arrays::SplatArrays;
 use super::cloud::synthetic_cloud;
-use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer};
+use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions, f32s_of};
-use crate::{DepthMap, Keyframe, Method, Projection, RenderRequest, Split};
+use crate::{Method, Projection, RenderRequest};
+use calibration::{CameraRefinement, ParamSet};
+use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;

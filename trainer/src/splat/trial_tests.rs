@@ -3,10 +3,12 @@
 
 use super::training_tests::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
-use super::{CameraRefinement, ParamSet, SplatOptions, SplatTrainer, Trial};
+use super::{SplatOptions, SplatTrainer};
+use crate::Method;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
-use crate::{Keyframe, Method, Split};
+use calibration::{CameraRefinement, ParamSet, Trial};
+use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
 /// Steps of each half of a trial of parameters that all images share.

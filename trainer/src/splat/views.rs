@@ -4,10 +4,12 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
-use super::camera_params::{CalibratedCamera, CameraParams};
+use super::camera_params::CameraParams;
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
+use crate::Error;
 use crate::gpu::{Buffer, Gpu, f32_of};
-use crate::{Error, Keyframe};
+use calibration::CalibratedCamera;
+use keyframe::Keyframe;
 use nalgebra::Point3;
 use std::collections::BTreeSet;
 use std::sync::Arc;

@@ -2,7 +2,7 @@
 
 use super::block::WEIGHT_ONE;
 use super::options::TsdfOptions;
-use crate::DepthMap;
+use keyframe::DepthMap;
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};

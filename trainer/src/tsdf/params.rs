@@ -1,9 +1,9 @@
 //! Small structs that kernels read, with the layouts of their WGSL counterparts.
 
 use super::chosen_grid::VoxelGrid;
-use crate::Keyframe;
 use crate::gpu::{f32_of, f32s_of};
-use crate::splat::CalibratedCamera;
+use calibration::CalibratedCamera;
+use keyframe::Keyframe;
 use kinematics::Transform;
 
 /// `Field` of `shared/field.wgsl`.

@@ -4,9 +4,10 @@ use super::buffers::FieldBuffers;
 use super::kernels::Pipelines;
 use super::marching::MeshBuffers;
 use super::params::{Backdrop, DepthView};
+use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
 use crate::splat::View;
-use crate::{Error, Keyframe};
+use keyframe::Keyframe;
 
 /// Maximum number of workgroups that share the visible blocks: enough to fill any GPU.
 const MAX_INTEGRATE_GROUPS: u32 = 8192;

@@ -7,14 +7,16 @@
 //! and after them in time.
 
 use super::NerfModel;
+use crate::Error;
 use crate::checkpoint::Array;
-use crate::gain::{Gain, MIN_GAIN_DB};
 use crate::nerf::extent::Extent;
 use crate::nerf::field_trainer::RayColor;
 use crate::nerf::params::{EMBEDDING, IMAGE_PARAM_STRIDE};
 use crate::nerf::rays::{self, RayImage, RaySampling};
-use crate::splat::{CameraCorrection, CameraRefinement, EMBEDDING_DIM, ParamSet, drift_weight, interpolate};
-use crate::{Error, Keyframe, TrialReport};
+use calibration::TrialReport;
+use calibration::{CameraCorrection, CameraRefinement, EMBEDDING_DIM, ParamSet, drift_weight, interpolate};
+use calibration::{Gain, MIN_GAIN_DB};
+use keyframe::Keyframe;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::collections::{BTreeMap, VecDeque};

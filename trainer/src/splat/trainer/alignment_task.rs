@@ -3,12 +3,12 @@
 
 use super::SplatTrainer;
 use crate::Error;
-use crate::align::{self, Alignment};
 use crate::splat::buffers::SplatBuffers;
-use crate::splat::camera_params::{CameraParams, ParamSet};
+use crate::splat::camera_params::CameraParams;
 use crate::splat::params::status;
 use crate::splat::seed::Seeder;
 use crate::splat::views::TrainView;
+use calibration::{Alignment, ParamSet, alignment_step};
 
 impl SplatTrainer {
     /// Number of steps until alignment is due.
@@ -17,7 +17,7 @@ impl SplatTrainer {
     }
 
     fn alignment_step(&self) -> u64 {
-        align::alignment_step(self.gpu.is_software(), self.options.n_planned_steps)
+        alignment_step(self.gpu.is_software(), self.options.n_planned_steps)
     }
 
     /// Starts alignment, or applies its result when due.

@@ -1,18 +1,21 @@
 //! Checkpoints of a splat model in training. They contain all state that affects further training, bit for bit.
 
 use super::{Seeding, Snapshot, SplatTrainer};
-use crate::align::{Alignment, AlignmentTask};
+use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::keyframe_signature::{self, KeyframeSignature};
 use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
-use crate::splat::camera_params::{CameraSlots, ParamSet};
+use crate::splat::camera_params::CameraSlots;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::seed::{SeedSnapshot, Seeder};
-use crate::splat::trials::{Arrival, Candidate, RemainingTrials, RunningTrial, Scores, Trial};
+use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial, Scores};
 use crate::splat::views::TrainView;
-use crate::{Error, Keyframe};
+use calibration::ParamSet;
+use calibration::{Alignment, AlignmentTask};
+use calibration::{Candidate, Trial};
+use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;

@@ -108,12 +108,15 @@ fn gather_splats(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
+    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
-    use crate::splat::trials::{Candidate, CountPolicy};
-    use crate::splat::{SplatOptions, Trial};
-    use crate::{Keyframe, Method, Split};
+    use crate::splat::trials::CountPolicy;
+    use calibration::Candidate;
+    use calibration::Trial;
+    use keyframe::{Keyframe, Split};
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {

@@ -1,13 +1,14 @@
 //! Scores of the model in training on images that it was not trained on.
 
 use super::{CameraCorrections, Learn, RequestedParts, SplatTrainer, VIEWS_AT_ONCE, corrected_camera};
+use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::ImageBuffers;
-use crate::splat::camera_params::interpolate;
 use crate::splat::params::Camera;
 use crate::splat::trials::Scores;
 use crate::splat::views::{Level, camera_of};
-use crate::{Error, Keyframe};
+use calibration::interpolate;
+use keyframe::Keyframe;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -268,11 +269,13 @@ impl<'a> RenderedView<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::GpuOptions;
+    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
-    use crate::splat::{CameraRefinement, ParamSet, SplatOptions};
-    use crate::{Method, Split};
+    use calibration::{CameraRefinement, ParamSet};
+    use keyframe::Split;
 
     const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
 

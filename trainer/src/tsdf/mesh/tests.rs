@@ -1,11 +1,12 @@
 //! Meshes of known shapes: accuracy, closedness, and the files.
 
 use super::{Mesh, write_glb, write_ply};
+use crate::Method;
 use crate::gpu::{Gpu, GpuOptions};
 use crate::test_scenes::{self as scenes, TestShape};
 use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
-use crate::{Keyframe, Method};
+use keyframe::Keyframe;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;

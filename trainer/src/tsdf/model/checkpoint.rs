@@ -5,10 +5,11 @@ use super::super::buffers::{Capacity, FieldBuffers};
 use super::super::chosen_grid::VoxelGrid;
 use super::super::options::TsdfOptions;
 use super::{INITIAL_CAPACITY, TsdfModel};
+use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
 use crate::keyframe_signature::{self, KeyframeSignature};
-use crate::{Error, Keyframe};
+use keyframe::Keyframe;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 

@@ -2,9 +2,9 @@
 //! order.
 
 use super::readings::{Reading, ray_of};
-use crate::DepthMap;
 use crate::tsdf::block::GridCoord;
 use crate::tsdf::chosen_grid::VoxelGrid;
+use keyframe::DepthMap;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;
 

@@ -3,7 +3,7 @@
 use super::readings::{Reading, ray_of};
 use crate::tsdf::block::{GridCoord, N_VOXELS};
 use crate::tsdf::chosen_grid::VoxelGrid;
-use crate::{DepthMap, Keyframe};
+use keyframe::{DepthMap, Keyframe};
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 

@@ -1,7 +1,7 @@
 //! Twin of `readings.wgsl`.
 
-use crate::DepthMap;
 use crate::tsdf::chosen_grid::VoxelGrid;
+use keyframe::DepthMap;
 use nalgebra::Vector3;
 
 /// A pixel's depth and surface orientation.

@@ -1,0 +1,247 @@
+//! Corrections of one camera, and the camera of a keyframe with them.
+
+use keyframe::{DepthMap, Keyframe, Shutter};
+use kinematics::{Stamp, Transform, Twist, f32_of, transform};
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
+
+/// Estimated calibration correction of one camera.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(default)]
+pub struct CameraCorrection {
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
+    /// `camera_from_world`.
+    pub rotation_rad: [f64; 3],
+    /// Translation in the camera's axes, meters.
+    pub translation_m: [f64; 3],
+    /// Time from the nominal pose of an image to its exposure, seconds.
+    pub time_offset_secs: f64,
+    /// Logarithm of the factor on the focal lengths.
+    pub log_focal: [f64; 2],
+    /// Offset of the principal point, in focal lengths.
+    pub principal_offset_focals: [f64; 2],
+    /// Offsets added to the readings of the joints that carry the camera, radians or meters; may be empty.
+    pub joint_offsets: Vec<f64>,
+    /// Rotation vector in the camera's own axes, radians. The rotation, then the translation, are applied after
+    /// `color_from_depth`.
+    pub depth_rotation_rad: [f64; 3],
+    /// Translation in the camera's axes, meters.
+    pub depth_translation_m: [f64; 3],
+    /// Logarithm of the factor on depth readings.
+    pub log_depth_scale: f64,
+    /// Offset added to the readout time, seconds.
+    pub readout_secs: f64,
+    /// Rotation vector (radians) and translation (meters) of each training image, by stamp in nanoseconds;
+    /// interpolated linearly in between.
+    pub drift: BTreeMap<i64, [f64; 6]>,
+    /// Share of the interpolated drift that is applied to images that were not trained on, 0 to 1.
+    pub drift_weight: f64,
+    /// Logarithms of the gains of red, green and blue of each training image, by stamp in nanoseconds.
+    pub log_gains: BTreeMap<i64, [f64; 3]>,
+    /// Appearance embeddings of each training image in a neural field, by stamp in nanoseconds. The values have no
+    /// meaning outside the field.
+    pub appearance_embeddings: BTreeMap<i64, [f64; EMBEDDING_DIM]>,
+}
+
+/// Dimension of an appearance embedding.
+pub const EMBEDDING_DIM: usize = 1;
+
+impl Default for CameraCorrection {
+    fn default() -> Self {
+        Self {
+            rotation_rad: [0.0; 3],
+            translation_m: [0.0; 3],
+            time_offset_secs: 0.0,
+            log_focal: [0.0; 2],
+            principal_offset_focals: [0.0; 2],
+            joint_offsets: Vec::new(),
+            depth_rotation_rad: [0.0; 3],
+            depth_translation_m: [0.0; 3],
+            log_depth_scale: 0.0,
+            readout_secs: 0.0,
+            drift: BTreeMap::new(),
+            drift_weight: 1.0,
+            log_gains: BTreeMap::new(),
+            appearance_embeddings: BTreeMap::new(),
+        }
+    }
+}
+
+/// A pinhole camera with its pose.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CalibratedCamera {
+    /// Pose of the camera in the world.
+    pub world_from_camera: Transform,
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+    /// Motion of the camera while its rows are read out, if known.
+    pub shutter: Option<Shutter>,
+    /// Pose of the depth frame in the camera frame, if there is depth.
+    pub color_from_depth: Option<Transform>,
+    /// Factors on red, green and blue of a picture that match it to the image: exposure and white balance.
+    pub gains: [f64; 3],
+}
+
+impl CalibratedCamera {
+    /// The camera of a keyframe without any correction.
+    pub fn of(keyframe: &Keyframe) -> Self {
+        Self {
+            world_from_camera: keyframe.world_from_camera,
+            focal_px: keyframe.focal_px,
+            principal_px: keyframe.principal_px,
+            shutter: keyframe.twist.map(|twist| Shutter { twist, readout_secs: keyframe.readout_secs }),
+            color_from_depth: keyframe
+                .depth
+                .as_ref()
+                .map(|depth| keyframe.world_from_camera.inverse() * depth.world_from_camera),
+            gains: [1.0; 3],
+        }
+    }
+}
+
+impl CameraCorrection {
+    /// The corrected camera of a keyframe; [`CalibratedCamera::of`] is the uncorrected one.
+    pub fn apply(&self, keyframe: &Keyframe) -> CalibratedCamera {
+        let lens = CalibratedCamera::of(keyframe);
+        let time_offset = self.time_corrected_from_input(keyframe);
+        let mut by_joints = Twist::zero();
+        for (twist, offset) in keyframe.joint_twists.iter().zip(&self.joint_offsets) {
+            by_joints.linear_m_s += twist.linear_m_s * *offset;
+            by_joints.angular_rad_s += twist.angular_rad_s * *offset;
+        }
+        let joints = transform::exp(&by_joints, -1.0);
+        let extrinsics = rigid_transform(self.rotation_rad.into(), self.translation_m.into());
+        let [rotation_x, rotation_y, rotation_z, x, y, z] = self.drift_at(keyframe.stamp);
+        let drift = rigid_transform(Vector3::new(rotation_x, rotation_y, rotation_z), Vector3::new(x, y, z));
+        let world_from_camera =
+            (extrinsics * drift * joints * time_offset * lens.world_from_camera.inverse()).inverse();
+        let raw_from_corrected = lens.world_from_camera.inverse() * world_from_camera;
+        let shutter = |shutter: Shutter| Shutter {
+            twist: shutter.twist.of_attached(&raw_from_corrected),
+            readout_secs: (shutter.readout_secs + self.readout_secs).max(0.0),
+        };
+        CalibratedCamera {
+            world_from_camera,
+            shutter: lens.shutter.map(shutter),
+            focal_px: std::array::from_fn(|axis| lens.focal_px[axis] * self.log_focal[axis].exp()),
+            principal_px: std::array::from_fn(|axis| {
+                lens.principal_px[axis] + self.principal_offset_focals[axis] * lens.focal_px[axis]
+            }),
+            color_from_depth: keyframe.depth.as_ref().map(|depth| self.color_from_depth(keyframe, depth)),
+            gains: interpolate(&self.log_gains, keyframe.stamp).unwrap_or_default().map(f64::exp),
+        }
+    }
+
+    /// Drift of an image: its own, or the weighted interpolation between its neighbors in time.
+    pub fn drift_at(&self, stamp: Stamp) -> [f64; 6] {
+        let share = if self.drift.contains_key(&stamp.0) { 1.0 } else { self.drift_weight };
+        interpolate(&self.drift, stamp).unwrap_or_default().map(|part| share * part)
+    }
+
+    /// Transform from the uncorrected camera to the camera at the exposure of the image.
+    pub fn time_corrected_from_input(&self, keyframe: &Keyframe) -> Transform {
+        keyframe.twist.map_or(Transform::identity(), |twist| {
+            rigid_transform(-self.time_offset_secs * twist.angular_rad_s, -self.time_offset_secs * twist.linear_m_s)
+        })
+    }
+
+    /// Corrected pose of a keyframe's depth frame in its color frame.
+    pub fn color_from_depth(&self, keyframe: &Keyframe, depth: &DepthMap) -> Transform {
+        let rigid_transform = rigid_transform(self.depth_rotation_rad.into(), self.depth_translation_m.into());
+        rigid_transform * keyframe.world_from_camera.inverse() * depth.world_from_camera
+    }
+
+    /// The keyframe with corrected pose, intrinsics, depth and readout time.
+    pub fn corrected(&self, keyframe: &Keyframe) -> Keyframe {
+        let CalibratedCamera { world_from_camera, focal_px, principal_px, .. } = self.apply(keyframe);
+        let depth = keyframe.depth.as_ref().map(|depth| {
+            let has_same_lens = shares_lens(keyframe, depth);
+            let focal = |axis: usize| depth.focal_px[axis] * self.log_focal[axis].exp();
+            let principal =
+                |axis: usize| depth.principal_px[axis] + self.principal_offset_focals[axis] * depth.focal_px[axis];
+            let factor = f32_of(self.log_depth_scale.exp());
+            DepthMap {
+                size_px: depth.size_px,
+                focal_px: if has_same_lens { [0, 1].map(focal) } else { depth.focal_px },
+                principal_px: if has_same_lens { [0, 1].map(principal) } else { depth.principal_px },
+                depth_m: match factor {
+                    1.0 => depth.depth_m.clone(),
+                    factor => depth.depth_m.iter().map(|z| z * factor).collect(),
+                },
+                world_from_camera: world_from_camera * self.color_from_depth(keyframe, depth),
+            }
+        });
+        let raw_from_corrected = keyframe.world_from_camera.inverse() * world_from_camera;
+        Keyframe {
+            focal_px,
+            principal_px,
+            depth,
+            world_from_camera,
+            twist: keyframe.twist.map(|twist| twist.of_attached(&raw_from_corrected)),
+            readout_secs: (keyframe.readout_secs + self.readout_secs).max(0.0),
+            joint_twists: keyframe.joint_twists.iter().map(|twist| twist.of_attached(&raw_from_corrected)).collect(),
+            ..keyframe.clone()
+        }
+    }
+}
+
+/// Linear interpolation at a stamp between the entries before and after it; `None` if there are no entries.
+pub fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp) -> Option<[f64; N]> {
+    let before = known.range(..=stamp.0).next_back();
+    let after = known.range(stamp.0..).next();
+    match (before, after) {
+        (Some((begin, from)), Some((end, to))) if end > begin => {
+            let share = (stamp.0 - begin) as f64 / (end - begin) as f64;
+            Some(std::array::from_fn(|ix| from[ix] + share * (to[ix] - from[ix])))
+        }
+        (Some((_, value)), _) | (None, Some((_, value))) => Some(*value),
+        (None, None) => None,
+    }
+}
+
+/// Share of the drift between images that also applies to other images, 0 to 1.
+///
+/// Leaves out each image, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the squared
+/// prediction errors to the squared drifts.
+///
+/// Returns 0 if the errors of images are independent, if predicting is worse than assuming no drift, or if there are
+/// too few images.
+///
+/// * `scene_size_m`: lever arm that converts rotations to lengths.
+pub fn drift_weight(drift: &BTreeMap<i64, [f64; 6]>, scene_size_m: f64) -> f64 {
+    /// Smaller weights may be due to chance.
+    const MIN_WEIGHT: f64 = 0.2;
+    let known: Vec<(f64, &[f64; 6])> = drift.iter().map(|(stamp, parts)| (*stamp as f64, parts)).collect();
+    let squares = |parts: [f64; 6]| {
+        let [rotation, translation] = [&parts[..3], &parts[3..]].map(|parts| parts.iter().map(|x| x * x).sum::<f64>());
+        rotation * scene_size_m * scene_size_m + translation
+    };
+    let (mut residual, mut all) = (0.0, 0.0);
+    for neighbors in known.windows(3) {
+        let [(begin, from), (stamp, own), (end, to)] = [neighbors[0], neighbors[1], neighbors[2]];
+        let frac = (stamp - begin) / (end - begin);
+        residual += squares(std::array::from_fn(|ix| own[ix] - from[ix] - frac * (to[ix] - from[ix])));
+        all += squares(*own);
+    }
+    let share = if all > 0.0 { 1.0 - residual / all } else { 0.0 };
+    if share < MIN_WEIGHT { 0.0 } else { share }
+}
+
+/// Rotation, then translation.
+pub fn rigid_transform(rotation_rad: Vector3<f64>, translation_m: Vector3<f64>) -> Transform {
+    Transform::from_parts(Translation3::from(translation_m), UnitQuaternion::from_scaled_axis(rotation_rad))
+}
+
+/// Whether the depth image has the lens of the color image, for example because it was registered to it. If so, lens
+/// corrections apply to both.
+pub fn shares_lens(keyframe: &Keyframe, depth: &DepthMap) -> bool {
+    const TOLERANCE_FRAC: f64 = 1e-4; // Sizes are rounded to pixels.
+    [0, 1].into_iter().all(|axis| {
+        let share = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
+        let difference_px = (depth.focal_px[axis] - share * keyframe.focal_px[axis]).abs()
+            + (depth.principal_px[axis] - share * keyframe.principal_px[axis]).abs();
+        difference_px <= TOLERANCE_FRAC * depth.focal_px[axis]
+    })
+}

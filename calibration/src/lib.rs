@@ -1,0 +1,45 @@
+//! Calibration parameters of cameras and their estimation from keyframes.
+//!
+//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics, joint
+//! offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are estimated.
+//! [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
+//! ([`Trial`], [`Gain`]) and reports the others with their uncertainty. [`AlignmentTask`] does that in parallel with
+//! training. [`register_station`] estimates the pose of a mobile base at one station.
+//!
+//! ```
+//! use calibration::CameraCorrection;
+//! # use keyframe::{Keyframe, Split};
+//! # use kinematics::{Stamp, Transform};
+//! # let keyframe = Keyframe {
+//! #     camera: "wrist".into(), stamp: Stamp(0), size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2],
+//! #     rgba_srgb: [0; 4].into(), depth: None, world_from_camera: Transform::identity(), twist: None,
+//! #     readout_secs: 0.0, joint_twists: [].into(), base: None, split: Split::Train, truth: None,
+//! # };
+//! // The camera is 5 mm further along its x axis than its extrinsics say.
+//! let correction = CameraCorrection { translation_m: [-0.005, 0.0, 0.0], ..CameraCorrection::default() };
+//! let corrected = correction.corrected(&keyframe);
+//! assert!((corrected.world_from_camera.translation.x - 0.005).abs() < 1e-12);
+//! ```
+
+mod background;
+mod correction;
+mod error;
+mod gain;
+mod params;
+mod registration;
+#[cfg(any(test, feature = "scenes"))]
+pub mod scenes;
+mod trial;
+
+pub use background::{AlignmentTask, alignment_step, run_in_background_pool};
+pub use correction::{
+    CalibratedCamera, CameraCorrection, EMBEDDING_DIM, drift_weight, interpolate, rigid_transform, shares_lens,
+};
+pub use error::Error;
+pub use gain::{Gain, MIN_GAIN_DB};
+pub use params::ParamSet;
+pub use registration::{
+    Alignment, Estimate, PoseEstimate, ScalarEstimate, StationCorrection, Unobservable, align, candidates,
+    register_station,
+};
+pub use trial::{CameraRefinement, Candidate, Trial, TrialReport};

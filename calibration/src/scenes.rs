@@ -1,0 +1,239 @@
+//! A room of textured planes, observed by a camera on an arm with four joints: keyframes with known calibration errors.
+
+use crate::{CameraCorrection, rigid_transform};
+use keyframe::{DepthMap, Keyframe, Split};
+use kinematics::{Stamp, Transform, Twist, transform};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Size of color and depth images, pixels.
+pub const SIZE_PX: [u32; 2] = [160, 120];
+const FOCAL_PX: [f64; 2] = [150.0, 148.0];
+const PRINCIPAL_PX: [f64; 2] = [81.0, 59.0];
+const N_IMAGES: usize = 40;
+const READOUT_SECS: f64 = 0.02;
+
+/// Azimuth, elevation, roll (radians) and reach (meters).
+pub type Joints = [f64; 4];
+
+/// Azimuth, elevation, roll (radians) and reach (meters).
+fn base_from_flange([azimuth, elevation, roll, reach]: Joints) -> Transform {
+    let rotation = |axis: Vector3<f64>, angle: f64| {
+        Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_scaled_axis(axis * angle))
+    };
+    let translation = |x: f64, y: f64, z: f64| Isometry3::translation(x, y, z);
+    // At zero, the flange looks along x, with its x axis to the right: -y of the base.
+    let look_at =
+        UnitQuaternion::from_matrix(&nalgebra::Matrix3::from_columns(&[-Vector3::y(), -Vector3::z(), Vector3::x()]));
+    rotation(Vector3::z(), azimuth)
+        * translation(0.1, 0.0, 0.5)
+        * rotation(Vector3::y(), elevation)
+        * translation(reach, 0.05, 0.0)
+        * rotation(Vector3::x(), roll)
+        * Isometry3::from_parts(Translation3::identity(), look_at)
+}
+
+fn flange_from_camera() -> Transform {
+    Transform::new(Vector3::new(0.03, -0.02, 0.05), Vector3::new(0.05, -0.1, 0.3))
+}
+
+/// Pose of the camera in the base frame at joint positions.
+pub fn camera_at(joints: Joints) -> Transform {
+    base_from_flange(joints) * flange_from_camera()
+}
+
+/// Joint positions of a scan at a time in seconds, with all joints or with the azimuth only.
+pub fn joints_at(secs: f64, azimuth_only: bool) -> Joints {
+    let wave = |size: f64, hz: f64, phase: f64| size * (2.0 * std::f64::consts::PI * hz * secs + phase).sin();
+    match azimuth_only {
+        true => [wave(0.5, 0.11, 0.2), 0.15, 0.2, 0.1],
+        false => [wave(0.4, 0.11, 0.2), 0.15 + wave(0.25, 0.23, 1.0), wave(0.5, 0.17, 2.0), 0.1 + wave(0.1, 0.31, 0.5)],
+    }
+}
+
+/// Twist of the camera when the joints move along a direction.
+fn twist_along(joints: Joints, direction: Joints) -> Twist {
+    const STEP: f64 = 1e-5;
+    let at = |sign: f64| camera_at(std::array::from_fn(|ix| joints[ix] + sign * STEP * direction[ix]));
+    transform::log(&(at(-1.0).inverse() * at(1.0)), 2.0 * STEP)
+}
+
+/// Distance along the ray to the nearest plane, and the brightness there.
+fn cast(from: Point3<f64>, ray: Vector3<f64>) -> (f64, f64) {
+    let planes = [
+        (Vector3::x(), 1.2),
+        (Vector3::new(-0.4, 1.0, 0.1).normalize(), 0.8),
+        (Vector3::new(-0.3, -1.0, 0.0).normalize(), 0.7),
+        (-Vector3::z(), 0.1),
+        (Vector3::new(0.8, 0.2, -1.0).normalize(), 0.75),
+        (Vector3::z(), 1.4),
+    ];
+    let distance = |(normal, offset): &(Vector3<f64>, f64)| {
+        let along = normal.dot(&ray);
+        let distance = (offset - normal.dot(&from.coords)) / along;
+        if along > 0.0 && distance > 0.0 { distance } else { f64::INFINITY }
+    };
+    let nearest = planes.iter().map(distance).fold(f64::INFINITY, f64::min);
+    let p = from + ray * nearest;
+    let wave = |size: f64, x: f64, y: f64, z: f64, phase: f64| size * (x * p.x + y * p.y + z * p.z + phase).sin();
+    let brightness = 128.0
+        + wave(30.0, 21.0, 13.0, -17.0, 0.3)
+        + wave(25.0, -11.0, 29.0, 9.0, 1.3)
+        + wave(25.0, 8.0, -7.0, 31.0, 2.1)
+        + wave(20.0, 3.0, 5.0, 4.0, 0.0)
+        + wave(12.0, 43.0, -31.0, 37.0, 0.7);
+    (nearest, brightness.clamp(0.0, 255.0))
+}
+
+/// Calibration errors and image noise.
+#[derive(Clone)]
+pub struct Miscalibration {
+    /// The input camera pose is the true pose times this.
+    pub extrinsics: Transform,
+    /// Time by which the input poses lag behind the images, seconds.
+    pub time_offset_secs: f64,
+    /// Error of the joint readings.
+    pub joints: Joints,
+    /// The input pose of the depth frame is the true pose times this.
+    pub depth_pose: Transform,
+    /// Relative error of the focal lengths.
+    pub focal_frac: f64,
+    /// Relative error of depth.
+    pub depth_frac: f64,
+    /// Error of the readout time, seconds.
+    pub readout_secs: f64,
+    /// Whether only the azimuth moves.
+    pub azimuth_only: bool,
+    /// Whether rows are exposed one after the other.
+    pub has_rolling_shutter: bool,
+    /// Image noise: 1 is that of a real camera.
+    pub noise: f64,
+    /// Seed of the noise.
+    pub seed: u64,
+}
+
+impl Miscalibration {
+    /// No error; ordinary noise.
+    pub fn none() -> Self {
+        Self {
+            extrinsics: Transform::identity(),
+            time_offset_secs: 0.0,
+            joints: [0.0; 4],
+            depth_pose: Transform::identity(),
+            focal_frac: 0.0,
+            depth_frac: 0.0,
+            readout_secs: 0.0,
+            azimuth_only: false,
+            has_rolling_shutter: false,
+            noise: 1.0,
+            seed: 1,
+        }
+    }
+}
+
+/// Normally distributed noise from a hash.
+pub fn noise(key: u64) -> f64 {
+    let mut state = key.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0xd1b5_4a32_d192_ed03;
+    let mut uniform = || {
+        state ^= state >> 29;
+        state = state.wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        state ^= state >> 32;
+        ((state >> 11) as f64 + 0.5) / (1u64 << 53) as f64
+    };
+    let (one, two) = (uniform(), uniform());
+    (-2.0 * one.ln()).sqrt() * (2.0 * std::f64::consts::PI * two).cos()
+}
+
+/// Keyframes of a scan of the room.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bytes and stamps of a test")]
+pub fn capture(miscalibration: &Miscalibration) -> Vec<Arc<Keyframe>> {
+    let image = |ix: usize| {
+        let secs = 0.3 * ix as f64 + 0.05 * (ix as f64 * 1.7).sin();
+        let joints = |secs: f64| joints_at(secs, miscalibration.azimuth_only);
+        let [width, height] = SIZE_PX.map(|side| side as usize);
+        let cast_pixel = |pose: &Transform, x: usize, y: usize| {
+            let at = [x as f64 + 0.5, y as f64 + 0.5];
+            let ray =
+                Vector3::new((at[0] - PRINCIPAL_PX[0]) / FOCAL_PX[0], (at[1] - PRINCIPAL_PX[1]) / FOCAL_PX[1], 1.0);
+            cast(Point3::from(pose.translation.vector), pose.rotation * ray)
+        };
+        let key = |pixel: usize, stream: u64| {
+            miscalibration.seed * 1_000_003 + (ix as u64 * 100_000 + pixel as u64) * 2 + stream
+        };
+        let mut rgba = Vec::new();
+        for y in 0..height {
+            let share = (y as f64 + 0.5) / height as f64 - 0.5;
+            let pose =
+                camera_at(joints(secs + if miscalibration.has_rolling_shutter { share * READOUT_SECS } else { 0.0 }));
+            for x in 0..width {
+                let (_, value) = cast_pixel(&pose, x, y);
+                let value =
+                    (value + miscalibration.noise * noise(key(y * width + x, 0))).round().clamp(0.0, 255.0) as u8;
+                rgba.extend([value, value, value, 255]);
+            }
+        }
+        let depth_from_true = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
+        let depth_pose = camera_at(joints(secs)) * depth_from_true;
+        let depth_m: Vec<f32> = (0..width * height)
+            .map(|pixel| {
+                let z = cast_pixel(&depth_pose, pixel % width, pixel / width).0;
+                ((z + 0.0007 * miscalibration.noise * z * z * noise(key(pixel, 1))) * (1.0 - miscalibration.depth_frac))
+                    as f32
+            })
+            .collect();
+        let reported_joints = {
+            let moved = joints(secs - miscalibration.time_offset_secs);
+            std::array::from_fn(|joint| moved[joint] - miscalibration.joints[joint])
+        };
+        let reported = camera_at(reported_joints) * miscalibration.extrinsics;
+        let attached = |twist: Twist| twist.of_attached(&miscalibration.extrinsics);
+        let rates = {
+            let (before, after) = (
+                joints(secs - miscalibration.time_offset_secs - 1e-4),
+                joints(secs - miscalibration.time_offset_secs + 1e-4),
+            );
+            std::array::from_fn(|joint| (after[joint] - before[joint]) / 2e-4)
+        };
+        let unit = |joint: usize| std::array::from_fn(|other| if joint == other { 1.0 } else { 0.0 });
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp((secs * 1e9) as i64),
+            size_px: SIZE_PX,
+            focal_px: FOCAL_PX.map(|focal| focal * (1.0 + miscalibration.focal_frac)),
+            principal_px: PRINCIPAL_PX,
+            rgba_srgb: rgba.into(),
+            depth: Some(DepthMap {
+                size_px: SIZE_PX,
+                focal_px: FOCAL_PX,
+                principal_px: PRINCIPAL_PX,
+                depth_m: depth_m.into(),
+                world_from_camera: reported * depth_from_true * miscalibration.depth_pose,
+            }),
+            world_from_camera: reported,
+            twist: Some(attached(twist_along(reported_joints, rates))),
+            readout_secs: if miscalibration.has_rolling_shutter {
+                READOUT_SECS - miscalibration.readout_secs
+            } else {
+                0.0
+            },
+            joint_twists: (0..4).map(|joint| attached(twist_along(reported_joints, unit(joint)))).collect(),
+            base: None,
+            split: Split::of(ix),
+            truth: None,
+        })
+    };
+    (0..N_IMAGES).into_par_iter().map(image).collect()
+}
+
+/// An extrinsics error of about 1 degree and 5 mm.
+pub fn wrong_extrinsics() -> Transform {
+    Transform::new(Vector3::new(0.003, -0.0035, 0.002), Vector3::new(0.01, 0.012, -0.008))
+}
+
+/// Rotation and translation that remain of an extrinsics error, degrees and millimeters.
+pub fn remaining(correction: &CameraCorrection, miscalibration: &Transform) -> (f64, f64) {
+    let estimated = rigid_transform(correction.rotation_rad.into(), correction.translation_m.into());
+    let remaining = miscalibration * estimated.inverse();
+    (remaining.rotation.angle().to_degrees(), 1e3 * remaining.translation.vector.norm())
+}

@@ -1,0 +1,43 @@
+//! Posed images for training: what capture produces and trainers take.
+//!
+//! A [`Keyframe`] is an undistorted image with the pose of its camera at mid-exposure, optionally with a [`DepthMap`],
+//! the motion of a rolling shutter and, from a simulator, the [`Truth`]. [`RangePoints`] is one revolution of a range
+//! scanner. All are plain arrays without driver or GPU types. Cameras are x right, y down, z forward; the world is z up.
+//!
+//! ```
+//! use keyframe::{Keyframe, Split};
+//! use kinematics::{Stamp, Transform};
+//!
+//! let gray = Keyframe {
+//!     camera: "wrist".into(),
+//!     stamp: Stamp(1_000_000_000),
+//!     size_px: [4, 3],
+//!     focal_px: [4.0, 4.0],
+//!     principal_px: [2.0, 1.5],
+//!     rgba_srgb: vec![128; 4 * 3 * 4].into(),
+//!     depth: None,
+//!     world_from_camera: Transform::translation(0.0, 0.0, 1.0),
+//!     twist: None,
+//!     readout_secs: 0.0,
+//!     joint_twists: [].into(),
+//!     base: None,
+//!     split: Split::Train,
+//!     truth: None,
+//! };
+//! gray.check()?;
+//! assert!(gray.is_finite() && gray.lacks_dense_depth());
+//! # Ok::<(), keyframe::Error>(())
+//! ```
+
+mod error;
+#[expect(clippy::module_inception, reason = "named after the type that it defines")]
+mod keyframe;
+mod range_points;
+#[cfg(any(test, feature = "scenes"))]
+pub mod scenes;
+mod shutter;
+
+pub use error::Error;
+pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
+pub use range_points::RangePoints;
+pub use shutter::Shutter;

@@ -1,0 +1,25 @@
+//! Options and requests that suit the scenes of known shapes.
+
+use crate::tsdf::TsdfOptions;
+use crate::{Projection, RenderRequest};
+pub(crate) use keyframe::scenes::*;
+use kinematics::Transform;
+
+pub(crate) fn options() -> TsdfOptions {
+    TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() }
+}
+
+pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {
+    RenderRequest {
+        world_from_camera,
+        size_px: SIZE_PX,
+        projection: Projection::Pinhole { focal_px: FOCAL_PX, principal_px: PRINCIPAL_PX },
+        shutter: None,
+        near_m: 0.01,
+        far_m: 100.0,
+        crop: None,
+        background_srgb: [0.0, 0.5, 1.0],
+        appearance_of: None,
+        depth: true,
+    }
+}
