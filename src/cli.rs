@@ -3,6 +3,7 @@
 use crate::commands::{
     bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
 };
+use crate::exit::Exit;
 use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
@@ -57,4 +58,26 @@ pub(crate) enum Command {
     Sim(sim::Args),
     /// Move an arm to given joint positions, within its limits, under supervision
     Move(move_arm::Args),
+}
+
+impl Command {
+    /// Runs the command.
+    pub(crate) fn run(self) -> anyhow::Result<Exit> {
+        match self {
+            Self::Run(args) => run::run(&args),
+            Self::Record(args) => record::run(&args),
+            Self::Train(args) => train::run(&args),
+            Self::View(args) => view::run(&args),
+            Self::Render(args) => render::run(&args),
+            Self::Eval(args) => eval::run(&args),
+            Self::Metrics(args) => metrics::run(args).map(|()| Exit::Done),
+            Self::Export(args) => export::run(&args),
+            Self::Fk(args) => fk::run(args).map(|()| Exit::Done),
+            Self::Bench(args) => bench::run(&args),
+            Self::Devices(args) => devices::run(&args),
+            Self::Doctor(args) => doctor::run(&args),
+            Self::Sim(args) => sim::run(&args),
+            Self::Move(args) => move_arm::run(&args),
+        }
+    }
 }

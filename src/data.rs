@@ -8,6 +8,7 @@ use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, SampleUse};
 use crate::method::ModelKind;
 use crate::open::{self, Opened};
+use crate::run_folder::is_recording;
 use crate::stations::{StationReport, Stations};
 use crate::{downscale, print};
 use anyhow::ensure;
@@ -17,9 +18,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-
-/// File extension of recordings.
-const RECORDING_EXTENSION: &str = "mcap";
 
 /// Which images are used, and for what.
 #[derive(Clone, Debug, clap::Args)]
@@ -374,11 +372,6 @@ impl Data {
 pub(crate) fn expect(path: &Path) -> anyhow::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
     Ok(())
-}
-
-/// Whether the file name is that of a recording.
-pub(crate) fn is_recording(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
 
 /// Name of a recorded image: camera and stamp.

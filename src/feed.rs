@@ -1,6 +1,7 @@
 //! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
 //! come out of a bounded queue.
 
+use crate::join::change::Change;
 use crate::join::{Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
 use crate::stop::Stop;
@@ -23,20 +24,6 @@ const MAX_WAITING: usize = 8;
 
 /// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
-
-/// A change of the set of keyframes.
-#[derive(Debug)]
-pub(crate) enum Change {
-    /// A new keyframe.
-    Accepted(Arc<Keyframe>),
-    /// A keyframe was evicted from the full store.
-    Evicted {
-        /// Name of its camera.
-        camera: Arc<str>,
-        /// Its stamp.
-        stamp: Stamp,
-    },
-}
 
 /// State of the input that the run reads while it runs.
 #[derive(Debug, Default)]

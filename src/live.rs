@@ -1,7 +1,8 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
-use crate::feed::{Change, Feed, InputResult};
-use crate::recovery::{self, Recoveries};
+use crate::feed::{Feed, InputResult};
+use crate::join::change::Change;
+use crate::recoveries::{self, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::scene_hint;
 use crate::session::Session;
@@ -145,7 +146,7 @@ impl Live {
 
     /// What is saved on disk if the run fails now.
     pub(crate) fn describe_recoverable(&mut self) -> String {
-        recovery::describe_recoverable(&mut self.sessions)
+        recoveries::describe_recoverable(&mut self.sessions)
     }
 
     /// Pushes new keyframes to the models: all that wait in real time, the one that is due in lockstep. Does nothing

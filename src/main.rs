@@ -29,9 +29,11 @@ mod method;
 mod model_bounds;
 mod next_commands;
 mod open;
+mod open_gpu;
 mod partial;
 mod pending_evaluation;
 mod print;
+mod recoveries;
 mod recovery;
 mod render_budget;
 mod replay;
@@ -58,7 +60,7 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
-    let ended = commands::run(cli.command);
+    let ended = cli.command.run();
     if let Err(error) = &ended
         && !exit::is_broken_pipe(error)
     {

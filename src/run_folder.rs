@@ -1,7 +1,6 @@
 //! The folder of a run, and the files in it.
 
 use crate::config::Rig;
-use crate::data::is_recording;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::ModelKind;
 use crate::splat_file;
@@ -15,6 +14,8 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use trainer::Method;
 
+/// File extension of recordings.
+const RECORDING_EXTENSION: &str = "mcap";
 /// The files of a saved model, in the order in which `checkpoint_sha256` covers them.
 const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", SPLATS];
 /// The only one of them that is a complete model on its own.
@@ -346,6 +347,11 @@ fn date_from_days(mut days: u64) -> (u64, usize, u64) {
         month_ix += 1;
     }
     (year, month_ix + 1, days + 1)
+}
+
+/// Whether the file name is that of a recording.
+pub(crate) fn is_recording(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
 
 #[cfg(test)]

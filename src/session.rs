@@ -9,10 +9,10 @@ use crate::evaluation_schedule::EvaluationSchedule;
 use crate::join::split_name;
 use crate::method::{self, FailedModel, ModelKind};
 use crate::next_commands::{self, DataSource, SavedModel};
+use crate::open_gpu;
 use crate::pending_evaluation::PendingEvaluation;
 use crate::recovery::{self, Recovery};
 use crate::stop::Stop;
-use crate::time_slices::TIME_SLICE;
 use crate::{camera_list, checkpoints, exit, print, report, run_folder};
 use anyhow::Context;
 use calibration::Alignment;
@@ -29,6 +29,8 @@ use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
 use trainer::{Method, Picture, Progress, RenderRequest};
 
+/// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
+pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
 /// Number of steps in a profile, which reports medians.
 const N_PROFILED: usize = 21;
 /// Drivers are slow for a while after large buffers have been freed.
@@ -497,7 +499,7 @@ impl Session {
             decisions.step_requested();
         }
         let n = self.method.step(max_steps.min(left))?;
-        recovery::lose_for_tests(&self.gpu, self.method.progress().step);
+        open_gpu::lose_for_tests(&self.gpu, self.method.progress().step);
         Ok(n)
     }
 

@@ -7,7 +7,7 @@
 //! that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
-use crate::feed::Change;
+use crate::join::change::Change;
 use calibration::{StationCorrection, register_station};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};

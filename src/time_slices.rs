@@ -6,9 +6,6 @@
 use crate::session::Session;
 use std::time::Duration;
 
-/// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
-pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
-
 /// Trains the model that has used the device least, among those that can train, and then evaluates all sessions that
 /// are due.
 ///

@@ -1,10 +1,11 @@
 //! Trains models from keyframes on disk: once in `train`, many times in `bench`.
 
 use crate::config::{DEFAULT_SEED, Rig};
-use crate::data::{self, Data, DataArgs};
+use crate::data::{Data, DataArgs};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::method::{self, ModelKind, ModelSpec};
-use crate::recovery::Recoveries;
+use crate::recoveries::Recoveries;
+use crate::run_folder;
 use crate::session::{Evaluators, Limits, OutputMode, Session};
 use crate::stop::Stop;
 use crate::time_slices;
@@ -127,7 +128,7 @@ pub(crate) fn model_specs(
 pub(crate) fn check_before_data(args: &TrainingArgs, path: &Path, images: &DataArgs) -> anyhow::Result<()> {
     let defaults = || Data::default_methods(path, images);
     let kinds = args.methods().map_or_else(defaults, |kinds| Ok(kinds.to_vec()))?;
-    Ok(args.check_before_data(&kinds, data::is_recording(path))?)
+    Ok(args.check_before_data(&kinds, run_folder::is_recording(path))?)
 }
 
 /// When to stop, from `--seconds` and `--steps`; `default_secs` if neither is given.

@@ -1,6 +1,7 @@
 //! `fieldrig devices`: lists connected devices, as reported by the kernel, with the values to use in a rig file.
 
 use crate::exit::Exit;
+use crate::open_gpu::open_gpu;
 use crate::print;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
@@ -60,7 +61,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 fn gpu() -> DeviceInfo {
-    let (name, usable, note) = match super::open_gpu() {
+    let (name, usable, note) = match open_gpu() {
         Ok(gpu) if gpu.is_software() => (gpu.describe(), true, "software adapter: works, but slowly".to_owned()),
         Ok(gpu) => (gpu.describe(), true, "trains and renders".to_owned()),
         Err(error) => ("none".to_owned(), false, error.to_string()),

@@ -7,6 +7,7 @@ use super::number_in_range;
 use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
 use crate::open;
+use crate::open_gpu::open_gpu;
 use crate::print;
 use crate::stop::Stop;
 #[cfg(target_os = "linux")]
@@ -127,7 +128,7 @@ fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
 }
 
 fn gpu() -> Vec<Finding> {
-    let gpu = match super::open_gpu() {
+    let gpu = match open_gpu() {
         Ok(gpu) => gpu,
         Err(error) => {
             let adapters = Gpu::adapters();

@@ -5,6 +5,7 @@ use crate::data::{self, Data, DataArgs, Purpose};
 use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
 use crate::exit::{self, Exit};
 use crate::join::KeyframeList;
+use crate::open_gpu::open_gpu;
 use crate::{method, print};
 use keyframe::{Keyframe, Split};
 use serde::Serialize;
@@ -49,7 +50,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Checked before the data, which takes long to read.
     args.images.holdout()?;
     data::expect(&args.data)?;
-    let mut model = method::load(super::open_gpu()?, &args.model)?;
+    let mut model = method::load(open_gpu()?, &args.model)?;
     let overrides = training_overrides(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);

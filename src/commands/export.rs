@@ -6,6 +6,7 @@ use crate::export::{Written, write_nerfstudio};
 use crate::join::{Join, KeyframeList, SampleUse};
 use crate::method::{self, ModelKind};
 use crate::open;
+use crate::open_gpu::open_gpu;
 use crate::partial::{self, Partial};
 use crate::print::{self, counted};
 use crate::run_folder;
@@ -147,7 +148,7 @@ fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow
 
 /// Exports the mesh, extracted from the voxels.
 fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
-    let mesh = TsdfModel::load(super::open_gpu()?, &args.from)?.mesh()?;
+    let mesh = TsdfModel::load(open_gpu()?, &args.from)?.mesh()?;
     let coarser = args.cell_m.map(|cell_m| mesh.clustered(cell_m));
     let written = coarser.as_ref().unwrap_or(&mesh);
     if let Some(cell_m) = args.cell_m

@@ -12,6 +12,7 @@ use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
 use crate::open::{self, Devices, Opened};
+use crate::open_gpu::open_gpu;
 use crate::print;
 use crate::recovery::{self, GpuUnrecoverable, Recovery};
 use crate::run_folder::{self, CreatedFolders};
@@ -274,7 +275,7 @@ pub(super) fn start(
     let count = args.training.count(CountArg::ToCap);
     let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
     let pace = args.pace(&rig)?;
-    let gpu = super::open_gpu()?;
+    let gpu = open_gpu()?;
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![method::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {

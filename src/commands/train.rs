@@ -11,7 +11,9 @@ use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
+use crate::open_gpu::open_gpu;
 use crate::print;
+use crate::recoveries;
 use crate::recovery::{self, Recovery};
 use crate::replay::Replay;
 use crate::run_folder::{self, CreatedFolders};
@@ -188,7 +190,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         };
         corrected_rig::check_target_file(rig, file)?; // Checked before training.
     }
-    let gpu = super::open_gpu()?;
+    let gpu = open_gpu()?;
     if let Some(source) = &depth_from {
         data.render_depth(gpu.clone(), source, args.json)?;
     }
@@ -288,7 +290,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         session,
         out,
     };
-    let recoverable = recovery::describe_recoverable(&mut sessions);
+    let recoverable = recoveries::describe_recoverable(&mut sessions);
     let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
     finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
     if let Some(file) = &args.write_rig {

@@ -4,9 +4,10 @@ use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
 use crate::method::{self, LoadedModel};
 use crate::model_bounds::Bounds;
+use crate::open_gpu::open_gpu;
 use crate::stop::Stop;
 use crate::viewer::{ModelViewer, ServedModel};
-use crate::{camera_list, data, print, run_folder, scene_hint};
+use crate::{camera_list, print, run_folder, scene_hint};
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
@@ -61,7 +62,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
     let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
-    let gpu = super::open_gpu()?;
+    let gpu = open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.
     let server = start_server(args.listen, &hub)?;
@@ -129,7 +130,7 @@ fn check_is_model(model: &Path) -> Result<(), BadArgument> {
             "{shown} is the address of a page: open it in a browser; view shows saved models and splat files"
         )));
     }
-    if model.is_file() && data::is_recording(model) {
+    if model.is_file() && run_folder::is_recording(model) {
         return Err(BadArgument(format!(
             "{shown} is a recording, not a model: train a model with `fieldrig train`, or watch one being trained with \
              `fieldrig run RIG.toml --from {shown}`"

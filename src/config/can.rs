@@ -1,7 +1,7 @@
 //! The keys of arms on CAN buses: `[arm.bus.NAME]` and `[arm.motor.NAME]`.
 
 use super::section::Section;
-use super::write::{is, name_of, table, whole};
+use super::values::{is, name_of, table, whole};
 use drivers::can::{BusConfig, Family, Gains, MotorConfig};
 use drivers::wire::can::cia402::Units;
 use drivers::wire::can::{canopen, odrive, robstride, tmotor};

@@ -9,6 +9,7 @@ mod read;
 mod section;
 #[cfg(test)]
 mod tests;
+mod values;
 mod write;
 
 pub(crate) use error::ConfigError;

@@ -1,7 +1,7 @@
 //! The keys in `[arm.motion]`, which define how an arm may be moved.
 
 use super::section::Section;
-use super::write::{is, name_of, table};
+use super::values::{is, name_of, table};
 use drivers::motion::OnLoss;
 use toml::{Table, Value};
 

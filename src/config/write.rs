@@ -4,6 +4,7 @@ use super::read::{
     ARM_DRIVERS, BASE_DRIVERS, CAMERA_DRIVERS, DELIVERIES, FILTERS, PACES, PARENTS, SCANNER_DRIVERS, STREAMS,
     TAG_FAMILIES,
 };
+use super::values::{is, name_of, table, whole};
 use super::{
     Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, UnknownCalibration, V4l2,
 };
@@ -27,24 +28,6 @@ pub(super) fn rig(rig: &Rig) -> String {
         ("sim", Some(Value::Table(sim(&rig.sim)))),
     ]);
     toml::to_string(&file).expect("tables of numbers and texts always serialize")
-}
-
-/// A table of the keys that have a value.
-pub(super) fn table<const N: usize>(entries: [(&str, Option<Value>); N]) -> Table {
-    entries.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))).collect()
-}
-
-pub(super) fn is(value: impl Into<Value>) -> Option<Value> {
-    Some(value.into())
-}
-
-pub(super) fn whole(number: u64) -> Option<Value> {
-    // Rig files contain no larger numbers.
-    is(i64::try_from(number).unwrap_or(i64::MAX))
-}
-
-pub(super) fn name_of<T: PartialEq>(choices: &[(&'static str, T)], choice: &T) -> Option<Value> {
-    choices.iter().find(|(_, candidate)| candidate == choice).map(|(name, _)| Value::from(*name))
 }
 
 fn arm(arm: &Arm) -> Table {

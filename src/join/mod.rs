@@ -5,6 +5,7 @@
 
 mod accept;
 mod assemble;
+pub(crate) mod change;
 mod list;
 mod motion;
 mod pixels;

@@ -6,6 +6,7 @@ use crate::bench::statistics::{median, sample_std};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
+use crate::open_gpu::open_gpu;
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -80,7 +81,7 @@ struct VariantResult {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
     let is_selected =

@@ -6,6 +6,7 @@ use crate::bench::statistics::{db_per_doubling, extent, median};
 use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
+use crate::open_gpu::open_gpu;
 use crate::training;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -80,7 +81,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     caps.dedup();
     // The number chosen by the trainer comes first, because most readers want it.
     caps.insert(0, None);
-    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     runs.expect(caps.len() * usize::try_from(args.seeds)?);
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let base_options = data.splats()?;

@@ -7,6 +7,7 @@ use crate::bench::statistics::{extent, median, sample_std, secs_to};
 use crate::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
+use crate::open_gpu::open_gpu;
 use crate::{evaluation_schedule, training};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
@@ -104,7 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Err(BadArgument("--seconds: must be above 0".into()).into());
     }
     let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
-    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let mut bench = Bench { args, peers, results: Vec::new(), notes: Vec::new() };
     let (mut data_losses, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;

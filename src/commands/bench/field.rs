@@ -1,5 +1,6 @@
 //! `fieldrig bench field`: measures the training speed of a neural field.
 
+use crate::open_gpu::open_gpu;
 use crate::print;
 use anyhow::Context;
 use serde::Serialize;
@@ -44,14 +45,14 @@ struct Row {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    let is_software = crate::commands::open_gpu()?.is_software();
+    let is_software = open_gpu()?.is_software();
     let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
     let n_repeats = args.repeats.unwrap_or(if is_software { 3 } else { 100 }) as usize;
     for (row_ix, n_samples) in
         (if args.samples.is_empty() { default_samples } else { &args.samples }).iter().enumerate()
     {
         // A new device for each row, so that the memory peak is that of the row.
-        let gpu = crate::commands::open_gpu()?;
+        let gpu = open_gpu()?;
         if row_ix == 0 {
             log::info!("{}", gpu.describe());
         }

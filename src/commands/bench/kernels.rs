@@ -1,5 +1,6 @@
 //! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
+use crate::open_gpu::{open_gpu, open_gpu_with};
 use anyhow::Context;
 use serde::Serialize;
 use std::io::Write;
@@ -95,7 +96,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
-    let defaults = if crate::commands::open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
+    let defaults = if open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
     let sizes = if args.size.is_empty() { defaults.size } else { &args.size };
     let splat_counts = if args.splats.is_empty() { defaults.splats } else { &args.splats };
     let counts = given.as_ref().map_or_else(
@@ -108,7 +109,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (size_ix, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A new device for each row, so that the memory peak is that of the row.
-            let gpu = crate::commands::open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
+            let gpu = open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }

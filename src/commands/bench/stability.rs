@@ -8,6 +8,7 @@ use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::ModelSpec;
+use crate::open_gpu::open_gpu;
 use crate::session::Limits;
 use crate::training;
 use anyhow::ensure;
@@ -118,7 +119,7 @@ struct Break {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     args.check()?;
-    let mut runs = Runs::open(&args.bench, crate::commands::open_gpu()?)?;
+    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let plans = args.plans(&data)?;
     let n_levels: usize = plans.iter().map(|plan| plan.levels.len()).sum();

@@ -1,0 +1,68 @@
+//! Opens the GPU as the environment says.
+
+use crate::allocator;
+use crate::exit::BadArgument;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Once, OnceLock};
+use trainer::gpu::{Gpu, GpuOptions};
+
+/// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
+/// and `no-matrices` only cooperative matrices.
+pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
+    open_gpu_with(GpuOptions::default())
+}
+
+pub(crate) fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
+    let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
+    let [optional_features, matrices] =
+        ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
+    let adapter = match std::env::var("FIELDRIG_GPU") {
+        Ok(text) => {
+            let invalid = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            Some(text.parse().map_err(invalid)?)
+        }
+        Err(_) => None,
+    };
+    hide_caught_panics();
+    check_open_for_tests()?;
+    // Lets tests exhaust GPU memory.
+    let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
+    let gpu = Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..options })?;
+    if gpu.is_software() {
+        allocator::keep_images_out_of_heaps();
+    }
+    Ok(gpu)
+}
+
+/// Hides the message of a panic that is caught: wgpu panics if it notices a lost device while it waits.
+fn hide_caught_panics() {
+    static IS_SET: Once = Once::new();
+    IS_SET.call_once(|| {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            if !info.payload_as_str().is_some_and(|message| message.starts_with("Error in Device::poll")) {
+                before(info);
+            }
+        }));
+    });
+}
+
+/// For tests: `FIELDRIG_TEST_LOSE_GPU_AT_STEP=N` loses the device once, when a model reaches step N.
+pub(crate) fn lose_for_tests(gpu: &Gpu, step: u64) {
+    static AT_STEP: OnceLock<Option<u64>> = OnceLock::new();
+    static IS_LOST: AtomicBool = AtomicBool::new(false);
+    let at_step = AT_STEP.get_or_init(|| std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP").ok()?.parse().ok());
+    if at_step.is_some_and(|at_step| step >= at_step) && !IS_LOST.swap(true, Ordering::Relaxed) {
+        gpu.lose();
+    }
+}
+
+/// For tests: with `FIELDRIG_TEST_OPEN_GPU_ONCE` set, the GPU can be opened only once.
+fn check_open_for_tests() -> Result<(), trainer::Error> {
+    static IS_OPENED: AtomicBool = AtomicBool::new(false);
+    let was_opened = IS_OPENED.swap(true, Ordering::Relaxed);
+    if was_opened && std::env::var_os("FIELDRIG_TEST_OPEN_GPU_ONCE").is_some() {
+        return Err(trainer::Error::NoAdapter);
+    }
+    Ok(())
+}
