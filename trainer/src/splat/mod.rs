@@ -22,6 +22,7 @@ mod passes;
 pub(crate) mod projections;
 pub mod reference;
 mod seed;
+mod snapshot;
 mod trainer;
 #[cfg(test)]
 mod training_tests;
@@ -30,11 +31,9 @@ mod trial_tests;
 mod trials;
 mod views;
 
-pub use camera_params::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
-pub(crate) use camera_params::{drift_weight, interpolate, rigid_transform, shares_lens};
 pub use options::SplatOptions;
 pub(crate) use params::{Camera, View};
 pub use trainer::SplatTrainer;
 pub(crate) use trainer::read_metadata;
-pub use trials::{CameraRefinement, Candidate, CountPolicy, Trial};
+pub use trials::CountPolicy;
 pub(crate) use views::{depth_in_color_view, median_depth_m};

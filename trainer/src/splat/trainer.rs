@@ -14,6 +14,7 @@ use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
 use super::seed::{self, Density, Seeder};
+use super::snapshot::{Seeding, Snapshot};
 use super::trials::{Due, SecondHalf, SplatTrials, TrialContext, TrialEnd, ValidationImage};
 use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use crate::checkpoint::PendingCheckpoint;
@@ -158,25 +159,6 @@ impl Drop for Compiling {
     fn drop(&mut self) {
         let _ = self.finish();
     }
-}
-
-/// The state that training changes, for restoring it later. No keyframe is waiting for its splats when it is taken.
-#[derive(Debug)]
-pub(crate) struct Snapshot {
-    pub(super) splats: SplatBuffers,
-    pub(super) cameras: (ParamSet, Buffer),
-    pub(super) step: u64,
-    pub(super) last_growth_step: u64,
-    pub(super) seeding: Seeding,
-}
-
-/// State that an arriving keyframe changes: seeded positions, and the scale and schedule of training.
-#[derive(Clone, Debug)]
-pub(crate) struct Seeding {
-    pub(super) seeder: Seeder,
-    pub(super) scene_size_m: f64,
-    pub(super) has_depth: bool,
-    pub(super) schedule_start: u64,
 }
 
 /// The resources of one training step.

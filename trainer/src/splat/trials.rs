@@ -8,7 +8,7 @@
 //! loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
 //! training keyframes.
 
-use super::trainer::Snapshot;
+use super::snapshot::Snapshot;
 use crate::gpu::Buffer;
 use calibration::{CameraRefinement, Candidate, ParamSet, Trial, TrialReport};
 use keyframe::Keyframe;

@@ -1,6 +1,6 @@
 //! Checkpoints of a splat model in training. They contain all state that affects further training, bit for bit.
 
-use super::{Seeding, Snapshot, SplatTrainer};
+use super::SplatTrainer;
 use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
@@ -10,6 +10,7 @@ use crate::splat::camera_params::CameraSlots;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::seed::{SeedSnapshot, Seeder};
+use crate::splat::snapshot::{Seeding, Snapshot};
 use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial, Scores};
 use crate::splat::views::TrainView;
 use calibration::ParamSet;
