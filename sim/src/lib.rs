@@ -11,6 +11,7 @@ pub mod config;
 mod egl;
 mod engine;
 mod error;
+mod follower;
 mod furniture;
 mod lab;
 mod lab_texture;
