@@ -27,6 +27,7 @@ mod panda;
 mod random;
 mod render;
 mod rig;
+mod rig_info;
 mod robot;
 mod scan;
 mod scene;
@@ -49,4 +50,5 @@ pub use config::{
 pub use error::Error;
 pub use live::{LiveRig, LiveTruth};
 pub use lockstep::Lockstep;
-pub use rig::{CameraInfo, PANDA_URDF, Rig, RigInfo, open};
+pub use rig::{PANDA_URDF, Rig, open};
+pub use rig_info::{CameraInfo, RigInfo};
