@@ -53,7 +53,8 @@ impl Candidate {
         }
     }
 
-    fn reduces_model(self) -> bool {
+    /// Whether the change makes the model smaller.
+    pub fn reduces_model(self) -> bool {
         !matches!(self, Self::Cameras(_))
     }
 }

@@ -2,8 +2,8 @@
 
 use crate::Error;
 use crate::config::N_JOINTS;
+use crate::follower::Follower;
 use crate::panda::{self, Joints};
-use crate::scan::Follower;
 use mujoco_rs::prelude::{MjData, MjModel};
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -112,8 +112,8 @@ mod tests {
     use super::*;
     use crate::CameraConfig;
     use crate::config::Scene;
+    use crate::follower::{Follower, Tour};
     use crate::panda;
-    use crate::scan::{Follower, Tour};
 
     #[test]
     fn arm_follows_tour_from_both_stations() {

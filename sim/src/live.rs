@@ -2,7 +2,7 @@
 
 use crate::Error;
 use crate::engine::{Delivery, Engine};
-use crate::rig::RigInfo;
+use crate::rig_info::RigInfo;
 use drivers::{Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample};
 use kinematics::{Intrinsics, JointState, Stamp};
 use std::collections::VecDeque;

@@ -1,7 +1,7 @@
 //! A rig that advances only when its samples are taken.
 
 use crate::engine::Engine;
-use crate::rig::RigInfo;
+use crate::rig_info::RigInfo;
 use drivers::{Sample, Source};
 
 /// Samples of a rig in delivery order. The same configuration and machine give the same bits.

@@ -1,17 +1,19 @@
-//! Builds a rig and describes it.
+//! Builds a rig from its configuration.
 
 use crate::arm::Arm;
 use crate::base::{BaseMotion, base_from_arm};
 use crate::cabinet_tour::CabinetTour;
 use crate::config::{Config, Parent, Scene};
 use crate::engine::{Cameras, Engine, history_nanos};
+use crate::follower::{Follower, Tour};
 use crate::live::LiveRig;
 use crate::lockstep::Lockstep;
 use crate::render::Renderer;
+use crate::rig_info::{CameraInfo, RigInfo};
 use crate::robot::Robot;
-use crate::scan::{Follower, Scan, Tour};
+use crate::scan::Scan;
 use crate::{CameraConfig, Error, scene};
-use kinematics::{Intrinsics, Stamp, Transform};
+use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
 /// The simulated arm as a URDF: same kinematics and limits, base `panda_link0`, flange `panda_link8`.
@@ -35,44 +37,6 @@ pub(crate) fn urdf_of(scene: Scene) -> &'static str {
 pub struct Rig {
     engine: Engine,
     info: RigInfo,
-}
-
-/// True parameters of a rig, which calibration should recover.
-#[derive(Clone, Debug, PartialEq)]
-pub struct RigInfo {
-    /// The cameras in the order of the configuration.
-    pub cameras: Vec<CameraInfo>,
-    /// Names of the joints in the order of the readings.
-    pub joint_names: Vec<String>,
-    /// The scanners in the order of the configuration.
-    pub scanner_names: Vec<String>,
-    /// Whether the base moves and reports its pose.
-    pub has_moving_base: bool,
-    /// URDF of the robot, with its own joint names.
-    pub urdf: &'static str,
-    /// Pose of the robot's base at the start.
-    pub world_from_base: Transform,
-    /// The renderer's name as reported by OpenGL.
-    pub renderer: String,
-}
-
-/// True parameters of a camera.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CameraInfo {
-    /// Name in the rig file.
-    pub name: String,
-    /// Lens parameters of color and depth.
-    pub intrinsics: Intrinsics,
-    /// Frame that the camera is attached to.
-    pub parent: Parent,
-    /// Camera pose in the parent frame.
-    pub parent_from_camera: Transform,
-    /// Images per second.
-    pub rate_hz: f64,
-    /// Time from the first row's exposure to the last row's, microseconds.
-    pub readout_micros: f64,
-    /// Whether it delivers depth.
-    pub has_depth: bool,
 }
 
 /// Builds the scene and starts its render thread. Takes one to two seconds.

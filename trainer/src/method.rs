@@ -3,8 +3,7 @@
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
 use crate::{Error, Picture, RenderRequest};
-use calibration::Alignment;
-use calibration::CalibratedCamera;
+use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;

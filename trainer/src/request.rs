@@ -1,7 +1,8 @@
 //! Requests for pictures of the model, and the pictures.
 
 use crate::gpu::Buffer;
-use kinematics::{Stamp, Transform, Twist};
+use keyframe::Shutter;
+use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
 /// A box with sides along the axes of its frame, meters.

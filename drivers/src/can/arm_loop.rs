@@ -7,10 +7,9 @@
 
 use super::bus::{Bus, BusEvent, WireErrors};
 use super::bus_load::max_cycle_rate_hz;
-use super::config::Family;
+use super::config::{Family, MovableArmConfig};
 use super::joints::JointReading;
 use super::motor::Reading;
-use super::movable::MovableArmConfig;
 use super::movable_motor::{Health, MovableMotor};
 use super::watchdog::WatchdogPlan;
 use crate::motion::{JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};

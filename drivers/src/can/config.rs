@@ -1,6 +1,8 @@
-//! Buses, motors and arms as described in the rig file.
+//! Configuration of buses, motors and arms.
 
+use crate::motion::MotionConfig;
 use crate::wire::can::frame::BitRates;
+use crate::wire::can::odrive::Endpoints;
 use crate::wire::can::{canopen, cia402, odrive, robstride, tmotor};
 
 /// Configuration of an arm from the rig file.
@@ -12,6 +14,17 @@ pub struct ArmConfig {
     pub motors: Vec<MotorConfig>,
     /// Rate at which motors are polled, in Hz. It is reduced if the load of a bus would exceed 70 %.
     pub rate_hz: f64,
+}
+
+/// Configuration of an arm that may be moved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MovableArmConfig {
+    /// Buses and motors. Motors in MIT mode need their gains.
+    pub arm: ArmConfig,
+    /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this computer stops sending.
+    pub motion: MotionConfig,
+    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
+    pub odrive_endpoints: Option<Endpoints>,
 }
 
 /// Configuration of a bus from the rig file.

@@ -4,7 +4,7 @@ use super::ROBSTRIDE_HOST;
 use super::config::{Family, MotorConfig};
 use super::emulated::EmulatedMotor;
 use super::motor::{MAX_RAD, Motor};
-use crate::fuzz::take;
+use crate::fuzz::input::take;
 use crate::wire::can::mit::{Command, Limits, Motion};
 use crate::wire::can::tmotor::Thermometer;
 use crate::wire::can::{Frame, Id, canopen, cia402, damiao, odrive, robstride, tmotor};
@@ -158,7 +158,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::can::emulated::State;
     use crate::can::motor::Reading;
-    use crate::fuzz::Random;
+    use crate::fuzz::random::Random;
 
     /// All frames on the buses while an arm is set up and read for some cycles.
     pub(crate) fn example_traffic() -> Vec<Frame> {

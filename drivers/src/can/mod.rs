@@ -1,5 +1,6 @@
 //! Arms whose joints are motors on CAN buses, over Linux sockets.
 //!
+//! * `config` describes buses, motors and arms.
 //! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on the wire.
 //! * `motor` reads one motor of any family. `arm` combines the readings of all motors into joint states, with one
 //!   thread per bus. Neither commands a motor.
@@ -39,12 +40,12 @@ mod watchdog;
 pub use arm::CanArm;
 #[cfg(target_os = "linux")]
 pub use bus::{Bus, BusEvent, WireErrors};
-pub use config::{ArmConfig, BusConfig, Family, Gains, MotorConfig};
+pub use config::{ArmConfig, BusConfig, Family, Gains, MotorConfig, MovableArmConfig};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]
 pub use link::{Link, LinkProblem, State};
 #[cfg(target_os = "linux")]
-pub use movable::{MovableArmConfig, MovableCanArm};
+pub use movable::MovableCanArm;
 
 /// Our host ID on Robstride buses. The manufacturer's program uses the same ID.
 const ROBSTRIDE_HOST: u8 = 0xFD;

@@ -5,11 +5,10 @@
 
 use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
-use super::config::ArmConfig;
+use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
 use super::watchdog::WatchdogPlan;
-use crate::motion::{JointTarget, Motion, MotionConfig, MovableArm};
-use crate::wire::can::odrive::Endpoints;
+use crate::motion::{JointTarget, Motion, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,17 +21,6 @@ use std::time::{Duration, Instant};
 const MAX_ANSWER: Duration = Duration::from_secs(1);
 /// Maximum time to recover. Preparing and enabling takes some hundred milliseconds per motor.
 const MAX_RECOVERY: Duration = Duration::from_secs(60);
-
-/// Configuration of an arm that may be moved.
-#[derive(Clone, Debug, PartialEq)]
-pub struct MovableArmConfig {
-    /// Buses and motors. Motors in MIT mode need their gains.
-    pub arm: ArmConfig,
-    /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this computer stops sending.
-    pub motion: MotionConfig,
-    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
-    pub odrive_endpoints: Option<Endpoints>,
-}
 
 /// An arm that is held where it was found, and may be moved.
 ///

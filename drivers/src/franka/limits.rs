@@ -6,8 +6,6 @@ use crate::motion::{JointTarget, MotionLimits};
 use franka::joint_velocity_limits::JointVelocityLimitsConfig;
 use franka::rate_limiting::{self, fer, limit_rate_joint_positions};
 
-/// Seconds between commands.
-pub(super) const STEP_SECS: f64 = rate_limiting::DELTA_T;
 /// Fraction of the robot's maximum velocity and acceleration that we use. The rest is a reserve for lost commands.
 const LIMIT_FRAC: f64 = 0.5;
 /// Fraction of its maximum jerk. After a command is lost unnoticed, the next one appears to the robot with four times

@@ -1,10 +1,11 @@
 //! Tracks the robot's commanded joint state from the positions that we sent and the states that it reported.
 
 use super::N_JOINTS;
-use super::limits::STEP_SECS;
 use crate::motion::Setpoint;
-use franka::RobotState;
+use franka::{RobotState, rate_limiting};
 
+/// Seconds between commands.
+const STEP_SECS: f64 = rate_limiting::DELTA_T;
 /// Maximum difference between our reference and the robot's, in rad. Smaller ones are rounding of FCI 10, up to 8
 /// rad.
 const POSITION_TOLERANCE_RAD: f64 = 4e-7;

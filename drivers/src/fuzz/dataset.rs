@@ -1,6 +1,6 @@
 //! Fuzz targets for dataset lists. The images they refer to are valid.
 
-use super::Scratch;
+use super::scratch::Scratch;
 use crate::dataset;
 use kinematics::transform;
 

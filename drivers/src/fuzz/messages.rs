@@ -1,6 +1,6 @@
 //! Fuzz target for messages of recordings.
 
-use super::take;
+use super::input::take;
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 
 /// Reads one byte for the kind of message, then one message. Checks that readable messages survive encoding and

@@ -1,6 +1,6 @@
 //! Fuzz target for images in every format of cameras and recordings.
 
-use super::take;
+use super::input::take;
 use crate::{Image, PixelFormat, YuvColors, YuvLayout, YuvMatrix, YuvRange, jpeg};
 use kinematics::Stamp;
 

@@ -1,6 +1,6 @@
 //! Fuzz target for recordings.
 
-use super::Scratch;
+use super::scratch::Scratch;
 use crate::Source;
 use crate::recording::Recording;
 

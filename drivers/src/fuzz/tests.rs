@@ -1,11 +1,14 @@
 //! Feeds the seeds of the folder `fuzz`, unchanged and corrupted, to every reader.
 
+use super::random::Random;
+use super::scratch::Scratch;
 use super::*;
 use crate::recording::{Recorder, RecordingMetadata};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample};
 use crate::{can, franka, udp};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
+use std::path::{Path, PathBuf};
 
 type Reader = fn(&[u8]);
 

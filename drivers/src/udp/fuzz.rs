@@ -102,7 +102,7 @@ fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
 pub(crate) mod tests {
     use super::*;
     use crate::RangePoint;
-    use crate::fuzz::Random;
+    use crate::fuzz::random::Random;
     use crate::wire::datagram::{
         Clock, DatagramHeader, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
     };

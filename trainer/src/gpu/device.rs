@@ -1,6 +1,6 @@
 //! The device that all kernels and viewers share, and its buffers.
 
-use super::Optional;
+use super::{GpuOptions, Optional};
 use crate::Error;
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
@@ -12,37 +12,6 @@ use std::time::Duration;
 
 /// How often the device is checked while a read-back has not arrived.
 const CHECK_PERIOD: Duration = Duration::from_millis(100);
-
-/// How to choose the adapter.
-#[derive(Clone, Copy, Debug)]
-pub struct GpuOptions {
-    /// Whether optional features of the adapter may be used.
-    pub optional_features: bool,
-    /// Whether cooperative matrices may be used.
-    pub matrices: bool,
-    /// Whether float atomics may be used. Their order of additions varies between runs, so training does not use them.
-    pub float_atomics: bool,
-    /// Lowers the largest binding, bytes; for tests of buffer limits.
-    pub max_binding_bytes: Option<u64>,
-    /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
-    pub memory_limit_bytes: Option<u64>,
-    /// Index into [`Gpu::adapters`]; `None`: the fastest adapter.
-    pub adapter: Option<usize>,
-}
-
-impl Default for GpuOptions {
-    fn default() -> Self {
-        Self {
-            optional_features: true,
-            matrices: true,
-            float_atomics: false,
-            max_binding_bytes: None,
-            memory_limit_bytes: None,
-            adapter: None,
-        }
-    }
-}
-
 /// Size of the blocks that small buffers share on a software adapter, the smallest that wgpu accepts.
 const SOFTWARE_BLOCK_BYTES: u64 = 4 << 20;
 /// Maximum total size of read-back buffers kept for reuse: a picture of 1024x1024 with depth takes 8 MiB.

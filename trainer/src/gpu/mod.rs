@@ -1,13 +1,15 @@
 //! GPU access: one device, pipelines with bindings by reflection, and lists of passes. Independent of splats.
 
 mod device;
+mod options;
 mod passes;
 mod pipeline;
 mod requirements;
 mod wgsl;
 
-pub use device::{Buffer, Gpu, GpuOptions, PendingRead};
+pub use device::{Buffer, Gpu, PendingRead};
 pub use kinematics::{f32_of, f32s_of};
+pub use options::GpuOptions;
 pub use passes::{PassTiming, Passes};
 pub use pipeline::{Kernel, Pipeline};
 pub use requirements::Optional;

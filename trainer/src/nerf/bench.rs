@@ -56,7 +56,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         for slot_ix in 0..n_steps {
             field_trainer.record_step(gpu, &options, slot_ix, STEP, &rays, ParamSet::NONE)?;
         }
-        Ok(field_trainer.submit(gpu))
+        Ok::<_, crate::Error>(field_trainer.submit(gpu))
     };
     submit(&mut field_trainer, STEPS_PER_SUBMIT)?.finish::<u32>(gpu)?;
     let n_submits = n_repeats.div_ceil(STEPS_PER_SUBMIT);
@@ -84,7 +84,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
             timed.push((sum, passes));
         }
         timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        Ok(timed.swap_remove(timed.len() / 2))
+        Ok::<_, crate::Error>(timed.swap_remove(timed.len() / 2))
     };
     let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
         field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::NONE)

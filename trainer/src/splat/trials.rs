@@ -10,7 +10,7 @@
 
 use super::snapshot::Snapshot;
 use crate::gpu::Buffer;
-use calibration::{CameraRefinement, Candidate, ParamSet, Trial, TrialReport};
+use calibration::{CameraRefinement, Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};

@@ -1,11 +1,12 @@
 //! Tests of the kernels against their f64 twins, with optional features and without.
 
 use super::block::{Blocks, GridCoord, N_VOXELS, stored_distance};
-use super::buffers::{Capacity, FieldBuffers};
+use super::buffers::FieldBuffers;
+use super::capacity::Capacity;
 use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
-use super::marching::{MeshBuffers, MeshCapacity};
 use super::mesh::{BlockMesh, unit_of};
+use super::mesh_buffers::{MeshBuffers, MeshCapacity};
 use super::params::MeshVertex;
 use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
@@ -186,12 +187,7 @@ fn readings_match_twin() {
     for options in gpu_variants() {
         let gpu = Gpu::open(&options).unwrap();
         let voxel_grid = VoxelGrid::choose(&scenes::options(), depth).unwrap();
-        let field = super::buffers::FieldBuffers::new(
-            &gpu,
-            &voxel_grid,
-            super::buffers::Capacity { n_blocks: 2048, n_chunks: 256 },
-        )
-        .unwrap();
+        let field = FieldBuffers::new(&gpu, &voxel_grid, Capacity { n_blocks: 2048, n_chunks: 256 }).unwrap();
         assert_eq!(field.field.bytes(), size_of::<Field>() as u64);
         let n = depth.depth_m.len();
         let mut slot = KeyframeSlot::new(&gpu, n as u64, u64::from(keyframe.size_px[0] * keyframe.size_px[1])).unwrap();

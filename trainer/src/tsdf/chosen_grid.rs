@@ -1,6 +1,7 @@
 //! Voxel size and related settings of a field: given, or chosen from the first depth image.
 
 use super::block::WEIGHT_ONE;
+use super::capacity::BYTES_PER_BLOCK;
 use super::options::TsdfOptions;
 use keyframe::DepthMap;
 use kinematics::Transform;
@@ -56,7 +57,7 @@ impl VoxelGrid {
         // A surface of n pixels has n (px / voxel)^2 voxels, and its truncation band has about a 16th as many blocks.
         let area_m2 = n_valid as f64 * px_m * px_m;
         let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {
-            let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / super::buffers::BYTES_PER_BLOCK as f64;
+            let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });
         let chosen_grid = px_m.max(by_noise_m).max(by_bytes_m).clamp(VOXEL_RANGE_M[0], VOXEL_RANGE_M[1]);

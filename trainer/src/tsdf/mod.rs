@@ -4,15 +4,18 @@
 
 pub mod block;
 mod buffers;
+mod capacity;
 mod chosen_grid;
 pub mod kernels;
 mod marching;
 pub mod mesh;
+mod mesh_buffers;
 mod model;
 mod options;
 mod params;
 mod passes;
 pub mod reference;
+mod transfer;
 
 #[cfg(test)]
 mod against_twin;

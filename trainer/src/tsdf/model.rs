@@ -6,11 +6,12 @@ mod meshing;
 mod saving;
 
 use super::block::{Blocks, GridCoord};
-use super::buffers::{self, Capacity, FieldBuffers};
+use super::buffers::FieldBuffers;
+use super::capacity::{self, BYTES_PER_BLOCK, BYTES_PER_CHUNK, Capacity};
 use super::chosen_grid::VoxelGrid;
 use super::kernels::Pipelines;
-use super::marching::MeshBuffers;
 use super::mesh::Mesher;
+use super::mesh_buffers::MeshBuffers;
 use super::options::TsdfOptions;
 use super::params::{DepthView, status};
 use super::passes::{self, Canvas, KeyframeSlot};
@@ -39,7 +40,7 @@ const INITIAL_CAPACITY: Capacity = Capacity { n_blocks: 4096, n_chunks: 512 };
 const MIN_BLOCKS: u32 = 256;
 /// Minimum budget: the initial table and the minimum number of blocks.
 pub(super) const MIN_BYTES: u64 =
-    INITIAL_CAPACITY.n_chunks as u64 * buffers::BYTES_PER_CHUNK + MIN_BLOCKS as u64 * buffers::BYTES_PER_BLOCK;
+    INITIAL_CAPACITY.n_chunks as u64 * BYTES_PER_CHUNK + MIN_BLOCKS as u64 * BYTES_PER_BLOCK;
 
 /// A colored distance field built from keyframes with depth.
 ///
@@ -165,17 +166,17 @@ impl TsdfModel {
     }
 
     fn max_blocks_with_table(&self, n_chunks: u32) -> u32 {
-        let table_bytes = u64::from(n_chunks) * buffers::BYTES_PER_CHUNK;
-        let n_blocks_in = |bytes: u64| bytes.saturating_sub(table_bytes) / buffers::BYTES_PER_BLOCK;
+        let table_bytes = u64::from(n_chunks) * BYTES_PER_CHUNK;
+        let n_blocks_in = |bytes: u64| bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK;
         let by_bytes = self.options.max_bytes.map_or(u64::MAX, n_blocks_in);
-        buffers::max_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+        capacity::max_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 
     /// Chooses the voxel size from the first depth image with valid readings and discards earlier ones. Returns whether
     /// there was one.
     fn begin(&mut self) -> Result<bool, Error> {
         // The size of one binding limits the field like a budget does.
-        let max_bytes = Some(u64::from(self.max_blocks()) * buffers::BYTES_PER_BLOCK);
+        let max_bytes = Some(u64::from(self.max_blocks()) * BYTES_PER_BLOCK);
         let options = TsdfOptions { max_bytes, ..self.options.clone() };
         while self.voxel_grid.is_none() {
             let Some(first) = self.pending.front() else { return Ok(false) };

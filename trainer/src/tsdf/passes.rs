@@ -2,7 +2,7 @@
 
 use super::buffers::FieldBuffers;
 use super::kernels::Pipelines;
-use super::marching::MeshBuffers;
+use super::mesh_buffers::MeshBuffers;
 use super::params::{Backdrop, DepthView};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};

@@ -301,8 +301,8 @@ fn swapping_to_host_memory_is_lossless() {
         fuse_all(&mut model);
         model
     };
-    let table_bytes = unlimited.progress().bytes - super::buffers::BYTES_PER_BLOCK * n_all;
-    let mut limited = model_with_budget(table_bytes + super::buffers::BYTES_PER_BLOCK * n_all * 6 / 10);
+    let table_bytes = unlimited.progress().bytes - super::capacity::BYTES_PER_BLOCK * n_all;
+    let mut limited = model_with_budget(table_bytes + super::capacity::BYTES_PER_BLOCK * n_all * 6 / 10);
     assert_eq!(limited.n_skipped(), 0);
     assert!(limited.n_host_blocks() > 0);
     assert!(limited.blocks().unwrap() == unlimited.blocks().unwrap());

@@ -1,7 +1,7 @@
 //! Fuzz target: arbitrary state datagrams.
 
 use super::{MAX_STATE_BYTES, StateQueue, StateReader, decode};
-use crate::fuzz::take;
+use crate::fuzz::input::take;
 use franka::FciVersion;
 use kinematics::Stamp;
 use std::time::Duration;
@@ -56,7 +56,7 @@ pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec
 pub(crate) mod tests {
     use super::*;
     use crate::franka::emulated::fuzz::tests::state_datagrams;
-    use crate::fuzz::Random;
+    use crate::fuzz::random::Random;
 
     pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 

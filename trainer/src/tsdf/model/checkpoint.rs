@@ -1,7 +1,8 @@
 //! Checkpoints of a field: everything needed to continue bit for bit.
 
 use super::super::block::{Block, Blocks, GridCoord, N_VOXELS};
-use super::super::buffers::{Capacity, FieldBuffers};
+use super::super::buffers::FieldBuffers;
+use super::super::capacity::Capacity;
 use super::super::chosen_grid::VoxelGrid;
 use super::super::options::TsdfOptions;
 use super::{INITIAL_CAPACITY, TsdfModel};

@@ -4,9 +4,10 @@ use super::TsdfModel;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming};
 use crate::tsdf::block::{Blocks, GridCoord};
-use crate::tsdf::buffers::{Capacity, FieldBuffers};
-use crate::tsdf::marching::{MeshBuffers, MeshCapacity};
+use crate::tsdf::buffers::FieldBuffers;
+use crate::tsdf::capacity::Capacity;
 use crate::tsdf::mesh::{BlockMesh, Mesh};
+use crate::tsdf::mesh_buffers::{MeshBuffers, MeshCapacity};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Blocks per batch when not all blocks are on the GPU. Each batch gets a temporary field.

@@ -2,7 +2,7 @@
 
 use super::super::{CommandedJoints, JointSimulator, Joints, Limits, RobotConfig};
 use super::{Client, N_JOINTS, Robot, Server};
-use crate::fuzz::take;
+use crate::fuzz::input::take;
 use franka::FciVersion;
 use kinematics::{Chain, Stamp, Transform};
 use std::io::{ErrorKind, Read, Write};
@@ -119,7 +119,7 @@ fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::fuzz::Random;
+    use crate::fuzz::random::Random;
     use franka::wire::HeaderLayout;
     use franka::wire::robot::{v5, v10};
     use zerocopy::IntoBytes;

@@ -1,0 +1,31 @@
+//! Options for opening a GPU.
+
+/// Which adapter to open, and how much of it to use.
+#[derive(Clone, Copy, Debug)]
+pub struct GpuOptions {
+    /// Whether optional features of the adapter may be used.
+    pub optional_features: bool,
+    /// Whether cooperative matrices may be used.
+    pub matrices: bool,
+    /// Whether float atomics may be used. Their order of additions varies between runs, so training does not use them.
+    pub float_atomics: bool,
+    /// Lowers the largest binding, bytes; for tests of buffer limits.
+    pub max_binding_bytes: Option<u64>,
+    /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
+    pub memory_limit_bytes: Option<u64>,
+    /// Index into [`Gpu::adapters`](super::Gpu::adapters); `None`: the fastest adapter.
+    pub adapter: Option<usize>,
+}
+
+impl Default for GpuOptions {
+    fn default() -> Self {
+        Self {
+            optional_features: true,
+            matrices: true,
+            float_atomics: false,
+            max_binding_bytes: None,
+            memory_limit_bytes: None,
+            adapter: None,
+        }
+    }
+}

@@ -1,0 +1,22 @@
+//! Sizes of the pool of blocks and of the hash table, and the GPU memory that they take.
+
+use super::block::N_VOXELS;
+use crate::gpu::Gpu;
+
+/// Bytes per block on the GPU: distances, colors, coordinates, and the flags `changed` and `visible`.
+pub(crate) const BYTES_PER_BLOCK: u64 = 512 * (4 + 8) + 16 + 4 + 4;
+/// Bytes per chunk: a key and the slots of its blocks.
+pub(crate) const BYTES_PER_CHUNK: u64 = 4 + 4 * 512;
+
+/// Sizes of the pool and the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Capacity {
+    pub(crate) n_blocks: u32,
+    /// A power of two.
+    pub(crate) n_chunks: u32,
+}
+
+/// Maximum number of blocks that the adapter can bind.
+pub(crate) fn max_blocks(gpu: &Gpu) -> u32 {
+    u32::try_from(gpu.max_binding_bytes() / (8 * N_VOXELS as u64)).unwrap_or(u32::MAX).max(1)
+}
