@@ -112,7 +112,7 @@ fn other_data_and_unknown_states_are_rejected() {
         error_with_changed_keyframe(&|keyframe| keyframe.world_from_camera.translation.x += 1e-6)
             .contains("different pose")
     );
-    assert!(error_with_changed_keyframe(&|keyframe| keyframe.camera = "other".into()).contains("not there"));
+    assert!(error_with_changed_keyframe(&|keyframe| keyframe.camera = "other".into()).contains("is missing"));
 
     let error_with_changed_checkpoint = |change: &dyn Fn(&mut Checkpoint)| {
         let mut other = checkpoint.clone();
