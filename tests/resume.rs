@@ -94,7 +94,7 @@ fn check_invalid_checkpoints_are_reported(folder: &Path) {
         printed
     };
     assert!(other_data(&["--scale", "0.5"]).contains("has 32x24 pixels, had 64x48"));
-    assert!(other_data(&["--holdout", "2"]).contains("is not there to be learned from"));
+    assert!(other_data(&["--holdout", "2"]).contains("is missing"));
     for flag in ["--seed", "--max-splats", "--plan-steps"] {
         assert!(assert_fails(&train(folder, &["--resume", "half", flag, "5"]).output().unwrap(), 2).contains(flag));
     }
@@ -214,7 +214,7 @@ fn killed_live_run_resumes_keyframes_and_clock() {
     let output = run(&["--resume", "out"]).output().unwrap();
     let stderr_text = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{stderr_text}");
-    assert!(stderr_text.contains("recorded in first.mcap; this part is not"), "{stderr_text}");
+    assert!(stderr_text.contains("recorded to first.mcap; this part is not"), "{stderr_text}");
     let printed = String::from_utf8(output.stdout).unwrap();
     let done: Value = serde_json::from_str(printed.lines().last().unwrap()).unwrap();
     assert_eq!((&done["event"], &done["out"]), (&json!("done"), &json!("out")));

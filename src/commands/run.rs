@@ -701,11 +701,7 @@ mod tests {
             (0, counts(1, 1, &[]), "ended before the trainer received a keyframe"),
             (0, counts(0, 0, &[]), "no image was received"),
             (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
-            (
-                0,
-                counts(7, 0, &[(Refusal::NoPose, 7)]),
-                "0 keyframes of 7 images; 7 no joint readings or pose of the base",
-            ),
+            (0, counts(7, 0, &[(Refusal::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
         ] {
             let message = no_model_reason(n_keyframes, &counts, &rig);
             assert!(message.contains(expected), "{message}");

@@ -9,9 +9,9 @@ use std::sync::Arc;
 pub(crate) enum Refusal {
     /// The rig file has no camera of this name.
     UnknownCamera,
-    /// Too many images waited for joint readings.
+    /// Too many images waited for joint states.
     QueueFull,
-    /// No joint readings around the stamp, or no base pose.
+    /// No joint states around the stamp, or no base pose.
     NoPose,
     /// The pose contains NaN or infinity.
     PoseNotFinite,
@@ -54,8 +54,8 @@ impl std::fmt::Display for Refusal {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::UnknownCamera => "camera not in the rig file",
-            Self::QueueFull => "too many images waiting for joint readings",
-            Self::NoPose => "no joint readings or base pose around the stamp",
+            Self::QueueFull => "too many images waiting for joint states",
+            Self::NoPose => "no joint states or base pose around the stamp",
             Self::PoseNotFinite => "pose not finite",
             Self::NotMoved => "not moved",
             Self::Blur => "motion blur",
@@ -139,7 +139,7 @@ impl std::fmt::Display for Counts {
             (self.evicted, "evicted from the full store"),
             (self.without_depth, "without depth"),
             (self.device_skipped, "dropped by devices"),
-            (self.joints_refused, "joint readings refused"),
+            (self.joints_refused, "joint states refused"),
             (self.base_poses_refused, "base poses refused"),
             (self.range_scans, "range scans transformed"),
             (self.range_scans_refused, "range scans refused"),

@@ -34,7 +34,7 @@ pub struct Gpu {
     next_id: AtomicU64,
     /// Read-back buffers for reuse, the oldest first.
     idle_staging: Mutex<VecDeque<wgpu::Buffer>>,
-    /// Locked for reading while mapped memory is copied: destroying the device unmaps it.
+    /// Locked for reading while memory is mapped or copied: destroying the device unmaps it.
     mapped: RwLock<()>,
 }
 
@@ -428,6 +428,7 @@ impl Gpu {
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
         // wgpu panics if it notices a lost device while it waits.
+        let _mapping = self.mapped.read().unwrap_or_else(PoisonError::into_inner); // Polling maps buffers.
         let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         match polled {
             Ok(Ok(_)) => Ok(()),
