@@ -8,7 +8,6 @@ use crate::stop::Stop;
 use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
-use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -8,7 +8,7 @@
 
 use crate::config::{BaseDriver, Parent, Rig};
 use crate::join::change::Change;
-use calibration::{StationCorrection, register_station};
+use calibration::{StationCorrection, register_station, run_in_background_pool};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
@@ -275,7 +275,7 @@ impl Stations {
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
             let found =
-                align::run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
+                run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
             SearchResult { found, took: started.elapsed() }
         }));
     }

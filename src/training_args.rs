@@ -3,7 +3,7 @@
 use crate::config::{self, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, SEED_RANGE};
 use crate::exit::BadArgument;
 use crate::method::{self, ModelKind};
-use calibration::align;
+use calibration::candidates;
 use calibration::{CameraRefinement, ParamSet};
 use clap::{ValueEnum, value_parser};
 use trainer::splat::CountPolicy;
@@ -255,7 +255,7 @@ impl AvailableData {
             }
         };
         RefineSettings {
-            align: CameraRefinement::Try(if self.depth { align::candidates() } else { Vec::new() }),
+            align: CameraRefinement::Try(if self.depth { candidates() } else { Vec::new() }),
             with_scene: CameraRefinement::Try(with_scene),
         }
     }

@@ -5,13 +5,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 6] = [
+const ALLOWED: [(&str, &[&str]); 8] = [
     ("kinematics", &[]),
+    ("keyframe", &["kinematics"]),
+    ("calibration", &["keyframe", "kinematics"]),
     ("drivers", &["kinematics"]),
     ("sim", &["drivers", "kinematics"]),
-    ("trainer", &["kinematics"]),
-    ("viz", &["kinematics", "trainer"]),
-    ("fieldrig", &["drivers", "kinematics", "sim", "trainer", "viz"]),
+    ("trainer", &["calibration", "keyframe", "kinematics"]),
+    ("viz", &["keyframe", "kinematics", "trainer"]),
+    ("fieldrig", &["calibration", "drivers", "keyframe", "kinematics", "sim", "trainer", "viz"]),
 ];
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.
