@@ -274,8 +274,7 @@ impl Stations {
             (self.reference_keyframes.clone(), guess * base_state.world_from_base);
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
-            let found =
-                run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
+            let found = run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
             SearchResult { found, took: started.elapsed() }
         }));
     }

@@ -30,7 +30,6 @@
 //! ```
 
 mod error;
-#[expect(clippy::module_inception, reason = "named after the type that it defines")]
 mod keyframe;
 mod range_points;
 #[cfg(any(test, feature = "scenes"))]

@@ -1,8 +1,9 @@
 //! MIT mode: position, velocity, two gains and a torque in the eight bytes of one frame.
 //!
-//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `cmjang/DM_Control_Python`
-//! `DM_CAN.py` and `neurobionics/TMotorCANControl` `mit_can.py`. The drive applies `torque = kp (position - measured)
-//! + kd (velocity - measured) + torque`. As in these sources, values outside the limits are clamped.
+//! Source: Ben Katz, mini cheetah motor controller (`pack_cmd`, `unpack_reply`); the same bytes in `DM_CAN.py` of
+//! `cmjang/DM_Control_Python` and in `mit_can.py` of `neurobionics/TMotorCANControl`. The drive applies
+//! `torque = kp (position - measured) + kd (velocity - measured) + torque`. As in these sources, values outside the
+//! limits are clamped.
 
 use super::CanError;
 use super::scale::Scale;
