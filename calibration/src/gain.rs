@@ -6,6 +6,14 @@ pub const MIN_GAIN_DB: f64 = 0.05;
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// Mean gain over the same images with a variant and without it.
+///
+/// ```
+/// use calibration::{Gain, MIN_GAIN_DB};
+///
+/// let gain = Gain::of(&[0.4, 0.5, 0.3, 0.45]);
+/// assert!(gain.is_significant(MIN_GAIN_DB));
+/// assert!(!Gain::of(&[0.9, -0.8, 0.7, -0.6]).is_significant(MIN_GAIN_DB), "the images disagree");
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gain {
     /// Mean gain, dB.

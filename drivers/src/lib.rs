@@ -1,4 +1,16 @@
 //! Devices, recordings and datasets as sources of stamped samples, behind a few traits.
+//!
+//! A program without a driver can send base poses, joint states and range scans as UDP datagrams:
+//!
+//! ```
+//! use drivers::wire::datagram::{Clock, DatagramHeader, PoseDatagram, decode_pose, encode_pose};
+//! use kinematics::Transform;
+//!
+//! let header = DatagramHeader { seq: 1, clock: Clock::Monotonic, stamp_nanos: 1_000_000_000 };
+//! let pose = PoseDatagram { header, world_from_base: Transform::translation(1.0, 2.0, 0.0), covariance: None };
+//! assert_eq!(decode_pose(&encode_pose(&pose))?, pose);
+//! # Ok::<(), drivers::wire::datagram::Malformed>(())
+//! ```
 
 pub mod align;
 pub mod can;

@@ -152,6 +152,21 @@ pub struct DepthMap {
 
 impl DepthMap {
     /// Point at depth `z_m` on the ray through the center of a pixel, in the depth camera's axes, meters.
+    ///
+    /// ```
+    /// use keyframe::DepthMap;
+    /// use kinematics::Transform;
+    ///
+    /// let depth = DepthMap {
+    ///     size_px: [4, 2],
+    ///     focal_px: [2.0, 2.0],
+    ///     principal_px: [2.0, 1.0],
+    ///     depth_m: vec![1.5; 8].into(),
+    ///     world_from_camera: Transform::identity(),
+    /// };
+    /// // The center of pixel (3, 0) is at (3.5, 0.5).
+    /// assert_eq!(depth.point(3, 0, 1.5), [1.125, -0.375, 1.5].into());
+    /// ```
     pub fn point(&self, x: u32, y: u32, z_m: f64) -> Vector3<f64> {
         let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];
         Vector3::new(ray(x, 0), ray(y, 1), 1.0) * z_m

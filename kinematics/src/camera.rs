@@ -20,6 +20,21 @@ pub struct Intrinsics {
 }
 
 /// Lens distortion.
+///
+/// ```
+/// use kinematics::{Intrinsics, Lens};
+///
+/// let fisheye = Intrinsics {
+///     size_px: [640, 480],
+///     focal_px: [300.0, 300.0],
+///     principal_px: [320.0, 240.0],
+///     lens: Lens::KannalaBrandt([-0.01, 0.002, 0.0, 0.0]),
+///     rectified: false,
+/// };
+/// let ray = fisheye.unproject([500.0, 100.0]).expect("the pixel is within the lens");
+/// let pixel = fisheye.project(&ray).expect("the ray is in front of the camera");
+/// assert!((pixel[0] - 500.0).abs() < 1e-6 && (pixel[1] - 100.0).abs() < 1e-6);
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Lens {
     /// No distortion.

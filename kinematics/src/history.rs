@@ -139,6 +139,21 @@ impl<T> Readings<T> {
 }
 
 /// Recent joint readings of one arm.
+///
+/// ```
+/// use kinematics::{JointHistory, JointState, Stamp};
+/// use std::time::Duration;
+///
+/// let mut history = JointHistory::new(Duration::from_millis(50), 1000);
+/// for (millis, position_rad) in [(0, 0.0), (10, 0.1), (20, 0.2)] {
+///     let stamp = Stamp(millis * 1_000_000);
+///     history.push(JointState { stamp, position: vec![position_rad], velocity: Vec::new(), effort: Vec::new() })?;
+/// }
+/// let at_shutter = history.at(Stamp(15_000_000))?;
+/// assert!((at_shutter.position[0] - 0.15).abs() < 1e-9);
+/// assert!(history.at(Stamp(30_000_000)).is_err(), "histories never extrapolate");
+/// # Ok::<(), kinematics::HistoryError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct JointHistory {
     readings: Readings<JointState>,

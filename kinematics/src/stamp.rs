@@ -4,6 +4,14 @@ use std::ops::{Add, AddAssign, Sub};
 use std::time::Duration;
 
 /// Nanoseconds on one monotonic clock. For images: mid-exposure, if the device reports it.
+///
+/// ```
+/// use kinematics::Stamp;
+///
+/// let shutter = Stamp(1_500_000_000);
+/// assert_eq!(shutter.plus_secs(0.25).secs(), 1.75);
+/// assert_eq!(shutter.secs_since(Stamp(2_000_000_000)), -0.5);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Stamp(pub i64);
 

@@ -83,6 +83,16 @@ pub fn interpolate(a: &Transform, b: &Transform, frac: f64) -> Transform {
 /// Motion of a frame that keeps `twist` for `secs`: the new `world_from_frame` is the old one times this.
 ///
 /// Source: Murray, Li and Sastry 1994, section 2.3.2 (exponential of se(3)).
+///
+/// ```
+/// use kinematics::{Twist, transform};
+/// use nalgebra::Vector3;
+///
+/// let twist = Twist { linear_m_s: Vector3::new(0.1, 0.0, 0.0), angular_rad_s: Vector3::new(0.0, 0.0, 0.5) };
+/// let moved = transform::exp(&twist, 2.0);
+/// let again = transform::log(&moved, 2.0);
+/// assert!((again.linear_m_s - twist.linear_m_s).norm() < 1e-12);
+/// ```
 pub fn exp(twist: &Twist, secs: f64) -> Transform {
     let rotation_vector = twist.angular_rad_s * secs;
     let translation_part = twist.linear_m_s * secs;

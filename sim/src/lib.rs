@@ -2,6 +2,17 @@
 //!
 //! [`open`] builds a rig. [`Rig::into_lockstep`] runs it as fast as the caller takes samples and gives the same bits
 //! for the same seed. [`Rig::into_live`] runs it in real time as devices.
+//!
+//! ```no_run
+//! use sim::Config;
+//!
+//! # let config = || -> Config { unimplemented!() };
+//! let config = config(); // cameras, arm, scene and seed
+//! let rig = sim::open(&config)?;
+//! let samples = rig.into_lockstep();
+//! # drop(samples);
+//! # Ok::<(), sim::Error>(())
+//! ```
 
 mod arm;
 mod base;

@@ -1,4 +1,13 @@
 //! Radiance fields trained on wgpu: keyframes in, pictures out.
+//!
+//! ```
+//! use trainer::eval::{PixelPair, psnr};
+//!
+//! let (rendered, truth) = ([100; 4 * 6], [110; 4 * 6]);
+//! let pair = PixelPair::new([3, 2], &rendered, &truth)?;
+//! assert!((psnr(&pair)? - 20.0 * (255.0_f64 / 10.0).log10()).abs() < 1e-9);
+//! # Ok::<(), trainer::Error>(())
+//! ```
 
 mod aligned;
 pub mod checkpoint;

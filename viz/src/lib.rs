@@ -2,6 +2,15 @@
 //!
 //! The training thread publishes to a [`Hub`], which never blocks it. A [`Server`] sends the hub's data to browsers
 //! over one port. `docs/reference/protocol.md` describes the messages.
+//!
+//! ```
+//! use viz::{Hub, Status};
+//!
+//! let hub = Hub::new();
+//! hub.set_status(Status { state: "training".to_owned(), seconds: 1.5, ..Status::default() });
+//! assert_eq!(hub.n_clients(), 0);
+//! assert!(hub.next_request().is_none(), "nobody requests a picture yet");
+//! ```
 
 mod admission;
 mod broadcast;

@@ -28,6 +28,21 @@ impl SplatArrays {
     /// # Errors
     ///
     /// Fails if lengths differ, the degree exceeds 3, a value is not finite, or a rotation has length zero.
+    ///
+    /// ```
+    /// use trainer::splat::arrays::SplatArrays;
+    ///
+    /// let one = SplatArrays {
+    ///     means: vec![[0.0; 3]],
+    ///     log_scales: vec![[-3.0; 3]],
+    ///     rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+    ///     opacity_logits: vec![2.0],
+    ///     sh: vec![[0.5, 0.1, 0.1]],
+    ///     sh_degree: 0,
+    /// };
+    /// assert_eq!(one.checked()?.n_splats(), 1);
+    /// # Ok::<(), trainer::Error>(())
+    /// ```
     pub fn checked(self) -> Result<Self, Error> {
         if self.n_coefficients() > MAX_COEFFICIENTS {
             return Err(Error::SplatArrays(format!("color degree {}, at most 3", self.sh_degree)));
