@@ -270,8 +270,9 @@ impl Gpu {
 
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
-        // A device that fails on its own keeps its mappings; `destroy` removes them at once.
+        // `destroy` frees memory at once, unlike a device that fails: nobody may read it, and no copy may be under way.
         let _no_reader = self.mapped.write().unwrap_or_else(PoisonError::into_inner);
+        let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
         self.device.destroy();
     }
 

@@ -395,7 +395,7 @@ fn non_finite_keyframes_leave_no_nan() {
     }
     assert!(model.render(&request(&keyframes[4])).unwrap().depth_m.iter().all(|depth| depth.is_finite()));
     let torn = Keyframe { rgba_srgb: vec![0; 12].into(), ..(*keyframes[1]).clone() };
-    assert!(matches!(model.push(Arc::new(torn)), Err(Error::PictureBytes { .. })));
+    assert!(matches!(model.push(Arc::new(torn)), Err(Error::Keyframe(keyframe::Error::ImageBytes { .. }))));
 }
 
 #[test]

@@ -437,10 +437,10 @@ fn unfused_keyframes_are_removable_and_bad_sizes_rejected() {
     assert!(model.blocks().unwrap() == fused_model(scenes::options(), &keyframes[..1]).blocks().unwrap());
     let mut short = (*keyframes[0]).clone();
     short.depth.as_mut().unwrap().depth_m = vec![1.0; 3].into();
-    assert!(matches!(model.push(Arc::new(short)), Err(Error::DepthSizeMismatch { rendered: 3, .. })));
+    assert!(matches!(model.push(Arc::new(short)), Err(Error::Keyframe(keyframe::Error::DepthPixels { got: 3, .. }))));
     let mut short = (*keyframes[0]).clone();
     short.rgba_srgb = vec![0; 3].into();
-    assert!(matches!(model.push(Arc::new(short)), Err(Error::PictureBytes { .. })));
+    assert!(matches!(model.push(Arc::new(short)), Err(Error::Keyframe(keyframe::Error::ImageBytes { .. }))));
 }
 
 #[test]
