@@ -14,7 +14,7 @@ use clap::{ArgAction, Parser, Subcommand};
     arg_required_else_help = true,
     max_term_width = 110,
     after_help = "Results go to stdout; the log and progress bars go to stderr.\n\
-                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 refused for lack of evidence.\n\
+                  Exit codes: 0 done, 1 failed, 2 bad arguments, 3 done with loss, 4 insufficient data.\n\
                   A loss is input data that is missing from the result: images that devices dropped or that cannot be decoded, \
                   or a truncated recording. Each loss is printed on stderr and, by train and run, listed in report.json. \
                   Output lines that could not be written count as losses, too."
@@ -30,7 +30,7 @@ pub(crate) struct Cli {
 /// The subcommand.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Train a scene model on live devices, a simulation or a recording, and show it in the browser
+    /// Train on live devices, a simulation or a recording; show the scene
     Run(run::Args),
     /// Record all devices of a rig to an MCAP file
     Record(record::Args),
@@ -48,15 +48,15 @@ pub(crate) enum Command {
     Export(export::Args),
     /// Compute the pose of a robot's tip for given joint values
     Fk(fk::Args),
-    /// Measure speed, accuracy over time and model size, and the cost of disturbances; draws charts
+    /// Measure speed, accuracy, robustness and memory; draws charts
     Bench(bench::Args),
     /// List the connected devices and whether this build can use them
     Devices(devices::Args),
-    /// Check the GPU, clocks, memory, permissions and devices, and print how to fix each problem
+    /// Check GPU, clocks, memory, permissions and devices; print fixes
     Doctor(doctor::Args),
-    /// Emulate the devices of a rig: Franka controller, CAN motors, UDP senders and camera files
+    /// Emulate the devices of a rig: Franka, CAN motors, UDP, cameras
     Sim(sim::Args),
-    /// Move an arm to given joint positions, within its limits, under supervision
+    /// Move an arm to joint positions, within its limits, supervised
     Move(move_arm::Args),
 }
 

@@ -165,7 +165,7 @@ fn curve_bench_skips_methods_without_sufficient_data() {
 
     assert_fails_with(folder, &["curve", "flat", "--method", "tsdf", "--seconds", "1", "--out", "d"], 4, &["depth"]);
     assert_fails_with(folder, &["budget", "flat", "--method", "splat,nerf"], 2, &["splat and nerf"]);
-    assert_fails_with(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["one method"]);
+    assert_fails_with(folder, &["stability", "flat", "--method", "splat,nerf"], 2, &["a single method"]);
 }
 
 #[test]
@@ -242,5 +242,5 @@ fn stability_bench_is_repeatable_and_needs_times() {
     assert_eq!(n_runs("none", "t"), 2, "undisturbed, and 100 ms");
     assert_eq!(n_runs("image-gains", "u"), 4, "each with and without the estimated camera parameters");
     let few = ["stability", ".", "--disturb", "keyframes,exposure", "--levels", "1"];
-    assert_fails_with(folder, &few, 2, &["--levels", "one disturbance"]);
+    assert_fails_with(folder, &few, 2, &["--levels", "a single disturbance"]);
 }
