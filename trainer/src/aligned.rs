@@ -5,7 +5,7 @@
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::PassTiming;
-use crate::splat::read_metadata;
+use crate::model_metadata::read_metadata;
 use crate::{Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};

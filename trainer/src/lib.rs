@@ -19,9 +19,12 @@ pub mod loss;
 pub mod method;
 #[cfg(test)]
 mod mismatches;
+mod model_metadata;
 pub mod nerf;
 pub mod optim;
 pub mod ply;
+#[cfg(test)]
+mod random;
 pub mod request;
 pub mod sort;
 pub mod splat;
@@ -34,6 +37,7 @@ mod test_scenes;
 
 pub mod atomic_file;
 pub mod tsdf;
+mod view;
 
 pub use aligned::{Aligned, Restartable, ResumedModel};
 pub use error::Error;

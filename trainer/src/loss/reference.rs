@@ -180,7 +180,7 @@ fn sign(value: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::mismatches::Mismatches;
-    use crate::splat::reference::scene::Random;
+    use crate::random::Random;
 
     const SIZE_PX: [usize; 2] = [17, 14];
     const N_PIXELS: usize = SIZE_PX[0] * SIZE_PX[1];

@@ -1,7 +1,7 @@
 //! Extent of the scene, estimated from the keyframes.
 
 use crate::Aabb;
-use crate::splat::Camera;
+use crate::view::Camera;
 use keyframe::{Keyframe, Shutter};
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Point3, Vector3};
@@ -130,7 +130,7 @@ fn depth_samples(keyframe: &Keyframe) -> Vec<(f64, Vector3<f64>)> {
 /// Size of a pixel in the scene, meters: median over the keyframes.
 pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, extent: &Extent) -> f64 {
     let size = |keyframe: &Keyframe| {
-        let typical_depth_m = crate::splat::median_depth_m(keyframe).unwrap_or(extent.radius_m);
+        let typical_depth_m = crate::view::median_depth_m(keyframe).unwrap_or(extent.radius_m);
         typical_depth_m / keyframe.focal_px[0].max(1.0)
     };
     let mut sizes: Vec<f64> = keyframes.map(size).collect();

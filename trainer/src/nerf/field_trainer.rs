@@ -14,7 +14,7 @@ use super::rays::{mix_hash, unit};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
-use crate::splat::Camera;
+use crate::view::Camera;
 use crate::{Error, Picture};
 use calibration::{EMBEDDING_DIM, ParamSet};
 use rayon::prelude::*;

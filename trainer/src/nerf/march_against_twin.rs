@@ -9,7 +9,7 @@ use super::reference::march::March;
 use super::reference::space::contract;
 use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
-use crate::splat::reference::scene::Random;
+use crate::random::Random;
 
 const N_CELLS: u32 = 64;
 /// More than a workgroup scans at once.

@@ -12,7 +12,7 @@ use super::sizes::Sizes;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
 use crate::method::submit_millis;
-use crate::splat::{Camera, projections};
+use crate::view::{Camera, projections};
 use crate::{Error, Method, Picture, Progress, RenderRequest, Restartable};
 use calibration::Alignment;
 use calibration::TrialReport;

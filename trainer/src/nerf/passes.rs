@@ -8,7 +8,7 @@ use super::kernels::{CHUNK_TILES, FieldPipelines, N_TILE};
 use super::params::{Backdrop, IMAGE_PARAM_STRIDE, ImageParam};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
-use crate::splat::View;
+use crate::view::View;
 use std::ops::Range;
 
 /// Resources for the passes of one batch of rays.

@@ -3,7 +3,7 @@
 use super::extent::Extent;
 use super::params;
 use crate::gpu::{f32_of, f32s_of};
-use crate::splat::depth_in_color_view;
+use crate::view::depth_in_color_view;
 use keyframe::Keyframe;
 use nalgebra::Vector3;
 use rayon::prelude::*;

@@ -19,7 +19,6 @@ mod non_finite_tests;
 mod options;
 mod params;
 mod passes;
-pub(crate) mod projections;
 pub mod reference;
 mod seed;
 mod snapshot;
@@ -32,8 +31,5 @@ mod trials;
 mod views;
 
 pub use options::SplatOptions;
-pub(crate) use params::{Camera, View};
 pub use trainer::SplatTrainer;
-pub(crate) use trainer::read_metadata;
 pub use trials::CountPolicy;
-pub(crate) use views::{depth_in_color_view, median_depth_m};

@@ -20,6 +20,8 @@ use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
 use crate::method::submit_millis;
+use crate::model_metadata::read_metadata;
+use crate::view::projections;
 use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, ply};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask};
@@ -1105,7 +1107,7 @@ impl Method for SplatTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
         self.seed_from_depth()?;
-        super::projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
+        projections::render(request, |camera| self.draw_view(camera, request.background_srgb, request.depth))
     }
 
     fn set_watched(&mut self, watched: bool) {
@@ -1176,28 +1178,6 @@ fn corrected_camera(corrections: &CameraCorrections, keyframe: &Keyframe) -> Cal
     corrections
         .get(keyframe.camera.as_ref())
         .map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
-}
-
-/// Camera corrections and alignment of a saved model.
-#[derive(Default, serde::Deserialize)]
-#[serde(default)]
-pub(crate) struct ModelMetadata {
-    pub(crate) cameras: BTreeMap<String, CameraCorrection>,
-    pub(crate) alignment: Option<Alignment>,
-}
-
-/// Reads the camera corrections of a saved model; empty if the file does not exist or lacks them.
-///
-/// # Errors
-///
-/// Fails if the file cannot be read or parsed.
-pub(crate) fn read_metadata(path: &Path) -> Result<ModelMetadata, Error> {
-    let invalid_file = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
-    match std::fs::read(path) {
-        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| invalid_file(error.to_string())),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ModelMetadata::default()),
-        Err(error) => Err(invalid_file(error.to_string())),
-    }
 }
 
 fn ensure_image_buffers(

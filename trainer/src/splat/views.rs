@@ -7,10 +7,10 @@
 use super::camera_params::CameraParams;
 use super::params::{Camera, LOW_PASS_PX2, TILE_PX};
 use crate::Error;
-use crate::gpu::{Buffer, Gpu, f32_of};
+use crate::gpu::{Buffer, Gpu};
+use crate::view::{depth_in_color_view, median_depth_m};
 use calibration::CalibratedCamera;
 use keyframe::Keyframe;
-use nalgebra::Point3;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -240,15 +240,6 @@ impl LevelImages {
     }
 }
 
-pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
-    let depth = keyframe.depth.as_ref()?;
-    // Samples all columns and rows, with a sufficient number of pixels from small images.
-    let step = 997.min(depth.depth_m.len() / 64).max(1);
-    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0).collect();
-    sample.sort_by(f32::total_cmp);
-    sample.get(sample.len() / 2).map(|z| f64::from(*z))
-}
-
 /// The uncorrected camera of a keyframe.
 pub(crate) fn camera_of(keyframe: &Keyframe) -> Camera {
     Camera {
@@ -306,39 +297,4 @@ fn downscaled_depth(keyframe: &Keyframe, size_px: [u32; 2], level: u32) -> Arc<[
         .flat_map(|y| (0..size_px[0] as usize).map(move |x| (x, y)))
         .map(|(x, y)| full[(y * edge + middle) * width + x * edge + middle])
         .collect()
-}
-
-/// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no depth.
-///
-/// Depth from a camera with another lens, pose or time is reprojected point by point; the nearest point is used.
-pub(crate) fn depth_in_color_view(keyframe: &Keyframe) -> Arc<[f32]> {
-    let Some(depth) = &keyframe.depth else { return [].into() };
-    let same_lens = depth.size_px == keyframe.size_px
-        && depth.focal_px == keyframe.focal_px
-        && depth.principal_px == keyframe.principal_px;
-    if same_lens && depth.world_from_camera == keyframe.world_from_camera {
-        return depth.depth_m.clone();
-    }
-    let color_from_depth = keyframe.world_from_camera.inverse() * depth.world_from_camera;
-    let [width, height] = keyframe.size_px;
-    let mut reprojected = vec![0.0f32; (width * height) as usize];
-    for (ix, z) in depth.depth_m.iter().enumerate().filter(|(_, z)| **z > 0.0) {
-        let (x, y) = ((ix as u32 % depth.size_px[0]), (ix as u32 / depth.size_px[0]));
-        let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - depth.principal_px[axis]) / depth.focal_px[axis];
-        let z = f64::from(*z);
-        let point = color_from_depth * Point3::new(ray(x, 0) * z, ray(y, 1) * z, z);
-        if point.z <= 0.0 {
-            continue;
-        }
-        let pixel = [0, 1].map(|axis| keyframe.focal_px[axis] * point[axis] / point.z + keyframe.principal_px[axis]);
-        if pixel[0] < 0.0 || pixel[1] < 0.0 || pixel[0] >= f64::from(width) || pixel[1] >= f64::from(height) {
-            continue;
-        }
-        let nearest_m = &mut reprojected[pixel[1] as usize * width as usize + pixel[0] as usize];
-        let depth_m = f32_of(point.z);
-        if *nearest_m == 0.0 || depth_m < *nearest_m {
-            *nearest_m = depth_m;
-        }
-    }
-    reprojected.into()
 }

@@ -77,8 +77,8 @@ impl Pipelines {
 #[cfg(test)]
 mod tests {
     use crate::gpu::{reflect, resolve};
-    use crate::splat::View;
     use crate::tsdf::params::{Backdrop, BlockMeshRange, DepthView, Field, MeshBatch, MeshVertex};
+    use crate::view::View;
 
     /// Names and offsets of a struct's fields and its size, as WGSL lays it out in every kernel that declares it.
     fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {

@@ -19,7 +19,7 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
 use crate::keyframe_signature::KeyframeSignature;
 use crate::method::submit_millis;
-use crate::splat::{Camera, projections};
+use crate::view::{Camera, projections};
 use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, Restartable};
 use calibration::Alignment;
 use calibration::CalibratedCamera;

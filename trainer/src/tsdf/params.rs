@@ -2,9 +2,9 @@
 
 use super::chosen_grid::VoxelGrid;
 use crate::gpu::{f32_of, f32s_of};
+use crate::view::rows_of;
 use calibration::CalibratedCamera;
 use keyframe::Keyframe;
-use kinematics::Transform;
 
 /// `Field` of `shared/field.wgsl`.
 #[repr(C)]
@@ -83,12 +83,6 @@ impl DepthView {
             color_size_px: keyframe.size_px,
         })
     }
-}
-
-/// The upper three rows of the transform's matrix.
-fn rows_of(transform: &Transform) -> [[f32; 4]; 3] {
-    let matrix = transform.to_homogeneous();
-    std::array::from_fn(|row| std::array::from_fn(|column| f32_of(matrix[(row, column)])))
 }
 
 /// `Backdrop` of `cast_rays.wgsl`.

@@ -6,7 +6,7 @@ use super::mesh_buffers::MeshBuffers;
 use super::params::{Backdrop, DepthView};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes};
-use crate::splat::View;
+use crate::view::View;
 use keyframe::Keyframe;
 
 /// Maximum number of workgroups that share the visible blocks: enough to fill any GPU.

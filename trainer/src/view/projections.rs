@@ -4,7 +4,7 @@
     reason = "pixels are rounded down on purpose, within image sizes that are u32"
 )]
 
-use super::params::{Camera, LOW_PASS_PX2};
+use super::{Camera, LOW_PASS_PX2};
 use crate::{Error, Picture, Projection, RenderRequest};
 use kinematics::Transform;
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};

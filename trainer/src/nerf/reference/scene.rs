@@ -5,7 +5,7 @@ use super::field::{Field, FieldGrad};
 use super::grid::GridShape;
 use super::network::Network;
 use super::ray::{self, Sample, Target, Weights};
-use crate::splat::reference::scene::Random;
+use crate::random::Random;
 
 fn rounded(value: f64) -> f64 {
     f64::from(crate::gpu::f32_of(value))

@@ -8,7 +8,7 @@ use super::super::chosen_grid::VoxelGrid;
 use super::super::params::DepthView;
 use super::TsdfModel;
 use crate::Error;
-use crate::splat::Camera;
+use crate::view::Camera;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use std::collections::BTreeSet;

@@ -1,0 +1,28 @@
+//! Camera corrections in the `model.json` of a saved model.
+
+use crate::Error;
+use calibration::{Alignment, CameraCorrection};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Camera corrections and alignment of a saved model.
+#[derive(Default, serde::Deserialize)]
+#[serde(default)]
+pub(crate) struct ModelMetadata {
+    pub(crate) cameras: BTreeMap<String, CameraCorrection>,
+    pub(crate) alignment: Option<Alignment>,
+}
+
+/// Reads the camera corrections of a saved model; empty if the file does not exist or lacks them.
+///
+/// # Errors
+///
+/// Fails if the file cannot be read or parsed.
+pub(crate) fn read_metadata(path: &Path) -> Result<ModelMetadata, Error> {
+    let invalid_file = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
+    match std::fs::read(path) {
+        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| invalid_file(error.to_string())),
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ModelMetadata::default()),
+        Err(error) => Err(invalid_file(error.to_string())),
+    }
+}
