@@ -9,7 +9,7 @@
 //! let header = DatagramHeader { seq: 1, clock: Clock::Monotonic, stamp_nanos: 1_000_000_000 };
 //! let pose = PoseDatagram { header, world_from_base: Transform::translation(1.0, 2.0, 0.0), covariance: None };
 //! assert_eq!(decode_pose(&encode_pose(&pose))?, pose);
-//! # Ok::<(), drivers::wire::datagram::Malformed>(())
+//! # Ok::<(), drivers::wire::Malformed>(())
 //! ```
 
 pub mod align;

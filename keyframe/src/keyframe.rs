@@ -165,7 +165,7 @@ impl DepthMap {
     ///     world_from_camera: Transform::identity(),
     /// };
     /// // The center of pixel (3, 0) is at (3.5, 0.5).
-    /// assert_eq!(depth.point(3, 0, 1.5), [1.125, -0.375, 1.5].into());
+    /// assert_eq!(depth.point(3, 0, 1.5).as_slice(), [1.125, -0.375, 1.5]);
     /// ```
     pub fn point(&self, x: u32, y: u32, z_m: f64) -> Vector3<f64> {
         let ray = |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - self.principal_px[axis]) / self.focal_px[axis];

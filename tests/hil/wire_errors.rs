@@ -47,5 +47,5 @@ fn unacknowledged_motor_is_not_reported_silent() {
     let error = CanArm::open(&config).expect_err("no motor is connected").to_string();
     stop.store(true, Ordering::Relaxed);
     controller.join().expect("the thread does not panic");
-    assert!(error.contains("nobody acknowledges frames"), "{error}");
+    assert!(error.contains("no node acknowledges frames"), "{error}");
 }
