@@ -1,4 +1,9 @@
 //! Depth of a keyframe in the view of its color camera.
+#![expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "pixels are rounded down on purpose, within image sizes that are u32"
+)]
 
 use keyframe::Keyframe;
 use kinematics::f32_of;
