@@ -97,6 +97,12 @@ struct Viewer {
 impl Viewer {
     fn start(address: SocketAddr) -> Self {
         let mut client = open_viewer(address);
+        // A client is protected once it has answered a WebSocket ping, which the server sends every second. Reading answers it.
+        for _ in 0..12 {
+            std::thread::sleep(Duration::from_millis(100));
+            client.send_json(&json!({"type": "ping", "t": 1.5}));
+            client.text_of("pong");
+        }
         let stop: Arc<AtomicBool> = Arc::default();
         let stopped = Arc::clone(&stop);
         let thread = std::thread::spawn(move || {
