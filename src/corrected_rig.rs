@@ -1,6 +1,8 @@
 //! Writes the rig file with the calibration corrections that alignment found.
 
-use crate::config::{Camera, Rig, TimeOffset};
+use capture::config::Camera;
+use capture::config::Rig;
+use capture::config::TimeOffset;
 use crate::exit::BadArgument;
 use anyhow::Context;
 use calibration::CameraCorrection;

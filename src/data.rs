@@ -1,16 +1,24 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
-use crate::config::{Override, Rig};
-use crate::dataset;
+use keyframe::counted;
+use capture::config::Override;
+use capture::config::Rig;
+use capture::dataset;
 use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::exit::{BadArgument, InsufficientData};
-use crate::holdout::Holdout;
-use crate::join::{Join, JoinEvent, KeyframeList, SampleUse};
+use keyframe::Holdout;
+use capture::Join;
+use capture::JoinEvent;
+use keyframe::KeyframeList;
+use capture::SampleUse;
 use crate::method::ModelKind;
-use crate::open::{self, Opened};
+use capture::open;
+use capture::open::Opened;
 use crate::run_folder::is_recording;
-use crate::stations::{StationReport, Stations};
-use crate::{downscale, print};
+use capture::StationReport;
+use capture::Stations;
+use crate::print;
+use capture::downscale;
 use anyhow::ensure;
 use keyframe::{Keyframe, Split};
 use std::collections::BTreeMap;
@@ -209,7 +217,7 @@ impl Data {
             Purpose::Scoring => (Split::Test, "no test image"),
         };
         if data.of_split(required_split).is_empty() {
-            let n_images = print::counted(data.keyframes.len() as u64, "image");
+            let n_images = counted(data.keyframes.len() as u64, "image");
             return Err(InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
         }
         Ok(data)

@@ -4,8 +4,8 @@
 //! gives the same model.
 
 use crate::exit::BadArgument;
-use crate::fingerprint;
-use crate::join::{split_from_name, split_name};
+use keyframe::split_from_name;
+use keyframe::split_name;
 use anyhow::{Context, anyhow};
 use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform};
@@ -194,7 +194,7 @@ fn motion([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
 }
 
 fn fingerprint_of(keyframe: &Keyframe) -> String {
-    format!("{:016x}", fingerprint::of(keyframe))
+    format!("{:016x}", keyframe::fingerprint(keyframe))
 }
 
 /// Activity since the last logged decision that affects the next one.

@@ -1,5 +1,6 @@
 //! `--depth-from`: renders depth for images without depth from a saved model.
 
+use keyframe::counted;
 use crate::evaluate::{CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::{evaluate, method, print, run_folder};
@@ -76,7 +77,7 @@ impl DepthSource {
             return Err(InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into());
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
-        let images = print::counted(n_images as u64, "image");
+        let images = counted(n_images as u64, "image");
         let message = format!(
             "rendered depth for {images} from {model_name}: {:.1} % of the missing pixels",
             100.0 * rendered_frac

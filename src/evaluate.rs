@@ -2,6 +2,7 @@
 //!
 //! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
 
+use keyframe::counted;
 use crate::print;
 use anyhow::Context;
 use calibration::CalibratedCamera;
@@ -206,7 +207,7 @@ pub(crate) fn covered_frac(picture: &Picture) -> f64 {
 pub(crate) fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
     if covered_frac < MIN_COVERED_FRAC {
-        let views = print::counted(covered_fracs.len() as u64, "view");
+        let views = counted(covered_fracs.len() as u64, "view");
         log::warn!("the model covers {:.1} % of {views}; {CHECK_SAME_SCENE}", 100.0 * covered_frac);
     }
 }

@@ -1,6 +1,6 @@
 //! Exit codes and the errors that lead to them.
 
-use crate::config::ConfigError;
+use capture::config::ConfigError;
 use crate::print;
 use std::io::ErrorKind;
 use std::process::ExitCode;

@@ -1,7 +1,8 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
-use crate::feed::{Feed, InputResult};
-use crate::join::change::Change;
+use capture::Feed;
+use capture::InputResult;
+use capture::Change;
 use crate::recoveries::{self, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::scene_hint;

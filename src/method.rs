@@ -6,7 +6,7 @@ mod kind;
 pub(crate) use failed_model::FailedModel;
 pub(crate) use kind::ModelKind;
 
-use crate::config::Train;
+use capture::config::Train;
 use crate::exit::BadArgument;
 use crate::model_bounds::Bounds;
 use crate::run_folder::{expect_model, expect_one_model};

@@ -184,15 +184,6 @@ pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
-/// A count and its noun: `1 image`, `2 images`.
-pub(crate) fn counted(n: u64, noun: &str) -> String {
-    match noun.strip_suffix('y') {
-        _ if n == 1 => format!("1 {noun}"),
-        Some(stem) => format!("{n} {stem}ies"),
-        None => format!("{n} {noun}s"),
-    }
-}
-
 /// Prints one JSON object on its own line.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)

@@ -1,14 +1,14 @@
 //! `train --replay-decisions`: trains with the decisions of a log.
 
-use crate::config::Override;
+use capture::config::Override;
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
 use crate::depth_from;
 use crate::exit::{BadArgument, InsufficientData};
-use crate::join::KeyframeList;
+use keyframe::KeyframeList;
 use crate::method::{ModelKind, ModelSpec};
 use crate::session::Session;
-use crate::stop::Stop;
+use capture::Stop;
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::collections::HashMap;

@@ -1,6 +1,6 @@
 //! The folder of a run, and the files in it.
 
-use crate::config::Rig;
+use capture::config::Rig;
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::ModelKind;
 use crate::splat_file;
@@ -298,7 +298,7 @@ pub(crate) fn write_atomic(path: &Path, text: &str) -> anyhow::Result<()> {
 
 /// Writes the keyframes of a run and their splits, for `--keyframes`.
 pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
-    write_atomic(path, &crate::join::keyframe_list(keyframes.iter()))
+    write_atomic(path, &crate::keyframe::list_text(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.

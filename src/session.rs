@@ -1,18 +1,19 @@
 //! A training session: one model with its keyframes, clock, evaluation schedule and reports.
 
+use keyframe::counted;
 use crate::bench::statistics::median;
 use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::evaluation_schedule::EvaluationSchedule;
-use crate::join::split_name;
+use keyframe::split_name;
 use crate::method::{self, FailedModel, ModelKind};
 use crate::next_commands::{self, DataSource, SavedModel};
 use crate::open_gpu;
 use crate::pending_evaluation::PendingEvaluation;
 use crate::recovery::{self, Recovery};
-use crate::stop::Stop;
+use capture::Stop;
 use crate::{camera_list, checkpoints, exit, print, report, run_folder};
 use anyhow::Context;
 use calibration::Alignment;
@@ -856,8 +857,8 @@ impl Session {
                 }
                 print::report(format_args!(
                     "{seconds:.1} s, {}, {}, {:.1} MB: {}",
-                    print::counted(done.steps, "step"),
-                    print::counted(done.primitives, self.method.primitive()),
+                    counted(done.steps, "step"),
+                    counted(done.primitives, self.method.primitive()),
                     done.bytes as f64 / 1e6,
                     done.scores
                 ));
@@ -1038,7 +1039,7 @@ impl Session {
             OutputMode::Lines => print::report(format_args!(
                 "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
                 eval.step,
-                print::counted(eval.primitives, self.method.primitive()),
+                counted(eval.primitives, self.method.primitive()),
                 progress.step_millis,
                 eval.scores
             )),
@@ -1072,7 +1073,7 @@ impl Session {
         let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
         self.bar.set_position(position);
         let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
-        let primitives = print::counted(progress.primitives, self.method.primitive());
+        let primitives = counted(progress.primitives, self.method.primitive());
         self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
     }
 }

@@ -3,7 +3,8 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
 //! as PNG. Ground truth from a simulator is left out.
 
-use crate::join::{split_from_name, split_name};
+use keyframe::split_from_name;
+use keyframe::split_name;
 use anyhow::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -237,7 +238,6 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fingerprint;
     use keyframe::Split;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
@@ -283,7 +283,7 @@ mod tests {
         assert_eq!(read.len(), 3);
         for (read, expected) in read.iter().zip(in_order) {
             assert_eq!((read.stamp, &read.camera, read.split), (expected.stamp, &expected.camera, expected.split));
-            assert_eq!(fingerprint::of(read), fingerprint::of(expected));
+            assert_eq!(keyframe::fingerprint(read), keyframe::fingerprint(expected));
             assert_eq!(read.base, expected.base);
         }
         stored.keep_only(&all[1..]).expect("they are there");

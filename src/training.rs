@@ -1,13 +1,14 @@
 //! Trains models from keyframes on disk: once in `train`, many times in `bench`.
 
-use crate::config::{DEFAULT_SEED, Rig};
+use capture::config::DEFAULT_SEED;
+use capture::config::Rig;
 use crate::data::{Data, DataArgs};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::method::{self, ModelKind, ModelSpec};
 use crate::recoveries::Recoveries;
 use crate::run_folder;
 use crate::session::{Evaluators, Limits, OutputMode, Session};
-use crate::stop::Stop;
+use capture::Stop;
 use crate::time_slices;
 use crate::training_args::{AvailableData, CountArg, Refine, RefineSettings, TrainingArgs};
 use keyframe::Keyframe;

@@ -1,6 +1,10 @@
 //! Flags shared by all commands that train. They override the keys of the same name in a rig file.
 
-use crate::config::{self, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, SEED_RANGE};
+use capture::config;
+use capture::config::MAX_BYTES_RANGE;
+use capture::config::MAX_SPLATS_RANGE;
+use capture::config::Override;
+use capture::config::SEED_RANGE;
 use crate::exit::BadArgument;
 use crate::method::{self, ModelKind};
 use calibration::candidates;

@@ -1,7 +1,7 @@
 //! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
 
 use crate::method::ModelKind;
-use crate::stop::Stop;
+use capture::Stop;
 use kinematics::Transform;
 use std::time::Duration;
 use trainer::{Aabb, Method, RenderRequest};

@@ -1,9 +1,9 @@
 //! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
 use crate::downscale;
-use crate::holdout::Holdout;
-use crate::print::counted;
-use anyhow::{Context, ensure};
+use keyframe::Holdout;
+use keyframe::counted;
+use crate::error::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
@@ -16,15 +16,15 @@ const CAMERA: &str = "camera";
 
 /// The photos of a dataset as keyframes.
 #[derive(Debug)]
-pub(crate) struct LoadedDataset {
+pub struct LoadedDataset {
     /// In the order of the dataset.
-    pub(crate) keyframes: Vec<Arc<Keyframe>>,
+    pub keyframes: Vec<Arc<Keyframe>>,
     /// Names of the photos, in the same order.
-    pub(crate) names: Vec<String>,
+    pub names: Vec<String>,
     /// Notes for the user.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
     /// Files that did not decode.
-    pub(crate) data_losses: Vec<String>,
+    pub data_losses: Vec<String>,
 }
 
 /// Decodes all photos in parallel.
@@ -35,12 +35,12 @@ pub(crate) struct LoadedDataset {
 /// # Errors
 ///
 /// If no photo decodes.
-pub(crate) fn load(
+pub fn load(
     dataset: &Dataset,
     holdout: &Holdout,
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
-) -> anyhow::Result<LoadedDataset> {
+) -> crate::Result<LoadedDataset> {
     for frame in &dataset.frames {
         downscale::intrinsics(&frame.intrinsics, scale_frac).with_context(|| frame.name.clone())?;
     }
@@ -130,11 +130,11 @@ impl LensMaps {
 }
 
 /// The keyframe of one photo, and an error message if its depth does not decode. The caller sets camera and split.
-fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> anyhow::Result<(Keyframe, Option<String>)> {
+fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> crate::Result<(Keyframe, Option<String>)> {
     let images = frame.load()?;
     let in_frame = || frame.name.clone();
     let depth = images.depth.as_ref().zip(frame.depth.as_ref()).map(|(depth, file)| {
-        anyhow::Ok(DepthMap {
+        crate::Result::Ok(DepthMap {
             size_px: depth.intrinsics.size_px,
             focal_px: depth.intrinsics.focal_px,
             principal_px: depth.intrinsics.principal_px,

@@ -1,6 +1,6 @@
 //! Downscales training images by averaging areas, together with their intrinsics.
 
-use crate::exit::BadArgument;
+use crate::Error;
 use kinematics::Intrinsics;
 
 /// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
@@ -9,18 +9,18 @@ const MIN_SIDE_PX: u32 = 16;
 const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
 
 /// Parses the value of `--scale`.
-pub(crate) fn parse_scale(text: &str) -> Result<f64, String> {
+pub fn parse_scale(text: &str) -> Result<f64, String> {
     let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
     share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
 }
 
 /// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error if they become too
 /// small.
-pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, BadArgument> {
+pub fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
     let scaled = full.scaled(share);
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
         let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
-        return Err(BadArgument(format!(
+        return Err(Error::BadInput(format!(
             "scale {share}: images of {from_width}x{from_height} pixels would have {width}x{height}, \
              the minimum is {MIN_SIDE_PX} along each side"
         )));
@@ -31,7 +31,7 @@ pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Ba
 /// Scales an image to its new size, `[height, width, 4]`; returns it unchanged if the size is the same.
 ///
 /// A new pixel is masked if any pixel it covers is masked, so that no masked content leaks into the result.
-pub(crate) fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
+pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     let mut rgba = if from_px == to_px { rgba } else { area_mean(&rgba, from_px, to_px) };
     for alpha in rgba.iter_mut().skip(3).step_by(4) {
         *alpha = if *alpha == 255 { 255 } else { 0 };

@@ -1,21 +1,20 @@
 //! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
 //! come out of a bounded queue.
 
-use crate::join::change::Change;
+use crate::join::Change;
 use crate::join::{Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
 use crate::stop::Stop;
-use anyhow::{Context, anyhow};
+use crate::error::{Context, Error, chain};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
-use kinematics::Stamp;
+use kinematics::{Stamp, Transform};
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use viz::{Hub, LiveImage, LivePixels};
 
 /// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live
 /// devices drop (and count) images.
@@ -23,6 +22,45 @@ const MAX_WAITING: usize = 8;
 
 /// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
 const MAX_LIVE_AGE_SECS: f64 = 60.0;
+
+/// Receives the camera images of a running input, for example to show them.
+pub trait ImageObserver: Send {
+    /// Whether anyone looks at images at the moment. If not, they are not decoded.
+    fn needs_images(&self) -> bool;
+
+    /// Takes an image.
+    fn observe(&self, image: ObservedImage);
+}
+
+/// A camera image with its pose, as it arrived.
+#[derive(Clone, Debug)]
+pub struct ObservedImage {
+    /// Name of the camera.
+    pub camera: Arc<str>,
+    /// Mid-exposure.
+    pub stamp: Stamp,
+    /// The same moment on this process's clock; the time of arrival if the stamp is on another clock.
+    pub captured_at: Instant,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// The image, not undistorted.
+    pub pixels: ObservedPixels,
+    /// Pose of the camera at the stamp, with the correction of its station.
+    pub world_from_camera: Transform,
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+}
+
+/// Pixels of an [`ObservedImage`].
+#[derive(Clone, Debug)]
+pub enum ObservedPixels {
+    /// A complete JPEG file.
+    Jpeg(Arc<[u8]>),
+    /// `[height, width, 3]`, sRGB.
+    Rgb(Arc<[u8]>),
+}
 
 /// State of the input that the run reads while it runs.
 #[derive(Debug, Default)]
@@ -33,30 +71,30 @@ struct Shared {
 }
 
 /// The parts of the input.
-pub(crate) struct Input {
-    pub(crate) source: Box<dyn Source>,
-    pub(crate) join: Join,
+pub struct Input {
+    pub source: Box<dyn Source>,
+    pub join: Join,
     /// Corrects base poses at stations, if the base moves.
-    pub(crate) stations: Option<Stations>,
-    pub(crate) recorder: Option<Recorder>,
+    pub stations: Option<Stations>,
+    pub recorder: Option<Recorder>,
     /// Whether devices are read in real time. The stamps of a recording are from another time.
-    pub(crate) is_live: bool,
+    pub is_live: bool,
     /// Focal length and principal point of every camera, pixels.
-    pub(crate) camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
+    pub camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
 
 /// The input after it ended.
-pub(crate) struct InputResult {
-    pub(crate) join: Join,
-    pub(crate) stations: Option<Stations>,
+pub struct InputResult {
+    pub join: Join,
+    pub stations: Option<Stations>,
     /// Error that ended the input early.
-    pub(crate) input_error: Option<drivers::Error>,
+    pub input_error: Option<drivers::Error>,
     /// Error that ended the recording early.
-    pub(crate) recording_error: Option<anyhow::Error>,
+    pub recording_error: Option<crate::Error>,
 }
 
 /// The running input.
-pub(crate) struct Feed {
+pub struct Feed {
     changes: Receiver<Change>,
     shared: Arc<Shared>,
     thread: JoinHandle<InputResult>,
@@ -65,27 +103,31 @@ pub(crate) struct Feed {
 
 impl Feed {
     /// Starts to read `input`. The feed ends when the input ends, at `stop`, or at an error of the source.
-    pub(crate) fn start(input: Input, hub: Hub, stop: Stop) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    ///
+    /// If no thread can be started.
+    pub fn start(input: Input, observer: Box<dyn ImageObserver>, stop: Stop) -> crate::Result<Self> {
         let (sender, changes) = sync_channel(MAX_WAITING);
         let shared = Arc::new(Shared::default());
-        let pump = Pump { input, hub, stop, sender, shared: shared.clone() };
+        let pump = Pump { input, observer, stop, sender, shared: shared.clone() };
         let thread =
             std::thread::Builder::new().name("input".into()).spawn(|| pump.run()).context("cannot start a thread")?;
         Ok(Self { changes, shared, thread, ended: false })
     }
 
     /// Time at which the first image arrived.
-    pub(crate) fn first_image(&self) -> Option<Instant> {
+    pub fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
     }
 
     /// Number of refused images so far, by reason.
-    pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
+    pub fn refused(&self) -> BTreeMap<String, u64> {
         lock(&self.shared.refused).clone()
     }
 
     /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
-    pub(crate) fn next(&mut self, timeout: Duration) -> Option<Change> {
+    pub fn next(&mut self, timeout: Duration) -> Option<Change> {
         match self.changes.recv_timeout(timeout) {
             Ok(change) => Some(change),
             Err(RecvTimeoutError::Timeout) => None,
@@ -97,26 +139,30 @@ impl Feed {
     }
 
     /// Whether the input ended and all its changes were taken.
-    pub(crate) fn ended(&self) -> bool {
+    pub fn ended(&self) -> bool {
         self.ended
     }
 
     /// Whether the source failed.
-    pub(crate) fn source_failed(&self) -> bool {
+    pub fn source_failed(&self) -> bool {
         self.shared.source_failed.load(Ordering::Relaxed)
     }
 
     /// Ends the input and waits for its thread, which closes the recording.
-    pub(crate) fn finish(self) -> anyhow::Result<InputResult> {
+    ///
+    /// # Errors
+    ///
+    /// If the thread panicked, which is a bug.
+    pub fn finish(self) -> crate::Result<InputResult> {
         // Wakes an input thread that is waiting to send.
         drop(self.changes);
-        self.thread.join().map_err(|_| anyhow!("the input thread panicked: this is a bug"))
+        self.thread.join().map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
     }
 }
 
 struct Pump {
     input: Input,
-    hub: Hub,
+    observer: Box<dyn ImageObserver>,
     stop: Stop,
     sender: SyncSender<Change>,
     shared: Arc<Shared>,
@@ -142,8 +188,8 @@ impl Pump {
             if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
                 && let Err(error) = recorder.write(&sample)
             {
-                let error = anyhow!(error);
-                log::error!("the recording ends here, the run continues: {error:#}");
+                let error = Error::from(error);
+                log::error!("the recording ends here, the run continues: {}", chain(&error));
                 recording_error = Some(error);
             }
             if matches!(sample, Sample::Image(_)) {
@@ -162,7 +208,7 @@ impl Pump {
         if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
             && let Err(error) = recorder.finish()
         {
-            recording_error = Some(anyhow!(error));
+            recording_error = Some(error.into());
         }
         InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
     }
@@ -204,22 +250,22 @@ impl Pump {
         changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| TrainerGone))
     }
 
-    /// Publishes a camera image to viewers.
+    /// Passes a camera image to the observer.
     fn publish_image(&self, posed_image: &PosedImage) {
-        if self.hub.n_clients() == 0 {
+        if !self.observer.needs_images() {
             return;
         }
         let image = &posed_image.image;
         let pixels = match image.format {
-            PixelFormat::Rgb8 => LivePixels::Rgb(image.data.clone()),
+            PixelFormat::Rgb8 => ObservedPixels::Rgb(image.data.clone()),
             // Some cameras send JPEG without tables, which browsers cannot show.
             PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
-                Ok(jpeg) => LivePixels::Jpeg(jpeg.as_ref().into()),
+                Ok(jpeg) => ObservedPixels::Jpeg(jpeg.as_ref().into()),
                 Err(_) => return,
             },
             PixelFormat::Bgr8 | PixelFormat::Gray8 | PixelFormat::Yuv { .. } | PixelFormat::Png => {
                 match image.decode_rgb() {
-                    Ok(rgb) => LivePixels::Rgb(rgb.into()),
+                    Ok(rgb) => ObservedPixels::Rgb(rgb.into()),
                     // The join counts images that do not decode.
                     Err(_) => return,
                 }
@@ -228,13 +274,13 @@ impl Pump {
         };
         let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera) else { return };
         let pose = |stations: &Stations| stations.corrected_pose(&image.camera, &posed_image.world_from_camera);
-        self.hub.set_live_image(LiveImage {
+        self.observer.observe(ObservedImage {
             camera: image.camera.clone(),
             stamp: image.stamp,
             captured_at: self.captured_at(image.stamp),
             size_px: image.size_px,
             pixels,
-            world_from_camera: Some(self.input.stations.as_ref().map_or(posed_image.world_from_camera, pose)),
+            world_from_camera: self.input.stations.as_ref().map_or(posed_image.world_from_camera, pose),
             focal_px,
             principal_px,
         });

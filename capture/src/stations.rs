@@ -7,7 +7,7 @@
 //! that recording agree; only the time at which keyframes pass depends on a clock.
 
 use crate::config::{BaseDriver, Parent, Rig};
-use crate::join::change::Change;
+use crate::join::Change;
 use calibration::{StationCorrection, register_station, run_in_background_pool};
 use keyframe::{BaseState, Keyframe, Split};
 use kinematics::{Stamp, Transform};
@@ -30,7 +30,7 @@ const MAX_HELD: usize = 128;
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
 /// Corrects keyframes for errors of the reported base poses.
-pub(crate) struct Stations {
+pub struct Stations {
     /// Cameras on the base or the arm.
     carried: BTreeSet<Arc<str>>,
     max_wait_secs: f64,
@@ -60,7 +60,7 @@ struct SearchResult {
 
 /// Report on a station after the first.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct StationReport {
+pub struct StationReport {
     /// Index of the station, counted from 0.
     station: usize,
     /// Number of keyframes used for registration.
@@ -81,7 +81,7 @@ struct PoseDistance {
 
 impl Stations {
     /// Returns `None` unless the base of the rig moves and realignment is enabled.
-    pub(crate) fn new(rig: &Rig) -> Option<Self> {
+    pub fn new(rig: &Rig) -> Option<Self> {
         let carried = || {
             let on_base = rig.cameras.iter().filter(|camera| camera.parent != Parent::World);
             on_base.map(|camera| Arc::clone(&camera.name)).collect()
@@ -102,7 +102,7 @@ impl Stations {
     }
 
     /// Continues after the keyframes of an earlier run; the first station is registered with them.
-    pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
+    pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
         if let Some(base_state) = keyframes.iter().rev().find_map(|keyframe| keyframe.base.as_ref()) {
@@ -114,7 +114,7 @@ impl Stations {
     }
 
     /// Processes a change; returns the changes that can be passed on.
-    pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
+    pub fn push(&mut self, change: Change) -> Vec<Change> {
         self.queue.push_back(change);
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
@@ -123,7 +123,7 @@ impl Stations {
 
     /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of all samples. Returns
     /// the changes that can be passed on.
-    pub(crate) fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
+    pub fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
         // Images with earlier stamps have already been decided by the join.
@@ -135,7 +135,7 @@ impl Stations {
     }
 
     /// Processes all queued changes at the end of the input; returns them.
-    pub(crate) fn finish(&mut self) -> Vec<Change> {
+    pub fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
         while !self.held.is_empty() {
@@ -146,7 +146,7 @@ impl Stations {
     }
 
     /// Corrects all keyframes of a recording.
-    pub(crate) fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
+    pub fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
         let mut released: Vec<Change> = Vec::new();
         for keyframe in keyframes {
             released.extend(self.push(Change::Accepted(keyframe)));
@@ -160,17 +160,17 @@ impl Stations {
     }
 
     /// Corrects the current pose of a camera, given its pose according to the reported base pose.
-    pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
+    pub fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
 
     /// Reports on all stations after the first.
-    pub(crate) fn reports(&self) -> &[StationReport] {
+    pub fn reports(&self) -> &[StationReport] {
         &self.reported
     }
 
     /// Total time spent on registration.
-    pub(crate) fn spent(&self) -> Duration {
+    pub fn spent(&self) -> Duration {
         self.spent
     }
 

@@ -1,11 +1,12 @@
 //! Fingerprint of the keyframe data that affect a model: a different fingerprint means a different model.
 
-use keyframe::{DepthMap, Keyframe};
+use crate::{DepthMap, Keyframe};
 use kinematics::Twist;
 
 /// Fingerprint of pixels, depth, intrinsics, pose, velocity and joint twists. The split and ground truth of a simulator
 /// are excluded.
-pub(crate) fn of(keyframe: &Keyframe) -> u64 {
+#[must_use]
+pub fn fingerprint(keyframe: &Keyframe) -> u64 {
     let mut hash = Hash::default();
     hash.sizes(keyframe.size_px, keyframe.focal_px, keyframe.principal_px);
     hash.pose(&keyframe.world_from_camera);
@@ -63,7 +64,7 @@ impl Hash {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{fingerprint as of, *};
     use keyframe::Split;
     use kinematics::{Stamp, Transform};
 

@@ -1,13 +1,11 @@
 //! Selects which photos of a dataset are excluded from training, and for what.
 
-use crate::exit::BadArgument;
-use anyhow::ensure;
-use keyframe::Split;
+use crate::{Error, Split};
 use std::path::Path;
 
 /// How test photos are chosen.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum Holdout {
+pub enum Holdout {
     /// Every n-th photo, starting with the first; n is at least 1.
     Every(usize),
     /// The photos with these names.
@@ -22,8 +20,12 @@ impl Default for Holdout {
 
 impl Holdout {
     /// Parses the value of `--holdout`: a number, or a file with one name per line.
-    pub(crate) fn from_argument(argument: &str) -> Result<Self, BadArgument> {
-        let invalid = |reason: &str| BadArgument(format!("--holdout {argument}: {reason}"));
+    ///
+    /// # Errors
+    ///
+    /// If it is neither a number from 1 nor a readable file with at least one name.
+    pub fn from_argument(argument: &str) -> Result<Self, Error> {
+        let invalid = |reason: &str| Error::Holdout { request: argument.to_owned(), reason: reason.to_owned() };
         if let Ok(every) = argument.parse::<i64>() {
             return usize::try_from(every)
                 .ok()
@@ -40,8 +42,12 @@ impl Holdout {
     /// The split of each photo, in the order of `names`.
     ///
     /// Validation photos lie halfway between test photos; with named test photos, they are every 8th of the others,
-    /// from the 5th. Names match with or without folder and extension. A name without a match is an error.
-    pub(crate) fn splits(&self, names: &[&str]) -> anyhow::Result<Vec<Split>> {
+    /// from the 5th. Names match with or without folder and extension.
+    ///
+    /// # Errors
+    ///
+    /// If a name matches no photo.
+    pub fn splits(&self, names: &[&str]) -> Result<Vec<Split>, Error> {
         match self {
             Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),
             Self::Named(test_names) => splits_by_name(test_names, names),
@@ -57,9 +63,11 @@ fn every_nth(ix: usize, every: usize) -> Split {
     }
 }
 
-fn splits_by_name(test_names: &[String], names: &[&str]) -> anyhow::Result<Vec<Split>> {
+fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, Error> {
     for test_name in test_names {
-        ensure!(names.iter().any(|name| matches_name(name, test_name)), "--holdout: no photo is named {test_name:?}");
+        if !names.iter().any(|name| matches_name(name, test_name)) {
+            return Err(Error::Holdout { request: format!("{test_name:?}"), reason: "no photo has this name".into() });
+        }
     }
     let mut n_remaining = 0;
     let split = |name: &&str| {
@@ -99,7 +107,7 @@ mod tests {
         let splits_by_name =
             |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
         assert_eq!(splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
-        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("no photo is named \"e\""));
+        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("\"e\": no photo has this name"));
         assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all photos may be scored");
     }
 

@@ -1,8 +1,6 @@
 //! Lists of keyframes, one per line: camera, stamp in nanoseconds, split.
 
-use crate::exit::InsufficientData;
-use anyhow::{Context, bail};
-use keyframe::{Keyframe, Split};
+use crate::{Error, Keyframe, Split};
 use kinematics::Stamp;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -13,31 +11,47 @@ const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation,
 
 /// The selected keyframes and their splits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct KeyframeList(BTreeMap<(String, i64), SplitIx>);
+pub struct KeyframeList(BTreeMap<(String, i64), SplitIx>);
 
 /// Index of a split in [`SPLITS`].
 type SplitIx = usize;
 
 impl KeyframeList {
     /// Reads a `keyframes.txt`.
-    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
-        let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the keyframe list {path:?}"))?;
-        Self::parse(&text).with_context(|| format!("the keyframe list {path:?}"))
+    ///
+    /// # Errors
+    ///
+    /// If the file cannot be read, lists no keyframe, or has an invalid line.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let read = std::fs::read_to_string(path);
+        let text = read.map_err(|error| Error::Read { path: path.to_owned(), reason: error.to_string() })?;
+        Self::parse(&text).map_err(|reason| Error::List { path: path.to_owned(), reason })
     }
 
     /// Number of listed keyframes.
-    pub(crate) fn len(&self) -> usize {
+    #[must_use]
+    pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Returns a message if some listed keyframes are not among these cameras and stamps, and an error if none is.
+    /// Whether no keyframe is listed.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Returns a message if some listed keyframes are not among these cameras and stamps.
     ///
     /// `example_image`: an image of the data, listed or not, for the error message.
-    pub(crate) fn check_found<'a>(
+    ///
+    /// # Errors
+    ///
+    /// If none of the listed keyframes is among them.
+    pub fn check_found<'a>(
         &self,
         found: impl Iterator<Item = (&'a str, Stamp)>,
         example_image: Option<(&str, Stamp)>,
-    ) -> Result<Option<String>, InsufficientData> {
+    ) -> Result<Option<String>, Error> {
         let found: BTreeSet<(&str, i64)> = found.map(|(camera, stamp)| (camera, stamp.0)).collect();
         let mut missing = self.0.keys().filter(|(camera, stamp)| !found.contains(&(camera.as_str(), *stamp)));
         let Some((camera, stamp)) = missing.next() else { return Ok(None) };
@@ -48,19 +62,17 @@ impl KeyframeList {
                 self.len()
             )));
         }
-        let example_image =
-            example_image.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
-        Err(InsufficientData(format!(
-            "the keyframe list matches nothing in the data: it lists {camera} {stamp}, the data has {example_image}"
-        )))
+        let found = example_image.map_or("no image".to_owned(), |(camera, stamp)| format!("{camera} {}", stamp.0));
+        Err(Error::NoListedKeyframe { listed: format!("{camera} {stamp}"), found })
     }
 
     /// The split of a listed keyframe.
-    pub(crate) fn split_of(&self, camera: &str, stamp: Stamp) -> Option<Split> {
+    #[must_use]
+    pub fn split_of(&self, camera: &str, stamp: Stamp) -> Option<Split> {
         self.0.get(&(camera.to_owned(), stamp.0)).map(|split| SPLITS[*split].0)
     }
 
-    fn parse(text: &str) -> anyhow::Result<Self> {
+    fn parse(text: &str) -> Result<Self, String> {
         let mut list = BTreeMap::new();
         for (line_ix, line) in
             text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'))
@@ -75,17 +87,17 @@ impl KeyframeList {
                 _ => None,
             };
             let Some((key, split)) = parsed else {
-                bail!(
+                return Err(format!(
                     "line {}: expected a camera, a stamp in nanoseconds and train, selection or test; found {line:?}",
                     line_ix + 1
-                );
+                ));
             };
             if list.insert(key, split).is_some() {
-                bail!("line {}: {line:?} is listed twice", line_ix + 1);
+                return Err(format!("line {}: {line:?} is listed twice", line_ix + 1));
             }
         }
         if list.is_empty() {
-            bail!("it lists no keyframe");
+            return Err("it lists no keyframe".to_owned());
         }
         Ok(Self(list))
     }
@@ -99,17 +111,20 @@ impl FromIterator<(String, Stamp, Split)> for KeyframeList {
 }
 
 /// The name of a split in files.
-pub(crate) fn split_name(split: Split) -> &'static str {
+#[must_use]
+pub fn split_name(split: Split) -> &'static str {
     SPLITS.iter().find(|(known, _)| *known == split).map_or("train", |(_, name)| name)
 }
 
 /// The split of a name in files.
-pub(crate) fn split_from_name(name: &str) -> Option<Split> {
+#[must_use]
+pub fn split_from_name(name: &str) -> Option<Split> {
     SPLITS.iter().find(|(_, known)| *known == name).map(|(split, _)| *split)
 }
 
 /// The text of a `keyframes.txt`.
-pub(crate) fn list_text<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
+#[must_use]
+pub fn list_text<'a>(keyframes: impl Iterator<Item = &'a Arc<Keyframe>>) -> String {
     let mut text = String::from("# camera stamp_nanos split\n");
     for keyframe in keyframes {
         let split = split_name(keyframe.split);
@@ -152,7 +167,7 @@ mod tests {
             ("wrist 1 train\nwrist 1 test\n", "twice"),
             ("# nothing\n", "no keyframe"),
         ] {
-            let message = KeyframeList::parse(text).expect_err(text).to_string();
+            let message = KeyframeList::parse(text).expect_err(text);
             assert!(message.contains(expected), "{message}");
         }
     }

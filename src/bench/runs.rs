@@ -1,13 +1,14 @@
 //! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
 //! repeat it.
 
+use crate::signals;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::evaluate::Evaluator;
 use crate::exit::{BadArgument, InsufficientData};
 use crate::method::{self, ModelKind, ModelSpec};
 use crate::run_folder::CreatedFolders;
 use crate::session::{Evaluation, Evaluators, Limits, OutputMode, TrainingOutcome};
-use crate::stop::Stop;
+use capture::Stop;
 use crate::training::{self, TrainingPlan};
 use crate::training_args::TrainingArgs;
 use crate::{print, run_folder};
@@ -191,7 +192,7 @@ impl Drop for Runs<'_> {
 impl<'a> Runs<'a> {
     /// Creates the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
-        let stop = Stop::on_ctrl_c()?;
+        let stop = signals::stop_on_signals()?;
         let mut created = CreatedFolders::default();
         let out = created.make(args.out.as_deref())?;
         let runs = out.join(RUNS);

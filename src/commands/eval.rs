@@ -1,10 +1,11 @@
 //! `fieldrig eval`: scores a saved model on test images.
 
-use crate::config::{Override, Rig};
+use capture::config::Override;
+use capture::config::Rig;
 use crate::data::{self, Data, DataArgs, Purpose};
 use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
 use crate::exit::{self, Exit};
-use crate::join::KeyframeList;
+use keyframe::KeyframeList;
 use crate::open_gpu::open_gpu;
 use crate::{method, print};
 use keyframe::{Keyframe, Split};

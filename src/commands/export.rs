@@ -1,17 +1,22 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use crate::config::Override;
+use crate::signals;
+use keyframe::counted;
+use capture::config::Override;
 use crate::exit::{self, BadArgument, Exit};
-use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList, SampleUse};
+use session::{Written, write_nerfstudio};
+use capture::Join;
+use keyframe::KeyframeList;
+use capture::SampleUse;
 use crate::method::{self, ModelKind};
-use crate::open;
+use capture::open;
 use crate::open_gpu::open_gpu;
-use crate::partial::{self, Partial};
+use session::partial;
+use session::partial::Partial;
 use crate::print::{self, counted};
 use crate::run_folder;
 use crate::splat_file;
-use crate::stations::Stations;
+use capture::Stations;
 use anyhow::{Context, ensure};
 use std::path::{Path, PathBuf};
 use trainer::tsdf::TsdfModel;
@@ -84,7 +89,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
     check_file(args)?;
-    partial::remove_on_signals()?;
+    signals::remove_partial_files_on_signals()?;
     match (args.to, contents) {
         (Format::Ply, Contents::Splats) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
         (Format::Spz, Contents::Splats) => export_splats(&args.from, splat_file::Format::Spz, &args.out),

@@ -1,10 +1,11 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use crate::config::Rig;
+use crate::signals;
+use capture::config::Rig;
 use crate::exit::{BadArgument, Exit};
-use crate::open;
+use capture::open;
 use crate::print;
-use crate::stop::Stop;
+use capture::Stop;
 use anyhow::{Context, bail};
 use drivers::motion::{JointTarget, Motion, OnLoss};
 use drivers::{Error, MovableArm, clock};
@@ -69,7 +70,7 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let Some(motion) = rig.arm.motion.as_ref() else {
         return Err(BadArgument(

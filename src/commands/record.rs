@@ -1,11 +1,17 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
+use crate::signals;
 use super::number_in_range;
-use crate::config::{ArmDriver, BaseDriver, Override, Rig};
+use capture::config::ArmDriver;
+use capture::config::BaseDriver;
+use capture::config::Override;
+use capture::config::Rig;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::open::{self, Devices, Opened};
+use capture::open;
+use capture::open::Devices;
+use capture::open::Opened;
 use crate::print;
-use crate::stop::Stop;
+use capture::Stop;
 use drivers::recording::Recording;
 use drivers::{Image, Sample, Source};
 use kinematics::Stamp;
@@ -147,7 +153,7 @@ fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
 
 /// Records until the time limit, the end of the devices, or Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
     let rig = Rig::load(&args.rig_file, &overrides)?;
     check_end(args, &rig)?;

@@ -1,10 +1,13 @@
 //! `fieldrig render`: renders images of a saved model.
 
+use crate::signals;
+use keyframe::counted;
 use crate::camera_path::{CameraPath, PathCamera};
 use crate::evaluate::{covered_frac, warn_if_hardly_covered};
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::partial::{self, Partial};
+use session::partial;
+use session::partial::Partial;
 use crate::run_folder::expect_model;
 use crate::{method, print};
 use anyhow::Context;
@@ -106,7 +109,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let requests = path.cameras.iter().map(|camera| args.request(camera, size_px)).collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
-    partial::remove_on_signals()?;
+    signals::remove_partial_files_on_signals()?;
     let mut model = method::load(open_gpu()?, &args.model)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
@@ -126,7 +129,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     bar.finish_and_clear();
     warn_if_hardly_covered(&covered_fracs);
     if !args.json {
-        let n_pictures = print::counted(requests.len() as u64, "image");
+        let n_pictures = counted(requests.len() as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)

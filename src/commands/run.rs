@@ -1,24 +1,35 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
+use crate::signals;
+use keyframe::counted;
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
-use crate::config::{ArmDriver, Override, Rig};
+use capture::config::ArmDriver;
+use capture::config::Override;
+use capture::config::Rig;
 use crate::decisions::{DecisionLog, RunDescription, Settings};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::feed::{Feed, Input};
-use crate::join::{Counts, Join, Refusal, SampleUse};
+use capture::Feed;
+use capture::Input;
+use capture::Counts;
+use capture::Join;
+use capture::Refusal;
+use capture::SampleUse;
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
-use crate::open::{self, Devices, Opened};
+use capture::open;
+use capture::open::Devices;
+use capture::open::Opened;
 use crate::open_gpu::open_gpu;
 use crate::print;
 use crate::recovery::{self, GpuUnrecoverable, Recovery};
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndingSession, Evaluators, FinishedModel, Limits, OutputMode, Session};
-use crate::stations::{StationReport, Stations};
-use crate::stop::Stop;
+use capture::StationReport;
+use capture::Stations;
+use capture::Stop;
 use crate::stored_keyframes::StoredKeyframes;
 use crate::training_args::{AvailableData, CountArg, REALIGN, Refine, TrainingArgs};
 use crate::viewer::{ModelViewer, ServedModel};
@@ -263,7 +274,7 @@ pub(super) fn start(
             run_folder::check_no_unfinished_run(out)?;
         }
     }
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let mut overrides = args.overrides();
     overrides.extend(previous.map(PreviousRun::overrides).into_iter().flatten());
     let rig = Rig::load(&args.rig_file, &overrides)?;
@@ -486,7 +497,7 @@ impl PreviousRun {
             "continuing the run in {} after {:.1} s, with {}",
             folder.display(),
             checkpoint.seconds,
-            print::counted(keyframes.len() as u64, "keyframe")
+            counted(keyframes.len() as u64, "keyframe")
         );
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
     }

@@ -1,8 +1,11 @@
 //! `fieldrig train`: trains models on a dataset folder or a recording.
 
+use crate::signals;
+use keyframe::counted;
 use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
 use crate::clock::Clock;
-use crate::config::{Override, Rig};
+use capture::config::Override;
+use capture::config::Rig;
 use crate::corrected_rig;
 use crate::data::{Data, DataArgs, Purpose};
 use crate::decisions::{DecisionLog, RunDescription, Settings};
@@ -18,8 +21,8 @@ use crate::recovery::{self, Recovery};
 use crate::replay::Replay;
 use crate::run_folder::{self, CreatedFolders};
 use crate::session::{self, EndingSession, Evaluators, Limits, OutputMode, Session};
-use crate::stations::StationReport;
-use crate::stop::Stop;
+use capture::StationReport;
+use capture::Stop;
 use crate::training;
 use crate::training_args::{REALIGN, TrainingArgs};
 use calibration::Alignment;
@@ -134,7 +137,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             run_folder::check_no_unfinished_run(out)?;
         }
     }
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let subject = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
     if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
@@ -423,7 +426,7 @@ impl Args {
         }
         let n_new = resumed.untrained.iter().filter(|keyframe| keyframe.split != Split::Test).count();
         if n_new > 0 {
-            log::warn!("{} that are not in the checkpoint", print::counted(n_new as u64, "new image"));
+            log::warn!("{} that are not in the checkpoint", counted(n_new as u64, "new image"));
         }
         resumed
     }

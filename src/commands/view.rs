@@ -1,11 +1,12 @@
 //! `fieldrig view`: serves saved models on the web page.
 
+use crate::signals;
 use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
 use crate::method::{self, LoadedModel};
 use crate::model_bounds::Bounds;
 use crate::open_gpu::open_gpu;
-use crate::stop::Stop;
+use capture::Stop;
 use crate::viewer::{ModelViewer, ServedModel};
 use crate::{camera_list, print, run_folder, scene_hint};
 use kinematics::Transform;
@@ -61,7 +62,7 @@ impl Up {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
-    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
+    let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.

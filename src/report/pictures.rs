@@ -1,6 +1,6 @@
 //! Test images next to the model's renders, small enough to embed in a page.
 
-use crate::downscale;
+use capture::downscale;
 use crate::evaluate;
 use anyhow::Context;
 use image::ExtendedColorType;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 /// Why a rig file was rejected. The message names the file, the line and the key.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub(crate) enum ConfigError {
+pub enum ConfigError {
     /// A file is missing or unreadable.
     #[error("cannot read {description} {path:?}")]
     Read { description: &'static str, path: PathBuf, source: std::io::Error },
@@ -28,7 +28,7 @@ pub(crate) enum ConfigError {
 
 /// Where a value comes from.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) enum SourceLocation {
+pub enum SourceLocation {
     /// A line of the rig file, from 1.
     Line { file: String, line: usize },
     /// A flag that overrides the key.

@@ -7,28 +7,28 @@ use toml::{Table, Value};
 
 /// How an arm may be moved; an arm without this table is only read.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct ArmMotion {
+pub struct ArmMotion {
     /// Fail-safe behavior of the motors when communication with this computer is lost.
-    pub(crate) on_loss: OnLoss,
+    pub on_loss: OnLoss,
     /// Time without communication until then.
-    pub(crate) timeout_millis: f64,
+    pub timeout_millis: f64,
     /// Time from rest to `arm.max_speed_rad_s` at full acceleration.
-    pub(crate) acceleration_secs: f64,
+    pub acceleration_secs: f64,
     /// Time from rest to full acceleration.
-    pub(crate) jerk_secs: f64,
+    pub jerk_secs: f64,
     /// Whether motors without a watchdog may be moved.
-    pub(crate) accept_no_watchdog: bool,
+    pub accept_no_watchdog: bool,
     /// External torques at which a Franka arm stops, Nm, in the order of its joints; `None` here and below: the
     /// driver's default.
-    pub(crate) contact_torque_nm: Option<[f64; 7]>,
+    pub contact_torque_nm: Option<[f64; 7]>,
     /// External forces at the end effector at which it stops, N.
-    pub(crate) contact_force_n: Option<[f64; 3]>,
+    pub contact_force_n: Option<[f64; 3]>,
     /// External moments at the end effector at which it stops, Nm.
-    pub(crate) contact_moment_nm: Option<[f64; 3]>,
+    pub contact_moment_nm: Option<[f64; 3]>,
     /// Joint stiffness, Nm/rad.
-    pub(crate) stiffness_nm_rad: Option<[f64; 7]>,
+    pub stiffness_nm_rad: Option<[f64; 7]>,
     /// Path of `ODrive`'s `flat_endpoints.json`; empty if not given.
-    pub(crate) odrive_endpoints: String,
+    pub odrive_endpoints: String,
 }
 
 const ON_LOSS: [(&str, OnLoss); 3] = [("hold", OnLoss::Hold), ("damp", OnLoss::Damp), ("release", OnLoss::Release)];

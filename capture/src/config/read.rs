@@ -3,10 +3,9 @@
 use super::section::{ParseContext, Section};
 use super::{
     Arm, ArmDriver, Base, BaseDriver, Camera, CameraDriver, CameraSim, ConfigError, DEFAULT_SEED, Depth, JoinConfig,
-    MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, Parent, Realsense, Rig, SEED_RANGE, Scanner, ScannerDriver,
+    MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Methods, Override, Parent, Realsense, Rig, SEED_RANGE, Scanner, ScannerDriver,
     ScannerSim, Sim, TimeOffset, Train, UnknownCalibration, V4l2,
 };
-use crate::method::ModelKind;
 use drivers::can::MotorConfig;
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::tags::{Family, TagPlacement};
@@ -54,6 +53,8 @@ pub(super) const SCANNER_DRIVERS: [(&str, ScannerDriver); 2] =
     [("udp", ScannerDriver::Udp), ("sim", ScannerDriver::Sim)];
 pub(super) const PARENTS: [(&str, Parent); 3] =
     [("flange", Parent::Flange), ("base", Parent::Base), ("world", Parent::World)];
+/// The scene model that is trained if the rig file names none.
+const DEFAULT_METHOD: &str = "splat";
 /// Default addresses for base poses and range scans; they accept data from this computer only.
 const DEFAULT_BASE_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7009);
 const DEFAULT_SCANNER_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7010);
@@ -513,9 +514,10 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
-        methods: keys
-            .choices("method", &ModelKind::ALL.map(|kind| (kind.name(), kind)))
-            .unwrap_or_else(|| vec![ModelKind::Splat]),
+        methods: Methods {
+            names: keys.words("method").unwrap_or_else(|| vec![DEFAULT_METHOD.to_owned()]),
+            location: keys.location("method"),
+        },
         max_splats: keys.whole("max_splats", MAX_SPLATS_RANGE),
         max_bytes: keys.whole("max_bytes", MAX_BYTES_RANGE),
         seed: keys.whole("seed", SEED_RANGE).unwrap_or(DEFAULT_SEED),

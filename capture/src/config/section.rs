@@ -261,6 +261,23 @@ impl<'a> Section<'a> {
         Some(found)
     }
 
+    /// A word, or a list of words without duplicates; `None` if absent or invalid.
+    pub(super) fn words(&mut self, key: &'static str) -> Option<Vec<String>> {
+        let value = self.take(key)?;
+        let words = value.as_array().map_or(std::slice::from_ref(&value), Vec::as_slice);
+        let words: Option<Vec<String>> = words.iter().map(|word| word.as_str().map(str::to_owned)).collect();
+        let is_repeated = |words: &[String]| (1..words.len()).any(|ix| words[..ix].contains(&words[ix]));
+        match words.filter(|words| !words.is_empty() && !is_repeated(words)) {
+            Some(words) => Some(words),
+            None => self.invalid(key, &value, "a word in quotes, or a list of these without duplicates"),
+        }
+    }
+
+    /// Where the value of a key comes from.
+    pub(super) fn location(&self, key: &str) -> SourceLocation {
+        self.context.location(&join(&self.path, key))
+    }
+
     /// A list of the given words without duplicates, which may be empty; `None` if absent or invalid.
     pub(super) fn choices_or_none<T: Copy + PartialEq>(
         &mut self,

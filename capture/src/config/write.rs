@@ -8,7 +8,6 @@ use super::values::{is, name_of, table, whole};
 use super::{
     Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, UnknownCalibration, V4l2,
 };
-use crate::method::ModelKind;
 use drivers::tags::TagPlacement;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
@@ -195,7 +194,7 @@ fn join(join: &JoinConfig) -> Table {
 
 fn train(train: &Train) -> Table {
     table([
-        ("method", is(methods(&train.methods))),
+        ("method", is(methods(train.methods.names()))),
         ("max_splats", train.max_splats.and_then(whole)),
         ("max_bytes", train.max_bytes.and_then(whole)),
         ("seed", whole(train.seed)),
@@ -205,10 +204,10 @@ fn train(train: &Train) -> Table {
 }
 
 /// The value of `train.method`: a word, or a list of words if there are several.
-pub(crate) fn methods(methods: &[ModelKind]) -> Value {
-    match methods {
-        [one] => one.name().into(),
-        several => several.iter().map(|kind| kind.name()).collect::<Vec<_>>().into(),
+fn methods(names: &[String]) -> Value {
+    match names {
+        [one] => one.as_str().into(),
+        several => several.to_vec().into(),
     }
 }
 

@@ -23,7 +23,7 @@ fn folder_of(n: usize, lens: &Value) -> tempfile::TempDir {
     folder
 }
 
-fn load_at(folder: &Path, scale_frac: f64) -> anyhow::Result<LoadedDataset> {
+fn load_at(folder: &Path, scale_frac: f64) -> crate::Result<LoadedDataset> {
     load(&drivers::dataset::read(folder)?, &Holdout::default(), scale_frac, &|_| ())
 }
 

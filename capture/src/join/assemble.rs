@@ -3,8 +3,8 @@
 use super::motion::CameraPose;
 use crate::config;
 use crate::downscale;
-use crate::exit::BadArgument;
-use anyhow::Context;
+use crate::Error;
+use crate::error::Context;
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};
 use kinematics::{Intrinsics, Undistortion};
@@ -19,7 +19,7 @@ pub(super) struct Undistorter {
 
 impl Undistorter {
     /// `scale`: factor for the width and height of the undistorted images.
-    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> Result<Self, BadArgument> {
+    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> Result<Self, Error> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
         Ok(Self { pinhole: downscale::intrinsics(&full, scale)?, full, undistortion })
@@ -42,7 +42,7 @@ impl Undistorter {
 
     /// Undistorts and scales `[height, width, 3]` to `[height, width, 4]`; alpha is 0 where the source image has no
     /// pixel.
-    pub(super) fn rgba(&self, rgb: &[u8]) -> anyhow::Result<Arc<[u8]>> {
+    pub(super) fn rgba(&self, rgb: &[u8]) -> crate::Result<Arc<[u8]>> {
         let opaque = || rgb.as_chunks::<3>().0.iter().flat_map(|[red, green, blue]| [*red, *green, *blue, 255]);
         if !self.is_downscaled() {
             return match &self.undistortion {
@@ -57,7 +57,7 @@ impl Undistorter {
         Ok(downscale::rgba(rgba, self.full.size_px, self.pinhole.size_px).into())
     }
 
-    fn depth_m(&self, depth_m: Vec<f32>) -> anyhow::Result<Vec<f32>> {
+    fn depth_m(&self, depth_m: Vec<f32>) -> crate::Result<Vec<f32>> {
         match &self.undistortion {
             Some(undistortion) => Ok(undistortion.apply_depth(&depth_m)?),
             None => Ok(depth_m),
@@ -71,7 +71,7 @@ pub(super) fn depth_map(
     depth: &config::Depth,
     undistorter: &Undistorter,
     camera_pose: &CameraPose,
-) -> anyhow::Result<DepthMap> {
+) -> crate::Result<DepthMap> {
     expect_size(image, &depth.intrinsics)?;
     let mut depth_m = undistorter.depth_m(image.decode_depth_m()?)?;
     #[expect(clippy::cast_possible_truncation, reason = "f32 is precise enough for a range in meters")]
@@ -92,13 +92,13 @@ pub(super) fn depth_map(
 }
 
 /// Decodes a color image to `[height, width, 3]`. Its size must be the one in the rig file.
-pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> anyhow::Result<Vec<u8>> {
+pub(super) fn rgb(image: &Image, intrinsics: &Intrinsics) -> crate::Result<Vec<u8>> {
     expect_size(image, intrinsics)?;
     Ok(image.decode_rgb()?)
 }
 
 /// Ground truth of a simulator for a keyframe, undistorted with the same maps.
-pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> anyhow::Result<Truth> {
+pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &Undistorter) -> crate::Result<Truth> {
     let rgba_srgb = undistorter.rgba(&rgb(&truth.image, intrinsics)?).context("the true image")?;
     // The ceiling is for noise at full size; averaging areas removes much of the noise.
     let psnr_ceiling = if undistorter.is_downscaled() { None } else { truth.psnr_ceiling };

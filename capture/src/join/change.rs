@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 /// A change of the set of keyframes.
 #[derive(Debug)]
-pub(crate) enum Change {
+pub enum Change {
     /// A new keyframe.
     Accepted(Arc<Keyframe>),
     /// A keyframe was evicted from the full store.

@@ -5,8 +5,7 @@
 
 mod accept;
 mod assemble;
-pub(crate) mod change;
-mod list;
+mod change;
 mod motion;
 mod pixels;
 mod ranges;
@@ -18,17 +17,17 @@ mod store;
 mod tests;
 mod waiting;
 
-pub(crate) use list::{KeyframeList, list_text as keyframe_list, split_from_name, split_name};
-pub(crate) use motion::{CameraPose, Motion};
-pub(crate) use refusal::{Counts, Refusal, SampleUse};
+pub use change::Change;
+pub use motion::{CameraPose, Motion};
+pub use refusal::{Counts, Refusal, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
-use crate::exit::InsufficientData;
+use crate::Error;
 use accept::Acceptance;
-use anyhow::Context;
+use crate::error::Context;
 use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
-use keyframe::{Keyframe, RangePoints, Split};
+use keyframe::{Keyframe, KeyframeList, RangePoints, Split};
 use kinematics::{HistoryError, Stamp, Transform};
 use ranges::RangeScans;
 use spacing::Spacing;
@@ -37,7 +36,7 @@ use store::KeyframeStore;
 use waiting::{Partner, Waiting};
 
 /// Converts samples to keyframes.
-pub(crate) struct Join {
+pub struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
     store: KeyframeStore,
@@ -61,7 +60,7 @@ pub(crate) struct Join {
 
 /// An event that follows from a sample.
 #[derive(Clone, Debug)]
-pub(crate) enum JoinEvent {
+pub enum JoinEvent {
     /// A new keyframe was added to the store.
     Accepted(Arc<Keyframe>),
     /// A keyframe was evicted from the full store.
@@ -74,10 +73,10 @@ pub(crate) enum JoinEvent {
 
 /// A color image and its camera pose.
 #[derive(Clone, Debug)]
-pub(crate) struct PosedImage {
+pub struct PosedImage {
     /// As delivered by the device; not undistorted.
-    pub(crate) image: Image,
-    pub(crate) world_from_camera: Transform,
+    pub image: Image,
+    pub world_from_camera: Transform,
 }
 
 /// One camera of the rig.
@@ -102,7 +101,7 @@ struct ReadyImage {
 
 impl Join {
     /// A join for the cameras and the arm of a rig.
-    pub(crate) fn new(rig: &Rig) -> anyhow::Result<Self> {
+    pub fn new(rig: &Rig) -> crate::Result<Self> {
         let join = &rig.join;
         let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
         Ok(Self {
@@ -127,7 +126,7 @@ impl Join {
     }
 
     /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store limits.
-    pub(crate) fn taking_only(mut self, list: KeyframeList) -> Self {
+    pub fn taking_only(mut self, list: KeyframeList) -> Self {
         self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
         self.list = Some(list);
         self
@@ -137,7 +136,7 @@ impl Join {
     ///
     /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, all
     /// new keyframes get a stamp offset.
-    pub(crate) fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
+    pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
             if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
@@ -151,12 +150,12 @@ impl Join {
     }
 
     /// Converts the stamp of a sample to the clock of the keyframes.
-    pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
+    pub fn shifted(&self, stamp: Stamp) -> Stamp {
         Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
     }
 
     /// Processes one sample and returns the resulting events.
-    pub(crate) fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
+    pub fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
         let mut events = Vec::new();
         self.newest = self.newest.max(sample.stamp());
         match sample {
@@ -191,29 +190,29 @@ impl Join {
     }
 
     /// Ends the stream and decides about the images that are still waiting.
-    pub(crate) fn finish(&mut self) -> Vec<JoinEvent> {
+    pub fn finish(&mut self) -> Vec<JoinEvent> {
         let mut events = Vec::new();
         self.process_ready(true, &mut events);
         events
     }
 
     /// Counts of all images so far.
-    pub(crate) fn counts(&self) -> &Counts {
+    pub fn counts(&self) -> &Counts {
         &self.counts
     }
 
     /// The keyframes in the store, in order of acceptance.
-    pub(crate) fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+    pub fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
         self.store.iter()
     }
 
     /// The newest scans of range scanners, with points in the world frame, oldest first.
-    pub(crate) fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
+    pub fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
         self.ranges.iter()
     }
 
     /// Compares the result with the list, as [`KeyframeList::check_found`] does.
-    pub(crate) fn check_list(&self) -> Result<Option<String>, InsufficientData> {
+    pub fn check_list(&self) -> Result<Option<String>, Error> {
         let Some(list) = &self.list else { return Ok(None) };
         let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
         list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))
@@ -341,7 +340,7 @@ impl Join {
 }
 
 impl CameraState {
-    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> anyhow::Result<Self> {
+    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> crate::Result<Self> {
         let named = || format!("camera {:?}", camera.name);
         let is_fixed = match camera.parent {
             Parent::Flange => false,
@@ -428,7 +427,7 @@ impl CameraState {
     }
 
     /// Logs the first decoding error of a camera; all of them are counted.
-    fn undecodable(&mut self, error: &anyhow::Error) -> Refusal {
+    fn undecodable(&mut self, error: &crate::Error) -> Refusal {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");
         }

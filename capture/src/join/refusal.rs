@@ -1,12 +1,12 @@
 //! Reasons why images did not become keyframes, and their counts.
 
-use crate::print::counted;
+use keyframe::counted;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Why an image did not become a keyframe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(crate) enum Refusal {
+pub enum Refusal {
     /// The rig file has no camera of this name.
     UnknownCamera,
     /// Too many images waited for joint states.
@@ -33,7 +33,7 @@ pub(crate) enum Refusal {
 
 impl Refusal {
     /// The key in reports and protocols.
-    pub(crate) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::UnknownCamera => "unknown_camera",
             Self::QueueFull => "queue_full",
@@ -70,34 +70,34 @@ impl std::fmt::Display for Refusal {
 
 /// Counts of all samples.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Counts {
+pub struct Counts {
     /// Color images received.
-    pub(crate) images: u64,
+    pub images: u64,
     /// Images that became keyframes.
-    pub(crate) accepted: u64,
+    pub accepted: u64,
     /// Keyframes evicted from the full store.
-    pub(crate) evicted: u64,
+    pub evicted: u64,
     /// Keyframes of depth cameras without depth.
-    pub(crate) without_depth: u64,
+    pub without_depth: u64,
     /// Images dropped by devices or queues before the join.
-    pub(crate) device_skipped: u64,
+    pub device_skipped: u64,
     /// Joint readings that were out of order, not finite, or of another arm.
-    pub(crate) joints_refused: u64,
+    pub joints_refused: u64,
     /// Base poses that were out of order or not finite.
-    pub(crate) base_poses_refused: u64,
+    pub base_poses_refused: u64,
     /// Range scans transformed to the world frame.
-    pub(crate) range_scans: u64,
+    pub range_scans: u64,
     /// Range scans without base poses, of unknown scanners, or dropped because too many were waiting.
-    pub(crate) range_scans_refused: u64,
+    pub range_scans_refused: u64,
     /// Images refused, by reason.
-    pub(crate) refused: BTreeMap<Refusal, u64>,
+    pub refused: BTreeMap<Refusal, u64>,
     /// Cameras that sent images but are not in the rig file.
-    pub(crate) unknown_cameras: BTreeSet<Arc<str>>,
+    pub unknown_cameras: BTreeSet<Arc<str>>,
 }
 
 /// Purpose of the samples, which determines whether dropped images are a loss.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum SampleUse {
+pub enum SampleUse {
     /// The samples are recorded: every image counts.
     Recorded,
     /// The samples are only processed. A live image that comes too fast is replaced by the next; in a replay, drops by
@@ -107,7 +107,7 @@ pub(crate) enum SampleUse {
 
 impl Counts {
     /// Lost data that should have been kept, one sentence each.
-    pub(crate) fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
+    pub fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
             data_losses.push(dropped_by_devices(self.device_skipped));

@@ -9,13 +9,13 @@ mod simulated_tests;
 mod tags;
 
 #[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
-pub(crate) use real::franka_chain;
-pub(crate) use real::{check_motion, movable_arm, udp_arm_address};
+pub use real::franka_chain;
+pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use anyhow::{Context, anyhow, bail};
+use crate::error::{Context, bail};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::{Error, Live, Sample, Source};
+use drivers::{Live, Sample, Source};
 use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
@@ -25,11 +25,11 @@ use tags::TagBaseSource;
 const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
-pub(crate) const FCI_PORT: u16 = 1337;
+pub const FCI_PORT: u16 = 1337;
 
 /// Which devices to open for a rig file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Devices {
+pub enum Devices {
     /// The devices in the rig file.
     Real,
     /// Simulated devices with the same names, sizes, rates, intrinsics and robot.
@@ -37,16 +37,16 @@ pub(crate) enum Devices {
 }
 
 /// An open rig or recording.
-pub(crate) struct Opened {
+pub struct Opened {
     /// The rig with all settings resolved.
-    pub(crate) rig: Rig,
-    pub(crate) source: Box<dyn Source>,
+    pub rig: Rig,
+    pub source: Box<dyn Source>,
     /// Set when the samples end early because the recording is damaged.
-    pub(crate) damage: Arc<OnceLock<String>>,
+    pub damage: Arc<OnceLock<String>>,
 }
 
 /// Opens the devices of a rig.
-pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
+pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
     if devices == Devices::Sim {
         rig.arm.driver = ArmDriver::Sim;
         rig.base.driver = match rig.base.driver {
@@ -68,7 +68,7 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let real = real::open(&mut rig).map_err(|error| anyhow!("{error:#}; {SIM_HINT}"))?;
+    let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{}; {SIM_HINT}", chain(&error))))?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
@@ -79,7 +79,7 @@ pub(crate) fn rig(mut rig: Rig, devices: Devices) -> anyhow::Result<Opened> {
 
 /// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
 /// recording.
-pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> anyhow::Result<Opened> {
+pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
         Some(rig) => rig,
@@ -103,7 +103,7 @@ pub(crate) fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -
 }
 
 /// Creates a recording of a rig, with the rig file and the URDF attached.
-pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
+pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
     let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
     let resolved = rig.to_toml();
     let description = RecordingMetadata {
@@ -115,12 +115,12 @@ pub(crate) fn recorder(path: &Path, rig: &Rig) -> anyhow::Result<Recorder> {
 }
 
 /// The kinematic chain from the robot's base to its flange.
-pub(crate) fn chain_of(rig: &Rig) -> anyhow::Result<Chain> {
+pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
     let arm = &rig.arm;
     Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
 }
 
-fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> anyhow::Result<Rig> {
+fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> crate::Result<Rig> {
     let text = |name| {
         let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} contains no {name}"))?;
         std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
@@ -129,7 +129,7 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> any
 }
 
 /// Cameras on the flange need joint readings.
-fn check_arm(rig: &Rig) -> anyhow::Result<()> {
+fn check_arm(rig: &Rig) -> crate::Result<()> {
     let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
         bail!(
@@ -141,7 +141,7 @@ fn check_arm(rig: &Rig) -> anyhow::Result<()> {
 }
 
 /// Intrinsics that are stored in the camera are unknown unless the camera is opened.
-fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
+fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
     if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
         bail!(
             "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
@@ -152,7 +152,7 @@ fn check_intrinsics(rig: &Rig) -> anyhow::Result<()> {
 }
 
 /// Whether any device of a rig is simulated.
-pub(crate) fn is_any_simulated(rig: &Rig) -> bool {
+pub fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
         || rig.base.driver == BaseDriver::Sim
         || rig.cameras.iter().any(|camera| camera.driver == CameraDriver::Sim)
@@ -166,7 +166,7 @@ fn unsupported_device(rig: &Rig) -> Option<String> {
 }
 
 #[cfg(feature = "sim")]
-fn simulate(rig: &Rig, real: drivers::Devices) -> anyhow::Result<Box<dyn Source>> {
+fn simulate(rig: &Rig, real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
     simulated::open(rig, real)
 }
 
@@ -181,7 +181,7 @@ fn base_moves(_scene: &str) -> bool {
 }
 
 #[cfg(not(feature = "sim"))]
-fn simulate(_rig: &Rig, _real: drivers::Devices) -> anyhow::Result<Box<dyn Source>> {
+fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
     bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
 }
 

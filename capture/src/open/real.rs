@@ -3,7 +3,7 @@
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
-use anyhow::{Context, bail};
+use crate::error::{Context, bail};
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
@@ -24,7 +24,7 @@ use std::time::Duration;
 const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
 
 /// Opens all real devices of a rig, possibly none. Fills in calibration that is stored in a camera.
-pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
+pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
     let mut devices = Devices::default();
     for camera in &mut rig.cameras {
         match camera.driver {
@@ -55,7 +55,7 @@ pub(super) fn open(rig: &mut Rig) -> anyhow::Result<Devices> {
 
 /// Opens the arm for motion: enables it and holds its position. Joint positions are those of the device, without
 /// `arm.joint_offsets`.
-pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
+pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
         bail!("the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md");
     };
@@ -67,20 +67,20 @@ pub(crate) fn movable_arm(rig: &Rig) -> anyhow::Result<Box<dyn MovableArm>> {
 }
 
 /// Checks the motion settings as far as possible without the arm.
-pub(crate) fn check_motion(rig: &Rig) -> anyhow::Result<()> {
+pub fn check_motion(rig: &Rig) -> crate::Result<()> {
     let Some(motion) = &rig.arm.motion else { return Ok(()) };
     match rig.arm.driver {
         #[cfg(target_os = "linux")]
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
-        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(anyhow::Error::msg)?),
+        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::msg)?),
         _ => bail!("arms with this driver can only be read"),
     }
 }
 
 /// Motion limits of each joint: positions from the URDF, speed from the rig file.
 #[cfg(target_os = "linux")]
-fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> {
+fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
     let Rig { arm, .. } = rig;
     let chain = super::chain_of(rig)?;
     let mut limits = Vec::new();
@@ -100,14 +100,14 @@ fn motion_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MotionConfig> 
 }
 
 #[cfg(target_os = "linux")]
-fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
     Ok(Box::new(MovableCanArm::open(&movable_config(rig, motion)?)?))
 }
 
 #[cfg(target_os = "linux")]
-fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmConfig> {
+fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints = || -> anyhow::Result<Endpoints> { Ok(Endpoints::parse(&std::fs::read_to_string(path)?)?) };
+    let endpoints = || -> crate::Result<Endpoints> { Ok(Endpoints::parse(&std::fs::read_to_string(path)?)?) };
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
@@ -116,7 +116,7 @@ fn movable_config(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<MovableArmCon
 }
 
 #[cfg(not(target_os = "linux"))]
-fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
     bail!("arms on CAN buses can only be moved on Linux")
 }
 
@@ -128,24 +128,24 @@ fn can_config(rig: &Rig) -> can::ArmConfig {
 
 /// Opens an arm with motors on CAN buses.
 #[cfg(target_os = "linux")]
-fn can_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+fn can_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     Ok(Box::new(CanArm::open(&can_config(rig))?))
 }
 
 #[cfg(not(target_os = "linux"))]
-fn can_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+fn can_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     bail!("arms on CAN buses can only be read on Linux")
 }
 
 /// Opens a Franka arm for reading over FCI.
 #[cfg(target_os = "linux")]
-fn franka_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+fn franka_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     Ok(Box::new(FrankaArm::open(&franka_config(rig)?)?))
 }
 
 /// Opens a Franka arm for motion over FCI.
 #[cfg(target_os = "linux")]
-fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
     let defaults = franka::ContactConfig::default();
     let contact = franka::ContactConfig {
         torque_nm: motion.contact_torque_nm.unwrap_or(defaults.torque_nm),
@@ -158,12 +158,12 @@ fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> anyhow::Result<Box<dyn M
 }
 
 #[cfg(not(target_os = "linux"))]
-fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> anyhow::Result<Box<dyn MovableArm>> {
+fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
     bail!("Franka arms can only be moved on Linux")
 }
 
 #[cfg(target_os = "linux")]
-fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
+fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
     let Rig { arm, .. } = rig;
     if arm.address.is_empty() {
         bail!("arm.address is missing: set it to the address of the robot's controller, such as \"172.16.0.2\"");
@@ -173,7 +173,7 @@ fn franka_config(rig: &Rig) -> anyhow::Result<franka::ArmConfig> {
 
 /// The chain from the link in which a Franka arm reports poses to its flange.
 #[cfg(target_os = "linux")]
-pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
+pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
     let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
     let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
@@ -184,19 +184,19 @@ pub(crate) fn franka_chain(rig: &Rig) -> anyhow::Result<kinematics::Chain> {
 }
 
 #[cfg(not(target_os = "linux"))]
-fn franka_arm(_rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+fn franka_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     bail!("Franka arms can only be read on Linux")
 }
 
 /// Opens an arm whose joint states are sent by another program.
-fn udp_arm(rig: &Rig) -> anyhow::Result<Box<dyn Arm>> {
+fn udp_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     let open = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
     log::info!("arm: listening on {}", open.address());
     Ok(Box::new(open))
 }
 
 /// The address on which joint states are received.
-pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
+pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
     match &*rig.arm.address {
         "" => Ok(DEFAULT_ARM_ADDRESS),
         text => text.parse().with_context(|| {
@@ -207,20 +207,20 @@ pub(crate) fn udp_arm_address(rig: &Rig) -> anyhow::Result<SocketAddr> {
 
 /// Opens a V4L2 camera: its color images, and its depth images if it has depth.
 #[cfg(target_os = "linux")]
-fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
     let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
     let configs = std::iter::once(v4l2_color(camera)).chain(depth);
     configs.map(|config| Ok(Box::new(V4l2Camera::open(config)?) as Box<dyn drivers::Camera>)).collect()
 }
 
 #[cfg(not(target_os = "linux"))]
-fn v4l2_cameras(camera: &Camera) -> anyhow::Result<Vec<Box<dyn drivers::Camera>>> {
+fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
     bail!("camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams", camera.name)
 }
 
 /// Opens a camera with nokhwa, which sets only size, rate and format.
 #[cfg(feature = "nokhwa")]
-fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
     let Camera { name, v4l2, .. } = camera;
     if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
         bail!("camera {name:?}: the driver nokhwa does not support gain, brightness or white balance: remove them");
@@ -242,7 +242,7 @@ fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
 }
 
 #[cfg(not(feature = "nokhwa"))]
-fn nokhwa_camera(camera: &Camera) -> anyhow::Result<Box<dyn drivers::Camera>> {
+fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
     bail!(
         "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; \
          on Linux, use driver = \"v4l2\" for webcams",
@@ -273,7 +273,7 @@ fn v4l2_color(camera: &Camera) -> Config {
 
 /// Settings of the depth images of a camera, which come from a separate device with automatic exposure.
 #[cfg(target_os = "linux")]
-fn v4l2_depth(camera: &Camera, depth: &Depth) -> anyhow::Result<Config> {
+fn v4l2_depth(camera: &Camera, depth: &Depth) -> crate::Result<Config> {
     let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {
         let name = &camera.name;
         bail!(

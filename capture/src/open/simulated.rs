@@ -1,14 +1,14 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
 use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
-use anyhow::bail;
+use crate::error::bail;
 use drivers::{Devices, Error, Live, Sample, Source};
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 
 /// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
 /// parallel.
-pub(super) fn open(rig: &Rig, real: Devices) -> anyhow::Result<Box<dyn Source>> {
+pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
     let mut config = config_of(rig)?;
     let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
     if rig.sim.lockstep {
@@ -70,7 +70,7 @@ impl Source for RealTime {
 }
 
 /// The simulator configuration of a rig.
-fn config_of(rig: &Rig) -> anyhow::Result<sim::Config> {
+fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
     let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
         let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
         bail!("sim.scene is {:?}; known scenes: {}", rig.sim.scene, known.join(", "));

@@ -2,7 +2,7 @@
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
 use crate::join::{CameraPose, Motion};
-use anyhow::bail;
+use crate::error::bail;
 use drivers::tags::{
     LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector, TagPlacement, locate,
 };
@@ -52,7 +52,7 @@ struct TagCounts {
 }
 
 impl TagBaseSource {
-    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> anyhow::Result<Self> {
+    pub(super) fn new(rig: &Rig, source: Box<dyn Source>) -> crate::Result<Self> {
         let mut arm = rig.clone();
         (arm.base.driver, arm.base.world_from_base) = (BaseDriver::Fixed, Transform::identity());
         let is_on_robot = |camera: &&Camera| camera.parent != Parent::World;

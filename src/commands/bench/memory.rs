@@ -1,5 +1,6 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
+use keyframe::counted;
 use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
 use crate::bench::page::{Findings, Table};
 use crate::bench::viewer::Viewer;
@@ -257,7 +258,7 @@ fn findings(args: &Args, measured: &MemoryRun) -> anyhow::Result<Findings> {
         let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
         format!("{:+.2} % per hour {name} {since}", growth.percent_per_hour)
     });
-    let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
+    let conditions = format!("{}, {}", args.input(), counted(args.viewers, "viewer"));
     let lines: Vec<Line> =
         COMPONENTS.iter().map(|component| line(component, samples)).filter(|line| !line.points.is_empty()).collect();
     let full = samples.iter().find(|sample| sample.evicted > 0);

@@ -2,10 +2,15 @@
 
 use super::Finding;
 use crate::bench::statistics::quantile;
-use crate::config::{BaseDriver, Rig};
-use crate::join::{Join, JoinEvent, Refusal};
-use crate::open::{self, Devices, Opened};
-use crate::stop::Stop;
+use capture::config::BaseDriver;
+use capture::config::Rig;
+use capture::Join;
+use capture::JoinEvent;
+use capture::Refusal;
+use capture::open;
+use capture::open::Devices;
+use capture::open::Opened;
+use capture::Stop;
 use drivers::{Sample, clock};
 use kinematics::Stamp;
 use serde::Serialize;
@@ -155,7 +160,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
 
 /// The devices of a rig with their rates, as far as the rig file gives them.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
-    use crate::config::ArmDriver;
+    use capture::config::ArmDriver;
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));

@@ -1,6 +1,8 @@
 //! Writes the images of a recording as files of a RealSense camera.
 
-use crate::config::{Camera, CameraDriver, Rig};
+use capture::config::Camera;
+use capture::config::CameraDriver;
+use capture::config::Rig;
 use anyhow::Context;
 use drivers::realsense::Pace;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};

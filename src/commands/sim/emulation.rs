@@ -1,12 +1,19 @@
 //! Emulates the devices of a rig file on the wire.
 
+use crate::signals;
 use super::Args;
 use super::bag::CameraFiles;
-use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use capture::config::ArmDriver;
+use capture::config::BaseDriver;
+use capture::config::Rig;
+use capture::config::ScannerDriver;
 use crate::exit::{BadArgument, Exit};
-use crate::open::{self, Devices, FCI_PORT, Opened};
+use capture::open;
+use capture::open::Devices;
+use capture::open::FCI_PORT;
+use capture::open::Opened;
 use crate::print;
-use crate::stop::Stop;
+use capture::Stop;
 use anyhow::{Context, bail};
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
@@ -48,7 +55,7 @@ struct ReadyEvent<'a> {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let (name, mut rig) = load(&args.rig_or_scene)?;
     check(&rig)?;
     if rig.arm.driver == ArmDriver::Franka {

@@ -1,7 +1,7 @@
 //! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
 
 use crate::partial::Partial;
-use anyhow::{Context, bail, ensure};
+use crate::error::{Context, bail, ensure};
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
@@ -29,12 +29,12 @@ const DEPTH: &str = "depth";
 
 /// Counts of what was written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Written {
-    pub(crate) n_images: usize,
-    pub(crate) n_depth: usize,
+pub struct Written {
+    pub n_images: usize,
+    pub n_depth: usize,
     /// Depth images that were left out because their intrinsics differ from those of the photo, which the format cannot
     /// express.
-    pub(crate) n_depth_skipped: usize,
+    pub n_depth_skipped: usize,
 }
 
 /// Writes a folder, which must not contain a dataset yet. `transforms.json` is written last, so a folder that has it is
@@ -42,7 +42,7 @@ pub(crate) struct Written {
 ///
 /// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
 /// not exported.
-pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> anyhow::Result<Written> {
+pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
     let transforms = out.join(nerfstudio::FILE_NAME);
     if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
         bail!("{} already exists: give another folder", existing.display());
@@ -80,7 +80,7 @@ pub(crate) fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<K
 }
 
 /// Writes the images of one keyframe and returns its entry.
-fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> anyhow::Result<Map<String, Value>> {
+fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> crate::Result<Map<String, Value>> {
     let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
     let mut frame = Map::new();
     let mut insert = |key: &str, value: Value| frame.insert(key.to_owned(), value);
@@ -148,7 +148,7 @@ fn depth_counts(depth: &DepthMap) -> Vec<u8> {
     depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
 }
 
-fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorType) -> anyhow::Result<()> {
+fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorType) -> crate::Result<()> {
     let write = || {
         path.parent().map_or(Ok(()), std::fs::create_dir_all)?;
         image::save_buffer(path, bytes, size_px[0], size_px[1], color)
@@ -156,15 +156,15 @@ fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorT
     write().with_context(|| format!("cannot write {}", path.display()))
 }
 
-fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
+fn write_text(path: &Path, text: &str) -> crate::Result<()> {
     std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset;
-    use crate::holdout::Holdout;
+    use capture::dataset;
+    use keyframe::Holdout;
     use kinematics::Stamp;
     use nalgebra::{UnitQuaternion, Vector3};
 

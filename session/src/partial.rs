@@ -2,31 +2,26 @@
 //!
 //! A [`Partial`] removes its files unless they are kept, both after an error and after a signal.
 
-use crate::stop;
-use anyhow::Context;
-use signal_hook::iterator::Signals;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
-/// Shells report this plus the signal number for a process ended by a signal.
-const SIGNAL_EXIT_BASE: i32 = 128;
 
 /// Files or folders being written; removed on drop unless they are kept.
 #[derive(Debug)]
 #[must_use = "dropping it removes its files"]
-pub(crate) struct Partial(Vec<PathBuf>);
+pub struct Partial(Vec<PathBuf>);
 
 impl Partial {
     /// A file that will be written, under its own name or, until it is complete, with the suffix `.part`.
-    pub(crate) fn file(path: &Path) -> Self {
+    pub fn file(path: &Path) -> Self {
         Self::register(vec![path.to_owned(), trainer::atomic_file::partial_path(path)])
     }
 
     /// A folder that will be filled with these entries; the folder itself, if it does not exist yet.
-    pub(crate) fn folder(path: &Path, entries: &[&str]) -> Self {
+    pub fn folder(path: &Path, entries: &[&str]) -> Self {
         if path.exists() {
             return Self::register(entries.iter().map(|entry| path.join(entry)).collect());
         }
@@ -41,7 +36,7 @@ impl Partial {
     }
 
     /// Keeps the files, because they are complete.
-    pub(crate) fn keep(mut self) {
+    pub fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
         in_progress().retain(|path| !paths.contains(path));
     }
@@ -57,21 +52,17 @@ impl Drop for Partial {
     }
 }
 
-/// Makes the signals that end a process remove partial files first.
-///
-/// For commands that have nothing to save when they are cancelled; others use [`crate::stop::Stop`].
-pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
-    let mut signals = Signals::new(stop::termination_signals()).context("cannot install signal handlers")?;
-    let remove_all = move || {
-        if let Some(signal) = signals.forever().next() {
-            // Locked until the process exits, so that no new file is started.
-            let in_progress = in_progress();
-            in_progress.iter().for_each(|path| remove(path));
-            std::process::exit(SIGNAL_EXIT_BASE + signal);
-        }
-    };
-    std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
-    Ok(())
+/// No new file is started while this exists.
+#[must_use = "dropping it allows new files"]
+pub struct NoNewFiles {
+    _in_progress: MutexGuard<'static, BTreeSet<PathBuf>>,
+}
+
+/// Removes all partial files, before the process exits.
+pub fn remove_all() -> NoNewFiles {
+    let in_progress = in_progress();
+    in_progress.iter().for_each(|path| remove(path));
+    NoNewFiles { _in_progress: in_progress }
 }
 
 fn in_progress() -> MutexGuard<'static, BTreeSet<PathBuf>> {
