@@ -199,7 +199,7 @@ impl Data {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
-            data.hold_out(holdout)?;
+            data.assign_splits(holdout)?;
         }
         if !use_reported_poses {
             data.realign();
@@ -338,7 +338,7 @@ impl Data {
     }
 
     /// Assigns splits anew, separately for each camera.
-    fn hold_out(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
+    fn assign_splits(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
             by_camera.entry(keyframe.camera.clone()).or_default().push(ix);

@@ -104,7 +104,7 @@ struct TrainDetails<'a> {
     seed: u64,
     startup_secs: f64,
     n_train: usize,
-    n_selection: usize,
+    n_validation: usize,
     n_test: usize,
     data_losses: &'a [String],
     /// Estimated base pose at each station after the first.
@@ -280,7 +280,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             seed,
             startup_secs,
             n_train: data.of_split(Split::Train).len(),
-            n_selection: data.of_split(Split::Validation).len(),
+            n_validation: data.of_split(Split::Validation).len(),
             n_test: data.of_split(Split::Test).len(),
             data_losses: &data.data_losses,
             stations: &data.stations,

@@ -1139,7 +1139,7 @@ impl Method for SplatTrainer {
     }
 
     fn report(&self) -> Vec<TrialReport> {
-        self.trials.finished.iter().map(Trial::part).collect()
+        self.trials.finished.iter().map(Trial::report).collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {

@@ -40,7 +40,7 @@ struct NerfState {
     /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     are_trials_finished: bool,
-    parts: Vec<TrialReport>,
+    trials: Vec<TrialReport>,
     n_discarded_steps: u64,
     /// Number of images that the parameter array can hold.
     image_capacity: Option<u32>,
@@ -118,7 +118,7 @@ impl NerfModel {
             field: self.field.as_ref().map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
             learned_params: self.learned_params,
             are_trials_finished: self.trials.are_finished(),
-            parts: self.trials.finished.clone(),
+            trials: self.trials.finished.clone(),
             n_discarded_steps: self.n_discarded_steps,
             image_capacity: self
                 .field
@@ -205,7 +205,7 @@ impl NerfModel {
         model.step = state.step;
         model.n_discarded_steps = state.n_discarded_steps;
         model.learned_params = state.learned_params;
-        model.trials = Trials::of(&state.options.cameras).after(state.parts.clone(), state.are_trials_finished);
+        model.trials = Trials::of(&state.options.cameras).after(state.trials.clone(), state.are_trials_finished);
         Ok((model, state))
     }
 

@@ -211,7 +211,7 @@ impl SplatTrainer {
             self.draw_keyframe(&keyframe, &corrections)?;
             let image = match image {
                 Some(image) => image,
-                None => self.gpu.storage_with("splat.held_back", &keyframe.rgba_srgb)?,
+                None => self.gpu.storage_with("splat.validation", &keyframe.rgba_srgb)?,
             };
             let rendered_view = RenderedView::of(&self.gpu, &self.learn, &self.drawing_buffers, &self.draw_view)?;
             let products = rendered_view.compare(&mut self.passes, &keyframe, &image)?;
