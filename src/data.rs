@@ -303,7 +303,7 @@ impl Data {
                     JoinEvent::Evicted { camera, stamp } => {
                         keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                     }
-                    JoinEvent::PosedImage(_) | JoinEvent::Refused { .. } => {}
+                    JoinEvent::PosedImage(_) | JoinEvent::Rejected { .. } => {}
                 }
             }
             bar.set_position(keyframes.len() as u64);

@@ -65,7 +65,7 @@ struct Readings<T> {
     max_gap: Duration,
     capacity: usize,
     buffer: VecDeque<(Stamp, T)>,
-    n_refused: u64,
+    n_rejected: u64,
 }
 
 /// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp coincides with a
@@ -78,7 +78,7 @@ struct Bracket<'a, T> {
 
 impl<T> Readings<T> {
     fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_refused: 0 }
+        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_rejected: 0 }
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
@@ -95,7 +95,7 @@ impl<T> Readings<T> {
     }
 
     fn reject(&mut self, why: HistoryError) -> Result<(), HistoryError> {
-        self.n_refused += 1;
+        self.n_rejected += 1;
         Err(why)
     }
 
@@ -224,8 +224,8 @@ impl JointHistory {
     }
 
     /// Number of readings dropped because they were out of order or invalid.
-    pub fn n_refused(&self) -> u64 {
-        self.readings.n_refused
+    pub fn n_rejected(&self) -> u64 {
+        self.readings.n_rejected
     }
 
     /// Removes all readings, for a device whose clock restarted.
@@ -300,8 +300,8 @@ impl PoseHistory {
     }
 
     /// Number of poses dropped because they were out of order or not finite.
-    pub fn n_refused(&self) -> u64 {
-        self.readings.n_refused
+    pub fn n_rejected(&self) -> u64 {
+        self.readings.n_rejected
     }
 
     /// Removes all poses, for a source whose clock restarted.
@@ -400,7 +400,7 @@ mod tests {
         assert_eq!(history.push(state(1.02, f64::NAN, None)), Err(HistoryError::NotFinite));
         let short = JointState { position: vec![0.0], ..state(1.02, 0.0, None) };
         assert_eq!(history.push(short), Err(HistoryError::JointCount { got: 1, expected: 2 }));
-        assert_eq!(history.n_refused(), 4);
+        assert_eq!(history.n_rejected(), 4);
         assert_eq!(history.newest(), Some(Stamp::from_secs(1.01)));
         assert!((history.at(Stamp::from_secs(1.005)).unwrap().position[0] - 0.55).abs() < 1e-12);
         history.clear();
@@ -423,6 +423,6 @@ mod tests {
         let broken = pose(f64::NAN);
         assert_eq!(history.push(Stamp::from_secs(2.0), broken), Err(HistoryError::NotFinite));
         assert!(history.push(Stamp::from_secs(1.05), pose(0.0)).is_err());
-        assert_eq!(history.n_refused(), 2);
+        assert_eq!(history.n_rejected(), 2);
     }
 }

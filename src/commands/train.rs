@@ -119,8 +119,8 @@ struct TrainDetails<'a> {
 /// Loads the data, trains until a limit or Ctrl-C, scores on the evaluation schedule, and saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
-    let ended = train(args, &mut created);
-    created.keep_or_remove(ended)
+    let result = train(args, &mut created);
+    created.keep_or_remove(result)
 }
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {

@@ -439,7 +439,7 @@ mod tests {
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
             "trials": [{ "candidate": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
-            "refused": { "blurred": 3 }, "alignment": null,
+            "rejected": { "blurred": 3 }, "alignment": null,
         }));
         for words in [
             "<title>runs/a &lt;b&gt;: splat</title>",
@@ -452,7 +452,7 @@ mod tests {
             "<svg ",
             "images/1.jpg",
             "+0.50 ± 0.10",
-            "<td>refused: blurred</td><td>3</td>",
+            "<td>rejected: blurred</td><td>3</td>",
             "<td>options: seed</td><td>7</td>",
             "prefers-color-scheme: dark",
         ] {
