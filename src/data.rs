@@ -314,7 +314,7 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+        let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(damage.get().cloned());
         data_losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();

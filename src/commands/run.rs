@@ -421,7 +421,7 @@ fn save(
     let mut data_losses = counts.data_losses(if args.record.is_some() && args.from.is_none() {
         SampleUse::Recorded
     } else {
-        SampleUse::Watched
+        SampleUse::ProcessedOnly
     });
     // Keyframes that are missing from the recording cannot be scored on it later.
     let is_recorded = input_result.recording_error.is_none();

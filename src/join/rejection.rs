@@ -102,7 +102,7 @@ pub(crate) enum SampleUse {
     Recorded,
     /// The samples are only processed. A live image that comes too fast is replaced by the next; in a replay, drops by
     /// devices were reported when the recording was made.
-    Watched,
+    ProcessedOnly,
 }
 
 impl Counts {
@@ -163,7 +163,7 @@ mod tests {
         counts.reject(Rejection::Undecodable);
         counts.reject(Rejection::NotMoved);
         assert_eq!(counts.data_losses(SampleUse::Recorded).len(), 2);
-        assert_eq!(counts.data_losses(SampleUse::Watched), ["1 image did not decode"]);
+        assert_eq!(counts.data_losses(SampleUse::ProcessedOnly), ["1 image did not decode"]);
     }
 
     #[test]

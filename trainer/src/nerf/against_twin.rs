@@ -424,7 +424,7 @@ fn optimizer_steps_match_twin() {
         passes.convert_weights(&mut list);
         passes.forward(&mut list, kept_step);
         passes.backward(&mut list, kept_step, gradients);
-        passes.learn(&mut list, [&rules[0], &rules[1]], kept_step, gradients, &moments);
+        passes.update(&mut list, [&rules[0], &rules[1]], kept_step, gradients, &moments);
         list.submit(gpu);
 
         let gradient = expected(&twin, &rays);
@@ -492,7 +492,7 @@ fn first_step_follows_summed_gradients() {
         passes.convert_weights(&mut list);
         passes.forward(&mut list, step);
         passes.backward(&mut list, step, gradients);
-        passes.learn(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
+        passes.update(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
         list.submit(gpu);
         let before = weights(&twin, widths);
         let got: Vec<f32> = gpu.read(&field.weights, before.len()).unwrap();

@@ -71,7 +71,7 @@ impl FieldTrainer {
     }
 
     /// Buffers needed to continue training, by name.
-    fn learned_params(&self) -> Vec<(String, &Buffer)> {
+    fn training_buffers(&self) -> Vec<(String, &Buffer)> {
         let mut all = self.render_buffers();
         all.extend(
             [
@@ -132,7 +132,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.training_buffers()));
         let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
         Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
     }
@@ -150,7 +150,7 @@ impl NerfModel {
             }
             None => field_trainer.drop_images(),
         }
-        for (name, buffer) in field_trainer.learned_params() {
+        for (name, buffer) in field_trainer.training_buffers() {
             if let Some(array) = snapshot.arrays.iter().find(|array| array.name == name) {
                 self.gpu.write(buffer, 0, &array.bytes);
             }
@@ -174,7 +174,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.training_buffers()));
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
@@ -216,7 +216,7 @@ impl NerfModel {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
-        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::learned_params)?;
+        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
         let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes, Arc::clone)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;

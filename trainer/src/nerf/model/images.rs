@@ -116,7 +116,7 @@ impl Trials {
 
 impl NerfModel {
     /// Image parameters that the next step optimizes.
-    pub(super) fn params_learned_now(&self) -> ParamSet {
+    pub(super) fn current_params(&self) -> ParamSet {
         if self.step >= self.options.n_planned_steps / POSE_START_DIVISOR {
             self.learned_params
         } else {
@@ -331,7 +331,7 @@ impl NerfModel {
         }
         self.finish_in_flight()?;
         let corrections = self.learned_corrections()?;
-        let learned_params = self.params_learned_now();
+        let learned_params = self.current_params();
         let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
         let predicted = |image: &RayImage| {
             interpolate(&corrections.get(image.keyframe.camera.as_ref())?.appearance_embeddings, image.keyframe.stamp)
