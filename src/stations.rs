@@ -393,7 +393,12 @@ impl StationReport {
                 }
             })
         });
-        Self { station: base_state.station.unwrap_or_default(), n_keyframes, correction: correction.cloned(), base_error }
+        Self {
+            station: base_state.station.unwrap_or_default(),
+            n_keyframes,
+            correction: correction.cloned(),
+            base_error,
+        }
     }
 }
 
@@ -403,10 +408,9 @@ impl std::fmt::Display for StationReport {
         match &self.correction {
             None => f.write_str("its images do not overlap with earlier ones; the previous correction is kept")?,
             Some(correction) if correction.kept => write!(f, "{correction}")?,
-            Some(correction) => write!(
-                f,
-                "the previous correction is kept, as this one is uncertain or not significant: {correction}"
-            )?,
+            Some(correction) => {
+                write!(f, "the previous correction is kept, as this one is uncertain or not significant: {correction}")?
+            }
         }
         for unobservable in self.correction.iter().flat_map(|correction| &correction.unobservable) {
             write!(f, "; not observable: {unobservable}")?;
@@ -619,7 +623,12 @@ mod tests {
         }
         assert_eq!((released.len(), stations.reports().len()), (4, 1));
         let Change::Accepted(keyframe) = &released[0] else { panic!("a keyframe") };
-        assert!(stations.reports()[0].correction.as_ref().is_none_or(|correction| !correction.kept || base_error(keyframe).0 < 2.0));
+        assert!(
+            stations.reports()[0]
+                .correction
+                .as_ref()
+                .is_none_or(|correction| !correction.kept || base_error(keyframe).0 < 2.0)
+        );
     }
 
     #[test]

@@ -9,20 +9,20 @@ use std::time::Duration;
 #[non_exhaustive]
 pub enum HistoryError {
     /// The newest reading is older than the stamp. Retry after more readings have arrived.
-    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
+    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.requested)).unwrap_or_default())]
     NotYet {
         /// Stamp of the newest reading; `None` if the history is empty.
         newest: Option<Stamp>,
         /// Requested stamp.
-        asked: Stamp,
+        requested: Stamp,
     },
     /// The stamp is before the oldest reading kept. Retrying does not help.
-    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
+    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.requested))]
     TooOld {
         /// The oldest reading kept.
         oldest: Stamp,
         /// Requested stamp.
-        asked: Stamp,
+        requested: Stamp,
     },
     /// The readings around the stamp are too far apart to interpolate. Retrying does not help.
     #[error("readings are missing for {:.1} ms around the requested stamp (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
@@ -55,8 +55,8 @@ pub enum HistoryError {
     },
 }
 
-fn behind(newest: Stamp, asked: Stamp) -> String {
-    format!(" (the newest is {:.1} ms older)", asked.secs_since(newest) * 1e3)
+fn behind(newest: Stamp, requested: Stamp) -> String {
+    format!(" (the newest is {:.1} ms older)", requested.secs_since(newest) * 1e3)
 }
 
 /// Stamped readings in order. The oldest are dropped at capacity.
@@ -99,25 +99,25 @@ impl<T> Readings<T> {
         Err(why)
     }
 
-    fn around(&self, asked: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
+    fn around(&self, requested: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
         let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back()) else {
-            return Err(HistoryError::NotYet { newest: None, asked });
+            return Err(HistoryError::NotYet { newest: None, requested });
         };
-        if asked > *newest {
-            return Err(HistoryError::NotYet { newest: Some(*newest), asked });
+        if requested > *newest {
+            return Err(HistoryError::NotYet { newest: Some(*newest), requested });
         }
-        if asked < *oldest {
-            return Err(HistoryError::TooOld { oldest: *oldest, asked });
+        if requested < *oldest {
+            return Err(HistoryError::TooOld { oldest: *oldest, requested });
         }
-        let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < asked);
+        let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < requested);
         let reading = |ix: usize| self.buffer.get(ix).map(|(stamp, reading)| (*stamp, reading));
         let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
         let after = reading(after_ix).expect("the newest reading is not before the stamp");
         let before = after_ix.checked_sub(1).and_then(reading);
-        if after.0 == asked {
+        if after.0 == requested {
             return Ok(match (before, reading(after_ix + 1)) {
-                (Some(before), _) if near(before.0, asked) => Bracket { before, after, frac: 1.0 },
-                (_, Some(next)) if near(asked, next.0) => Bracket { before: after, after: next, frac: 0.0 },
+                (Some(before), _) if near(before.0, requested) => Bracket { before, after, frac: 1.0 },
+                (_, Some(next)) if near(requested, next.0) => Bracket { before: after, after: next, frac: 0.0 },
                 _ => Bracket { before: after, after, frac: 0.0 },
             });
         }
@@ -125,7 +125,7 @@ impl<T> Readings<T> {
         if !near(before.0, after.0) {
             return Err(HistoryError::Gap { before: before.0, after: after.0, max_gap: self.max_gap });
         }
-        let frac = asked.secs_since(before.0) / after.0.secs_since(before.0);
+        let frac = requested.secs_since(before.0) / after.0.secs_since(before.0);
         Ok(Bracket { before, after, frac })
     }
 

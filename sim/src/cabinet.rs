@@ -196,7 +196,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
         let point = Point3::new(near + (far - near) * u, (1.0 - 2.0 * v) * ROOM_HALF_Y_M, 0.0);
-        occluders.light_share(&point, &Vector3::z(), name)
+        occluders.light_frac(&point, &Vector3::z(), name)
     });
     let mut plate = lab_texture::mounting_plate();
     plate.shade(WHOLE, 80, |u, v, name| {
@@ -205,7 +205,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
             (0.5 - u) * 2.0 * HALF_M,
             CENTER_Z_M + (1.0 - 2.0 * v) * HALF_M,
         );
-        occluders.light_share(&point, &-Vector3::x(), name)
+        occluders.light_frac(&point, &-Vector3::x(), name)
     });
     vec![
         ("items", lab_texture::items()),
