@@ -259,7 +259,7 @@ impl Data {
         quiet: bool,
     ) -> anyhow::Result<Self> {
         let folder = drivers::dataset::read(path)?;
-        let bar = print::bar(Some(folder.frames.len() as u64), "{bar:30} {pos} of {len} images", quiet);
+        let bar = print::bar(Some(folder.images.len() as u64), "{bar:30} {pos} of {len} images", quiet);
         let loaded = dataset::load(&folder, holdout, scale, &|n_done| bar.set_position(n_done as u64));
         bar.finish_and_clear();
         let loaded = loaded?;
