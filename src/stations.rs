@@ -431,7 +431,7 @@ mod tests {
     use keyframe::DepthMap;
     use nalgebra::Vector3;
 
-    /// A room corner with marks on its walls, rendered from a camera pose: brightness and depth.
+    /// A room corner with textured walls, rendered from a camera pose: brightness and depth.
     fn render_room(pose: &Transform) -> (Vec<u8>, Vec<f32>) {
         let (mut rgba, mut depth_m) = (Vec::new(), Vec::new());
         let origin = pose.translation.vector;

@@ -125,13 +125,13 @@ fn lever_and_cables() -> (Mesh, Mesh) {
     let mut cables = Mesh::default();
     for (ix, (from_y, to_y)) in [(-0.30, -0.22), (-0.18, 0.05), (0.0, 0.10), (0.14, 0.33)].into_iter().enumerate() {
         let depth = 2.325 - 0.02 * ix as f64;
-        let place = |step: i32| {
+        let point_at = |step: i32| {
             let share = f64::from(step) / 8.0;
             let sag = 0.05 * (share * std::f64::consts::PI).sin();
             [depth - 0.5 * sag, from_y + (to_y - from_y) * share + sag, 1.17 - share * 0.36 - sag]
         };
         for step in 0..8 {
-            cables.append(bar(place(step), place(step + 1), 0.0075), Vector3::zeros());
+            cables.append(bar(point_at(step), point_at(step + 1), 0.0075), Vector3::zeros());
         }
     }
     (lever, cables)

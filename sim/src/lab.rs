@@ -138,9 +138,9 @@ fn bowl() -> Mesh {
 
 /// Fruit in the bowl, one mesh per color.
 fn fruit() -> [Mesh; 3] {
-    let ball = |places: &[[f64; 4]]| {
+    let ball = |spheres: &[[f64; 4]]| {
         let mut mesh = Mesh::default();
-        for [x, y, z, radius] in places {
+        for [x, y, z, radius] in spheres {
             let axes = [Vector3::x() * *radius, Vector3::y() * *radius, Vector3::z() * (0.93 * radius)];
             mesh.add_ellipsoid(Point3::new(*x, *y, TOP_M + z), axes, 12, |_, _| 0.5, 0.5);
         }

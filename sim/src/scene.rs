@@ -186,12 +186,12 @@ mod tests {
             data.qpos_mut().copy_from_slice(&position_rad);
             data.forward_kinematics();
             let [w, x, y, z] = data.xquat()[flange_ix];
-            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
             let ours = panda::base_from_flange(&Joints::from(position_rad));
             let urdf = chain.forward(&position_rad).expect("seven joints");
             for pose in [ours, urdf] {
                 assert!((pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm() < TOLERANCE);
-                assert!(pose.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
+                assert!(pose.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
             }
         }
     }
@@ -218,9 +218,9 @@ mod tests {
             data.forward_kinematics();
             let expected = world_from_base * chain.forward(position_rad).expect("as many joints");
             let [w, x, y, z] = data.xquat()[tip_ix];
-            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
             assert!((expected.translation.vector - Vector3::from(data.xpos()[tip_ix])).norm() < TOLERANCE);
-            assert!(expected.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
+            assert!(expected.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
         }
     }
 }

@@ -71,7 +71,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     images: DataArgs,
     /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
-    /// half of their pixels. All methods treat it as measured. The model must be of the same place, in the same world
+    /// half of their pixels. All methods treat it as measured. The model must be of the same scene, in the same world
     /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,

@@ -160,7 +160,7 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     };
     let mut html = format!(
         "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
-         the same pose. None of these images was used for training.</p>\n<div class=\"shots\">\n"
+         the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
     let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
@@ -194,7 +194,7 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
     });
     let shape = if height > width { " tall" } else { "" };
     format!(
-        "<article class=\"shot card{shape}\"><h3>{name}<span>{psnr:.2} dB</span>{ssim}{tag}</h3>\n<div class=\"pair\">\n{}{}\
+        "<article class=\"comparison card{shape}\"><h3>{name}<span>{psnr:.2} dB</span>{ssim}{tag}</h3>\n<div class=\"pair\">\n{}{}\
          <div class=\"stack\">{}{depth}</div></div></article>\n",
         figure(image, "test image"),
         figure(render, "render"),

@@ -245,11 +245,11 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     let eye = Point3::from(camera.world_from_camera.translation.vector);
     for (u, v) in [(0.0, 0.0), (640.0, 0.0), (640.0, 480.0), (0.0, 480.0)] {
         for share in [0.3, 0.6, 0.9] {
-            let place = pixel_of(request, eye + (corner(u, v) - eye) * share);
+            let center_px = pixel_of(request, eye + (corner(u, v) - eye) * share);
             let is_near = (-REACH_PX..=REACH_PX)
-                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (place.0 + dx, place.1 + dy)))
+                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (center_px.0 + dx, center_px.1 + dy)))
                 .any(|(x, y)| is_accent(pixel(&shot, x, y)));
-            assert!(is_near, "no line of the frustum near {place:?}");
+            assert!(is_near, "no line of the frustum near {center_px:?}");
         }
     }
 }

@@ -177,7 +177,7 @@ impl MovableArm for MovableFrankaArm {
     }
 
     /// Clears the reflex, if one stopped the arm. A user stop or locked joints must be released by a person first;
-    /// the error says so.
+    /// the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
         let Some(mailbox_state) =
             self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)

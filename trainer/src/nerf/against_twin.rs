@@ -145,7 +145,8 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     gpu.write(&samples.spans, 0, bytemuck::cast_slice(&spans));
     let embeddings: Vec<[f64; EMBEDDING_DIM]> =
         rays.iter().map(|ray| ray.embedding.clone().try_into().unwrap()).collect();
-    let image_params = gpu.storage_with("terms", bytemuck::cast_slice(&params::image_params_of(&embeddings))).unwrap();
+    let image_params =
+        gpu.storage_with("image_params", bytemuck::cast_slice(&params::image_params_of(&embeddings))).unwrap();
     let gradients = FieldGradients::new(&gpu, &twin.shape).unwrap();
     gpu.write(&gradients.scales, 0, bytemuck::cast_slice(scales));
     let loss = RayLoss {

@@ -575,8 +575,13 @@ impl SplatTrainer {
         listed
     }
 
-    fn list_step(&self, list: &mut Passes, pipelines: &TrainPipelines, place: (usize, usize)) -> Result<(), Error> {
-        let TrainView { view, level, lens } = self.train_view(list, pipelines, place)?;
+    fn list_step(
+        &self,
+        list: &mut Passes,
+        pipelines: &TrainPipelines,
+        view_level: (usize, usize),
+    ) -> Result<(), Error> {
+        let TrainView { view, level, lens } = self.train_view(list, pipelines, view_level)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
