@@ -18,7 +18,7 @@ pub(crate) enum Exit {
     /// Done, but some data is missing from the result.
     Loss = 3,
     /// Not done: the input is not sufficient for a result.
-    Refused = 4,
+    InsufficientData = 4,
 }
 
 impl Exit {
@@ -52,7 +52,7 @@ pub(crate) fn of(error: &anyhow::Error) -> Exit {
     if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>() || is_small_budget(cause)) {
         Exit::BadArguments
     } else if error.chain().any(|cause| cause.is::<InsufficientData>()) {
-        Exit::Refused
+        Exit::InsufficientData
     } else {
         Exit::Failed
     }

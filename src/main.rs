@@ -49,14 +49,14 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
-    let ended = cli.command.run();
-    if let Err(error) = &ended
+    let result = cli.command.run();
+    if let Err(error) = &result
         && !exit::is_broken_pipe(error)
     {
         print::error(error);
     }
     print::flush();
-    match ended {
+    match result {
         Ok(exit) => exit.or_output_loss().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
         Err(error) => exit::of(&error).into(),

@@ -4,7 +4,7 @@ use crate::downscale;
 use keyframe::Holdout;
 use keyframe::counted;
 use crate::error::{Context, ensure};
-use drivers::dataset::{Dataset, DatasetFrame, DepthImage};
+use drivers::dataset::{Dataset, DatasetImage, DepthImage};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
 use rayon::prelude::*;
@@ -41,18 +41,18 @@ pub fn load(
     scale_frac: f64,
     on_progress: &(dyn Fn(usize) + Sync),
 ) -> crate::Result<LoadedDataset> {
-    for frame in &dataset.frames {
-        downscale::intrinsics(&frame.intrinsics, scale_frac).with_context(|| frame.name.clone())?;
+    for image in &dataset.images {
+        downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
     }
-    let names: Vec<&str> = dataset.frames.iter().map(|frame| frame.name.as_str()).collect();
+    let names: Vec<&str> = dataset.images.iter().map(|image| image.name.as_str()).collect();
     let splits = holdout.splits(&names).with_context(|| dataset.path.display().to_string())?;
     let n_done = AtomicUsize::new(0);
     let camera: Arc<str> = CAMERA.into();
-    let load_one = |(lens, frame, split): (&LensMaps, &DatasetFrame, Split)| {
-        let keyframe = keyframe(lens, frame, scale_frac);
+    let load_one = |(lens, image, split): (&LensMaps, &DatasetImage, Split)| {
+        let keyframe = keyframe(lens, image, scale_frac);
         on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
         (
-            frame.name.clone(),
+            image.name.clone(),
             keyframe.map(|(keyframe, depth)| (Keyframe { camera: camera.clone(), split, ..keyframe }, depth)),
         )
     };
@@ -60,10 +60,10 @@ pub fn load(
     // Photos with the same lens follow each other, so only one set of maps is in memory at a time.
     let mut results = Vec::with_capacity(names.len());
     let mut start = 0;
-    for run in dataset.frames.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
+    for run in dataset.images.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
         let lens = LensMaps::of(&run[0].intrinsics);
         let jobs = run.par_iter().zip(&splits[start..start + run.len()]);
-        results.par_extend(jobs.map(|(frame, split)| load_one((&lens, frame, *split))));
+        results.par_extend(jobs.map(|(image, split)| load_one((&lens, image, *split))));
         start += run.len();
     }
 
@@ -130,31 +130,31 @@ impl LensMaps {
 }
 
 /// The keyframe of one photo, and an error message if its depth does not decode. The caller sets camera and split.
-fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> crate::Result<(Keyframe, Option<String>)> {
-    let images = frame.load()?;
-    let in_frame = || frame.name.clone();
-    let depth = images.depth.as_ref().zip(frame.depth.as_ref()).map(|(depth, file)| {
+fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<(Keyframe, Option<String>)> {
+    let loaded = image.load()?;
+    let in_image = || image.name.clone();
+    let depth = loaded.depth.as_ref().zip(image.depth.as_ref()).map(|(depth, file)| {
         crate::Result::Ok(DepthMap {
             size_px: depth.intrinsics.size_px,
             focal_px: depth.intrinsics.focal_px,
             principal_px: depth.intrinsics.principal_px,
-            depth_m: lens.undistorted_depth(depth).with_context(in_frame)?.into(),
+            depth_m: lens.undistorted_depth(depth).with_context(in_image)?.into(),
             world_from_camera: file.world_from_camera,
         })
     });
     let depth = depth.transpose()?;
-    let rgba = lens.undistorted_color(images.rgba_srgb).with_context(in_frame)?;
-    let scaled = frame.intrinsics.scaled(scale_frac);
-    let rgba = downscale::rgba(rgba, frame.intrinsics.size_px, scaled.size_px);
+    let rgba = lens.undistorted_color(loaded.rgba_srgb).with_context(in_image)?;
+    let scaled = image.intrinsics.scaled(scale_frac);
+    let rgba = downscale::rgba(rgba, image.intrinsics.size_px, scaled.size_px);
     let keyframe = Keyframe {
         camera: CAMERA.into(),
-        stamp: frame.stamp,
+        stamp: image.stamp,
         size_px: scaled.size_px,
         focal_px: scaled.focal_px,
         principal_px: scaled.principal_px,
         rgba_srgb: rgba.into(),
         depth,
-        world_from_camera: frame.world_from_camera,
+        world_from_camera: image.world_from_camera,
         twist: None,
         readout_secs: 0.0,
         joint_twists: [].into(),
@@ -162,7 +162,7 @@ fn keyframe(lens: &LensMaps, frame: &DatasetFrame, scale_frac: f64) -> crate::Re
         split: Split::Train,
         truth: None,
     };
-    Ok((keyframe, images.depth_error))
+    Ok((keyframe, loaded.depth_error))
 }
 
 #[cfg(test)]

@@ -66,7 +66,7 @@ pub enum ObservedPixels {
 #[derive(Debug, Default)]
 struct Shared {
     first_image: OnceLock<Instant>,
-    refused: Mutex<BTreeMap<String, u64>>,
+    rejected: Mutex<BTreeMap<String, u64>>,
     source_failed: AtomicBool,
 }
 
@@ -121,9 +121,9 @@ impl Feed {
         self.shared.first_image.get().copied()
     }
 
-    /// Number of refused images so far, by reason.
-    pub fn refused(&self) -> BTreeMap<String, u64> {
-        lock(&self.shared.refused).clone()
+    /// Number of rejected images so far, by reason.
+    pub fn rejected(&self) -> BTreeMap<String, u64> {
+        lock(&self.shared.rejected).clone()
     }
 
     /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
@@ -219,8 +219,8 @@ impl Pump {
                 JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,
                 JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
                 JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
-                JoinEvent::Refused { why, .. } => {
-                    *lock(&self.shared.refused).entry(why.name().to_owned()).or_default() += 1;
+                JoinEvent::Rejected { why, .. } => {
+                    *lock(&self.shared.rejected).entry(why.name().to_owned()).or_default() += 1;
                 }
             }
         }

@@ -43,6 +43,6 @@ mod test_data;
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result, chain};
 pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
-pub use join::{CameraPose, Change, Counts, Join, JoinEvent, Motion, PosedImage, Refusal, SampleUse};
+pub use join::{CameraPose, Change, Counts, Join, JoinEvent, Motion, PosedImage, Rejection, SampleUse};
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

@@ -54,7 +54,7 @@ pub struct Stations {
 
 /// Result of registering a station.
 struct SearchResult {
-    found: Option<StationCorrection>,
+    correction: Option<StationCorrection>,
     took: Duration,
 }
 
@@ -66,7 +66,7 @@ pub struct StationReport {
     /// Number of keyframes used for registration.
     n_keyframes: usize,
     /// The correction since the previous station; null if the images do not overlap with those of earlier stations.
-    found: Option<StationCorrection>,
+    correction: Option<StationCorrection>,
     /// Error of the base pose before and after the correction; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     base_error: Option<[PoseDistance; 2]>,
@@ -181,7 +181,7 @@ impl Stations {
                 // If registration fails, only the correction of this station is lost.
                 let search_result = search.join().unwrap_or_else(|_| {
                     log::error!("registering a station panicked: this is a bug");
-                    SearchResult { found: None, took: Duration::ZERO }
+                    SearchResult { correction: None, took: Duration::ZERO }
                 });
                 self.apply_result(search_result, released);
             }
@@ -274,13 +274,13 @@ impl Stations {
             (self.reference_keyframes.clone(), guess * base_state.world_from_base);
         self.search = Some(std::thread::spawn(move || {
             let started = Instant::now();
-            let found = run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
-            SearchResult { found, took: started.elapsed() }
+            let correction = run_in_background_pool(|| register_station(&reference_keyframes, &new, &world_from_base));
+            SearchResult { correction, took: started.elapsed() }
         }));
     }
 
     /// Passes the queued keyframes with the correction found by registration.
-    fn apply_result(&mut self, SearchResult { found, took }: SearchResult, released: &mut Vec<Change>) {
+    fn apply_result(&mut self, SearchResult { correction, took }: SearchResult, released: &mut Vec<Change>) {
         self.spent += took;
         let base_state = self.group().next().and_then(|keyframe| keyframe.base.clone());
         let base_state = base_state.expect("the keyframes of the registered station are queued");
@@ -288,10 +288,10 @@ impl Stations {
         // Correction at a reported base pose that lies at this fraction of the path between the two stations.
         let correction_at = |reported: &Transform, fraction: f64| {
             let guess = before * reported;
-            found.as_ref().map_or(before, |found| found.map_from_odom(&guess, fraction) * before)
+            correction.as_ref().map_or(before, |correction| correction.map_from_odom(&guess, fraction) * before)
         };
         let now = correction_at(&base_state.world_from_base, 1.0);
-        let correction = |at: &BaseState| match at.station {
+        let correction_of = |at: &BaseState| match at.station {
             Some(_) => now,
             None => {
                 let (from, to) =
@@ -303,12 +303,12 @@ impl Stations {
             &base_state,
             [&before, &now],
             self.group().filter(|of| is_usable(of)).count(),
-            found.as_ref(),
+            correction.as_ref(),
         );
         log::info!("{report}");
         self.reported.push(report);
         let held: Vec<Change> =
-            std::mem::take(&mut self.held).into_iter().map(|held| corrected(held, correction)).collect();
+            std::mem::take(&mut self.held).into_iter().map(|held| corrected(held, correction_of)).collect();
         (self.station, self.world_from_base, self.map_from_odom) =
             (base_state.station, base_state.world_from_base, now);
         for change in &held {
@@ -382,7 +382,7 @@ impl StationReport {
         base_state: &BaseState,
         [before, after]: [&Transform; 2],
         n_keyframes: usize,
-        found: Option<&StationCorrection>,
+        correction: Option<&StationCorrection>,
     ) -> Self {
         let base_error = base_state.truth.map(|truth| {
             [before, after].map(|map_from_odom| {
@@ -393,21 +393,26 @@ impl StationReport {
                 }
             })
         });
-        Self { station: base_state.station.unwrap_or_default(), n_keyframes, found: found.cloned(), base_error }
+        Self {
+            station: base_state.station.unwrap_or_default(),
+            n_keyframes,
+            correction: correction.cloned(),
+            base_error,
+        }
     }
 }
 
 impl std::fmt::Display for StationReport {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "base at station {}: ", self.station)?;
-        match &self.found {
-            None => f.write_str("its images do not overlap with earlier ones, so the reported pose is kept")?,
-            Some(found) if found.kept => write!(f, "{found}")?,
-            Some(found) => {
-                write!(f, "the reported pose is kept, as the correction is uncertain or not significant: {found}")?
+        match &self.correction {
+            None => f.write_str("its images do not overlap with earlier ones; the previous correction is kept")?,
+            Some(correction) if correction.kept => write!(f, "{correction}")?,
+            Some(correction) => {
+                write!(f, "the previous correction is kept, as this one is uncertain or not significant: {correction}")?
             }
         }
-        for unobservable in self.found.iter().flat_map(|found| &found.unobservable) {
+        for unobservable in self.correction.iter().flat_map(|correction| &correction.unobservable) {
             write!(f, "; not observable: {unobservable}")?;
         }
         if let Some([before, after]) = self.base_error {
@@ -426,7 +431,7 @@ mod tests {
     use keyframe::DepthMap;
     use nalgebra::Vector3;
 
-    /// A room corner with marks on its walls, rendered from a camera pose: brightness and depth.
+    /// A room corner with textured walls, rendered from a camera pose: brightness and depth.
     fn render_room(pose: &Transform) -> (Vec<u8>, Vec<f32>) {
         let (mut rgba, mut depth_m) = (Vec::new(), Vec::new());
         let origin = pose.translation.vector;
@@ -618,7 +623,12 @@ mod tests {
         }
         assert_eq!((released.len(), stations.reports().len()), (4, 1));
         let Change::Accepted(keyframe) = &released[0] else { panic!("a keyframe") };
-        assert!(stations.reports()[0].found.as_ref().is_none_or(|found| !found.kept || base_error(keyframe).0 < 2.0));
+        assert!(
+            stations.reports()[0]
+                .correction
+                .as_ref()
+                .is_none_or(|correction| !correction.kept || base_error(keyframe).0 < 2.0)
+        );
     }
 
     #[test]

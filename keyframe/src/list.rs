@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
-const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "selection"), (Split::Test, "test")];
+const SPLITS: [(Split, &str); 3] = [(Split::Train, "train"), (Split::Validation, "validation"), (Split::Test, "test")];
 
 /// The selected keyframes and their splits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -88,7 +88,7 @@ impl KeyframeList {
             };
             let Some((key, split)) = parsed else {
                 return Err(format!(
-                    "line {}: expected a camera, a stamp in nanoseconds and train, selection or test; found {line:?}",
+                    "line {}: expected a camera, a stamp in nanoseconds and train, validation or test; found {line:?}",
                     line_ix + 1
                 ));
             };
@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn list_is_parsed_and_errors_give_the_line() {
-        let list = KeyframeList::parse("# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 selection\n")
+        let list = KeyframeList::parse("# camera stamp split\nwrist 17 test\n\nwrist -3 train\nside 17 validation\n")
             .expect("a list");
         assert_eq!(list.len(), 3);
         assert_eq!(list.split_of("wrist", Stamp(17)), Some(Split::Test));

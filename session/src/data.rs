@@ -207,7 +207,7 @@ impl Data {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
-            data.hold_out(holdout)?;
+            data.assign_splits(holdout)?;
         }
         if !use_reported_poses {
             data.realign();
@@ -267,7 +267,7 @@ impl Data {
         quiet: bool,
     ) -> anyhow::Result<Self> {
         let folder = drivers::dataset::read(path)?;
-        let bar = print::bar(Some(folder.frames.len() as u64), "{bar:30} {pos} of {len} images", quiet);
+        let bar = print::bar(Some(folder.images.len() as u64), "{bar:30} {pos} of {len} images", quiet);
         let loaded = dataset::load(&folder, holdout, scale, &|n_done| bar.set_position(n_done as u64));
         bar.finish_and_clear();
         let loaded = loaded?;
@@ -311,7 +311,7 @@ impl Data {
                     JoinEvent::Evicted { camera, stamp } => {
                         keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
                     }
-                    JoinEvent::PosedImage(_) | JoinEvent::Refused { .. } => {}
+                    JoinEvent::PosedImage(_) | JoinEvent::Rejected { .. } => {}
                 }
             }
             bar.set_position(keyframes.len() as u64);
@@ -322,7 +322,7 @@ impl Data {
         apply(join.finish());
         bar.finish_and_clear();
         log::info!("{}", join.counts());
-        let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+        let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(damage.get().cloned());
         data_losses.extend(join.check_list()?);
         let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
@@ -346,7 +346,7 @@ impl Data {
     }
 
     /// Assigns splits anew, separately for each camera.
-    fn hold_out(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
+    fn assign_splits(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
             by_camera.entry(keyframe.camera.clone()).or_default().push(ix);

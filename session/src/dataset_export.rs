@@ -241,8 +241,12 @@ mod tests {
         second.depth.as_mut().unwrap().focal_px = [40.0, 40.0];
         let written = write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
         assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_skipped: 1 });
-        let sizes: Vec<_> =
-            drivers::dataset::read(folder.path()).unwrap().frames.iter().map(|f| f.intrinsics.size_px).collect();
+        let sizes: Vec<_> = drivers::dataset::read(folder.path())
+            .unwrap()
+            .images
+            .iter()
+            .map(|image| image.intrinsics.size_px)
+            .collect();
         assert_eq!(sizes, [[24, 32], [32, 24]]);
     }
 

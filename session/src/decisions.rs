@@ -386,7 +386,7 @@ impl Decisions {
             if let Decision::Restored(pushed) | Decision::Push(pushed) = &entry.decision
                 && pushed.split().is_none()
             {
-                return Err(invalid(format!("line {number}: {:?} is not train, selection or test", pushed.split)));
+                return Err(invalid(format!("line {number}: {:?} is not train, validation or test", pushed.split)));
             }
             entries.push(entry);
         }
@@ -524,7 +524,7 @@ mod tests {
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),
             ("\"seed\":true", "\"sing\":true", "line 3: "),
-            ("\"selection\"", "\"selected\"", "line 6: \"selected\" is not train"),
+            ("\"validation\"", "\"selected\"", "line 6: \"selected\" is not train"),
             ("{\"step\":40,\"remove\"", "{\"step\":70,\"remove\"", "line 8: step 40 comes after a later one"),
             ("{\"step\":40,\"checkpoint\":true}", "{\"step\":40,\"end\":true}", "line 9 comes after the end"),
         ] {

@@ -314,11 +314,11 @@ impl Live {
             state: self.state().to_owned(),
             seconds: clock_secs,
             keyframes: self.keyframes.len() as u64,
-            refused: self.feed.refused(),
+            rejected: self.feed.rejected(),
             model: models.next().unwrap_or_default(),
             others: models.collect(),
             notes: self.notes.clone(),
-            ended: None,
+            result: None,
         });
         Ok(())
     }

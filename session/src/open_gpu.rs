@@ -1,4 +1,4 @@
-//! Opens the GPU as the environment says.
+//! Opens the GPU with the settings from environment variables.
 
 use crate::allocator;
 use crate::exit::BadArgument;

@@ -198,11 +198,11 @@ impl CreatedFolders {
     }
 
     /// Removes the created folders if the command was rejected because of bad arguments or insufficient data.
-    pub(crate) fn keep_or_remove<T>(self, ended: anyhow::Result<T>) -> anyhow::Result<T> {
-        if ended.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::Refused)) {
+    pub(crate) fn keep_or_remove<T>(self, result: anyhow::Result<T>) -> anyhow::Result<T> {
+        if result.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::InsufficientData)) {
             self.remove_created();
         }
-        ended
+        result
     }
 }
 
@@ -430,12 +430,12 @@ mod tests {
         }
         assert!(!folder.path().join("a").exists());
         let failed = Err(anyhow::anyhow!("the disk is full"));
-        for (ended, file) in [(refused(), CHECKPOINT), (refused(), "scan.mcap"), (failed, "keyframes.txt")] {
+        for (result, file) in [(refused(), CHECKPOINT), (refused(), "scan.mcap"), (failed, "keyframes.txt")] {
             let mut created = CreatedFolders::default();
             let out = folder.path().join(file);
             created.make(Some(&out)).expect("it is free");
             std::fs::write(out.join(file), b"x").expect("file");
-            assert!(created.keep_or_remove(ended).is_err() && out.exists(), "{file}");
+            assert!(created.keep_or_remove(result).is_err() && out.exists(), "{file}");
         }
     }
 

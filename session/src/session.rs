@@ -189,8 +189,8 @@ struct Report<'a, T: Serialize> {
     adapter: String,
     #[serde(flatten)]
     details: &'a T,
-    /// Results of the trials of model parts.
-    parts: Vec<TrialReport>,
+    /// Results of A/B trials.
+    trials: Vec<TrialReport>,
     /// GPU time of each pass of a step in milliseconds, if profiling was requested.
     passes: Vec<(&'static str, f64)>,
     evaluations: &'a [Evaluation],
@@ -833,7 +833,7 @@ impl Session {
             done: &done,
             adapter: self.gpu.describe(),
             details,
-            parts: self.method.report(),
+            trials: self.method.report(),
             passes,
             evaluations: &outcome.evaluations,
             per_image: self.named(&outcome.per_image),

@@ -198,7 +198,7 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+    let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
     data_losses.extend(opened.damage.get().cloned());
     data_losses.extend(missing_from_list);
     Ok(exit::from_losses(&data_losses))

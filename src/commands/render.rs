@@ -95,7 +95,7 @@ struct RenderedPicture {
     depth: Option<PathBuf>,
     size_px: [u32; 2],
     /// Wall time from the request to the pixels, milliseconds.
-    draw_ms: f64,
+    draw_millis: f64,
 }
 
 /// Renders every camera of the path.
@@ -117,10 +117,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
         let picture = model.render(request)?;
-        let draw_ms = since.elapsed().as_secs_f64() * 1e3;
+        let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
-        let rendered = RenderedPicture { picture, depth, size_px, draw_ms };
+        let rendered = RenderedPicture { picture, depth, size_px, draw_millis };
         bar.inc(1);
         if args.json {
             print::report_json(&rendered)?;

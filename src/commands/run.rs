@@ -14,7 +14,7 @@ use capture::Feed;
 use capture::Input;
 use capture::Counts;
 use capture::Join;
-use capture::Refusal;
+use capture::Rejection;
 use capture::SampleUse;
 use crate::live::{Live, LiveOptions, Pace};
 use crate::method::{self, ModelKind, ModelSpec, Resumed};
@@ -136,7 +136,7 @@ struct RunDetails {
     seed: u64,
     keyframes: usize,
     evicted: u64,
-    refused: BTreeMap<&'static str, u64>,
+    rejected: BTreeMap<&'static str, u64>,
     device_skipped: u64,
     /// Number of range scans, which are stored in addition to the keyframes, and of their points.
     range_scans: usize,
@@ -152,8 +152,8 @@ struct RunDetails {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
-    let ended = drive(args, &mut created);
-    created.keep_or_remove(ended)
+    let result = drive(args, &mut created);
+    created.keep_or_remove(result)
 }
 
 fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
@@ -169,7 +169,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let args = &previous.as_ref().map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
     let mut running = start(args, previous.as_ref(), created)?;
-    let ended = loop {
+    let result = loop {
         match running.run_time_slice() {
             Ok(true) => {}
             Ok(false) => match running.live.wait() {
@@ -182,7 +182,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     };
     let Running { live, rig, folders, damage, stop, server, .. } = running;
     let hub = live.hub();
-    if let Err(error) = ended {
+    if let Err(error) = result {
         stop.request();
         if recovery::is_gpu_error(&error) || error.is::<GpuUnrecoverable>() {
             return Err(keep_input(live, &folders, error));
@@ -432,7 +432,7 @@ fn save(
     let mut data_losses = counts.data_losses(if args.record.is_some() && args.from.is_none() {
         SampleUse::Recorded
     } else {
-        SampleUse::Watched
+        SampleUse::ProcessedOnly
     });
     // Keyframes that are missing from the recording cannot be scored on it later.
     let is_recorded = input_result.recording_error.is_none();
@@ -445,7 +445,7 @@ fn save(
             seed: rig.train.seed,
             keyframes: session.keyframes().len(),
             evicted: counts.evicted,
-            refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
+            rejected: counts.rejected.iter().map(|(why, n)| (why.name(), *n)).collect(),
             device_skipped: counts.device_skipped,
             range_scans: input_result.join.range_scans().count(),
             range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
@@ -665,7 +665,7 @@ fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
     let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
-    let n_unknown = counts.refused.get(&Refusal::UnknownCamera).copied().unwrap_or_default();
+    let n_unknown = counts.rejected.get(&Rejection::UnknownCamera).copied().unwrap_or_default();
     match (n_keyframes, counts.accepted) {
         (1, _) => format!("nothing to train on: the only keyframe is a test image ({counts})"),
         (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are test images ({counts})"),
@@ -700,10 +700,10 @@ mod tests {
     fn run_without_a_model_reports_the_reason() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
-        let counts = |images, accepted, refused: &[(Refusal, u64)]| Counts {
+        let counts = |images, accepted, rejected: &[(Rejection, u64)]| Counts {
             images,
             accepted,
-            refused: refused.iter().copied().collect(),
+            rejected: rejected.iter().copied().collect(),
             unknown_cameras: ["front".into()].into(),
             ..Counts::default()
         };
@@ -711,8 +711,8 @@ mod tests {
             (1, counts(1, 1, &[]), "the only keyframe is a test image (1 keyframe of 1 image)"),
             (0, counts(1, 1, &[]), "ended before the trainer received a keyframe"),
             (0, counts(0, 0, &[]), "no image was received"),
-            (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
-            (0, counts(7, 0, &[(Refusal::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
+            (0, counts(7, 0, &[(Rejection::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
+            (0, counts(7, 0, &[(Rejection::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
         ] {
             let message = no_model_reason(n_keyframes, &counts, &rig);
             assert!(message.contains(expected), "{message}");

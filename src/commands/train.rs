@@ -74,7 +74,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     images: DataArgs,
     /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
-    /// half of their pixels. All methods treat it as measured. The model must be of the same place, in the same world
+    /// half of their pixels. All methods treat it as measured. The model must be of the same scene, in the same world
     /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
@@ -107,7 +107,7 @@ struct TrainDetails<'a> {
     seed: u64,
     startup_secs: f64,
     n_train: usize,
-    n_selection: usize,
+    n_validation: usize,
     n_test: usize,
     data_losses: &'a [String],
     /// Estimated base pose at each station after the first.
@@ -122,8 +122,8 @@ struct TrainDetails<'a> {
 /// Loads the data, trains until a limit or Ctrl-C, scores on the evaluation schedule, and saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
-    let ended = train(args, &mut created);
-    created.keep_or_remove(ended)
+    let result = train(args, &mut created);
+    created.keep_or_remove(result)
 }
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
@@ -283,7 +283,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             seed,
             startup_secs,
             n_train: data.of_split(Split::Train).len(),
-            n_selection: data.of_split(Split::Validation).len(),
+            n_validation: data.of_split(Split::Validation).len(),
             n_test: data.of_split(Split::Test).len(),
             data_losses: &data.data_losses,
             stations: &data.stations,

@@ -4,7 +4,7 @@
 
 use super::motion::{self, CameraPose};
 use super::pixels::{PixelStatistics, SharpnessHistory};
-use super::refusal::Refusal;
+use super::rejection::Rejection;
 use super::spacing::Spacing;
 use crate::config::{self, JoinConfig};
 use kinematics::{Intrinsics, Stamp, Transform};
@@ -42,14 +42,14 @@ impl Acceptance {
 
     /// Checks that the camera has moved enough since the nearest keyframe. For a fixed camera, checks instead that
     /// enough time has passed.
-    pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Refusal> {
+    pub(super) fn check_motion(&self, stamp: Stamp, pose: &Transform) -> Result<(), Rejection> {
         let moved = if self.is_fixed {
             let waited = self.last.is_none_or(|last| stamp.secs_since(last) * 1e3 >= self.config.fixed_interval_millis);
             waited && self.accepted.len() < self.config.fixed_keyframes
         } else {
             self.accepted.iter().all(|accepted| self.spacing.between(accepted, pose) >= 1.0)
         };
-        if moved { Ok(()) } else { Err(Refusal::NotMoved) }
+        if moved { Ok(()) } else { Err(Rejection::NotMoved) }
     }
 
     /// Checks that the camera is slow enough for its exposure and readout time. `depth_m`: distance of the scene.
@@ -59,9 +59,9 @@ impl Acceptance {
         pinhole: &Intrinsics,
         exposure_secs: Option<f64>,
         depth_m: f64,
-    ) -> Result<(), Refusal> {
+    ) -> Result<(), Rejection> {
         let Some(twist) = &camera_pose.twist else {
-            return if self.readout_secs > 0.0 { Err(Refusal::ShearUnknown) } else { Ok(()) };
+            return if self.readout_secs > 0.0 { Err(Rejection::ShearUnknown) } else { Ok(()) };
         };
         let speed_px_s = motion::image_speed_px_s(twist, pinhole, depth_m);
         let blur_px = speed_px_s * exposure_secs.unwrap_or(0.0);
@@ -69,20 +69,20 @@ impl Acceptance {
         // Written so that a NaN speed is rejected too.
         match (blur_px <= self.config.max_blur_px, shear_px <= self.config.max_shear_px) {
             (true, true) => Ok(()),
-            (false, _) => Err(Refusal::Blur),
-            (true, false) => Err(Refusal::Shear),
+            (false, _) => Err(Rejection::Blur),
+            (true, false) => Err(Rejection::Shear),
         }
     }
 
     /// Checks exposure and sharpness. `rgb` is `[height, width, 3]`.
-    pub(super) fn check_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Refusal> {
+    pub(super) fn check_pixels(&mut self, rgb: &[u8], size_px: [u32; 2]) -> Result<(), Rejection> {
         let statistics = PixelStatistics::of(rgb, size_px);
         let is_well_exposed = (self.config.min_luma_frac..=self.config.max_luma_frac).contains(&statistics.luma_frac);
         if !is_well_exposed || statistics.clipped_frac > self.config.max_clipped_frac {
-            return Err(Refusal::Exposure);
+            return Err(Rejection::Exposure);
         }
         let relative = self.sharpness.relative(statistics.sharpness);
-        if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Refusal::NotSharp) }
+        if relative >= self.config.min_sharpness_frac { Ok(()) } else { Err(Rejection::NotSharp) }
     }
 
     /// Adds the pose of a keyframe of the resumed run. Its stamp may be from another clock, so the interval of a fixed
@@ -115,14 +115,14 @@ mod tests {
         };
         let (mut running, mut resumed, pose) = (fixed(), fixed(), Transform::identity());
         running.accept(Stamp(3_600_000_000_000), &pose);
-        assert_eq!(running.check_motion(Stamp(0), &pose), Err(Refusal::NotMoved));
+        assert_eq!(running.check_motion(Stamp(0), &pose), Err(Rejection::NotMoved));
         resumed.accept_resumed(&pose);
         assert_eq!(resumed.check_motion(Stamp(0), &pose), Ok(()));
     }
 
     #[test]
     fn unknown_velocity_is_rejected_only_for_rolling_shutters() {
-        for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Refusal::ShearUnknown))] {
+        for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Rejection::ShearUnknown))] {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
             let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
             let camera = &rig.cameras[0];
@@ -137,7 +137,7 @@ mod tests {
             assert_eq!(check(Some(Twist::zero())), Ok(()));
             let mut broken = Twist::zero();
             broken.linear_m_s.x = f64::NAN;
-            assert_eq!(check(Some(broken)), Err(Refusal::Blur));
+            assert_eq!(check(Some(broken)), Err(Rejection::Blur));
         }
     }
 }

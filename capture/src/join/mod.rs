@@ -9,7 +9,7 @@ mod change;
 mod motion;
 mod pixels;
 mod ranges;
-mod refusal;
+mod rejection;
 mod spacing;
 mod station_detector;
 mod store;
@@ -19,7 +19,7 @@ mod waiting;
 
 pub use change::Change;
 pub use motion::{CameraPose, Motion};
-pub use refusal::{Counts, Refusal, SampleUse};
+pub use rejection::{Counts, Rejection, SampleUse};
 
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use crate::Error;
@@ -68,7 +68,7 @@ pub enum JoinEvent {
     /// A color image with a known pose, whether or not it becomes a keyframe.
     PosedImage(PosedImage),
     /// A color image did not become a keyframe.
-    Refused { why: Refusal },
+    Rejected { why: Rejection },
 }
 
 /// A color image and its camera pose.
@@ -167,15 +167,15 @@ impl Join {
                     self.warned_joint_limits = true;
                 }
                 let is_valid = self.motion.push_joints(state);
-                self.counts.joints_refused += u64::from(!is_valid);
+                self.counts.joints_rejected += u64::from(!is_valid);
             }
             Sample::Base(pose) => {
                 let is_valid = self.motion.push_base(&pose);
-                self.counts.base_poses_refused += u64::from(!is_valid);
+                self.counts.base_poses_rejected += u64::from(!is_valid);
             }
             Sample::Range(scan) => {
                 let is_queued = self.ranges.push(scan);
-                self.counts.range_scans_refused += u64::from(!is_queued);
+                self.counts.range_scans_rejected += u64::from(!is_queued);
             }
             Sample::BaseTruth(truth) => self.motion.push_base_truth(&truth),
             Sample::Image(image) => self.push_image(image, &mut events),
@@ -224,7 +224,7 @@ impl Join {
         let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
             if !image.is_depth() {
                 self.counts.unknown_cameras.insert(Arc::clone(&image.camera));
-                self.refuse(&image.camera, image.stamp, Refusal::UnknownCamera, events);
+                self.reject(&image.camera, image.stamp, Rejection::UnknownCamera, events);
             }
             return;
         };
@@ -233,7 +233,7 @@ impl Join {
             camera.waiting.push_depth(stamp, image);
         } else if let Some(dropped_image) = camera.waiting.push_color(image) {
             let stamp = camera.config.mid_exposure(dropped_image.stamp);
-            self.refuse(&dropped_image.camera, stamp, Refusal::QueueFull, events);
+            self.reject(&dropped_image.camera, stamp, Rejection::QueueFull, events);
         }
     }
 
@@ -241,7 +241,7 @@ impl Join {
     fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
         let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
         self.counts.range_scans += counts_placed.n_placed;
-        self.counts.range_scans_refused += counts_placed.n_refused;
+        self.counts.range_scans_rejected += counts_placed.n_rejected;
         for camera_ix in 0..self.cameras.len() {
             while let Some(ready) = self.next_ready(camera_ix, at_end) {
                 match ready {
@@ -253,7 +253,7 @@ impl Join {
                         events.push(JoinEvent::PosedImage(posed_image));
                         self.decide(camera_ix, ready, events);
                     }
-                    Err((camera, stamp)) => self.refuse(&camera, stamp, Refusal::NoPose, events),
+                    Err((camera, stamp)) => self.reject(&camera, stamp, Rejection::NoPose, events),
                 }
             }
         }
@@ -307,13 +307,13 @@ impl Join {
         self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
         let camera = &mut self.cameras[camera_ix];
         let split = match listed {
-            Some(None) => return, // Not listed, which is not a refusal.
+            Some(None) => return, // Not listed, which is not a rejection.
             Some(Some(split)) => split,
             None => Split::of(camera.n_accepted),
         };
         let keyframe = match camera.keyframe(ready, split, listed.is_none(), self.default_depth_m) {
             Ok(keyframe) => keyframe,
-            Err(why) => return self.refuse(&name, stamp, why, events),
+            Err(why) => return self.reject(&name, stamp, why, events),
         };
         camera.n_accepted += 1;
         self.counts.accepted += 1;
@@ -332,10 +332,10 @@ impl Join {
         }
     }
 
-    fn refuse(&mut self, camera: &str, stamp: Stamp, why: Refusal, events: &mut Vec<JoinEvent>) {
+    fn reject(&mut self, camera: &str, stamp: Stamp, why: Rejection, events: &mut Vec<JoinEvent>) {
         log::debug!("camera {camera:?}: the image at {} ns did not become a keyframe: {why}", stamp.0);
-        self.counts.refuse(why);
-        events.push(JoinEvent::Refused { why });
+        self.counts.reject(why);
+        events.push(JoinEvent::Rejected { why });
     }
 }
 
@@ -367,17 +367,17 @@ impl CameraState {
         })
     }
 
-    /// The keyframe of an image, or the reason for refusing it. `run_checks` is false if a list selects the keyframes.
+    /// The keyframe of an image, or the reason for rejecting it. `run_checks` is false if a list selects the keyframes.
     fn keyframe(
         &mut self,
         ready: ReadyImage,
         split: Split,
         run_checks: bool,
         default_depth_m: f64,
-    ) -> Result<Keyframe, Refusal> {
+    ) -> Result<Keyframe, Rejection> {
         let pose = &ready.camera_pose.world_from_camera;
         if !kinematics::transform::is_finite(pose) {
-            return Err(Refusal::PoseNotFinite);
+            return Err(Rejection::PoseNotFinite);
         }
         if run_checks {
             self.acceptance.check_motion(ready.stamp, pose)?;
@@ -427,10 +427,10 @@ impl CameraState {
     }
 
     /// Logs the first decoding error of a camera; all of them are counted.
-    fn undecodable(&mut self, error: &crate::Error) -> Refusal {
+    fn undecodable(&mut self, error: &crate::Error) -> Rejection {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
             log::warn!("{error:#}");
         }
-        Refusal::Undecodable
+        Rejection::Undecodable
     }
 }

@@ -173,7 +173,7 @@ impl Motion {
             )),
             Parent::Flange => {
                 let joints = self.joints.at(stamp)?;
-                // Readings of the wrong length are refused when they are pushed, so the chain cannot fail here.
+                // Readings of the wrong length are rejected when they are pushed, so the chain cannot fail here.
                 let Ok(base_from_flange) = self.chain.forward(&joints.position) else {
                     return Err(HistoryError::NotFinite);
                 };

@@ -31,7 +31,7 @@ pub(super) struct RangeScans {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct PlacementCounts {
     pub(super) n_placed: u64,
-    pub(super) n_refused: u64,
+    pub(super) n_rejected: u64,
 }
 
 impl RangeScans {
@@ -117,7 +117,7 @@ impl RangeScans {
                     }
                 }
                 Err(HistoryError::NotYet { .. }) if !at_end && newest.secs_since(scan.stamp) <= max_wait_secs => break,
-                Err(_) => counts_placed.n_refused += 1,
+                Err(_) => counts_placed.n_rejected += 1,
             }
             self.waiting.pop_front();
         }

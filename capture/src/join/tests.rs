@@ -1,6 +1,6 @@
-//! Generated samples in, keyframes out: poses at the shutter time, every refusal, the bounds, and bit-exact replay.
+//! Generated samples in, keyframes out: poses at the shutter time, every rejection, the bounds, and bit-exact replay.
 
-use super::{Join, JoinEvent, KeyframeList, Refusal, keyframe_list};
+use super::{Join, JoinEvent, KeyframeList, Rejection, keyframe_list};
 use crate::config::{Override, Rig};
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
@@ -102,7 +102,7 @@ fn samples(secs: i64) -> Vec<Sample> {
 #[derive(Default)]
 struct JoinOutcome {
     keyframes: Vec<Arc<Keyframe>>,
-    refused: Vec<Refusal>,
+    rejected: Vec<Rejection>,
     evicted: Vec<i64>,
     n_posed: usize,
 }
@@ -113,7 +113,7 @@ fn run_join(join: &mut Join, samples: impl IntoIterator<Item = Sample>) -> JoinO
         for event in events {
             match event {
                 JoinEvent::Accepted(keyframe) => outcome.keyframes.push(keyframe),
-                JoinEvent::Refused { why } => outcome.refused.push(why),
+                JoinEvent::Rejected { why } => outcome.rejected.push(why),
                 JoinEvent::Evicted { stamp, .. } => outcome.evicted.push(stamp.0),
                 JoinEvent::PosedImage(_) => outcome.n_posed += 1,
             }
@@ -247,7 +247,7 @@ fn replay_reproduces_keyframes_bit_for_bit() {
         let replayed = std::iter::from_fn(|| source.next_sample().expect("readable"));
         let replay = run_join(&mut join(&opened.rig), replayed);
         assert_eq!(differences(&live.keyframes, &replay.keyframes), Vec::<String>::new());
-        assert_eq!(live.refused, replay.refused);
+        assert_eq!(live.rejected, replay.rejected);
     }
     assert!(
         live.keyframes.iter().any(|keyframe| keyframe.rgba_srgb.chunks(4).any(|pixel| pixel[3] == 0)),
@@ -271,15 +271,15 @@ fn images_without_joint_readings_are_dropped_and_counted() {
     let mut join = join(&rig);
     let outcome = run_join(&mut join, kept);
     assert_eq!(
-        outcome.refused.iter().filter(|why| **why == Refusal::NoPose).count(),
+        outcome.rejected.iter().filter(|why| **why == Rejection::NoPose).count(),
         40,
         "all images without readings"
     );
     assert!(outcome.keyframes.iter().all(|keyframe| !in_gap(keyframe.stamp.0)));
-    assert_eq!(join.counts().refused[&Refusal::NoPose], 40);
+    assert_eq!(join.counts().rejected[&Rejection::NoPose], 40);
     assert_eq!(join.counts().images, 80);
     assert_eq!(
-        join.counts().accepted + join.counts().refused.values().sum::<u64>(),
+        join.counts().accepted + join.counts().rejected.values().sum::<u64>(),
         80,
         "every image is accounted for"
     );
@@ -298,8 +298,8 @@ fn non_finite_readings_reject_nearby_images() {
     });
     let mut join = join(&rig);
     let outcome = run_join(&mut join, broken);
-    assert_eq!(join.counts().joints_refused, 200);
-    assert!(join.counts().refused[&Refusal::NoPose] >= 9, "{}", join.counts());
+    assert_eq!(join.counts().joints_rejected, 200);
+    assert!(join.counts().rejected[&Rejection::NoPose] >= 9, "{}", join.counts());
     assert!(outcome.keyframes.iter().all(|keyframe| kinematics::transform::is_finite(&keyframe.world_from_camera)));
     let mut short = Join::new(&rig).expect("a good rig");
     short.push(Sample::Joints(JointState {
@@ -308,7 +308,7 @@ fn non_finite_readings_reject_nearby_images() {
         velocity: vec![],
         effort: vec![],
     }));
-    assert_eq!(short.counts().joints_refused, 1);
+    assert_eq!(short.counts().joints_rejected, 1);
 }
 
 #[test]
@@ -327,7 +327,7 @@ fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
     mixed.sort_by_key(Sample::stamp);
     let mut moving = join(&rig);
     let outcome = run_join(&mut moving, mixed);
-    assert_eq!(moving.counts().base_poses_refused, 1);
+    assert_eq!(moving.counts().base_poses_rejected, 1);
     assert!(outcome.keyframes.len() > 20, "{}", moving.counts());
     let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).expect("a Panda");
     for keyframe in &outcome.keyframes {
@@ -340,7 +340,7 @@ fn moving_base_carries_cameras_and_bad_pose_is_rejected() {
 }
 
 #[test]
-fn every_refusal_reason_is_reachable() {
+fn every_rejection_reason_is_reachable() {
     let counts_with = |how: fn(Image) -> Image, overrides: &[Override]| {
         let corrupted = samples(4).into_iter().map(|sample| match sample {
             Sample::Image(image) if !image.is_depth() && image.stamp.0 > 2_000_000_000 => Sample::Image(how(image)),
@@ -350,30 +350,30 @@ fn every_refusal_reason_is_reachable() {
         run_join(&mut join, corrupted);
         join.counts().clone()
     };
-    type Case = (Refusal, fn(Image) -> Image, Vec<Override>);
+    type Case = (Rejection, fn(Image) -> Image, Vec<Override>);
     let cases: [Case; 8] = [
-        (Refusal::UnknownCamera, |image| Image { camera: "elbow".into(), ..image }, vec![]),
+        (Rejection::UnknownCamera, |image| Image { camera: "elbow".into(), ..image }, vec![]),
         (
-            Refusal::NotMoved,
+            Rejection::NotMoved,
             |image| image,
             vec![Override::new("join.min_translation_m", 0.2), Override::new("join.min_rotation_rad", 1.0)],
         ),
-        (Refusal::Blur, |image| Image { exposure_secs: Some(0.1), ..image }, vec![]),
-        (Refusal::Shear, |image| image, vec![Override::new("join.max_shear_px", 0.05)]),
-        (Refusal::Undecodable, |image| Image { format: PixelFormat::Jpeg, ..image }, vec![]),
-        (Refusal::Undecodable, |image| Image { size_px: [48, 64], ..image }, vec![]),
-        (Refusal::Exposure, |image| Image { data: vec![3; image.data.len()].into(), ..image }, vec![]),
-        (Refusal::NotSharp, |image| Image { data: vec![128; image.data.len()].into(), ..image }, vec![]),
+        (Rejection::Blur, |image| Image { exposure_secs: Some(0.1), ..image }, vec![]),
+        (Rejection::Shear, |image| image, vec![Override::new("join.max_shear_px", 0.05)]),
+        (Rejection::Undecodable, |image| Image { format: PixelFormat::Jpeg, ..image }, vec![]),
+        (Rejection::Undecodable, |image| Image { size_px: [48, 64], ..image }, vec![]),
+        (Rejection::Exposure, |image| Image { data: vec![3; image.data.len()].into(), ..image }, vec![]),
+        (Rejection::NotSharp, |image| Image { data: vec![128; image.data.len()].into(), ..image }, vec![]),
     ];
     for (why, how, overrides) in cases {
         let counts = counts_with(how, &overrides);
-        assert!(counts.refused.get(&why).is_some_and(|n| *n >= 3), "{why}: {counts}");
+        assert!(counts.rejected.get(&why).is_some_and(|n| *n >= 3), "{why}: {counts}");
         assert!(counts.to_string().contains(&why.to_string()));
     }
     assert_eq!(
-        counts_with(|image| image, &[]).refused.keys().collect::<Vec<_>>(),
-        [&Refusal::NotMoved],
-        "no other refusals for good images"
+        counts_with(|image| image, &[]).rejected.keys().collect::<Vec<_>>(),
+        [&Rejection::NotMoved],
+        "no other rejections for good images"
     );
 }
 
@@ -396,7 +396,7 @@ fn list_selects_exactly_its_keyframes() {
     let mut first = join(&rig(&[]));
     let chosen = run_join(&mut first, samples(6));
     std::fs::write(&path, keyframe_list(first.keyframes())).expect("disk space");
-    // A rig whose checks would refuse all of them.
+    // A rig whose checks would reject all of them.
     let strict = rig(&[
         Override::new("join.max_shear_px", 0),
         Override::new("join.min_translation_m", 10),
@@ -405,7 +405,7 @@ fn list_selects_exactly_its_keyframes() {
     let mut second = join(&strict).taking_only(KeyframeList::load(&path).expect("a list"));
     let listed = run_join(&mut second, samples(6));
     assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
-    assert_eq!((listed.refused, listed.evicted), (vec![], vec![]));
+    assert_eq!((listed.rejected, listed.evicted), (vec![], vec![]));
     let again = folder.path().join("again.txt");
     std::fs::write(&again, keyframe_list(second.keyframes())).expect("disk space");
     assert_eq!(std::fs::read_to_string(&path).expect("a list"), std::fs::read_to_string(&again).expect("a list"));

@@ -231,7 +231,7 @@ mod tests {
         ];
         let error_of = |overrides: &[Override]| {
             let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
-            format!("{:#}", opened.err().expect("nothing is plugged in"))
+            format!("{:#}", opened.err().expect("nothing is connected"))
         };
         let message = error_of(&absent);
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
@@ -251,7 +251,7 @@ mod tests {
             let overrides =
                 driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
             let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
-            format!("{:#}", opened.err().expect("nothing is plugged in"))
+            format!("{:#}", opened.err().expect("nothing is connected"))
         };
         assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
         let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
@@ -267,7 +267,7 @@ mod tests {
             Override::new("camera.wrist.device", "no such serial"),
         ];
         let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
-        let message = format!("{:#}", opened.err().expect("nothing is plugged in"));
+        let message = format!("{:#}", opened.err().expect("nothing is connected"));
         let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
         assert!(message.contains(expected) && message.contains("--sim"), "{message}");
     }

@@ -61,7 +61,7 @@ impl Page<'_> {
         page.push_str(&curve(report, method));
         page.push_str(&collapsible(&scores_of_images(report), "Scores of all test images"));
         page.push_str(&collapsible(&evaluations_table(report, self.primitive), "Scores during training"));
-        page.push_str(&parts(&report["parts"]));
+        page.push_str(&trials(&report["trials"]));
         page.push_str(&self.settings_tables());
         page.push_str("</main></body></html>\n");
         page
@@ -75,7 +75,7 @@ impl Page<'_> {
     }
 
     fn settings_tables(&self) -> String {
-        let excluded_keys = ["done", "data_losses", "evaluations", "parts", "passes", "per_image"];
+        let excluded_keys = ["done", "data_losses", "evaluations", "trials", "passes", "per_image"];
         let extra = self.report.as_object().into_iter().flatten();
         let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
         let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
@@ -160,7 +160,7 @@ fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
     };
     let mut html = format!(
         "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
-         the same pose. None of these images was used for training.</p>\n<div class=\"shots\">\n"
+         the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
     );
     let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
     let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
@@ -194,7 +194,7 @@ fn comparison_card(comparison: &Comparison, tag: &str) -> String {
     });
     let shape = if height > width { " tall" } else { "" };
     format!(
-        "<article class=\"shot card{shape}\"><h3>{name}<span>{psnr:.2} dB</span>{ssim}{tag}</h3>\n<div class=\"pair\">\n{}{}\
+        "<article class=\"comparison card{shape}\"><h3>{name}<span>{psnr:.2} dB</span>{ssim}{tag}</h3>\n<div class=\"pair\">\n{}{}\
          <div class=\"stack\">{}{depth}</div></div></article>\n",
         figure(image, "test image"),
         figure(render, "render"),
@@ -298,15 +298,15 @@ fn collapsible(table: &Table, title: &str) -> String {
     }
 }
 
-/// The results of the trials of model parts.
-fn parts(parts: &Value) -> String {
-    let rows: Vec<Vec<String>> = array(parts)
+/// The results of A/B trials.
+fn trials(trials: &Value) -> String {
+    let rows: Vec<Vec<String>> = array(trials)
         .iter()
-        .map(|part| {
-            let number = |key: &str| part[key].as_f64().unwrap_or_default();
-            let kept = if part["kept"] == Value::Bool(true) { "kept" } else { "dropped" };
+        .map(|trial| {
+            let number = |key: &str| trial[key].as_f64().unwrap_or_default();
+            let kept = if trial["kept"] == Value::Bool(true) { "kept" } else { "dropped" };
             let gain = format!("{:+.2} ± {:.2}", number("gain_db"), number("standard_error_db"));
-            vec![text_of(&part["part"]), gain, text_of(&part["n_images"]), kept.to_owned()]
+            vec![text_of(&trial["candidate"]), gain, text_of(&trial["n_images"]), kept.to_owned()]
         })
         .collect();
     if rows.is_empty() {
@@ -333,7 +333,7 @@ fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> St
 fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
     let key = match key {
         "n_train" => "training images".to_owned(),
-        "n_selection" => "validation images".to_owned(),
+        "n_validation" => "validation images".to_owned(),
         "n_test" => "test images".to_owned(),
         "startup_secs" => "seconds before training".to_owned(),
         other => other.replace('_', " "),
@@ -438,8 +438,8 @@ mod tests {
             "data_losses": ["1 image <broken>"],
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
             "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
-            "parts": [{ "part": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
-            "refused": { "blurred": 3 }, "alignment": null,
+            "trials": [{ "candidate": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
+            "rejected": { "blurred": 3 }, "alignment": null,
         }));
         for words in [
             "<title>runs/a &lt;b&gt;: splat</title>",
@@ -452,7 +452,7 @@ mod tests {
             "<svg ",
             "images/1.jpg",
             "+0.50 ± 0.10",
-            "<td>refused: blurred</td><td>3</td>",
+            "<td>rejected: blurred</td><td>3</td>",
             "<td>options: seed</td><td>7</td>",
             "prefers-color-scheme: dark",
         ] {

@@ -24,7 +24,7 @@ const WRITE_PERIOD: Duration = Duration::from_secs(60);
 /// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
-const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
+const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.validation"];
 /// Number of GPU buffers in the table, the largest first.
 const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;

@@ -6,7 +6,7 @@ use capture::config::BaseDriver;
 use capture::config::Rig;
 use capture::Join;
 use capture::JoinEvent;
-use capture::Refusal;
+use capture::Rejection;
 use capture::open;
 use capture::open::Devices;
 use capture::open::Opened;
@@ -143,10 +143,10 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
         })
         .collect();
     findings.extend(devices.iter().filter_map(problem));
-    let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
-    let n_posed = join.counts().images - join.counts().refused.get(&Refusal::NoPose).copied().unwrap_or(0);
-    if !refused.is_empty() {
-        let message = format!("images that did not become keyframes: {}", refused.join(", "));
+    let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
+    if !rejected.is_empty() {
+        let message = format!("images that did not become keyframes: {}", rejected.join(", "));
         findings.push(if 2 * n_posed < join.counts().images {
             let remedy =
                 "each image needs joint states, and base poses if the base moves, around its time: check their source";

@@ -199,7 +199,7 @@ impl FieldTrainer {
             }
             passes.update_images(list, moments, images);
         }
-        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
+        passes.update(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
         Ok(())
     }
 

@@ -5,7 +5,7 @@
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines, UnorderedPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use crate::Error;
@@ -80,7 +80,7 @@ pub struct Repeats {
 struct KernelBench {
     gpu: Arc<Gpu>,
     draw: DrawPipelines,
-    learn: LearnPipelines,
+    train: TrainPipelines,
     splats: SplatBuffers,
     scratch: Scratch,
     image_buffers: ImageBuffers,
@@ -146,7 +146,7 @@ pub fn time_kernels(
 impl KernelBench {
     fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
-        let learn = LearnPipelines::new(&gpu)?;
+        let train = TrainPipelines::new(&gpu)?;
         let n_splats =
             u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
@@ -184,7 +184,7 @@ impl KernelBench {
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
             unordered: None,
             draw,
-            learn,
+            train,
             splats,
             size_px,
             gpu,
@@ -232,15 +232,15 @@ impl KernelBench {
 
     fn record_step(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule, false);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule, false);
         self.record_end(passes);
     }
 
     fn record_step_visible(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule_visible, false);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule_visible, false);
         self.record_end(passes);
     }
 
@@ -258,7 +258,7 @@ impl KernelBench {
         view.draw(passes, &self.draw);
         view.compare(
             passes,
-            &self.learn,
+            &self.train,
             &Target {
                 image: &self.image,
                 depth: &self.depth,
@@ -271,7 +271,7 @@ impl KernelBench {
     }
 
     fn record_end(&self, passes: &mut Passes) {
-        passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
+        passes.dispatch(&self.gpu, &self.train.advance, 1, &[("status", &self.status)]);
     }
 
     fn new_unordered(&self, overrides_of_update: &[(&str, f64)]) -> Result<Option<Unordered>, Error> {
@@ -376,8 +376,8 @@ mod tests {
             let sums: Vec<f32> = gpu.read(&unordered.sums, 12 * cloud.n_splats()).unwrap();
             assert!(sums.iter().all(|sum| *sum == 0.0), "the sums are reset to zero for the next step");
         } else {
-            let update = LearnPipelines::gradients_only(&gpu).unwrap();
-            view.backward(&mut passes, &bench.learn);
+            let update = TrainPipelines::gradients_only(&gpu).unwrap();
+            view.backward(&mut passes, &bench.train);
             view.update(&mut passes, &update, &bench.rule, true);
             passes.submit(&gpu);
         }

@@ -486,8 +486,8 @@ fn measure_640x480_keyframe() {
     eprintln!("{}", gpu.describe());
     let mut model = TsdfModel::new(gpu, options()).unwrap();
     let keyframe_at = |ix: i64| {
-        let turn = 0.02 * ix as f64 - 1.57;
-        let eye = Point3::new(1.6 * turn.cos(), 1.6 * turn.sin(), 0.9);
+        let angle = 0.02 * ix as f64 - 1.57;
+        let eye = Point3::new(1.6 * angle.cos(), 1.6 * angle.sin(), 0.9);
         Arc::new(scenes::large_keyframe(ix, &shapes, scenes::look_at(eye, Point3::new(0.0, 0.3, 0.3))))
     };
     for ix in 0..8 {

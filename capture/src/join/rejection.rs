@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 /// Why an image did not become a keyframe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Refusal {
+pub enum Rejection {
     /// The rig file has no camera of this name.
     UnknownCamera,
     /// Too many images waited for joint states.
@@ -31,7 +31,7 @@ pub enum Refusal {
     NotSharp,
 }
 
-impl Refusal {
+impl Rejection {
     /// The key in reports and protocols.
     pub fn name(self) -> &'static str {
         match self {
@@ -50,7 +50,7 @@ impl Refusal {
     }
 }
 
-impl std::fmt::Display for Refusal {
+impl std::fmt::Display for Rejection {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::UnknownCamera => "camera not in the rig file",
@@ -82,15 +82,15 @@ pub struct Counts {
     /// Images dropped by devices or queues before the join.
     pub device_skipped: u64,
     /// Joint readings that were out of order, not finite, or of another arm.
-    pub joints_refused: u64,
+    pub joints_rejected: u64,
     /// Base poses that were out of order or not finite.
-    pub base_poses_refused: u64,
+    pub base_poses_rejected: u64,
     /// Range scans transformed to the world frame.
     pub range_scans: u64,
     /// Range scans without base poses, of unknown scanners, or dropped because too many were waiting.
-    pub range_scans_refused: u64,
-    /// Images refused, by reason.
-    pub refused: BTreeMap<Refusal, u64>,
+    pub range_scans_rejected: u64,
+    /// Images rejected, by reason.
+    pub rejected: BTreeMap<Rejection, u64>,
     /// Cameras that sent images but are not in the rig file.
     pub unknown_cameras: BTreeSet<Arc<str>>,
 }
@@ -102,7 +102,7 @@ pub enum SampleUse {
     Recorded,
     /// The samples are only processed. A live image that comes too fast is replaced by the next; in a replay, drops by
     /// devices were reported when the recording was made.
-    Watched,
+    ProcessedOnly,
 }
 
 impl Counts {
@@ -112,14 +112,14 @@ impl Counts {
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {
             data_losses.push(dropped_by_devices(self.device_skipped));
         }
-        if let Some(n_undecodable) = self.refused.get(&Refusal::Undecodable) {
+        if let Some(n_undecodable) = self.rejected.get(&Rejection::Undecodable) {
             data_losses.push(format!("{} did not decode", counted(*n_undecodable, "image")));
         }
         data_losses
     }
 
-    pub(super) fn refuse(&mut self, why: Refusal) {
-        *self.refused.entry(why).or_default() += 1;
+    pub(super) fn reject(&mut self, why: Rejection) {
+        *self.rejected.entry(why).or_default() += 1;
     }
 }
 
@@ -132,17 +132,17 @@ fn dropped_by_devices(n_images: u64) -> String {
 impl std::fmt::Display for Counts {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{} of {}", counted(self.accepted, "keyframe"), counted(self.images, "image"))?;
-        for (why, n) in &self.refused {
+        for (why, n) in &self.rejected {
             write!(f, "; {n} {why}")?;
         }
         let rest = [
             (self.evicted, "evicted from the full store"),
             (self.without_depth, "without depth"),
             (self.device_skipped, "dropped by devices"),
-            (self.joints_refused, "joint states refused"),
-            (self.base_poses_refused, "base poses refused"),
+            (self.joints_rejected, "joint states rejected"),
+            (self.base_poses_rejected, "base poses rejected"),
             (self.range_scans, "range scans transformed"),
-            (self.range_scans_refused, "range scans refused"),
+            (self.range_scans_rejected, "range scans rejected"),
         ];
         for (n, what) in rest {
             if n > 0 {
@@ -160,18 +160,18 @@ mod tests {
     #[test]
     fn dropped_images_are_counted_once() {
         let mut counts = Counts { device_skipped: 2, ..Counts::default() };
-        counts.refuse(Refusal::Undecodable);
-        counts.refuse(Refusal::NotMoved);
+        counts.reject(Rejection::Undecodable);
+        counts.reject(Rejection::NotMoved);
         assert_eq!(counts.data_losses(SampleUse::Recorded).len(), 2);
-        assert_eq!(counts.data_losses(SampleUse::Watched), ["1 image did not decode"]);
+        assert_eq!(counts.data_losses(SampleUse::ProcessedOnly), ["1 image did not decode"]);
     }
 
     #[test]
     fn summary_lists_only_nonzero_counts() {
         let mut counts = Counts { images: 9, accepted: 4, device_skipped: 2, ..Counts::default() };
-        counts.refuse(Refusal::NotMoved);
-        counts.refuse(Refusal::NotMoved);
-        counts.refuse(Refusal::Blur);
+        counts.reject(Rejection::NotMoved);
+        counts.reject(Rejection::NotMoved);
+        counts.reject(Rejection::Blur);
         assert_eq!(counts.to_string(), "4 keyframes of 9 images; 2 not moved; 1 motion blur; 2 dropped by devices");
     }
 }

@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 
 /// One posed photo on disk.
 #[derive(Clone, Debug, PartialEq)]
-pub struct DatasetFrame {
+pub struct DatasetImage {
     /// Name in the dataset, usually the path of the image inside the folder.
     pub name: String,
     /// Lens parameters of the color image at its original size.
     pub intrinsics: Intrinsics,
     /// Pose at `stamp`.
     pub world_from_camera: Transform,
-    /// When the photo was taken. If the dataset has no times, frames are 1 ms apart in the order of their names.
+    /// When the photo was taken. If the dataset has no times, images are 1 ms apart in the order of their names.
     pub stamp: Stamp,
     /// The color image.
     pub image_path: PathBuf,
@@ -36,15 +36,15 @@ pub struct DepthFile {
     pub world_from_camera: Transform,
 }
 
-/// The decoded files of one frame.
+/// The decoded files of one image.
 #[derive(Clone, Debug, PartialEq)]
-pub struct FrameImages {
+pub struct LoadedImage {
     /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha of the photo
     /// excludes, else 255.
     pub rgba_srgb: Vec<u8>,
     /// Depth, still distorted.
     pub depth: Option<DepthImage>,
-    /// Why depth is missing although the frame has a depth file.
+    /// Why depth is missing although the image has a depth file.
     pub depth_error: Option<String>,
 }
 
@@ -57,9 +57,9 @@ pub struct DepthImage {
     pub depth_m: Vec<f32>,
 }
 
-impl DatasetFrame {
-    /// Decodes the files of this frame. If only the depth image fails to decode, the photo is still returned.
-    pub fn load(&self) -> Result<FrameImages, Error> {
+impl DatasetImage {
+    /// Decodes the files of this image. If only the depth image fails to decode, the photo is still returned.
+    pub fn load(&self) -> Result<LoadedImage, Error> {
         let mut rgba = decode_file(&self.image_path)?.into_rgba8();
         self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
         for pixel in rgba.pixels_mut() {
@@ -77,7 +77,7 @@ impl DatasetFrame {
             Some(Ok(depth)) => (Some(depth), None),
             None => (None, None),
         };
-        Ok(FrameImages { rgba_srgb: rgba.into_raw(), depth, depth_error })
+        Ok(LoadedImage { rgba_srgb: rgba.into_raw(), depth, depth_error })
     }
 
     fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
