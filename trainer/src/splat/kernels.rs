@@ -20,10 +20,7 @@ const PROJECTION: Source = source!("projection");
 const GRADIENT: Source = source!("gradient");
 const TILES: Source = source!("tiles");
 const BINS: Source = source!("bins");
-const GRADIENT_SLOTS: Source = source!("gradients", "gradients_slots");
-const GRADIENT_SUM: Source = source!("gradient_sum", "gradient_sum_slots");
 const SHARED: &[Source] = &[
-    GRADIENT_SUM,
     VIEW,
     STATUS,
     MODEL,
@@ -57,7 +54,7 @@ const LOSS_STRIPS: &[Source] = &[
 ];
 /// Imports of `update`.
 macro_rules! update_sources {
-    ($gradient_sum:expr, $camera_sums:literal) => {
+    ($camera_sums:literal) => {
         &[
             VIEW,
             STATUS,
@@ -66,16 +63,12 @@ macro_rules! update_sources {
             source!("sh"),
             GRADIENT,
             source!("random"),
-            $gradient_sum,
             source!("camera_sums", $camera_sums),
         ]
     };
 }
 /// Imports of `update` if camera parameters are optimized, too.
-const WITH_CAMERA: &[Source] = update_sources!(GRADIENT_SUM, "camera_sums_tree");
-/// Imports of `update` if gradients are summed in any order.
-const UPDATE_UNORDERED: &[Source] =
-    update_sources!(source!("gradient_sum", "gradient_sum_unordered"), "camera_sums_none");
+const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
 /// Imports of the kernels over pixels.
 macro_rules! blend_sources {
@@ -86,37 +79,11 @@ macro_rules! blend_sources {
         ]
     };
 }
-const BLEND: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_subgroup")
-);
-const BLEND_BY_MEMORY: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_memory")
-);
-const BLEND_STRIPS: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_4"),
-    source!("strips"),
-    source!("lane_sums", "lane_sums_tree")
-);
-/// Imports of both variants of `backward` if gradients are summed in any order.
-const BACKWARD_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_unordered"),
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_unordered")
-);
-const BACKWARD_STRIPS_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_unordered"),
-    source!("pixels", "pixels_4"),
-    source!("strips"),
-    source!("lane_sums", "lane_sums_unordered")
-);
+const BLEND: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_subgroup"));
+const BLEND_BY_MEMORY: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_memory"));
+const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -186,11 +153,8 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("backward", BLEND),
     kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
-    kernel!("backward", BACKWARD_UNORDERED),
-    kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED),
     kernel!("update"),
     kernel!("update", WITH_CAMERA),
-    kernel!("update", UPDATE_UNORDERED),
     kernel!("correct_view"),
     kernel!("refine_camera"),
     kernel!("advance"),
@@ -314,31 +278,6 @@ impl LearnPipelines {
     #[cfg(test)]
     pub(crate) fn camera_gradients_only(gpu: &Gpu) -> Result<Pipeline, Error> {
         Pipeline::new(gpu, kernel!("refine_camera"), &[("GRADIENTS_ONLY", 1.0)])
-    }
-}
-
-/// Pipelines of a step that sums gradients by atomic additions and `subgroupAdd`, in any order. They are used only in
-/// benchmarks, to measure the cost of a fixed order.
-#[derive(Debug)]
-pub(crate) struct UnorderedPipelines {
-    pub(crate) backward: Pipeline,
-    pub(crate) update: Pipeline,
-}
-
-impl UnorderedPipelines {
-    /// Compiles the pipelines. Returns `None` if the adapter lacks atomic additions of floats or suitable subgroups,
-    /// or if float atomics were not requested.
-    pub(crate) fn new(gpu: &Gpu, overrides_of_update: &[(&str, f64)]) -> Result<Option<Self>, Error> {
-        let backward = match gpu.optional().subgroup_lanes {
-            _ if !gpu.optional().float_atomics => return Ok(None),
-            Some(8) => Pipeline::new(gpu, kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED), &[])?,
-            Some(lanes) if (16..=128).contains(&lanes) => {
-                Pipeline::new(gpu, kernel!("backward", BACKWARD_UNORDERED), &[("SUBGROUP", f64::from(lanes))])?
-            }
-            _ => return Ok(None),
-        };
-        let update = Pipeline::new(gpu, kernel!("update", UPDATE_UNORDERED), overrides_of_update)?;
-        Ok(Some(Self { backward, update }))
     }
 }
 
