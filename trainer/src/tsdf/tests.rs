@@ -3,10 +3,11 @@
 
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
-use crate::gpu::{Gpu, GpuOptions};
+use crate::gpu::{Gpu, GpuOptions, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
 use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
 use keyframe::Keyframe;
+use kinematics::random::Random;
 use kinematics::{Stamp, Transform};
 use nalgebra::{Point3, Vector3};
 use std::sync::Arc;
@@ -452,11 +453,8 @@ fn voxel_size_follows_pixel_size_and_noise() {
     assert!((chosen_grid.voxel_m - 2.0 / 89.0).abs() < 1e-3, "{chosen_grid:?}");
     assert!(chosen_grid.noise_per_m2 < 1e-6);
     let mut noisy = depth.clone();
-    let mut state = 1_u64;
-    let mut uniform = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 40) as f32 / (1u64 << 24) as f32 - 0.5
-    };
+    let mut random = Random::new(1);
+    let mut uniform = || f32_of(random.uniform(-0.5, 0.5));
     noisy.depth_m =
         noisy.depth_m.iter().map(|z| z + 0.08 * (0..4).map(|_| uniform()).sum::<f32>()).collect::<Vec<_>>().into();
     // The sum of four uniform numbers has a standard deviation of 1 / sqrt(3).
