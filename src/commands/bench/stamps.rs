@@ -2,9 +2,9 @@
 //! jitter.
 
 use crate::bench::page::{Findings, Table};
-use crate::bench::statistics::{median, quantile};
 use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::exit::{BadArgument, Exit};
+use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
 use serde::Serialize;
@@ -150,15 +150,14 @@ impl StampErrors {
         }
         let median_millis = median(errors).unwrap_or(f64::NAN);
         let mut sizes: Vec<f64> = errors.iter().map(|error| error.abs()).collect();
-        sizes.sort_by(f64::total_cmp);
         Self {
             rate_hz,
             is_calibrated,
             images: n,
-            within_1_ms_frac: sizes.partition_point(|size| *size <= MAX_ERROR_MILLIS) as f64 / n as f64,
+            within_1_ms_frac: sizes.iter().filter(|size| **size <= MAX_ERROR_MILLIS).count() as f64 / n as f64,
             median_millis,
-            p99_abs_millis: quantile(&sizes, 0.99).unwrap_or(f64::NAN),
-            max_abs_millis: quantile(&sizes, 1.0).unwrap_or(f64::NAN),
+            p99_abs_millis: quantile(&mut sizes, 0.99, Rank::Lower).unwrap_or(f64::NAN),
+            max_abs_millis: quantile(&mut sizes, 1.0, Rank::Lower).unwrap_or(f64::NAN),
             bars,
         }
     }

@@ -11,6 +11,7 @@ use super::passes::{Target, ViewPasses};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use kinematics::Transform;
+use kinematics::quantile::{Rank, quantile};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -277,8 +278,8 @@ impl KernelBench {
             let span = passes.submit_timed_total(&self.gpu)?;
             spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
         }
-        spans.sort_by(f64::total_cmp);
-        Ok((spans[spans.len() / 2], consecutive_millis))
+        let median = quantile(&mut spans, 0.5, Rank::Upper).unwrap_or(f64::NAN);
+        Ok((median, consecutive_millis))
     }
 
     fn counters(&self) -> Result<Vec<u32>, Error> {
