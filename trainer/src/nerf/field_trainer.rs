@@ -553,7 +553,8 @@ fn march_of(nerf_budget: NerfBudget) -> March {
         n_cells: nerf_budget.n_cells,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: [0; 3],
+        unused: 0,
+        unused_2: [0; 2],
     }
 }
 

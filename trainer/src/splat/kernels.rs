@@ -134,7 +134,8 @@ fn blend(gpu: &Gpu) -> Blend {
 }
 
 /// All kernels of this module, for validation.
-pub const KERNELS: &[Kernel] = &[
+#[cfg(test)]
+pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("project"),
     kernel!("count_bins"),
     kernel!("sum_bins"),
@@ -283,36 +284,14 @@ impl LearnPipelines {
 
 #[cfg(test)]
 mod tests {
-    use crate::gpu::{reflect, resolve};
-
-    /// Names and offsets of a struct's fields and its size in WGSL; checks that all kernels that use it agree.
-    fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
-        let layouts = super::KERNELS.iter().filter_map(|kernel| {
-            let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-            module.types.iter().find_map(|(_, found)| match &found.inner {
-                wgpu::naga::TypeInner::Struct { members, span } if found.name.as_deref() == Some(name) => {
-                    let fields = members.iter().map(|member| (member.name.clone().unwrap(), member.offset as usize));
-                    Some((fields.collect(), *span as usize))
-                }
-                _ => None,
-            })
-        });
-        let layouts: Vec<(Vec<_>, usize)> = layouts.collect();
-        assert!(layouts.iter().all(|layout| *layout == layouts[0]), "{name} differs between kernels: {layouts:?}");
-        layouts[0].clone()
-    }
-
-    macro_rules! assert_layout {
-        ($type:ident, [$($field:ident),*]) => {
-            let in_rust = vec![$((stringify!($field).to_owned(), std::mem::offset_of!($type, $field))),*];
-            assert_eq!((in_rust, size_of::<$type>()), layout_in_wgsl(stringify!($type)), stringify!($type));
-        };
-    }
+    use super::KERNELS;
+    use crate::gpu::testing::{assert_layout, assert_valid};
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {
         use crate::splat::params::{CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View};
         assert_layout!(
+            KERNELS,
             View,
             [
                 camera_row_0,
@@ -332,8 +311,9 @@ mod tests {
                 crop_max
             ]
         );
-        assert_layout!(Model, [n_splats, capacity, sh_degree, n_sh_rest]);
+        assert_layout!(KERNELS, Model, [n_splats, capacity, sh_degree, n_sh_rest]);
         assert_layout!(
+            KERNELS,
             Rule,
             [
                 mean_rate_m,
@@ -356,10 +336,19 @@ mod tests {
                 unused
             ]
         );
-        assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]);
-        assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]);
-        assert_layout!(Lens, [linear, angular, camera_params, image_params, unused]);
         assert_layout!(
+            KERNELS,
+            Supervision,
+            [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]
+        );
+        assert_layout!(
+            KERNELS,
+            Growth,
+            [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]
+        );
+        assert_layout!(KERNELS, Lens, [linear, angular, camera_params, image_params, unused]);
+        assert_layout!(
+            KERNELS,
             CameraRule,
             [
                 camera_mask,
@@ -372,21 +361,12 @@ mod tests {
                 image_decay
             ]
         );
-        assert_layout!(Capacity, [n_entries, n_slots, unused]);
-        assert_layout!(Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
+        assert_layout!(KERNELS, Capacity, [n_entries, n_slots, unused]);
+        assert_layout!(KERNELS, Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
     }
 
     #[test]
     fn every_kernel_is_valid() {
-        let kernels = super::KERNELS.iter().chain(crate::sort::KERNELS);
-        let invalid: Vec<String> = kernels
-            .filter_map(|kernel| {
-                resolve(kernel.source, kernel.shared)
-                    .and_then(|text| reflect(kernel.source.name, &text).map(|_| ()))
-                    .err()
-            })
-            .map(|error| error.to_string())
-            .collect();
-        assert!(invalid.is_empty(), "{}", invalid.join("\n"));
+        assert_valid(KERNELS);
     }
 }
