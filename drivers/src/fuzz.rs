@@ -10,7 +10,6 @@ mod dataset;
 pub(crate) mod input;
 mod messages;
 mod pixels;
-#[cfg(test)]
 mod recording;
 mod scratch;
 #[cfg(test)]
