@@ -9,10 +9,6 @@ use trainer::gpu::{Gpu, GpuOptions};
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
 /// and `no-matrices` only cooperative matrices.
 pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
-    open_gpu_with(GpuOptions::default())
-}
-
-pub(crate) fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
@@ -27,7 +23,8 @@ pub(crate) fn open_gpu_with(options: GpuOptions) -> anyhow::Result<Arc<Gpu>> {
     check_open_for_tests()?;
     // Lets tests exhaust GPU memory.
     let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
-    let gpu = Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..options })?;
+    let gpu =
+        Gpu::open(&GpuOptions { optional_features, matrices, memory_limit_bytes, adapter, ..GpuOptions::default() })?;
     if gpu.is_software() {
         allocator::keep_images_out_of_heaps();
     }

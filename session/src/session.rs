@@ -1,7 +1,6 @@
 //! A training session: one model with its keyframes, clock, evaluation schedule and reports.
 
 use keyframe::counted;
-use crate::bench::statistics::median;
 use crate::checkpoints::{Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
@@ -21,6 +20,7 @@ use calibration::CalibratedCamera;
 use calibration::TrialReport;
 use indicatif::ProgressBar;
 use keyframe::{DepthMap, Keyframe, Split};
+use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};

@@ -7,6 +7,7 @@ use crate::Error;
 use crate::error::Context;
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};
+use kinematics::quantile::{Rank, quantile};
 use kinematics::{Intrinsics, Undistortion};
 use std::sync::Arc;
 
@@ -109,14 +110,9 @@ pub(super) fn truth(truth: &TruthImage, intrinsics: &Intrinsics, undistorter: &U
 pub(super) fn median_depth_m(map: &DepthMap) -> Option<f64> {
     let width = map.size_px[0] as usize;
     let rows = map.depth_m.chunks(width.max(1)).step_by(8);
-    let mut valid_depths: Vec<f32> =
-        rows.flat_map(|row| row.iter().step_by(8).copied()).filter(|depth_m| *depth_m > 0.0).collect();
-    if valid_depths.is_empty() {
-        return None;
-    }
-    let middle_ix = valid_depths.len() / 2;
-    let (_, median, _) = valid_depths.select_nth_unstable_by(middle_ix, f32::total_cmp);
-    Some(f64::from(*median))
+    let mut valid_depths: Vec<f64> =
+        rows.flat_map(|row| row.iter().step_by(8).copied()).filter(|depth_m| *depth_m > 0.0).map(f64::from).collect();
+    quantile(&mut valid_depths, 0.5, Rank::Upper)
 }
 
 fn expect_size(image: &Image, intrinsics: &Intrinsics) -> Result<(), drivers::Error> {

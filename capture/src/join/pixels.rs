@@ -1,5 +1,7 @@
 //! Pixel statistics of an image: brightness, clipping, sharpness.
 
+use kinematics::quantile::{Rank, quantile};
+
 /// Approximate width of the reduced image. A common width makes sharpness comparable between cameras and averages out
 /// noise.
 const REDUCED_WIDTH: usize = 320;
@@ -122,9 +124,8 @@ impl SharpnessHistory {
             self.0.pop_front();
         }
         self.0.push_back(sharpness);
-        let mut sorted: Vec<f64> = self.0.iter().copied().collect();
-        sorted.sort_by(f64::total_cmp);
-        let median = sorted[sorted.len() / 2];
+        let mut latest: Vec<f64> = self.0.iter().copied().collect();
+        let median = quantile(&mut latest, 0.5, Rank::Upper).unwrap_or(0.0);
         if median > 0.0 { sharpness / median } else { 1.0 }
     }
 }

@@ -9,6 +9,7 @@ use drivers::wire::datagram::{Clock, DatagramHeader, PoseDatagram, ScanPart, enc
 use drivers::{RangePoint, Sample};
 use keyframe::Keyframe;
 use kinematics::Transform;
+use kinematics::quantile::median;
 use std::net::{SocketAddr, UdpSocket};
 use std::path::Path;
 use std::sync::Arc;
@@ -406,10 +407,7 @@ fn tag_corners_match_the_simulator() {
         }
     }
     // Medians, because corners of sides at grazing angles are unreliable.
-    let median = |mut numbers: Vec<f64>| {
-        numbers.sort_by(f64::total_cmp);
-        numbers[numbers.len() / 2]
-    };
+    let median = |numbers: Vec<f64>| median(&numbers).expect("corners");
     let along = |axis: usize| median(off_px.iter().map(|error_of| error_of[axis]).collect());
     let spread = median(off_px.iter().map(|[x, y]| x.hypot(*y)).collect());
     // Half a pixel would mean that corners are counted from the center of the first pixel.

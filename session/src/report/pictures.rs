@@ -6,12 +6,16 @@ use anyhow::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use keyframe::Keyframe;
+use kinematics::f32s_of;
+use kinematics::quantile::trimmed_range;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{Method, Picture};
 
 /// Maximum number of test images shown.
 const MAX_IMAGES: usize = 12;
+/// Fraction of the depths that are outside of the range of colors, at each end.
+const OUTSIDE_FRAC: f64 = 0.02;
 /// Maximum side of the image and the render.
 const MAX_SIDE_PX: u32 = 640;
 /// Maximum side of the error and depth pictures.
@@ -122,12 +126,9 @@ impl DepthPicture {
     /// `None` if nothing was drawn.
     fn of(picture: &Picture, size_px: [u32; 2]) -> anyhow::Result<Option<Self>> {
         let subsampled = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
-        let mut known: Vec<f32> = subsampled.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
-        if known.is_empty() {
-            return Ok(None);
-        }
-        known.sort_by(f32::total_cmp);
-        let range_m = [known[known.len() / 50], known[known.len() - 1 - known.len() / 50]];
+        let valid = subsampled.iter().copied().filter(|z| *z > 0.0 && z.is_finite());
+        let mut known: Vec<f64> = valid.map(f64::from).collect();
+        let Some(range_m) = trimmed_range(&mut known, OUTSIDE_FRAC).map(f32s_of) else { return Ok(None) };
         let span_m = (range_m[1] - range_m[0]).max(1e-6);
         let color = |z: f32| if z > 0.0 && z.is_finite() { turbo((z - range_m[0]) / span_m) } else { [0; 3] };
         let pixels: Vec<u8> = subsampled.into_iter().flat_map(color).collect();

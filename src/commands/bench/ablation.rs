@@ -2,12 +2,13 @@
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{median, sample_std};
+use crate::bench::statistics::sample_std;
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
 use crate::open_gpu::open_gpu;
 use crate::training;
+use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;

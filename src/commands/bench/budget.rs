@@ -2,12 +2,13 @@
 
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{db_per_doubling, extent, median};
+use crate::bench::statistics::{db_per_doubling, extent};
 use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
 use crate::open_gpu::open_gpu;
 use crate::training;
+use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;

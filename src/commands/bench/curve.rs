@@ -3,12 +3,13 @@
 use crate::bench::page::{Findings, Table};
 use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{extent, median, sample_std, secs_to};
+use crate::bench::statistics::{extent, sample_std, secs_to};
 use crate::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
 use crate::method::{ModelKind, ModelSpec};
 use crate::open_gpu::open_gpu;
 use crate::{evaluation_schedule, training};
+use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;

@@ -1,12 +1,11 @@
 //! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
-use crate::open_gpu::{open_gpu, open_gpu_with};
+use crate::open_gpu::open_gpu;
 use anyhow::Context;
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
-use trainer::gpu::GpuOptions;
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
@@ -79,8 +78,6 @@ struct Row {
     /// Step that updates only the visible splats.
     step_visible_millis: f64,
     n_visible: u64,
-    /// Step with unordered sums; null if the adapter has no atomic float addition.
-    step_unordered_millis: Option<f64>,
     render_wall_millis: f64,
     step_wall_millis: f64,
     mean_rgb: [f64; 3],
@@ -108,7 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (size_ix, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A new device for each row, so that the memory peak is that of the row.
-            let gpu = open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
+            let gpu = open_gpu()?;
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
@@ -137,7 +134,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 step_millis: figures.step_millis,
                 step_visible_millis: figures.step_visible_millis,
                 n_visible: figures.n_visible,
-                step_unordered_millis: figures.step_unordered_millis,
                 render_wall_millis: figures.render_wall_millis,
                 step_wall_millis: figures.step_wall_millis,
                 mean_rgb: figures.mean_rgb,
@@ -148,12 +144,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 writeln!(out, "{}", serde_json::to_string(&row)?)?;
                 continue;
             }
-            let unordered = row
-                .step_unordered_millis
-                .map_or("unordered sums: not supported".into(), |ms| format!("unordered sums {ms:.3} ms"));
             writeln!(
                 out,
-                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms; {unordered}), mean {:.5?}, peak {} MB",
+                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms), mean {:.5?}, peak {} MB",
                 row.size_px[0],
                 row.size_px[1],
                 row.n_splats,

@@ -3,6 +3,7 @@
 use keyframe::counted;
 use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
 use crate::bench::page::{Findings, Table};
+use crate::bench::statistics::extent;
 use crate::bench::viewer::Viewer;
 use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::commands::run::{self, Running};
@@ -11,6 +12,7 @@ use crate::print;
 use crate::run_folder::CreatedFolders;
 use anyhow::Context;
 use clap::Parser;
+use kinematics::quantile::{Rank, quantile};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -230,10 +232,9 @@ fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
         let mut mb: Vec<f64> =
             group.iter().filter_map(component.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
-        mb.sort_by(f64::total_cmp);
-        let (low, high) = (*mb.first()?, *mb.last()?);
+        let [low, high] = extent(&mb)?;
         let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
-        Some(Point { x, y: mb[mb.len() / 2], low, high })
+        Some(Point { x, y: quantile(&mut mb, 0.5, Rank::Upper)?, low, high })
     };
     let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
     Line {

@@ -3,7 +3,7 @@
 use crate::bench::disturb::Disturbance;
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{Interpolation, break_point, extent, median};
+use crate::bench::statistics::{Interpolation, break_point, extent};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
@@ -13,6 +13,7 @@ use crate::session::Limits;
 use crate::training;
 use anyhow::ensure;
 use keyframe::{Keyframe, Split};
+use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;

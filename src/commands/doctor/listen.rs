@@ -1,7 +1,6 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
-use crate::bench::statistics::quantile;
 use capture::config::BaseDriver;
 use capture::config::Rig;
 use capture::Join;
@@ -13,6 +12,7 @@ use capture::open::Opened;
 use capture::Stop;
 use drivers::{Sample, clock};
 use kinematics::Stamp;
+use kinematics::quantile::{Rank, quantile};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -69,13 +69,11 @@ impl Track {
 
     fn summarize(mut self, device: String, expected_hz: Option<f64>, is_simulated: bool) -> DeviceStatistics {
         let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
-        gaps.sort_by(f64::total_cmp);
-        self.latency_millis.sort_by(f64::total_cmp);
         let span_secs = match (self.stamps.first(), self.stamps.last()) {
             (Some(first), Some(last)) => last.secs_since(*first),
             _ => 0.0,
         };
-        let quantile_of = |sorted: &[f64], frac| quantile(sorted, frac).unwrap_or(0.0);
+        let quantile_of = |values: &mut [f64], frac| quantile(values, frac, Rank::Lower).unwrap_or(0.0);
         let n_gaps = self.stamps.len().saturating_sub(1);
         DeviceStatistics {
             device,
@@ -84,11 +82,11 @@ impl Track {
             expected_hz,
             dropped: self.dropped,
             latency: (!is_simulated).then(|| Latency {
-                latency_p50_millis: quantile_of(&self.latency_millis, 0.5),
-                latency_p99_millis: quantile_of(&self.latency_millis, 0.99),
-                latency_max_millis: quantile_of(&self.latency_millis, 1.0),
+                latency_p50_millis: quantile_of(&mut self.latency_millis, 0.5),
+                latency_p99_millis: quantile_of(&mut self.latency_millis, 0.99),
+                latency_max_millis: quantile_of(&mut self.latency_millis, 1.0),
             }),
-            gap_p99_millis: quantile_of(&gaps, 0.99),
+            gap_p99_millis: quantile_of(&mut gaps, 0.99),
         }
     }
 }

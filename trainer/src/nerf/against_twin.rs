@@ -3,8 +3,8 @@
 use super::buffers::{
     FieldBuffers, FieldGradients, FieldMoments, ImageParamBuffers, RaySlot, SampleBuffers, StepBuffers,
 };
-use super::kernels::{FieldPipelines, KERNELS, N_CHUNK, Widths};
-use super::params::{self, AdamRule, Batch, ImageParamRule, Level, RayLoss, Span};
+use super::kernels::{FieldPipelines, N_CHUNK, Widths};
+use super::params::{self, AdamRule, Batch, ImageParamRule, RayLoss, Span};
 use super::passes::FieldPasses;
 use super::reference::field::{Field, FieldGrad};
 use super::reference::network::Network;
@@ -12,7 +12,7 @@ use super::reference::pose::ImagePose;
 use super::reference::ray as reference;
 use super::reference::scene::{EMBEDDING_DIM, Ray, WEIGHTS, field, gradient, ray, samples};
 use super::reference::space::contract;
-use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of, reflect, resolve};
+use crate::gpu::{Buffer, Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
 use crate::optim::reference::{Adam, Moments};
 
@@ -525,29 +525,4 @@ fn saturated_gradients_are_counted_and_skipped() {
     let n_saturated = gpu.read::<u32>(&gradients.counts, 1).unwrap()[0];
     assert!(n_saturated > N_RAYS * 7 * 8, "only {n_saturated}");
     assert!(gpu.read::<i32>(&gradients.grid, 2 * twin.table.len()).unwrap().iter().all(|sum| *sum == 0));
-}
-
-#[test]
-fn kernels_validate_and_struct_layouts_match() {
-    for kernel in KERNELS {
-        let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-        for (_, found) in module.types.iter() {
-            let wgpu::naga::TypeInner::Struct { span, .. } = &found.inner else { continue };
-            let in_rust = match found.name.as_deref() {
-                Some("Batch") => size_of::<Batch>(),
-                Some("Ray") => size_of::<params::Ray>(),
-                Some("Span") => size_of::<Span>(),
-                Some("March") => size_of::<params::March>(),
-                Some("OccupancyUpdate") => size_of::<params::OccupancyUpdate>(),
-                Some("Backdrop") => size_of::<params::Backdrop>(),
-                Some("Level") => size_of::<Level>(),
-                Some("RayLoss") => size_of::<RayLoss>(),
-                Some("StepScale") => size_of::<params::StepScale>(),
-                Some("ImageParamRule") => size_of::<ImageParamRule>(),
-                Some("AdamRule") => size_of::<AdamRule>(),
-                _ => continue,
-            };
-            assert_eq!(*span as usize, in_rust, "{:?} in {}", found.name, kernel.source.name);
-        }
-    }
 }

@@ -10,13 +10,13 @@ use super::params::{
     RayLoss, image_params_of,
 };
 use super::passes::{Canvas, FieldPasses};
-use super::rays::{mix_hash, unit};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
 use crate::view::Camera;
 use crate::{Error, Picture};
 use calibration::{EMBEDDING_DIM, ParamSet};
+use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -133,7 +133,7 @@ impl FieldTrainer {
     /// (Glorot and Bengio 2010).
     fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
         let uniform = |stream: u64, ix: usize, bound: f64| {
-            f32_of(bound * (2.0 * unit(mix_hash(seed ^ mix_hash(stream << 40 | ix as u64))) - 1.0))
+            f32_of(bound * (2.0 * unit_from_bits(hash(seed ^ hash(stream << 40 | ix as u64))) - 1.0))
         };
         let n_numbers = 2 * self.field.n_entries as usize;
         let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE)).collect();
@@ -509,7 +509,7 @@ pub(crate) struct RayColor {
 
 /// A random background: the field must not use the background to explain the images.
 fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
-    [0, 1, 2].map(|ix| f32_of(unit(mix_hash(options.seed ^ mix_hash(step << 2 | ix)))))
+    [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.seed ^ hash(step << 2 | ix)))))
 }
 
 /// Parameters and optimizer state of the first images.
@@ -553,7 +553,8 @@ fn march_of(nerf_budget: NerfBudget) -> March {
         n_cells: nerf_budget.n_cells,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: [0; 3],
+        unused: 0,
+        unused_2: [0; 2],
     }
 }
 

@@ -149,7 +149,7 @@ fn growth_matches_the_twin() {
     for ix in [0, 255, 256, 699] {
         splats[ix].opacity_logit = -9.0; // Dead.
     }
-    let mut random = scene::Random::new(9);
+    let mut random = scene::F32Random::new(9);
     let errors: Vec<f32> = (0..N_BEFORE).map(|_| f32_of(random.uniform(0.0, 1.0).powi(8))).collect();
     let mut fixture = KernelFixture::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
     let gpu = fixture.gpu.clone();
@@ -202,7 +202,7 @@ fn growth_matches_the_twin() {
 fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
     const N_AFTER: u32 = 1_200_000; // A few of a million choices are rounded to dead splats.
-    let mut random = scene::Random::new(12);
+    let mut random = scene::F32Random::new(12);
     let n = N_BEFORE as usize;
     let is_dead: Vec<bool> = (0..n).map(|_| random.uniform(0.0, 1.0) < 0.5).collect();
     let arrays = SplatArrays {

@@ -1,7 +1,7 @@
 //! The stages of drawing and training, as lists of passes.
 
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, Ssim, TrainPipelines, UnorderedPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines, Ssim};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
@@ -259,14 +259,10 @@ impl ViewPasses<'_> {
 
     /// Propagates the gradients from the pixels to the intersections.
     pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
-        self.backward_into(passes, &pipelines.backward, &self.scratch.gradients);
-    }
-
-    fn backward_into(&self, passes: &mut Passes, backward: &Pipeline, gradients: &Buffer) {
         let Self { gpu, scratch, image_buffers, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
-            backward,
+            &pipelines.backward,
             u64::from(n_tiles(size_px)),
             &[
                 ("view", view),
@@ -278,7 +274,7 @@ impl ViewPasses<'_> {
                 ("upstream", &image_buffers.upstream),
                 ("pixel_totals", &image_buffers.pixel_totals),
                 ("last", &image_buffers.last),
-                ("gradients", gradients),
+                ("gradients", &scratch.gradients),
             ],
         );
     }
@@ -301,34 +297,11 @@ impl ViewPasses<'_> {
     /// Propagates the gradients from the intersections to the parameters and takes one optimizer step. Set `camera`
     /// if `update` is the kernel that also sums the gradients with respect to the camera.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
-        let mut buffers = vec![("slot_begins", &self.scratch.slot_begins), ("gradients", &self.scratch.gradients)];
-        if camera {
-            buffers.push(("camera_sums", &self.scratch.camera_sums));
-        }
-        self.update_from(passes, update, rule, buffers);
-    }
-
-    /// Runs `backward` and `update` with one sum of 12 f32 per splat, to which gradients are added in any order. The
-    /// sums must be zero before and are reset to zero afterwards.
-    pub(crate) fn backward_and_update_unordered(
-        &self,
-        passes: &mut Passes,
-        pipelines: &UnorderedPipelines,
-        rule: &Buffer,
-        sums: &Buffer,
-    ) {
-        self.backward_into(passes, &pipelines.backward, sums);
-        self.update_from(passes, &pipelines.update, rule, vec![("gradients", sums)]);
-    }
-
-    fn update_from<'b>(
-        &'b self,
-        passes: &mut Passes,
-        update: &Pipeline,
-        rule: &'b Buffer,
-        mut buffers: Vec<(&'b str, &'b Buffer)>,
-    ) {
         let Self { gpu, splats, scratch, status, view, .. } = *self;
+        let mut buffers = vec![("slot_begins", &scratch.slot_begins), ("gradients", &scratch.gradients)];
+        if camera {
+            buffers.push(("camera_sums", &scratch.camera_sums));
+        }
         buffers.extend([
             ("view", view),
             ("model", &splats.model),

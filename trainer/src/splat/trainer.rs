@@ -29,6 +29,7 @@ use calibration::{CalibratedCamera, CameraCorrection, ParamSet};
 use calibration::{CameraRefinement, Candidate, Trial};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use kinematics::quantile::{Rank, quantile};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -467,8 +468,7 @@ impl SplatTrainer {
         let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
         let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
         let mut depths: Vec<f64> = self.views.iter().filter_map(|view| view.median_depth_m).collect();
-        depths.sort_by(f64::total_cmp);
-        let median_depth_m = depths.get(depths.len() / 2).copied().unwrap_or(spread);
+        let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
         self.scene_size_m = (1.1 * spread).max(0.5 * median_depth_m).max(1e-3);
     }
 

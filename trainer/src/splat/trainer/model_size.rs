@@ -117,6 +117,7 @@ mod tests {
     use calibration::Candidate;
     use calibration::Trial;
     use keyframe::{Keyframe, Split};
+    use kinematics::random::Random;
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
@@ -194,12 +195,11 @@ mod tests {
     /// Adds noise of up to a quarter of the range to the images: no model can score much more than 21 dB on them.
     fn noisy(keyframes: &[Arc<Keyframe>]) -> Vec<Arc<Keyframe>> {
         let noisy = |keyframe: &Arc<Keyframe>| {
-            let mut state = keyframe.stamp.0.cast_unsigned();
+            let mut random = Random::new(keyframe.stamp.0.cast_unsigned());
             let mut rgba = keyframe.rgba_srgb.to_vec();
             for pixel in rgba.chunks_exact_mut(4) {
                 for color in &mut pixel[..3] {
-                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-                    let noise = i16::try_from((state >> 33) % 129).unwrap() - 64;
+                    let noise = i16::try_from(random.below(129)).unwrap() - 64;
                     *color = u8::try_from((i16::from(*color) + noise).clamp(0, 255)).unwrap();
                 }
             }

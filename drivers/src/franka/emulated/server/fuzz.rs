@@ -120,9 +120,9 @@ fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::fuzz::random::Random;
     use franka::wire::HeaderLayout;
     use franka::wire::robot::{v5, v10};
+    use kinematics::random::Random;
     use zerocopy::IntoBytes;
     use zerocopy::little_endian::{F64, U64};
 
@@ -199,7 +199,7 @@ pub(crate) mod tests {
 
     #[test]
     fn only_a_started_motion_moves_joints() {
-        let mut random = Random(4);
+        let mut random = Random::new(4);
         for version in crate::franka::fuzz::tests::VERSIONS {
             let records = example_traffic(version);
             let (first, last) = commanded(version, &records.concat());
