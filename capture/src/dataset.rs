@@ -134,7 +134,7 @@ fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Re
     let loaded = image.load()?;
     let in_image = || image.name.clone();
     let depth = loaded.depth.as_ref().zip(image.depth.as_ref()).map(|(depth, file)| {
-        crate::Result::Ok(DepthMap {
+        Ok::<_, crate::Error>(DepthMap {
             size_px: depth.intrinsics.size_px,
             focal_px: depth.intrinsics.focal_px,
             principal_px: depth.intrinsics.principal_px,

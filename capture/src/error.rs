@@ -86,8 +86,13 @@ from_other!(sim::Error);
 /// The message of an error followed by those of its causes, separated by colons.
 #[must_use]
 pub fn chain(error: &(dyn StdError + 'static)) -> String {
-    let messages = std::iter::successors(Some(error), |error| error.source()).map(ToString::to_string);
-    messages.collect::<Vec<_>>().join(": ")
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        text += &format!(": {error}");
+        cause = error.source();
+    }
+    text
 }
 
 /// Adds the operation that failed to an error.

@@ -215,7 +215,7 @@ impl Join {
     pub fn check_list(&self) -> Result<Option<String>, Error> {
         let Some(list) = &self.list else { return Ok(None) };
         let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
-        list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))
+        Ok(list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))?)
     }
 
     fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {

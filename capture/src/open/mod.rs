@@ -13,7 +13,7 @@ pub use real::franka_chain;
 pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use crate::error::{Context, bail};
+use crate::error::{Context, Error, bail, chain};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::{Live, Sample, Source};
 use kinematics::Chain;
@@ -192,7 +192,7 @@ struct RecordingSource {
 }
 
 impl Source for RecordingSource {
-    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+    fn next_sample(&mut self) -> Result<Option<Sample>, drivers::Error> {
         let sample = self.recording.next_sample()?;
         if sample.is_none()
             && let Some(damage) = self.recording.damage()

@@ -73,7 +73,7 @@ pub fn check_motion(rig: &Rig) -> crate::Result<()> {
         #[cfg(target_os = "linux")]
         ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
         #[cfg(target_os = "linux")]
-        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::msg)?),
+        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::Failed)?),
         _ => bail!("arms with this driver can only be read"),
     }
 }
@@ -107,7 +107,7 @@ fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn Movab
 #[cfg(target_os = "linux")]
 fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
     let path = &motion.odrive_endpoints;
-    let endpoints = || -> crate::Result<Endpoints> { Ok(Endpoints::parse(&std::fs::read_to_string(path)?)?) };
+    let endpoints = || Endpoints::parse(&std::fs::read_to_string(path)?).map_err(crate::Error::other);
     let odrive_endpoints = match path.as_str() {
         "" => None,
         _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
