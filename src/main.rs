@@ -2,45 +2,16 @@
 
 mod allocator;
 mod bench;
-mod camera_list;
-mod camera_path;
-mod chart;
-mod checkpoints;
+mod checkpoint_args;
 mod cli;
-mod clock;
 mod commands;
-mod corrected_rig;
-mod data;
-mod decisions;
-mod depth_from;
-mod evaluate;
-mod evaluation_schedule;
+mod console;
+mod data_args;
 mod exit;
-mod live;
-mod method;
-mod model_bounds;
-mod next_commands;
 mod open_gpu;
-mod pending_evaluation;
 mod print;
-mod recoveries;
-mod recovery;
-mod render_budget;
-mod replay;
-mod report;
-mod run_folder;
-mod scene_hint;
-mod session;
 mod signals;
-mod splat_file;
-mod stored_keyframes;
-#[cfg(test)]
-#[path = "../tests/common/test_data.rs"]
-mod test_data;
-mod time_slices;
-mod training;
 mod training_args;
-mod viewer;
 
 use clap::Parser;
 use std::process::ExitCode;

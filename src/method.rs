@@ -6,22 +6,22 @@ mod kind;
 pub(crate) use failed_model::FailedModel;
 pub(crate) use kind::ModelKind;
 
+use anyhow::Context;
+use calibration::CameraRefinement;
 use capture::config::Train;
+use crate::splat_file;
 use crate::exit::BadArgument;
 use crate::model_bounds::Bounds;
 use crate::run_folder::{expect_model, expect_one_model};
-use crate::splat_file;
-use anyhow::Context;
-use calibration::CameraRefinement;
 use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
+use trainer::{Aligned, Method, Restartable};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::nerf::{NerfModel, NerfOptions};
 use trainer::splat::{SplatOptions, SplatTrainer};
 use trainer::tsdf::{TsdfModel, TsdfOptions};
-use trainer::{Aligned, Method, Restartable};
 
 /// Names of kinds as prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
 pub(crate) fn describe(kinds: &[ModelKind]) -> String {
@@ -166,19 +166,4 @@ pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, needs_bounds: bool) 
     let method: Box<dyn Method> =
         Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer });
     Ok(LoadedModel { kind: ModelKind::Splat, method, bounds })
-}
-
-/// Trainer options from the settings in a rig file. `steps` is the number of steps if it is fixed in advance.
-pub(crate) fn options(train: &Train, steps: Option<u64>) -> Result<SplatOptions, BadArgument> {
-    let defaults = SplatOptions::default();
-    let max_splats = train.max_splats.unwrap_or(defaults.max_splats.into());
-    Ok(SplatOptions {
-        seed: train.seed,
-        max_splats: u32::try_from(max_splats)
-            .map_err(|_| BadArgument(format!("max_splats = {max_splats}: must be at most {}", u32::MAX)))?,
-        max_bytes: train.max_bytes,
-        sh_degree: train.sh_degree,
-        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
-        ..defaults
-    })
 }

@@ -1,6 +1,6 @@
 //! Bounds of most of a saved model, for the first view of a model without a list of cameras.
 
-use kinematics::quantile::{Rank, quantile};
+use kinematics::quantile::{quantile, Rank};
 use trainer::splat::arrays::SplatArrays;
 use trainer::tsdf::VoxelGrid;
 use trainer::tsdf::block::{BLOCK_EDGE, GridCoord};

@@ -2,8 +2,8 @@
 
 use anyhow::Context;
 use std::path::{Path, PathBuf};
-use trainer::splat::arrays::SplatArrays;
 use trainer::{ply, spz};
+use trainer::splat::arrays::SplatArrays;
 
 /// The file of splats in the folder of a model.
 const IN_FOLDER: &str = "splats.ply";

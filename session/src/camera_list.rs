@@ -2,26 +2,26 @@
 //! view from them.
 
 use crate::{camera_path, run_folder};
-use anyhow::Context;
+use crate::error::Context;
 use kinematics::Transform;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use viz::KeyframePose;
 
 /// Name of the file in the run folder.
-pub(crate) const FILE: &str = "cameras.json";
+pub const FILE: &str = "cameras.json";
 
 /// Pose and intrinsics of one keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct PosedCamera {
-    pub(crate) camera: String,
-    pub(crate) stamp_nanos: i64,
-    pub(crate) split: String,
-    pub(crate) size_px: [u32; 2],
-    pub(crate) focal_px: [f64; 2],
-    pub(crate) principal_px: [f64; 2],
+pub struct PosedCamera {
+    pub camera: String,
+    pub stamp_nanos: i64,
+    pub split: String,
+    pub size_px: [u32; 2],
+    pub focal_px: [f64; 2],
+    pub principal_px: [f64; 2],
     /// 4x4 matrix, row major.
-    pub(crate) world_from_camera: [f64; 16],
+    pub world_from_camera: [f64; 16],
 }
 
 #[derive(Serialize, Deserialize)]
@@ -30,13 +30,13 @@ struct File {
 }
 
 /// Writes the list, one camera per line.
-pub(crate) fn write(folder: &Path, cameras: &[PosedCamera]) -> anyhow::Result<()> {
+pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
     let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
     run_folder::write_atomic(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
 }
 
 /// Reads the list; `None` if the folder has none.
-pub(crate) fn read(folder: &Path) -> anyhow::Result<Option<Vec<KeyframePose>>> {
+pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
     let path = folder.join(FILE);
     let text = match std::fs::read_to_string(&path) {
         Ok(text) => text,
@@ -57,19 +57,19 @@ pub(crate) fn read(folder: &Path) -> anyhow::Result<Option<Vec<KeyframePose>>> {
             principal_px: camera.principal_px,
         })
     });
-    posed.collect::<anyhow::Result<_>>().map(Some)
+    posed.collect::<crate::Result<_>>().map(Some)
 }
 
 /// The 4x4 matrix of a pose, row major.
-pub(crate) fn row_major(pose: &Transform) -> [f64; 16] {
+pub fn row_major(pose: &Transform) -> [f64; 16] {
     let rows = pose.to_homogeneous().transpose();
     std::array::from_fn(|ix| rows[ix])
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use nalgebra::{Isometry3, Vector3};
+    use super::*;
 
     fn camera() -> PosedCamera {
         let pose = Isometry3::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));

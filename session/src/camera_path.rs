@@ -1,7 +1,7 @@
 //! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
-use crate::exit::BadArgument;
-use anyhow::{Context, ensure};
+use crate::Error;
+use crate::error::{ensure, Context};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use serde::Deserialize;
@@ -9,18 +9,18 @@ use std::path::Path;
 
 /// One viewpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct PathCamera {
-    pub(crate) world_from_camera: Transform,
+pub struct PathCamera {
+    pub world_from_camera: Transform,
     /// Vertical field of view in radians, if the path specifies it.
-    pub(crate) fov_y_rad: Option<f64>,
+    pub fov_y_rad: Option<f64>,
 }
 
 /// A camera path.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct CameraPath {
-    pub(crate) cameras: Vec<PathCamera>,
+pub struct CameraPath {
+    pub cameras: Vec<PathCamera>,
     /// Width and height of the pictures in pixels, if the path specifies them.
-    pub(crate) size_px: Option<[u32; 2]>,
+    pub size_px: Option<[u32; 2]>,
 }
 
 /// The only camera type that is supported in a path.
@@ -45,18 +45,18 @@ struct PathFileCamera {
 
 impl CameraPath {
     /// Reads a nerfstudio camera path and converts its cameras to the axes of [`kinematics::camera`].
-    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+    pub fn load(path: &Path) -> crate::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
         Self::parse(&text).with_context(|| format!("the nerfstudio camera path {}", path.display()))
     }
 
     /// A path with one viewpoint: 16 numbers, row major, `world_from_camera` with the axes of [`kinematics::camera`].
-    pub(crate) fn of_pose(numbers: &[f64]) -> Result<Self, BadArgument> {
-        let world_from_camera = rigid(numbers).map_err(|error| BadArgument(format!("--pose: {error}")))?;
+    pub fn of_pose(numbers: &[f64]) -> Result<Self, Error> {
+        let world_from_camera = rigid(numbers).map_err(|error| Error::BadInput(format!("--pose: {error}")))?;
         Ok(Self { cameras: vec![PathCamera { world_from_camera, fov_y_rad: None }], size_px: None })
     }
 
-    fn parse(text: &str) -> anyhow::Result<Self> {
+    fn parse(text: &str) -> crate::Result<Self> {
         let file: PathFile = serde_json::from_str(text)?;
         ensure!(!file.camera_path.is_empty(), "it contains no cameras");
         let camera_type = file.camera_type.as_deref().unwrap_or(PERSPECTIVE);
@@ -67,7 +67,7 @@ impl CameraPath {
         let camera = |(ix, camera): (usize, &PathFileCamera)| {
             let world_from_opengl = rigid(&camera.camera_to_world).with_context(|| format!("camera {ix}"))?;
             let opengl_from_camera = drivers::dataset::nerfstudio::opengl_from_camera();
-            anyhow::Ok(PathCamera {
+            Ok::<_, crate::Error>(PathCamera {
                 world_from_camera: world_from_opengl * opengl_from_camera,
                 fov_y_rad: camera.fov.map(f64::to_radians),
             })
@@ -80,7 +80,7 @@ impl CameraPath {
 }
 
 /// The rigid transform of a 4x4 matrix, row major.
-pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
+pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
     /// Files round to about six digits.
     const TOLERANCE: f64 = 1e-3;
     ensure!(numbers.len() == 16, "a pose has 16 numbers, got {}", numbers.len());
@@ -99,8 +99,8 @@ pub(crate) fn rigid(numbers: &[f64]) -> anyhow::Result<Transform> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use nalgebra::Point3;
+    use super::*;
 
     const IDENTITY: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 

@@ -1,9 +1,10 @@
 //! Checkpoints of a model in training: taken periodically and written on a separate thread.
 
-use crate::exit::BadArgument;
-use crate::run_folder::{CHECKPOINT, expect_one_model};
+use capture::chain;
+use crate::Error;
+use crate::error::Context;
+use crate::run_folder::{expect_one_model, CHECKPOINT};
 use crate::stored_keyframes::StoredKeyframes;
-use anyhow::Context;
 use keyframe::Keyframe;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -21,46 +22,50 @@ const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
 const CHECKPOINT_SECS: &str = "checkpoint-secs";
 
 /// How often checkpoints are written.
-#[derive(Clone, Copy, Debug, clap::Args)]
-pub(crate) struct CheckpointArgs {
-    /// Write a checkpoint for `--resume` every S seconds and at the end; 0: never [default: 60]
-    #[arg(long, value_name = "S", value_parser = secs)]
-    checkpoint_secs: Option<Duration>,
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CheckpointOptions {
+    /// Time between two checkpoints; zero: never; `None`: 60 s.
+    pub period: Option<Duration>,
 }
 
-impl CheckpointArgs {
+impl CheckpointOptions {
     /// The flag as it is stored in a checkpoint, if it was given.
-    pub(crate) fn flag(self) -> Option<(String, String)> {
-        Some((CHECKPOINT_SECS.to_owned(), self.checkpoint_secs?.as_secs_f64().to_string()))
+    pub fn flag(self) -> Option<(String, String)> {
+        Some((CHECKPOINT_SECS.to_owned(), self.period?.as_secs_f64().to_string()))
     }
 
     /// This flag, or the value of the earlier run if it was not given.
-    pub(crate) fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
-        let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| secs(text).ok());
-        Self { checkpoint_secs: self.checkpoint_secs.or_else(previous) }
+    pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
+        let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| parse_period(text).ok());
+        Self { period: self.period.or_else(previous) }
     }
 }
 
-fn secs(text: &str) -> Result<Duration, String> {
+/// Parses a number of seconds that is at least 0.
+///
+/// # Errors
+///
+/// If it is no such number.
+pub fn parse_period(text: &str) -> Result<Duration, String> {
     let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
     secs.ok_or_else(|| "expected a number of at least 0".to_owned())
 }
 
 /// Reads the checkpoint in a run folder.
-pub(crate) fn read(folder: &Path) -> anyhow::Result<Checkpoint> {
+pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
     expect_one_model(folder)?;
     Checkpoint::read(&folder.join(CHECKPOINT))
         .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))
 }
 
 /// Rejects a limit in seconds that earlier training has already reached.
-pub(crate) fn check_limit_not_passed(
+pub fn check_limit_not_passed(
     seconds: Option<f64>,
     checkpoint: &Checkpoint,
     subject: &str,
-) -> Result<(), BadArgument> {
+) -> Result<(), Error> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
-        Some(seconds) => Err(BadArgument(format!(
+        Some(seconds) => Err(Error::BadInput(format!(
             "--seconds {seconds}: {subject} has already been trained for {:.1} s, which count; give a larger limit",
             checkpoint.seconds
         ))),
@@ -70,15 +75,15 @@ pub(crate) fn check_limit_not_passed(
 
 /// What every checkpoint of a run contains in addition to the model state.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct RunFlags {
+pub struct RunFlags {
     /// SHA-256 of the model from which depth was rendered.
-    pub(crate) depth_from: Option<String>,
+    pub depth_from: Option<String>,
     /// Flags of the run that affect its keyframes, and its limits.
-    pub(crate) flags: BTreeMap<String, String>,
+    pub flags: BTreeMap<String, String>,
 }
 
 /// The checkpoints of one run. Each one replaces the previous one.
-pub(crate) struct Checkpoints {
+pub struct Checkpoints {
     path: PathBuf,
     run_flags: RunFlags,
     period: Duration,
@@ -95,26 +100,26 @@ pub(crate) struct Checkpoints {
 
 /// A writer thread.
 struct WriterThread {
-    thread: JoinHandle<anyhow::Result<()>>,
+    thread: JoinHandle<crate::Result<()>>,
     /// Whether it writes a checkpoint rather than only keyframes.
     is_checkpoint: bool,
 }
 
 /// A model in training, and the other contents of its checkpoint.
-pub(crate) struct Snapshot<'a> {
-    pub(crate) method: &'a mut dyn Method,
+pub struct Snapshot<'a> {
+    pub method: &'a mut dyn Method,
     /// All keyframes in the store, including test keyframes.
-    pub(crate) keyframes: &'a [Arc<Keyframe>],
+    pub keyframes: &'a [Arc<Keyframe>],
     /// Training time, seconds.
-    pub(crate) seconds: f64,
+    pub seconds: f64,
     /// Whether training has reached its limit.
-    pub(crate) is_finished: bool,
+    pub is_finished: bool,
 }
 
 impl Checkpoints {
     /// Returns `None` if checkpoints are disabled. The first one is due after one period.
-    pub(crate) fn new(folder: &Path, args: CheckpointArgs) -> Option<Self> {
-        let (period, path) = (args.checkpoint_secs.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
+    pub fn new(folder: &Path, options: CheckpointOptions) -> Option<Self> {
+        let (period, path) = (options.period.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
         (!period.is_zero()).then(|| Self {
             path,
             run_flags: RunFlags::default(),
@@ -129,25 +134,25 @@ impl Checkpoints {
     }
 
     /// Stores these flags in each checkpoint.
-    pub(crate) fn with_flags(self, run_flags: RunFlags) -> Self {
+    pub fn with_flags(self, run_flags: RunFlags) -> Self {
         Self { run_flags, ..self }
     }
 
     /// Also stores the keyframes, for a live run whose images exist nowhere else. The first checkpoint is due as soon
     /// as the first keyframes are written, because resuming needs both.
-    pub(crate) fn with_keyframes(self, run: &Path) -> Self {
+    pub fn with_keyframes(self, run: &Path) -> Self {
         let due_after = self.period.min(KEYFRAME_PERIOD);
         Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
     }
 
     /// Whether keyframes are stored too.
-    pub(crate) fn keeps_keyframes(&self) -> bool {
+    pub fn keeps_keyframes(&self) -> bool {
         self.stored_keyframes.is_some()
     }
 
     /// Starts a checkpoint if one is due and the previous one is complete; returns whether it did. Write errors are
     /// logged and do not stop training.
-    pub(crate) fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
+    pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
         if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
             return Ok(false);
         }
@@ -168,14 +173,14 @@ impl Checkpoints {
     }
 
     /// Starts a checkpoint of the current state once the one in progress is complete.
-    pub(crate) fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
+    pub fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
         let job = self.take(now)?;
         self.write(job);
         Ok(())
     }
 
     /// Copies the current state for writing later.
-    pub(crate) fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
+    pub fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
         self.wait_and_warn();
         let started = Instant::now();
         let pending = now.method.checkpoint()?;
@@ -191,7 +196,7 @@ impl Checkpoints {
     }
 
     /// Writes a copy on a separate thread.
-    pub(crate) fn write(&mut self, job: CheckpointWrite) {
+    pub fn write(&mut self, job: CheckpointWrite) {
         let thread = std::thread::spawn(move || job.write());
         self.writer = Some(WriterThread { thread, is_checkpoint: true });
         (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
@@ -204,23 +209,23 @@ impl Checkpoints {
             Ok(()) => {}
             Err(error) if is_checkpoint => {
                 let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
-                log::warn!("cannot write a checkpoint{previous}: {error:#}");
+                log::warn!("cannot write a checkpoint{previous}: {}", chain(&error));
             }
             // The next checkpoint stores them too, and warns if that fails.
-            Err(error) => log::debug!("cannot store keyframes: {error:#}"),
+            Err(error) => log::debug!("cannot store keyframes: {}", chain(&error)),
         }
     }
 
     /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one is used.
-    pub(crate) fn newest(&mut self) -> Option<&Path> {
+    pub fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
-            log::warn!("the checkpoint in progress failed: {error:#}");
+            log::warn!("the checkpoint in progress failed: {}", chain(&error));
         }
         self.has_any.then_some(&self.path)
     }
 
     /// Waits until the checkpoint in progress is on disk.
-    pub(crate) fn wait(&mut self) -> anyhow::Result<()> {
+    pub fn wait(&mut self) -> crate::Result<()> {
         let Some(WriterThread { thread, is_checkpoint }) = self.writer.take() else { return Ok(()) };
         match thread.join() {
             Ok(written) => {
@@ -234,7 +239,7 @@ impl Checkpoints {
 }
 
 /// A checkpoint that is ready to be written.
-pub(crate) struct CheckpointWrite {
+pub struct CheckpointWrite {
     pending: PendingCheckpoint,
     seconds: f64,
     is_finished: bool,
@@ -245,7 +250,7 @@ pub(crate) struct CheckpointWrite {
 
 impl CheckpointWrite {
     /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous checkpoint needed.
-    fn write(self) -> anyhow::Result<()> {
+    fn write(self) -> crate::Result<()> {
         let started = Instant::now();
         let RunFlags { depth_from, flags } = self.run_flags;
         if let Some((stored, keyframes)) = &self.keyframes {
@@ -267,27 +272,27 @@ mod tests {
 
     #[test]
     fn checkpoint_period_must_be_a_number() {
-        assert_eq!(secs("0"), Ok(Duration::ZERO));
-        assert_eq!(secs("0.5"), Ok(Duration::from_millis(500)));
+        assert_eq!(parse_period("0"), Ok(Duration::ZERO));
+        assert_eq!(parse_period("0.5"), Ok(Duration::from_millis(500)));
         for invalid in ["-1", "nan", "inf", "minute", ""] {
-            assert!(secs(invalid).is_err(), "{invalid}");
+            assert!(parse_period(invalid).is_err(), "{invalid}");
         }
     }
 
     #[test]
     fn resumed_run_keeps_the_checkpoint_period() {
         let [none, one, two] = [None, Some(1.0), Some(2.5)]
-            .map(|secs| CheckpointArgs { checkpoint_secs: secs.map(Duration::from_secs_f64) });
-        let flags = |args: CheckpointArgs| args.flag().into_iter().collect();
-        assert_eq!(none.or_previous(&flags(two)).checkpoint_secs, two.checkpoint_secs);
-        assert_eq!(one.or_previous(&flags(two)).checkpoint_secs, one.checkpoint_secs);
-        assert_eq!(none.or_previous(&flags(none)).checkpoint_secs, None);
+            .map(|secs| CheckpointOptions { period: secs.map(Duration::from_secs_f64) });
+        let flags = |options: CheckpointOptions| options.flag().into_iter().collect();
+        assert_eq!(none.or_previous(&flags(two)).period, two.period);
+        assert_eq!(one.or_previous(&flags(two)).period, one.period);
+        assert_eq!(none.or_previous(&flags(none)).period, None);
     }
 
     #[test]
     fn missing_checkpoint_error_names_the_folder() {
         let folder = tempfile::tempdir().expect("a folder");
-        let message = format!("{:#}", read(folder.path()).expect_err("none"));
+        let message = chain(&read(folder.path()).expect_err("none"));
         assert!(message.contains(folder.path().to_str().expect("plain")) && message.contains(CHECKPOINT), "{message}");
     }
 }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 /// Training time in seconds, excluding evaluation. Clones share the same time.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Clock(Rc<Cell<ClockState>>);
+pub struct Clock(Rc<Cell<ClockState>>);
 
 #[derive(Clone, Copy, Debug, Default)]
 struct ClockState {
@@ -18,29 +18,29 @@ struct ClockState {
 
 impl Clock {
     /// A clock that continues from the training time of earlier runs.
-    pub(crate) fn with_elapsed(previous_secs: f64) -> Self {
+    pub fn with_elapsed(previous_secs: f64) -> Self {
         Self(Rc::new(Cell::new(ClockState { previous_secs, ..ClockState::default() })))
     }
 
     /// Starts the clock unless it is already running.
-    pub(crate) fn start(&self, at: Instant) {
+    pub fn start(&self, at: Instant) {
         let state = self.0.get();
         self.0.set(ClockState { started: state.started.or(Some(at)), ..state });
     }
 
     /// Time at which the clock was started, if it was.
-    pub(crate) fn started(&self) -> Option<Instant> {
+    pub fn started(&self) -> Option<Instant> {
         self.0.get().started
     }
 
     /// Excludes time that was not spent on training.
-    pub(crate) fn exclude(&self, spent: Duration) {
+    pub fn exclude(&self, spent: Duration) {
         let state = self.0.get();
         self.0.set(ClockState { excluded: state.excluded + spent, ..state });
     }
 
     /// Seconds so far.
-    pub(crate) fn secs(&self) -> f64 {
+    pub fn secs(&self) -> f64 {
         let state = self.0.get();
         let of_this_run = |started: Instant| started.elapsed().saturating_sub(state.excluded).as_secs_f64();
         state.previous_secs + state.started.map_or(0.0, of_this_run)

@@ -1,12 +1,9 @@
 //! Writes the rig file with the calibration corrections that alignment found.
 
-use capture::config::Camera;
-use capture::config::Rig;
-use capture::config::TimeOffset;
-use crate::exit::BadArgument;
-use anyhow::Context;
-use calibration::CameraCorrection;
-use calibration::{Alignment, Estimate};
+use calibration::{Alignment, CameraCorrection, Estimate};
+use capture::config::{Camera, Rig, TimeOffset};
+use crate::Error;
+use crate::error::Context;
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
@@ -15,7 +12,7 @@ use std::path::{Path, PathBuf};
 const SOURCE: &str = "train --write-rig";
 
 /// The rig with all corrections applied. Per-image pose corrections have no key in a rig file and are left out.
-pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig> {
+pub fn corrected(rig: &Rig, alignment: &Alignment) -> crate::Result<Rig> {
     let mut rig = rig.clone();
     for camera in &mut rig.cameras {
         if let Some(correction) = alignment.corrections.get(&*camera.name) {
@@ -35,13 +32,13 @@ pub(crate) fn corrected(rig: &Rig, alignment: &Alignment) -> anyhow::Result<Rig>
 }
 
 /// Checks that the rig file can be written there.
-pub(crate) fn check_target_file(rig: &Rig, file: &Path) -> Result<(), BadArgument> {
+pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
     let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if !folder.is_dir() || file.is_dir() {
-        return Err(BadArgument(format!("--write-rig {}: must be a file in an existing folder", file.display())));
+        return Err(Error::BadInput(format!("--write-rig {}: must be a file in an existing folder", file.display())));
     }
     match other_robot(rig, file) {
-        Some(urdf) => Err(BadArgument(format!(
+        Some(urdf) => Err(Error::BadInput(format!(
             "--write-rig {}: {} is the URDF of another robot; write the rig file to a separate folder",
             file.display(),
             urdf.display()
@@ -58,7 +55,7 @@ fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
 }
 
 /// Writes a rig file and the robot's URDF next to it. Does not overwrite the URDF of another robot.
-pub(crate) fn write(rig: &Rig, file: &Path) -> anyhow::Result<()> {
+pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
     check_target_file(rig, file)?;
     let urdf = file.with_file_name(drivers::recording::URDF_FILE);
     let in_file = || format!("cannot write {}", file.display());
@@ -111,9 +108,9 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use calibration::ScalarEstimate;
     use std::collections::BTreeMap;
+    use super::*;
 
     const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
 

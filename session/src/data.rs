@@ -1,59 +1,43 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
-use keyframe::counted;
-use capture::config::Override;
-use capture::config::Rig;
-use capture::dataset;
+use capture::{dataset, downscale, Join, JoinEvent, SampleUse, StationReport, Stations};
+use capture::config::{Override, Rig};
+use capture::open::{self, Opened};
+use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
-use crate::exit::{BadArgument, InsufficientData};
-use keyframe::Holdout;
-use capture::Join;
-use capture::JoinEvent;
-use keyframe::KeyframeList;
-use capture::SampleUse;
-use crate::method::ModelKind;
-use capture::open;
-use capture::open::Opened;
+use crate::error::ensure;
+use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::is_recording;
-use capture::StationReport;
-use capture::Stations;
-use crate::print;
-use capture::downscale;
-use anyhow::ensure;
-use keyframe::{Keyframe, Split};
+use crate::train_settings::methods_of;
+use keyframe::{counted, Holdout, Keyframe, KeyframeList, Split};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::ModelKind;
 use trainer::gpu::Gpu;
 
 /// Which images are used, and for what.
-#[derive(Clone, Debug, clap::Args)]
-pub(crate) struct DataArgs {
-    /// Use every N-th image for testing, or the images listed in a file, one per line; with 1, eval scores all
-    /// [default: 8]
-    #[arg(long, value_name = "N|FILE")]
-    pub(crate) holdout: Option<String>,
-    /// Use exactly the keyframes listed by an earlier run (keyframes.txt)
-    #[arg(long, value_name = "FILE", conflicts_with = "holdout")]
-    pub(crate) keyframes: Option<PathBuf>,
-    /// Read a recording with this rig file instead of the one stored in it
-    #[arg(long, value_name = "FILE")]
-    pub(crate) rig: Option<PathBuf>,
-    /// Scale the images (not their depth) to this fraction of their width and height, 0.05 to 1 [default: the rig
-    /// file's, else 1]
-    #[arg(long, value_name = "SHARE", value_parser = downscale::parse_scale)]
-    pub(crate) scale: Option<f64>,
+#[derive(Clone, Debug, Default)]
+pub struct DataOptions {
+    /// Use every n-th image for testing, or the images listed in this file; every 8th if `None`.
+    pub holdout: Option<String>,
+    /// Use exactly the keyframes of this list.
+    pub keyframes: Option<PathBuf>,
+    /// Read a recording with this rig file instead of the one stored in it.
+    pub rig: Option<PathBuf>,
+    /// Scale the images (not their depth) to this fraction of their width and height.
+    pub scale: Option<f64>,
 }
 
-impl DataArgs {
+impl DataOptions {
     /// The test images selected by `--holdout`, if it is given.
-    pub(crate) fn holdout(&self) -> Result<Option<Holdout>, BadArgument> {
+    pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
         self.holdout.as_deref().map(Holdout::from_argument).transpose()
     }
 
     /// The given flags that affect keyframes: names and values, with absolute paths for files.
-    pub(crate) fn flags(&self) -> BTreeMap<String, String> {
+    pub fn flags(&self) -> BTreeMap<String, String> {
         let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
         let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
         let given = [
@@ -66,7 +50,7 @@ impl DataArgs {
     }
 
     /// The flags that affect the pixels of listed keyframes, as command-line arguments.
-    pub(crate) fn flags_of_images(&self) -> Vec<String> {
+    pub fn flags_of_images(&self) -> Vec<String> {
         let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
         let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);
         rig.into_iter().chain(scale).flatten().collect()
@@ -76,19 +60,19 @@ impl DataArgs {
     /// is accepted, because it may have moved; its contents are compared later.
     ///
     /// `subject`: name of the earlier result for messages.
-    pub(crate) fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, BadArgument> {
+    pub fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, Error> {
         let now = self.flags();
         for (name, value) in before {
             let is_other = |now: &String| now != value && is_number(now) && is_number(value);
             if let Some(now) = now.get(name).filter(|now| is_other(now)) {
-                return Err(BadArgument(format!("--{name} {now}: {subject} was trained with --{name} {value}")));
+                return Err(Error::BadInput(format!("--{name} {now}: {subject} was trained with --{name} {value}")));
             }
         }
         let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
         // Both flags select images, so either one replaces both.
         let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
         let scale = unset_flag("scale").map(|scale| scale.parse());
-        let scale = scale.transpose().map_err(|_| BadArgument(format!("{subject}: its scale is not a number")))?;
+        let scale = scale.transpose().map_err(|_| Error::BadInput(format!("{subject}: its scale is not a number")))?;
         let restored = Self {
             holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
             keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
@@ -113,28 +97,28 @@ fn is_number(text: &str) -> bool {
 }
 
 /// Loaded keyframes and their metadata.
-pub(crate) struct Data {
+pub struct Data {
     /// In the order of the data.
-    pub(crate) keyframes: Vec<Arc<Keyframe>>,
+    pub keyframes: Vec<Arc<Keyframe>>,
     /// Names of the images, in the same order.
-    pub(crate) names: Vec<String>,
+    pub names: Vec<String>,
     /// The rig of the recording; `None` for a folder.
-    pub(crate) rig: Option<Rig>,
+    pub rig: Option<Rig>,
     /// Whether the stamps are times rather than image indices.
-    pub(crate) has_times: bool,
+    pub has_times: bool,
     /// Data that could not be read. If there are any, the exit code is 3.
-    pub(crate) data_losses: Vec<String>,
+    pub data_losses: Vec<String>,
     /// The correction of the base pose at each station after the first.
-    pub(crate) stations: Vec<StationReport>,
+    pub stations: Vec<StationReport>,
     /// Depth that was rendered from a model for images without depth.
-    pub(crate) rendered_depth: Option<RenderedDepth>,
+    pub rendered_depth: Option<RenderedDepth>,
     /// Time spent on station registration and depth rendering, which precede training but count as training time.
-    pub(crate) preparation_time: Duration,
+    pub preparation_time: Duration,
 }
 
 /// What the data are used for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Purpose {
+pub enum Purpose {
     /// Needs at least one training image.
     Training,
     /// Needs at least one test image.
@@ -154,13 +138,13 @@ struct DataSelection {
 
 impl Data {
     /// Reads a folder, or a recording through the join.
-    pub(crate) fn load(
+    pub fn load(
         path: &Path,
-        args: &DataArgs,
+        args: &DataOptions,
         purpose: Purpose,
         overrides: &[Override],
-        quiet: bool,
-    ) -> anyhow::Result<Self> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
         let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
         let holdout = args.holdout()?;
         Self::load_selected(
@@ -168,22 +152,22 @@ impl Data {
             DataSelection { list, holdout, scale: args.scale, rig: args.rig.clone(), use_reported_poses: false },
             purpose,
             overrides,
-            quiet,
+            progress,
         )
     }
 
     /// Reads the keyframes of a list, with images scaled to this fraction of their size and base poses as reported.
-    pub(crate) fn of_list(
+    pub fn of_list(
         path: &Path,
         list: KeyframeList,
         rig: Option<PathBuf>,
         scale: f64,
         overrides: &[Override],
-        quiet: bool,
-    ) -> anyhow::Result<Self> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
         let selection =
             DataSelection { list: Some(list), holdout: None, scale: Some(scale), rig, use_reported_poses: true };
-        Self::load_selected(path, selection, Purpose::Training, overrides, quiet)
+        Self::load_selected(path, selection, Purpose::Training, overrides, progress)
     }
 
     fn load_selected(
@@ -191,8 +175,8 @@ impl Data {
         selection: DataSelection,
         purpose: Purpose,
         overrides: &[Override],
-        quiet: bool,
-    ) -> anyhow::Result<Self> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
         let DataSelection { list, holdout, scale, rig, use_reported_poses } = selection;
         expect(path)?;
         let is_recording = is_recording(path);
@@ -200,11 +184,11 @@ impl Data {
             let scale = scale.map(|scale| Override::new("train.scale", scale));
             let overrides: Vec<Override> = overrides.iter().cloned().chain(scale).collect();
             let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
-            Self::from_recording(path, rig, list, overrides, quiet)?
+            Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
-            return Err(BadArgument(format!("--rig {}: only recordings take a rig file", rig.display())).into());
+            return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())).into());
         } else {
-            Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, quiet)?
+            Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, progress)?
         };
         if let (true, Some(holdout)) = (is_recording, &holdout) {
             data.assign_splits(holdout)?;
@@ -218,43 +202,43 @@ impl Data {
         };
         if data.of_split(required_split).is_empty() {
             let n_images = counted(data.keyframes.len() as u64, "image");
-            return Err(InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
+            return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
         }
         Ok(data)
     }
 
     /// The rig with which a recording is read, before flags override it.
-    pub(crate) fn rig_as_given(path: &Path, args: &DataArgs) -> anyhow::Result<Rig> {
+    pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
         let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
         Ok(open::recording(path, rig, &[])?.rig)
     }
 
     /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
-    pub(crate) fn default_methods(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<ModelKind>> {
+    pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
         expect(path)?;
-        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![ModelKind::Splat] })
+        if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::Splat]) }
     }
 
     /// Keyframes of one split.
-    pub(crate) fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
+    pub fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
         self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
     }
 
     /// Names of the images by camera and stamp.
-    pub(crate) fn image_names(&self) -> BTreeMap<(String, i64), String> {
+    pub fn image_names(&self) -> BTreeMap<(String, i64), String> {
         let key = |keyframe: &Arc<Keyframe>| (keyframe.camera.to_string(), keyframe.stamp.0);
         self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
     }
 
     /// Whether any keyframe has depth.
-    pub(crate) fn has_depth(&self) -> bool {
+    pub fn has_depth(&self) -> bool {
         self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
     }
 
     /// Renders depth for images without depth from a model.
-    pub(crate) fn render_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, quiet: bool) -> anyhow::Result<()> {
+    pub fn render_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, progress: OnReadProgress<'_>) -> crate::Result<()> {
         let started = Instant::now();
-        self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, quiet)?);
+        self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, progress)?);
         self.preparation_time += started.elapsed();
         Ok(())
     }
@@ -264,13 +248,12 @@ impl Data {
         holdout: &Holdout,
         scale: f64,
         list: Option<KeyframeList>,
-        quiet: bool,
-    ) -> anyhow::Result<Self> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
         let folder = drivers::dataset::read(path)?;
-        let bar = print::bar(Some(folder.images.len() as u64), "{bar:30} {pos} of {len} images", quiet);
-        let loaded = dataset::load(&folder, holdout, scale, &|n_done| bar.set_position(n_done as u64));
-        bar.finish_and_clear();
-        let loaded = loaded?;
+        let n_all = Some(folder.images.len());
+        let on_image = |n_done| progress(ReadProgress { noun: "images", n_done, n_all });
+        let loaded = dataset::load(&folder, holdout, scale, &on_image)?;
         for note in &loaded.notes {
             log::warn!("{note}");
         }
@@ -295,14 +278,13 @@ impl Data {
         rig: Option<Rig>,
         list: Option<KeyframeList>,
         overrides: Vec<Override>,
-        quiet: bool,
-    ) -> anyhow::Result<Self> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
         let Opened { rig, mut source, damage } = open::recording(path, rig, &overrides)?;
         let mut join = Join::new(&rig)?;
         if let Some(list) = list {
             join = join.taking_only(list);
         }
-        let bar = print::bar(None, "{spinner} {pos} keyframes", quiet);
         let mut keyframes: Vec<Arc<Keyframe>> = Vec::new();
         let mut apply = |events: Vec<JoinEvent>| {
             for event in events {
@@ -314,13 +296,12 @@ impl Data {
                     JoinEvent::PosedImage(_) | JoinEvent::Rejected { .. } => {}
                 }
             }
-            bar.set_position(keyframes.len() as u64);
+            progress(ReadProgress { noun: "keyframes", n_done: keyframes.len(), n_all: None });
         };
         while let Some(sample) = source.next_sample()? {
             apply(join.push(sample));
         }
         apply(join.finish());
-        bar.finish_and_clear();
         log::info!("{}", join.counts());
         let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
         data_losses.extend(damage.get().cloned());
@@ -346,7 +327,7 @@ impl Data {
     }
 
     /// Assigns splits anew, separately for each camera.
-    fn assign_splits(&mut self, holdout: &Holdout) -> anyhow::Result<()> {
+    fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
         let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
         for (ix, keyframe) in self.keyframes.iter().enumerate() {
             by_camera.entry(keyframe.camera.clone()).or_default().push(ix);
@@ -361,7 +342,7 @@ impl Data {
     }
 
     /// Keeps only the listed keyframes, with the splits in the list.
-    fn take_only(&mut self, list: &KeyframeList) -> Result<(), InsufficientData> {
+    fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
         let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
         self.data_losses.extend(list.check_found(images(), images().next())?);
         let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
@@ -377,7 +358,7 @@ impl Data {
 }
 
 /// Returns an error if the path does not exist.
-pub(crate) fn expect(path: &Path) -> anyhow::Result<()> {
+pub fn expect(path: &Path) -> crate::Result<()> {
     ensure!(path.exists(), "{} does not exist", path.display());
     Ok(())
 }
@@ -393,17 +374,17 @@ mod tests {
 
     #[test]
     fn missing_flags_are_restored() {
-        let none = DataArgs { holdout: None, keyframes: None, rig: None, scale: None };
-        let first = DataArgs { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
-        let again = |args: &DataArgs| args.completed_with("the checkpoint", &first.flags());
+        let none = DataOptions { holdout: None, keyframes: None, rig: None, scale: None };
+        let first = DataOptions { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
+        let again = |args: &DataOptions| args.completed_with("the checkpoint", &first.flags());
         assert_eq!(again(&none).expect("no flag is given").flags(), first.flags());
-        let listed = DataArgs { keyframes: Some("other.txt".into()), ..none.clone() };
+        let listed = DataOptions { keyframes: Some("other.txt".into()), ..none.clone() };
         let names: Vec<String> = again(&listed).expect("lists are compared later").flags().into_keys().collect();
         assert_eq!(names, ["keyframes", "scale"]);
-        let same = DataArgs { scale: Some(0.25), ..none.clone() };
+        let same = DataOptions { scale: Some(0.25), ..none.clone() };
         assert_eq!(again(&same).expect("the same").flags(), first.flags());
-        let other = again(&DataArgs { scale: Some(0.5), ..none.clone() }).expect_err("another").0;
+        let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").0;
         assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
-        assert!(again(&DataArgs { holdout: Some("2".into()), ..none }).is_err());
+        assert!(again(&DataOptions { holdout: Some("2".into()), ..none }).is_err());
     }
 }

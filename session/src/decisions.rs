@@ -3,11 +3,9 @@
 //! One JSON object per line, see `docs/reference/files.md`. The log contains no times: replaying it with the same data
 //! gives the same model.
 
-use crate::exit::BadArgument;
-use keyframe::split_from_name;
-use keyframe::split_name;
-use anyhow::{Context, anyhow};
-use keyframe::{Keyframe, Split};
+use crate::Error;
+use crate::error::Context;
+use keyframe::{split_from_name, split_name, Keyframe, Split};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
@@ -15,7 +13,7 @@ use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::mpsc::{sync_channel, SyncSender};
 use std::thread::JoinHandle;
 use trainer::splat::SplatOptions;
 
@@ -28,36 +26,36 @@ const MAX_WAITING: usize = 4096;
 /// The first line: the settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Settings {
+pub struct Settings {
     version: u64,
-    pub(crate) method: String,
+    pub method: String,
     /// Name of the dataset folder or recording; `None` if a live run was not recorded.
-    pub(crate) data: Option<String>,
+    pub data: Option<String>,
     /// The GPU adapter: others round differently.
-    pub(crate) adapter: String,
+    pub adapter: String,
     /// Fraction of the width and height to which images were scaled.
-    pub(crate) scale: f64,
+    pub scale: f64,
     /// SHA-256 of the model from which missing depth was rendered; `None` if depth was not rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub(crate) depth_from: Option<String>,
+    pub depth_from: Option<String>,
     /// Number of earlier updates if the run continued from a checkpoint.
-    pub(crate) from_step: Option<u64>,
-    pub(crate) options: SplatOptions,
+    pub from_step: Option<u64>,
+    pub options: SplatOptions,
 }
 
 /// Everything that determines a training result besides its data.
-pub(crate) struct RunDescription<'a> {
-    pub(crate) method: &'a str,
-    pub(crate) data: Option<&'a Path>,
-    pub(crate) adapter: String,
-    pub(crate) scale: f64,
-    pub(crate) depth_from: Option<String>,
-    pub(crate) from_step: Option<u64>,
-    pub(crate) options: SplatOptions,
+pub struct RunDescription<'a> {
+    pub method: &'a str,
+    pub data: Option<&'a Path>,
+    pub adapter: String,
+    pub scale: f64,
+    pub depth_from: Option<String>,
+    pub from_step: Option<u64>,
+    pub options: SplatOptions,
 }
 
 impl Settings {
-    pub(crate) fn new(description: RunDescription<'_>) -> Self {
+    pub fn new(description: RunDescription<'_>) -> Self {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         Self {
             version: VERSION,
@@ -74,24 +72,24 @@ impl Settings {
 
 impl Settings {
     /// The settings of a run that continues from a checkpoint after this many updates, or restarts.
-    pub(crate) fn continued_from(&self, from_step: Option<u64>) -> Self {
+    pub fn continued_from(&self, from_step: Option<u64>) -> Self {
         Self { from_step, ..self.clone() }
     }
 }
 
 /// A decision and the step at which it was made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Entry {
+pub struct Entry {
     /// Number of updates before the decision, including those of rejected trials.
-    pub(crate) step: u64,
+    pub step: u64,
     #[serde(flatten)]
-    pub(crate) decision: Decision,
+    pub decision: Decision,
 }
 
 /// The kind of decision.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Decision {
+pub enum Decision {
     /// A keyframe that the model in the checkpoint was trained on.
     Restored(Pushed),
     /// A keyframe was added.
@@ -111,9 +109,9 @@ pub(crate) enum Decision {
 /// A keyframe that was added.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Pushed {
-    pub(crate) camera: String,
-    pub(crate) stamp_nanos: i64,
+pub struct Pushed {
+    pub camera: String,
+    pub stamp_nanos: i64,
     split: String,
     fingerprint: String,
     /// Correction of the base pose (`map_from_odom`), if the keyframe's station was re-registered: a translation in
@@ -125,15 +123,15 @@ pub(crate) struct Pushed {
 /// A keyframe that was removed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(crate) struct Removed {
-    pub(crate) camera: String,
-    pub(crate) stamp_nanos: i64,
+pub struct Removed {
+    pub camera: String,
+    pub stamp_nanos: i64,
 }
 
 /// The JSON value `true`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(into = "bool", try_from = "bool")]
-pub(crate) struct True;
+pub struct True;
 
 impl From<True> for bool {
     fn from(_: True) -> Self {
@@ -160,7 +158,7 @@ impl Pushed {
     }
 
     /// The keyframe as it was added, computed from the keyframe with base poses as reported.
-    pub(crate) fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
+    pub fn corrected(&self, reported: &Arc<Keyframe>) -> Arc<Keyframe> {
         match self.map_from_odom {
             Some(numbers) => Arc::new(reported.with_base_correction(&motion(numbers))),
             None => reported.clone(),
@@ -168,12 +166,12 @@ impl Pushed {
     }
 
     /// The split of the keyframe. Always `Some` for a log that was read, because the parser checks it.
-    pub(crate) fn split(&self) -> Option<Split> {
+    pub fn split(&self) -> Option<Split> {
         split_from_name(&self.split)
     }
 
     /// Whether a keyframe has the same pixels, depth, intrinsics, pose and velocity.
-    pub(crate) fn matches(&self, keyframe: &Keyframe) -> bool {
+    pub fn matches(&self, keyframe: &Keyframe) -> bool {
         self.fingerprint == fingerprint_of(keyframe)
     }
 }
@@ -206,7 +204,7 @@ enum Activity {
 }
 
 /// Writes the log on a separate thread, so that a slow disk or a large image does not delay training.
-pub(crate) struct DecisionLog {
+pub struct DecisionLog {
     sender: SyncSender<Line>,
     thread: JoinHandle<std::io::Result<()>>,
     last_step: Option<u64>,
@@ -224,7 +222,7 @@ enum Line {
 impl DecisionLog {
     /// Creates the log in a run folder. A run that continues from a checkpoint writes a separate file and keeps the
     /// earlier log.
-    pub(crate) fn create(folder: &Path, settings: Settings) -> anyhow::Result<Self> {
+    pub fn create(folder: &Path, settings: Settings) -> crate::Result<Self> {
         let name = match settings.from_step {
             None => FILE.to_owned(),
             Some(step) => FILE.replace('.', &format!("-from-{step}.")),
@@ -242,34 +240,34 @@ impl DecisionLog {
         Ok(log)
     }
 
-    pub(crate) fn restored(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
+    pub fn restored(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
         self.write(Line::Restored(step, keyframe.clone()));
     }
 
-    pub(crate) fn pushed(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
+    pub fn pushed(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
         self.log_activity(step);
         self.write(Line::Push(step, keyframe.clone()));
     }
 
-    pub(crate) fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
+    pub fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
         self.log_activity(step);
         let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
         self.write(Line::Entry(Entry { step, decision: Decision::Remove(removed_keyframe) }));
     }
 
     /// Records that a viewer requested a picture.
-    pub(crate) fn seeded(&mut self) {
+    pub fn seeded(&mut self) {
         if self.activity == Activity::Nothing {
             self.activity = Activity::Seeded;
         }
     }
 
     /// Records that training steps were requested.
-    pub(crate) fn step_requested(&mut self) {
+    pub fn step_requested(&mut self) {
         self.activity = Activity::Training;
     }
 
-    pub(crate) fn checkpoint(&mut self, step: u64) {
+    pub fn checkpoint(&mut self, step: u64) {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));
     }
@@ -279,17 +277,17 @@ impl DecisionLog {
     /// # Errors
     ///
     /// If the log could not be written completely.
-    pub(crate) fn end(mut self, step: u64) -> anyhow::Result<()> {
+    pub fn end(mut self, step: u64) -> crate::Result<()> {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
         drop(self.sender);
-        let written = self.thread.join().map_err(|_| anyhow!("the log thread panicked: this is a bug"))?;
+        let written = self.thread.join().map_err(|_| crate::error::failed!("the log thread panicked: this is a bug"))?;
         written.context("the decision log is incomplete")
     }
 
     /// Closes the log without an end, as if the run had been killed. All decisions so far are written when this
     /// returns.
-    pub(crate) fn close_unfinished(self) {
+    pub fn close_unfinished(self) {
         drop(self.sender);
         let _ = self.thread.join(); // An incomplete log counts as truncated at an earlier step.
     }
@@ -334,32 +332,32 @@ impl Line {
 
 /// A log that was read.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Decisions {
-    pub(crate) settings: Settings,
-    pub(crate) entries: Vec<Entry>,
+pub struct Decisions {
+    pub settings: Settings,
+    pub entries: Vec<Entry>,
 }
 
 impl Decisions {
-    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+    pub fn load(path: &Path) -> crate::Result<Self> {
         let text = std::fs::read_to_string(path).with_context(|| format!("cannot read the decision log {path:?}"))?;
         Self::parse(&text).with_context(|| format!("the decision log {path:?}"))
     }
 
     /// Whether the log contains the end of training. The log of a killed run does not.
-    pub(crate) fn is_complete(&self) -> bool {
+    pub fn is_complete(&self) -> bool {
         self.entries.last().is_some_and(|entry| entry.decision == Decision::End(True))
     }
 
     /// The keyframes in the log, in order.
-    pub(crate) fn pushed(&self) -> impl Iterator<Item = &Pushed> {
+    pub fn pushed(&self) -> impl Iterator<Item = &Pushed> {
         self.entries.iter().filter_map(|entry| match &entry.decision {
             Decision::Restored(pushed) | Decision::Push(pushed) => Some(pushed),
             _ => None,
         })
     }
 
-    fn parse(text: &str) -> anyhow::Result<Self> {
-        let invalid = |reason: String| anyhow::Error::new(BadArgument(reason));
+    fn parse(text: &str) -> crate::Result<Self> {
+        let invalid = |reason: String| (Error::BadInput(reason));
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
         let description: serde_json::Value =
@@ -396,8 +394,8 @@ impl Decisions {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use kinematics::Transform;
+    use super::*;
 
     fn settings(from_step: Option<u64>) -> Settings {
         Settings::new(RunDescription {

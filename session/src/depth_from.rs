@@ -1,42 +1,42 @@
 //! `--depth-from`: renders depth for images without depth from a saved model.
 
-use keyframe::counted;
-use crate::evaluate::{CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
-use crate::exit::{BadArgument, InsufficientData};
-use crate::{evaluate, method, print, run_folder};
-use anyhow::Context;
-use keyframe::{DepthMap, Keyframe, Split};
+use capture::chain;
+use crate::{run_folder, Error};
+use crate::error::Context;
+use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
+use crate::read_progress::{OnReadProgress, ReadProgress};
+use keyframe::{counted, DepthMap, Keyframe, Split};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::gpu::Gpu;
 use trainer::{Method, Picture};
+use trainer::gpu::Gpu;
 
 /// A saved model from which depth is rendered.
 #[derive(Clone, Debug)]
-pub(crate) struct DepthSource {
+pub struct DepthSource {
     model: PathBuf,
     /// SHA-256 of its files.
-    pub(crate) sha256: String,
+    pub sha256: String,
 }
 
 /// Result of rendering depth.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct RenderedDepth {
+pub struct RenderedDepth {
     model: PathBuf,
     model_sha256: String,
     /// Number of images for which depth was rendered; only images with depth on less than half of their pixels are
     /// eligible.
-    pub(crate) n_images: usize,
+    pub n_images: usize,
     /// Fraction of the missing pixels of such images that were filled.
     rendered_frac: f64,
 }
 
 impl DepthSource {
     /// The model in a folder, or in a single file of splats.
-    pub(crate) fn find(model: &Path) -> anyhow::Result<Self> {
-        let invalid = |error: anyhow::Error| BadArgument(format!("--depth-from: {error:#}"));
+    pub fn find(model: &Path) -> crate::Result<Self> {
+        let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {}", chain(&error)));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes = std::fs::read(model).with_context(|| format!("cannot read {}", model.display()))?;
@@ -49,32 +49,30 @@ impl DepthSource {
 
     /// Renders depth for all keyframes except test keyframes that have no depth or only sparse depth. Measured depth is
     /// kept.
-    pub(crate) fn draw(
+    pub fn draw(
         &self,
         gpu: Arc<Gpu>,
         keyframes: &mut [Arc<Keyframe>],
-        quiet: bool,
-    ) -> anyhow::Result<RenderedDepth> {
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<RenderedDepth> {
         let model_name = self.model.display();
-        let mut model = method::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?;
-        let bar = print::bar(Some(keyframes.len() as u64), "{bar:30} {pos} of {len} depth images", quiet);
+        let mut model = trainer::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?;
+        let n_all = Some(keyframes.len());
         let mut totals = Filled::default();
         let mut n_images = 0;
-        for keyframe in
-            keyframes.iter_mut().filter(|keyframe| keyframe.split != Split::Test && keyframe.lacks_dense_depth())
-        {
+        let lacking = |keyframe: &&mut Arc<Keyframe>| keyframe.split != Split::Test && keyframe.lacks_dense_depth();
+        for (ix, keyframe) in keyframes.iter_mut().filter(lacking).enumerate() {
             let filled = fill(model.as_mut(), keyframe)?;
             n_images += usize::from(filled.n_rendered > 0);
             totals = Filled {
                 n_missing: totals.n_missing + filled.n_missing,
                 n_rendered: totals.n_rendered + filled.n_rendered,
             };
-            bar.inc(1);
+            progress(ReadProgress { noun: "depth images", n_done: ix + 1, n_all });
         }
-        bar.finish_and_clear();
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into());
+            return Err(Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into());
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");
@@ -96,14 +94,14 @@ impl DepthSource {
 /// Returns an error unless both SHA-256 sums, of the model used `before` and of the one given `now`, are the same.
 ///
 /// `subject`: name of the earlier result for messages.
-pub(crate) fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), BadArgument> {
+pub fn check_same(subject: &str, before: Option<&str>, now: Option<&str>) -> Result<(), Error> {
     match (before, now) {
         (before, now) if before == now => Ok(()),
-        (None, _) => Err(BadArgument(format!("{subject} was made without --depth-from: remove the flag"))),
-        (Some(before), None) => Err(BadArgument(format!(
+        (None, _) => Err(Error::BadInput(format!("{subject} was made without --depth-from: remove the flag"))),
+        (Some(before), None) => Err(Error::BadInput(format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}: give that model with --depth-from"
         ))),
-        (Some(before), Some(now)) => Err(BadArgument(format!(
+        (Some(before), Some(now)) => Err(Error::BadInput(format!(
             "{subject} used depth rendered from the model with the SHA-256 {before}, but the model given with \
              --depth-from has {now}"
         ))),
@@ -119,7 +117,7 @@ struct Filled {
 
 /// Renders the missing depth of one keyframe: in the pixels of its depth image, or of its color image if it has no
 /// depth image.
-fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> anyhow::Result<Filled> {
+fn fill(model: &mut dyn Method, keyframe: &mut Arc<Keyframe>) -> crate::Result<Filled> {
     let mut request_keyframe = keyframe.as_ref().clone();
     let depth = request_keyframe.depth.get_or_insert_with(|| DepthMap {
         size_px: keyframe.size_px,

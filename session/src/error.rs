@@ -43,6 +43,9 @@ pub enum Error {
     /// An error of another library.
     #[error(transparent)]
     Other(Box<dyn StdError + Send + Sync>),
+    /// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
+    #[error("{0}")]
+    GpuUnrecoverable(String),
     /// The operation that failed, with the cause.
     #[error("{context}")]
     Context {
@@ -70,6 +73,7 @@ impl Error {
             Self::Keyframe(error) => error.class(),
             Self::Context { source, .. } => source.class(),
             Self::Failed(_)
+            | Self::GpuUnrecoverable(_)
             | Self::Trainer(_)
             | Self::Driver(_)
             | Self::Kinematics(_)
@@ -78,6 +82,39 @@ impl Error {
                 ErrorClass::Failed
             }
         }
+    }
+
+    /// The error without the operations that failed.
+    fn cause(&self) -> &Self {
+        match self {
+            Self::Context { source, .. } => source.cause(),
+            cause => cause,
+        }
+    }
+
+    /// Whether the GPU caused the error: it was lost or out of memory.
+    #[must_use]
+    pub fn is_gpu_error(&self) -> bool {
+        matches!(self.cause(), Self::Trainer(error) if error.is_gpu_error())
+    }
+
+    /// Whether the GPU failed and could not be reopened.
+    #[must_use]
+    pub fn is_gpu_unrecoverable(&self) -> bool {
+        matches!(self.cause(), Self::GpuUnrecoverable(_))
+    }
+
+    /// Whether reading or writing a file failed, for example on a full disk.
+    #[must_use]
+    pub fn is_io(&self) -> bool {
+        std::iter::successors(Some(self.cause() as &(dyn StdError + 'static)), |error| error.source())
+            .any(|error| error.is::<std::io::Error>() || matches!(error.downcast_ref(), Some(Self::Io(_))))
+    }
+
+    /// Adds the operation that failed.
+    #[must_use]
+    pub fn with_context(self, context: impl Into<String>) -> Self {
+        Self::Context { context: context.into(), source: Box::new(self) }
     }
 
     /// An error of a library that is not part of this interface.
@@ -135,8 +172,8 @@ pub(crate) use ensure;
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use capture::chain;
+    use super::*;
 
     #[test]
     fn context_keeps_the_class_and_the_causes() {

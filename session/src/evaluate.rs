@@ -2,18 +2,16 @@
 //!
 //! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
 
-use keyframe::counted;
-use crate::print;
-use anyhow::Context;
 use calibration::CalibratedCamera;
-use keyframe::{DepthMap, Keyframe};
+use crate::error::Context;
+use keyframe::{counted, DepthMap, Keyframe};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::{Method, Picture, Projection, RenderRequest};
+use trainer::eval::{depth_rmse_m, psnr, ssim, surface_error, Lpips, PixelPair, SurfaceError};
 
 /// Environment variable with the path of the LPIPS weights, used if no flag gives one.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
@@ -23,15 +21,15 @@ const NEAR_M: f64 = 0.01;
 const FAR_M: f64 = 1000.0;
 
 /// Minimum alpha of a pixel that counts as covered by the model.
-pub(crate) const MIN_ALPHA: u8 = 128;
+pub const MIN_ALPHA: u8 = 128;
 /// Minimum covered fraction; below it, the model probably does not show the scene of the images.
-pub(crate) const MIN_COVERED_FRAC: f64 = 0.05;
+pub const MIN_COVERED_FRAC: f64 = 0.05;
 /// Hint for that case.
-pub(crate) const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
+pub const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
 
 /// Computes scores of test images.
 #[derive(Clone)]
-pub(crate) struct Evaluator {
+pub struct Evaluator {
     /// Whether to compute all available scores rather than PSNR only.
     is_full: bool,
     /// `None` without weights.
@@ -40,67 +38,67 @@ pub(crate) struct Evaluator {
 
 /// Scores of one test image. `None` means unknown, never zero.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct ImageScores {
-    pub(crate) camera: String,
-    pub(crate) stamp_nanos: i64,
+pub struct ImageScores {
+    pub camera: String,
+    pub stamp_nanos: i64,
     /// PSNR against the image as the camera delivered it, dB.
-    pub(crate) psnr: f64,
-    pub(crate) ssim: Option<f64>,
-    pub(crate) lpips: Option<f64>,
+    pub psnr: f64,
+    pub ssim: Option<f64>,
+    pub lpips: Option<f64>,
     /// Root mean square error along z over pixels where both have depth, meters.
-    pub(crate) depth_rmse_m: Option<f64>,
+    pub depth_rmse_m: Option<f64>,
     /// Accuracy: mean distance of the rendered surface from the measured one along its normal, meters.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) surface_error_m: Option<f64>,
+    pub surface_error_m: Option<f64>,
     /// Completeness: fraction of the measured surface that is rendered within 5 mm.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) surface_within_5_mm: Option<f64>,
+    pub surface_within_5_mm: Option<f64>,
     /// PSNR against the noise-free image, rendered at the true pose, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) psnr_truth: Option<f64>,
+    pub psnr_truth: Option<f64>,
     /// PSNR of the delivered image against the noise-free one, dB; in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) psnr_ceiling: Option<f64>,
+    pub psnr_ceiling: Option<f64>,
     /// Fraction of pixels that the model covers; `None` if the picture stayed on the GPU.
     #[serde(skip)]
-    pub(crate) covered_frac: Option<f64>,
+    pub covered_frac: Option<f64>,
 }
 
 /// Mean scores over the test images. `None` means unknown, never zero.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub(crate) struct Scores {
-    pub(crate) psnr: Option<f64>,
-    pub(crate) ssim: Option<f64>,
-    pub(crate) lpips: Option<f64>,
-    pub(crate) depth_rmse_m: Option<f64>,
+pub struct Scores {
+    pub psnr: Option<f64>,
+    pub ssim: Option<f64>,
+    pub lpips: Option<f64>,
+    pub depth_rmse_m: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) surface_error_m: Option<f64>,
+    pub surface_error_m: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) surface_within_5_mm: Option<f64>,
+    pub surface_within_5_mm: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) psnr_truth: Option<f64>,
+    pub psnr_truth: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) psnr_ceiling: Option<f64>,
+    pub psnr_ceiling: Option<f64>,
     /// PSNR per camera; empty if there is only one.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub(crate) psnr_per_camera: BTreeMap<String, f64>,
+    pub psnr_per_camera: BTreeMap<String, f64>,
 }
 
 impl Evaluator {
     /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights, LPIPS.
-    pub(crate) fn thorough(lpips_weights: Option<&Path>) -> anyhow::Result<Self> {
+    pub fn thorough(lpips_weights: Option<&Path>) -> crate::Result<Self> {
         let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
         let lpips = lpips_weights.or(named.as_deref()).map(Lpips::load).transpose()?;
         Ok(Self { is_full: true, lpips: lpips.map(Arc::new) })
     }
 
     /// Computes PSNR only, with one render per image.
-    pub(crate) fn psnr_only() -> Self {
+    pub fn psnr_only() -> Self {
         Self { is_full: false, lpips: None }
     }
 
     /// Scores one test keyframe.
-    pub(crate) fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
+    pub fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
         if !self.is_full
             && self.lpips.is_none()
             && let Some(psnr) = psnr_on_gpu(method, keyframe)?
@@ -138,24 +136,24 @@ impl Evaluator {
     }
 
     /// Scores one test keyframe. Errors name the keyframe.
-    pub(crate) fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<ImageScores> {
+    pub fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
         self.score(method, keyframe)
             .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
     }
 
     /// Scores test keyframes one after the other.
-    pub(crate) fn score_all<'a>(
+    pub fn score_all<'a>(
         &self,
         method: &mut dyn Method,
         tests: impl Iterator<Item = &'a Arc<Keyframe>>,
-    ) -> anyhow::Result<Vec<ImageScores>> {
+    ) -> crate::Result<Vec<ImageScores>> {
         tests.map(|keyframe| self.score_named(method, keyframe)).collect()
     }
 }
 
 impl Scores {
     /// The means over `images`.
-    pub(crate) fn mean(images: &[ImageScores]) -> Self {
+    pub fn mean(images: &[ImageScores]) -> Self {
         let mut psnr_per_camera = BTreeMap::new();
         for image in images {
             psnr_per_camera.entry(image.camera.clone()).or_insert_with(Vec::new).push(image.psnr);
@@ -197,14 +195,14 @@ impl Display for Scores {
 }
 
 /// Fraction of a picture's pixels that the model covers.
-pub(crate) fn covered_frac(picture: &Picture) -> f64 {
+pub fn covered_frac(picture: &Picture) -> f64 {
     let pixels = picture.rgba_srgb.as_chunks::<4>().0;
     let n_covered = pixels.iter().filter(|[.., alpha]| *alpha >= MIN_ALPHA).count();
     n_covered as f64 / pixels.len().max(1) as f64
 }
 
 /// Warns if a model covers almost nothing of these pictures, given the covered fraction of each.
-pub(crate) fn warn_if_hardly_covered(covered_fracs: &[f64]) {
+pub fn warn_if_hardly_covered(covered_fracs: &[f64]) {
     let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
     if covered_frac < MIN_COVERED_FRAC {
         let views = counted(covered_fracs.len() as u64, "view");
@@ -223,7 +221,7 @@ fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
 }
 
 /// Renders a model from the pose of a keyframe, with the same rolling shutter and the camera's gains.
-pub(crate) fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
+pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
     let lens = method.calibrated_camera(keyframe)?;
     let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
     if lens.gains != [1.0; 3] {
@@ -246,7 +244,7 @@ fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f6
 
 /// Renders a model from the pose of a keyframe's depth image, with the size and intrinsics of `depth`: the full depth
 /// map or a subsampled one. `None` for a keyframe without depth.
-pub(crate) fn render_depth(
+pub fn render_depth(
     method: &mut dyn Method,
     keyframe: &Keyframe,
     depth: &DepthMap,
@@ -292,7 +290,7 @@ struct DepthError {
     surface: Option<SurfaceError>,
 }
 
-fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<DepthError> {
+fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<DepthError> {
     let Some(full) = &keyframe.depth else { return Ok(DepthError::default()) };
     let stride = method.depth_stride();
     let subsampled = (stride > 1).then(|| full.subsampled(stride));
@@ -305,7 +303,7 @@ fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<D
 }
 
 /// PSNR against the noise-free image, which has no rolling shutter and was taken from the true pose.
-fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> anyhow::Result<Option<f64>> {
+fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<f64>> {
     let Some(truth) = &keyframe.truth else { return Ok(None) };
     let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
     let at_truth = RenderRequest { shutter: None, ..request(keyframe, &lens) };

@@ -2,7 +2,7 @@
 
 /// The evaluation schedule of a session.
 #[derive(Clone, Debug)]
-pub(crate) struct EvaluationSchedule {
+pub struct EvaluationSchedule {
     next_secs: f64,
 }
 
@@ -14,7 +14,7 @@ impl Default for EvaluationSchedule {
 
 impl EvaluationSchedule {
     /// Whether an evaluation time was reached at `secs`. Several reached at once count as one.
-    pub(crate) fn reached(&mut self, secs: f64) -> bool {
+    pub fn reached(&mut self, secs: f64) -> bool {
         let mut reached = false;
         while secs >= self.next_secs {
             self.next_secs = next_after(self.next_secs);
@@ -25,12 +25,12 @@ impl EvaluationSchedule {
 }
 
 /// The latest evaluation time at `secs`; `None` before the first.
-pub(crate) fn latest(secs: f64) -> Option<f64> {
+pub fn latest(secs: f64) -> Option<f64> {
     up_to(secs).last()
 }
 
 /// The evaluation times up to `secs`.
-pub(crate) fn up_to(secs: f64) -> impl Iterator<Item = f64> {
+pub fn up_to(secs: f64) -> impl Iterator<Item = f64> {
     let first = EvaluationSchedule::default().next_secs;
     std::iter::successors(Some(first), |evaluation_secs| Some(next_after(*evaluation_secs)))
         .take_while(move |evaluation_secs| *evaluation_secs <= secs)

@@ -1,13 +1,10 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
-use capture::Feed;
-use capture::InputResult;
-use capture::Change;
-use crate::recoveries::{self, Recoveries};
+use capture::{Change, Feed, InputResult};
+use crate::{scene_hint, time_slices};
+use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
-use crate::scene_hint;
 use crate::session::Session;
-use crate::time_slices;
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -26,7 +23,7 @@ const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
 
 /// What determines when keyframes are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Pace {
+pub enum Pace {
     /// Real time: keyframes are taken as they arrive.
     RealTime,
     /// Lockstep with the trainer: a keyframe is taken every given number of steps, so that a seed gives one result.
@@ -37,7 +34,7 @@ pub(crate) enum Pace {
 }
 
 /// The parts of a live run.
-pub(crate) struct Live {
+pub struct Live {
     /// The first one is drawn for viewers that name no method.
     sessions: Vec<Session>,
     feed: Feed,
@@ -59,7 +56,7 @@ pub(crate) struct Live {
 
 impl Live {
     /// Combines the parts; does not start anything yet.
-    pub(crate) fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+    pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
         Self {
             next_keyframe_at: vec![0; sessions.len()],
             sessions,
@@ -74,12 +71,12 @@ impl Live {
             published: None,
             scoring_time: Duration::ZERO,
             notes: options.notes,
-            recoveries: Recoveries::default(),
+            recoveries: Recoveries::new(options.open_gpu),
         }
     }
 
     /// Continues with the keyframes of an earlier run, which the sessions already hold.
-    pub(crate) fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+    pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
         self.keyframes = keyframes;
         self.publish_keyframes();
         if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
@@ -94,7 +91,7 @@ impl Live {
 
     /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
     /// without training data.
-    pub(crate) fn is_over(&self) -> bool {
+    pub fn is_over(&self) -> bool {
         if self.is_scoring() {
             return false; // Scores at the limit are still reported.
         }
@@ -106,39 +103,39 @@ impl Live {
 
     /// Whether the input ended and a step limit was set that no model can reach without more keyframes. Without a step
     /// limit the run does not end; the result stays visible.
-    pub(crate) fn has_exhausted_input(&self) -> bool {
+    pub fn has_exhausted_input(&self) -> bool {
         self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
     }
 
     /// The hub that clients are connected to.
-    pub(crate) fn hub(&self) -> Hub {
+    pub fn hub(&self) -> Hub {
         self.hub.clone()
     }
 
     /// Keyframes in the store, in order of acceptance.
-    pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
+    pub fn keyframes(&self) -> &[Arc<Keyframe>] {
         &self.keyframes
     }
 
     /// Number of keyframes evicted so far.
-    pub(crate) fn n_evicted(&self) -> u64 {
+    pub fn n_evicted(&self) -> u64 {
         self.n_evicted
     }
 
     /// The models in training.
-    pub(crate) fn sessions(&self) -> &[Session] {
+    pub fn sessions(&self) -> &[Session] {
         &self.sessions
     }
 
     /// Takes keyframes, trains, draws and publishes in turn. If the GPU fails, it is reopened.
-    pub(crate) fn advance(&mut self) -> anyhow::Result<()> {
+    pub fn advance(&mut self) -> crate::Result<()> {
         let advanced =
             self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
         advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
     }
 
     /// Waits for queued work. If the GPU failed, it is reopened; returns whether that was necessary.
-    pub(crate) fn wait(&mut self) -> anyhow::Result<bool> {
+    pub fn wait(&mut self) -> crate::Result<bool> {
         match self.sessions.iter().try_for_each(Session::wait) {
             Ok(()) => Ok(false),
             Err(error) => self.recoveries.recover(&mut self.sessions, error).map(|()| true),
@@ -146,13 +143,13 @@ impl Live {
     }
 
     /// What is saved on disk if the run fails now.
-    pub(crate) fn describe_recoverable(&mut self) -> String {
+    pub fn describe_recoverable(&mut self) -> String {
         recoveries::describe_recoverable(&mut self.sessions)
     }
 
     /// Pushes new keyframes to the models: all that wait in real time, the one that is due in lockstep. Does nothing
     /// during an evaluation.
-    fn take_keyframes(&mut self) -> anyhow::Result<()> {
+    fn take_keyframes(&mut self) -> crate::Result<()> {
         if self.is_scoring() {
             return Ok(());
         }
@@ -217,7 +214,7 @@ impl Live {
 
     /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does
     /// nothing if a requested picture may be drawn at once.
-    fn step(&mut self) -> anyhow::Result<()> {
+    fn step(&mut self) -> crate::Result<()> {
         self.sessions.iter().try_for_each(Session::check_gpu)?;
         if !self.is_training() {
             return Ok(());
@@ -258,7 +255,7 @@ impl Live {
     }
 
     /// Draws requested pictures as long as training keeps its share of the time.
-    fn render(&mut self) -> anyhow::Result<()> {
+    fn render(&mut self) -> crate::Result<()> {
         let started = Instant::now();
         if !self.is_training() || self.is_idle() {
             self.budget = RenderBudget::default(); // Training does not need the time.
@@ -291,7 +288,7 @@ impl Live {
     }
 
     /// Publishes the status of the run to viewers, a few times per second.
-    fn publish(&mut self) -> anyhow::Result<()> {
+    fn publish(&mut self) -> crate::Result<()> {
         if self.published.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
             return Ok(());
         }
@@ -324,7 +321,7 @@ impl Live {
     }
 
     /// Ends the input; returns the sessions and the remaining input.
-    pub(crate) fn finish(self) -> (Vec<Session>, anyhow::Result<InputResult>) {
+    pub fn finish(self) -> (Vec<Session>, crate::Result<InputResult>) {
         // The status stays visible, because viewers wait for the scores.
         self.hub.set_state("saving");
         (self.sessions, self.feed.finish())
@@ -373,7 +370,7 @@ impl Live {
         }
     }
 
-    fn apply(&mut self, change: Change) -> anyhow::Result<()> {
+    fn apply(&mut self, change: Change) -> crate::Result<()> {
         match change {
             Change::Accepted(keyframe) => {
                 // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
@@ -399,13 +396,15 @@ impl Live {
 }
 
 /// Options of a live run.
-pub(crate) struct LiveOptions {
+pub struct LiveOptions {
     /// What determines when keyframes are taken.
-    pub(crate) pace: Pace,
+    pub pace: Pace,
     /// Number of keyframes with which training starts.
-    pub(crate) start_keyframes: usize,
+    pub start_keyframes: usize,
     /// Notes shown on the page.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
+    /// Opens the GPU again after a failure.
+    pub open_gpu: OpenGpu,
 }
 
 /// The session of a method; the first one if no method is given.

@@ -1,23 +1,23 @@
 //! Commands to run after training. They work as printed, in the folder in which training was started.
 
-use crate::method::ModelKind;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use trainer::ModelKind;
 
 /// The images that a model was trained on, for commands that need them.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct DataSource {
+pub struct DataSource {
     /// Dataset folder or recording; `None` if a live run was not recorded.
-    pub(crate) path: Option<PathBuf>,
+    pub path: Option<PathBuf>,
     /// Flags with which `eval` loads the same images.
-    pub(crate) flags: Vec<String>,
+    pub flags: Vec<String>,
     /// Names of the images, by camera and stamp.
-    pub(crate) image_names: BTreeMap<(String, i64), String>,
+    pub image_names: BTreeMap<(String, i64), String>,
 }
 
 impl DataSource {
     /// The file name of an image, or without one its camera and stamp.
-    pub(crate) fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
+    pub fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
         let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
         known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
     }
@@ -25,22 +25,22 @@ impl DataSource {
 
 /// What the commands need to know about a saved model.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct SavedModel<'a> {
-    pub(crate) kind: ModelKind,
-    pub(crate) folder: &'a Path,
-    pub(crate) data: &'a DataSource,
-    pub(crate) n_tests: usize,
+pub struct SavedModel<'a> {
+    pub kind: ModelKind,
+    pub folder: &'a Path,
+    pub data: &'a DataSource,
+    pub n_tests: usize,
 }
 
 /// A command and its purpose.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct NextCommand {
-    pub(crate) purpose: &'static str,
-    pub(crate) command: String,
+pub struct NextCommand {
+    pub purpose: &'static str,
+    pub command: String,
 }
 
 /// The commands for models that were trained together.
-pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
+pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
     let program = std::env::args_os().next().map_or("fieldrig".into(), |word| word.to_string_lossy().into_owned());
     let mut commands = Vec::new();
     let mut add = |purpose, words: &[&str]| {
@@ -72,12 +72,12 @@ pub(crate) fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
 }
 
 /// The command line of this process.
-pub(crate) fn this_command() -> String {
+pub fn this_command() -> String {
     std::env::args_os().map(|word| quoted(&word.to_string_lossy())).collect::<Vec<_>>().join(" ")
 }
 
 /// Purposes and commands in two columns.
-pub(crate) fn lines(commands: &[NextCommand]) -> Vec<String> {
+pub fn lines(commands: &[NextCommand]) -> Vec<String> {
     let width = commands.iter().map(|next| next.purpose.len()).max().unwrap_or_default() + 1;
     let line = |next: &NextCommand| format!("{:width$}  {}", format!("{}:", next.purpose), next.command);
     commands.iter().map(line).collect()
@@ -111,7 +111,7 @@ fn argument(path: &Path) -> String {
 }
 
 /// A word, quoted for a shell.
-pub(crate) fn quoted(word: &str) -> String {
+pub fn quoted(word: &str) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "_-./:=@%+,".contains(letter);
     if !word.is_empty() && word.chars().all(is_plain) {
         return word.to_owned();

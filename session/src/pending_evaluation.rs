@@ -11,9 +11,9 @@ use std::time::Duration;
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
 /// An evaluation in progress.
-pub(crate) struct PendingEvaluation {
+pub struct PendingEvaluation {
     /// Training time when the evaluation was due, seconds.
-    pub(crate) seconds: f64,
+    pub seconds: f64,
     /// Ordered so that the first images scored are already spread evenly over all.
     remaining: VecDeque<Arc<Keyframe>>,
     images: Vec<ImageScores>,
@@ -22,7 +22,7 @@ pub(crate) struct PendingEvaluation {
 
 impl PendingEvaluation {
     /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
-    pub(crate) fn new<'a>(
+    pub fn new<'a>(
         seconds: f64,
         tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
         max_images: usize,
@@ -35,23 +35,23 @@ impl PendingEvaluation {
     }
 
     /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
-    pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
+    pub fn take_next(&mut self) -> Option<Arc<Keyframe>> {
         if self.spent < MAX_SCORING { self.remaining.pop_front() } else { None }
     }
 
     /// Adds the scores of the last keyframe and the time that scoring took.
-    pub(crate) fn add(&mut self, scores: ImageScores, spent: Duration) {
+    pub fn add(&mut self, scores: ImageScores, spent: Duration) {
         self.images.push(scores);
         self.spent += spent;
     }
 
     /// Whether no image is left to score.
-    pub(crate) fn is_complete(&self) -> bool {
+    pub fn is_complete(&self) -> bool {
         self.remaining.is_empty() || self.spent >= MAX_SCORING
     }
 
     /// The scores so far.
-    pub(crate) fn into_images(self) -> Vec<ImageScores> {
+    pub fn into_images(self) -> Vec<ImageScores> {
         self.images
     }
 }

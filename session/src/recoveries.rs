@@ -1,10 +1,12 @@
 //! Recovery from a GPU failure during a run: every model continues on a reopened device from its newest checkpoint.
 
-use crate::open_gpu::open_gpu;
-use crate::recovery::{GpuUnrecoverable, is_gpu_error};
+use capture::chain;
+use crate::Error;
+use crate::error::Context;
 use crate::session::Session;
-use anyhow::Context;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
 
 /// How many times a run tries to reopen the GPU.
 const MAX_RECOVERIES: u32 = 3;
@@ -14,7 +16,7 @@ const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
 const RETRY_DELAY: Duration = Duration::from_secs(1);
 
 /// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
-pub(crate) fn describe_recoverable(sessions: &mut [Session]) -> String {
+pub fn describe_recoverable(sessions: &mut [Session]) -> String {
     let recoverable = sessions.iter_mut().filter_map(|session| {
         let has_checkpoint = session.has_checkpoint();
         Some(session.recovery()?.describe_recoverable(has_checkpoint))
@@ -22,18 +24,28 @@ pub(crate) fn describe_recoverable(sessions: &mut [Session]) -> String {
     recoverable.collect::<Vec<_>>().join("; ")
 }
 
+/// Opens the GPU again after a failure.
+pub type OpenGpu = fn() -> crate::Result<Arc<Gpu>>;
+
 /// Counts the attempts of a run to reopen the GPU.
-#[derive(Debug, Default)]
-pub(crate) struct Recoveries {
+#[derive(Debug)]
+pub struct Recoveries {
+    open_gpu: OpenGpu,
     n: u32,
     last: Option<Instant>,
 }
 
 impl Recoveries {
+    /// No attempts so far.
+    #[must_use]
+    pub fn new(open_gpu: OpenGpu) -> Self {
+        Self { open_gpu, n: 0, last: None }
+    }
+
     /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail,
     /// returns the error.
-    pub(crate) fn recover(&mut self, sessions: &mut [Session], error: anyhow::Error) -> anyhow::Result<()> {
-        if !is_gpu_error(&error) || sessions.iter().any(|session| session.recovery().is_none()) {
+    pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
+        if !error.is_gpu_error() || sessions.iter().any(|session| session.recovery().is_none()) {
             return Err(error);
         }
         let began = Instant::now();
@@ -46,8 +58,8 @@ impl Recoveries {
                 std::thread::sleep(RETRY_DELAY);
             }
             self.n += 1;
-            log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
-            match restart_all(sessions) {
+            log::warn!("{}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", chain(&error), self.n);
+            match restart_all(sessions, self.open_gpu) {
                 Ok(()) => {
                     // Several sessions share one clock.
                     sessions.iter().take(1).for_each(|session| session.exclude(began.elapsed()));
@@ -58,14 +70,14 @@ impl Recoveries {
             }
         }
         let recoverable = describe_recoverable(sessions);
-        Err(GpuUnrecoverable(format!(
-            "{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}"
-        ))
-        .into())
+        Err(Error::GpuUnrecoverable(format!(
+            "{}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}",
+            chain(&error)
+        )))
     }
 }
 
-fn restart_all(sessions: &mut [Session]) -> anyhow::Result<()> {
+fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()> {
     sessions.iter_mut().for_each(Session::drop_model); // The new model may need its memory.
     let gpu = open_gpu().context("cannot reopen the GPU")?;
     sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))

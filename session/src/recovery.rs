@@ -1,30 +1,30 @@
 //! What a model needs to recover from a GPU failure, and the errors of one.
 
 use crate::decisions::Settings;
-use crate::method::ModelSpec;
 use crate::run_folder::CHECKPOINT;
 use keyframe::Keyframe;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use trainer::ModelSpec;
 
 /// What a session needs to continue on another device.
-pub(crate) struct Recovery {
-    pub(crate) model_spec: ModelSpec,
+pub struct Recovery {
+    pub model_spec: ModelSpec,
     /// Folder of the run.
-    pub(crate) folder: PathBuf,
+    pub folder: PathBuf,
     /// Folder of the checkpoint that the run was resumed from, if it was.
-    pub(crate) resumed: Option<PathBuf>,
+    pub resumed: Option<PathBuf>,
     /// Keyframes that the resumed model was trained on.
-    pub(crate) known: Vec<Arc<Keyframe>>,
+    pub known: Vec<Arc<Keyframe>>,
     /// Settings for the decision log.
-    pub(crate) settings: Settings,
+    pub settings: Settings,
     /// The command that continues from the newest checkpoint.
-    pub(crate) resume_command: String,
+    pub resume_command: String,
 }
 
 impl Recovery {
     /// What can be continued if the model cannot be saved, as a sentence without a period.
-    pub(crate) fn describe_recoverable(&self, has_checkpoint: bool) -> String {
+    pub fn describe_recoverable(&self, has_checkpoint: bool) -> String {
         let Self { folder, resume_command, .. } = self;
         match (has_checkpoint, &self.resumed) {
             (true, _) => {
@@ -42,20 +42,10 @@ fn in_folder(folder: &Path) -> String {
     folder.join(CHECKPOINT).display().to_string()
 }
 
-/// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct GpuUnrecoverable(pub(crate) String);
-
-/// Whether the GPU caused the error.
-pub(crate) fn is_gpu_error(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| cause.downcast_ref().is_some_and(trainer::Error::is_gpu_error))
-}
-
 /// Adds what is saved on disk to an error of the GPU.
-pub(crate) fn with_recoverable(error: anyhow::Error, recoverable: &str) -> anyhow::Error {
-    if is_gpu_error(&error) && !recoverable.is_empty() {
-        error.context(format!("the GPU failed at the end of the run; {recoverable}"))
+pub fn with_recoverable(error: crate::Error, recoverable: &str) -> crate::Error {
+    if error.is_gpu_error() && !recoverable.is_empty() {
+        error.with_context(format!("the GPU failed at the end of the run; {recoverable}"))
     } else {
         error
     }

@@ -1,49 +1,48 @@
 //! `train --replay-decisions`: trains with the decisions of a log.
 
+use capture::Stop;
 use capture::config::Override;
+use crate::{depth_from, Error};
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
-use crate::depth_from;
-use crate::exit::{BadArgument, InsufficientData};
-use keyframe::KeyframeList;
-use crate::method::{ModelKind, ModelSpec};
+use crate::read_progress::OnReadProgress;
 use crate::session::Session;
-use capture::Stop;
-use keyframe::Keyframe;
+use keyframe::{Keyframe, KeyframeList};
 use kinematics::Stamp;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
+use trainer::{ModelKind, ModelSpec};
 
 /// A decision log to replay.
-pub(crate) struct Replay {
+pub struct Replay {
     path: PathBuf,
-    pub(crate) decisions: Decisions,
+    pub decisions: Decisions,
     kind: ModelKind,
 }
 
 impl Replay {
     /// Reads a log.
-    pub(crate) fn load(path: &Path) -> anyhow::Result<Self> {
+    pub fn load(path: &Path) -> crate::Result<Self> {
         let decisions = Decisions::load(path)?;
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
-            BadArgument(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
+            Error::BadInput(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
         })?;
         let replay = Self { path: path.to_owned(), decisions, kind };
         if replay.decisions.pushed().next().is_none() {
-            return Err(InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into());
+            return Err(Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into());
         }
         Ok(replay)
     }
 
     /// Loads exactly the keyframes in the log; [`Self::check_data`] checks that they are the same.
-    pub(crate) fn load_data(&self, path: &Path, rig: Option<PathBuf>, quiet: bool) -> anyhow::Result<Data> {
+    pub fn load_data(&self, path: &Path, rig: Option<PathBuf>, progress: OnReadProgress<'_>) -> crate::Result<Data> {
         let pushed = || self.decisions.pushed();
         let list: KeyframeList = pushed()
             .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
             .collect();
-        let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), quiet)?;
+        let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), progress)?;
         let as_pushed: HashMap<(&str, i64), &Pushed> =
             pushed().map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed)).collect();
         for keyframe in &mut data.keyframes {
@@ -60,18 +59,18 @@ impl Replay {
     }
 
     /// Returns an error if a keyframe of the log is missing from the data or differs.
-    pub(crate) fn check_data(&self, path: &Path, data: &Data) -> Result<(), InsufficientData> {
+    pub fn check_data(&self, path: &Path, data: &Data) -> Result<(), Error> {
         let by_key = by_name(&data.keyframes);
         let (name, shown) = (self.name(), path.display());
         for pushed in self.decisions.pushed() {
             let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
             let Some(keyframe) = by_key.get(&(camera, stamp)) else {
-                return Err(InsufficientData(format!(
+                return Err(Error::InsufficientData(format!(
                     "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
                 )));
             };
             if !pushed.matches(keyframe) {
-                return Err(InsufficientData(format!(
+                return Err(Error::InsufficientData(format!(
                     "image {stamp} of camera {camera:?} has other pixels, depth, intrinsics or pose in {shown} than in \
                      {name}"
                 )));
@@ -81,33 +80,33 @@ impl Replay {
     }
 
     /// Checks that depth was rendered from the same model as in the logged run, identified by its SHA-256.
-    pub(crate) fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), BadArgument> {
+    pub fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), Error> {
         depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
     }
 
     /// Checks that training starts where the log does. `from_step`: the step of the checkpoint that training continues
     /// from.
-    pub(crate) fn check_start(&self, from_step: Option<u64>) -> Result<(), BadArgument> {
+    pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {
         let name = self.name();
         match (self.decisions.settings.from_step, from_step) {
             (log, here) if log == here => Ok(()),
-            (None, _) => Err(BadArgument(format!("{name} starts at the first step: remove --resume"))),
-            (Some(log), None) => Err(BadArgument(format!(
+            (None, _) => Err(Error::BadInput(format!("{name} starts at the first step: remove --resume"))),
+            (Some(log), None) => Err(Error::BadInput(format!(
                 "{name} continues from step {log}: give the folder of that checkpoint with --resume"
             ))),
             (Some(log), Some(here)) => {
-                Err(BadArgument(format!("{name} continues from step {log}, but the checkpoint is at step {here}")))
+                Err(Error::BadInput(format!("{name} continues from step {log}, but the checkpoint is at step {here}")))
             }
         }
     }
 
     /// The method and options of the logged run.
-    pub(crate) fn model_spec(&self) -> ModelSpec {
+    pub fn model_spec(&self) -> ModelSpec {
         ModelSpec { kind: self.kind, options: self.decisions.settings.options.clone() }
     }
 
     /// Warns if the GPU adapter differs from that of the log.
-    pub(crate) fn check_adapter(&self, adapter: &str) {
+    pub fn check_adapter(&self, adapter: &str) {
         let logged_adapter = &self.decisions.settings.adapter;
         if logged_adapter != adapter {
             log::warn!("{} was written on {logged_adapter:?}: this adapter rounds differently", self.name());
@@ -115,7 +114,7 @@ impl Replay {
     }
 
     /// Replays the decisions, each at its step.
-    pub(crate) fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> anyhow::Result<()> {
+    pub fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> crate::Result<()> {
         let by_key = by_name(keyframes);
         session.start_clock(Instant::now());
         for entry in &self.decisions.entries {
@@ -125,7 +124,7 @@ impl Replay {
                     break;
                 }
                 if session.step(entry.step - n_total_steps)? == 0 {
-                    return Err(InsufficientData(format!(
+                    return Err(Error::InsufficientData(format!(
                         "{} requires step {}, but there is nothing to train on",
                         self.name(),
                         entry.step

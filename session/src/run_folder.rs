@@ -1,10 +1,8 @@
 //! The folder of a run, and the files in it.
 
 use capture::config::Rig;
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::ModelKind;
-use crate::splat_file;
-use anyhow::{Context, bail, ensure};
+use crate::Error;
+use crate::error::{bail, ensure, Context};
 use keyframe::Keyframe;
 use serde::Serialize;
 use sha2::{Digest, Sha256};
@@ -12,7 +10,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::Method;
+use trainer::{splat_file, Method, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
@@ -25,17 +23,17 @@ const RUNS: &str = "runs";
 /// Folder in which a model is saved until it is complete.
 const PARTIAL_MODEL: &str = "model.part";
 /// The checkpoint in the folder of a run.
-pub(crate) const CHECKPOINT: &str = "training.ckpt";
+pub const CHECKPOINT: &str = "training.ckpt";
 /// Lock file, held while a run writes into a folder.
 const LOCK: &str = ".lock";
 const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains one or several models, so that results are never mixed or overwritten.
-pub(crate) fn check_no_model(folder: &Path) -> Result<(), BadArgument> {
+pub fn check_no_model(folder: &Path) -> Result<(), Error> {
     let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.map(|kind| PathBuf::from(kind.name())));
     let mut files = subfolders.flat_map(|path| MODEL_FILES.map(|name| path.join(name)));
     match files.find(|file| folder.join(file).exists()) {
-        Some(file) => Err(BadArgument(format!(
+        Some(file) => Err(Error::BadInput(format!(
             "--out {}: the folder already contains a model ({}); give another folder",
             folder.display(),
             file.display()
@@ -46,10 +44,10 @@ pub(crate) fn check_no_model(folder: &Path) -> Result<(), BadArgument> {
 
 /// Returns an error if a folder contains one or several interrupted runs, because a new run would replace their
 /// checkpoints.
-pub(crate) fn check_no_unfinished_run(out: &Path) -> Result<(), BadArgument> {
+pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
     let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.into_iter().map(|kind| out.join(kind.name())));
     match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
-        Some(folder) => Err(BadArgument(format!(
+        Some(folder) => Err(Error::BadInput(format!(
             "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
             out.display(),
             folder.display()
@@ -59,18 +57,18 @@ pub(crate) fn check_no_unfinished_run(out: &Path) -> Result<(), BadArgument> {
 }
 
 /// Returns an error if results would be written into the folder of the data.
-pub(crate) fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), BadArgument> {
+pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
         (Some(folder), Some(data)) if folder == data => {
-            Err(BadArgument(format!("--out {}: this is the folder of the data; give another folder", out.display())))
+            Err(Error::BadInput(format!("--out {}: this is the folder of the data; give another folder", out.display())))
         }
         _ => Ok(()),
     }
 }
 
 /// Returns an error that names the subfolders if a folder contains models of several methods where one model is needed.
-pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
+pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
     let inside: Vec<String> = ModelKind::ALL
         .into_iter()
@@ -81,11 +79,11 @@ pub(crate) fn expect_one_model(folder: &Path) -> Result<(), BadArgument> {
     if inside.is_empty() || holds_one(folder) {
         return Ok(());
     }
-    Err(BadArgument(format!("{}: the folder contains several methods; give {}", folder.display(), inside.join(" or "))))
+    Err(Error::BadInput(format!("{}: the folder contains several methods; give {}", folder.display(), inside.join(" or "))))
 }
 
 /// Returns an error unless the path is a model: an existing folder with exactly one model, or a file of splats.
-pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
+pub fn expect_model(model: &Path) -> crate::Result<()> {
     let shown = model.display();
     ensure!(model.exists(), "{shown} does not exist");
     if model.is_dir() {
@@ -101,14 +99,14 @@ pub(crate) fn expect_model(model: &Path) -> anyhow::Result<()> {
         model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
     if is_model_part || splat_file::Format::of(model).is_none() {
         let message = format!("{shown} is not a file of splats (.ply, .spz); for a saved model, give its folder");
-        return Err(BadArgument(message).into());
+        return Err(Error::BadInput(message).into());
     }
     Ok(())
 }
 
 /// The models at a path: the path itself, or the models in the folder of a run of several methods. Returns the same
 /// errors as [`expect_model`]. Methods without a model are left out, unless none has one.
-pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
+pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
     let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
     let inside = ModelKind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
     let inside: Vec<PathBuf> = inside.collect();
@@ -121,7 +119,7 @@ pub(crate) fn models_at(path: &Path) -> anyhow::Result<Vec<PathBuf>> {
 
 /// Folders created by this run. They are removed if the run is rejected.
 #[derive(Debug, Default)]
-pub(crate) struct CreatedFolders {
+pub struct CreatedFolders {
     /// Folders of the run, each before its parent.
     leaves: Vec<PathBuf>,
     /// Their parents, each before its own parent.
@@ -131,12 +129,12 @@ pub(crate) struct CreatedFolders {
 impl CreatedFolders {
     /// Creates the folder of each model of a run: the requested folder for a single model, else a subfolder per method.
     /// Writes the resolved rig file, if any, into each of them, with only the method of that model.
-    pub(crate) fn make_each(
+    pub fn make_each(
         &mut self,
         requested: Option<&Path>,
         kinds: &[ModelKind],
         rig: Option<&Rig>,
-    ) -> anyhow::Result<Vec<PathBuf>> {
+    ) -> crate::Result<Vec<PathBuf>> {
         let write = |rig: &Rig, folder: &Path| {
             rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))
         };
@@ -144,7 +142,7 @@ impl CreatedFolders {
         let folders: Vec<PathBuf> = match kinds {
             [_] => vec![out.clone()],
             several => {
-                several.iter().map(|kind| self.make(Some(&out.join(kind.name())))).collect::<anyhow::Result<_>>()?
+                several.iter().map(|kind| self.make(Some(&out.join(kind.name())))).collect::<crate::Result<_>>()?
             }
         };
         if let Some(rig) = rig {
@@ -157,7 +155,7 @@ impl CreatedFolders {
     }
 
     /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model is an error.
-    pub(crate) fn make(&mut self, requested: Option<&Path>) -> anyhow::Result<PathBuf> {
+    pub fn make(&mut self, requested: Option<&Path>) -> crate::Result<PathBuf> {
         let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
         let missing = |folder: &Path| folder.ancestors().take_while(is_missing).map(Path::to_owned).collect::<Vec<_>>();
         let runs = missing(Path::new(RUNS));
@@ -178,7 +176,7 @@ impl CreatedFolders {
     }
 
     /// Removes the created folders with their contents, unless they contain a model, a checkpoint or a recording.
-    pub(crate) fn remove_created(self) {
+    pub fn remove_created(self) {
         let holds_recording = |folder: &PathBuf| {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
             entries.map(|entry| entry.path()).any(|path| is_recording(&path))
@@ -197,19 +195,18 @@ impl CreatedFolders {
         }
     }
 
-    /// Removes the created folders if the command was rejected because of bad arguments or insufficient data.
-    pub(crate) fn keep_or_remove<T>(self, result: anyhow::Result<T>) -> anyhow::Result<T> {
-        if result.as_ref().is_err_and(|error| matches!(exit::of(error), Exit::BadArguments | Exit::InsufficientData)) {
+    /// Removes the created folders if the command was rejected, because of bad input or insufficient data.
+    pub fn keep_unless(self, is_rejected: bool) {
+        if is_rejected {
             self.remove_created();
         }
-        result
     }
 }
 
-fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
+fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
     if let Some(folder) = requested {
         if folder.to_str().is_none() {
-            return Err(BadArgument(format!("--out {}: the name must be valid UTF-8", folder.display())).into());
+            return Err(Error::BadInput(format!("--out {}: the name must be valid UTF-8", folder.display())).into());
         }
         check_no_model(folder)?;
         std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
@@ -220,12 +217,12 @@ fn make(requested: Option<&Path>) -> anyhow::Result<PathBuf> {
 }
 
 /// Creates a folder in the system's temporary folder, for a model that cannot be saved in the folder of its run.
-pub(crate) fn make_fallback_folder() -> anyhow::Result<PathBuf> {
+pub fn make_fallback_folder() -> crate::Result<PathBuf> {
     make_in(&std::env::temp_dir(), "fieldrig-")
 }
 
 /// Creates a new folder named after the current time.
-fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
+fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
     #[expect(clippy::disallowed_methods, reason = "only a readable name; no time is measured")]
     let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     std::fs::create_dir_all(parent).with_context(|| format!("cannot create the folder {}", parent.display()))?;
@@ -248,14 +245,14 @@ fn make_in(parent: &Path, prefix: &str) -> anyhow::Result<PathBuf> {
 }
 
 /// Locks a folder against other runs for the lifetime of this process.
-fn lock(folder: &Path) -> anyhow::Result<()> {
+fn lock(folder: &Path) -> crate::Result<()> {
     let path = folder.join(LOCK);
     let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
     match file.try_lock() {
         Ok(()) => std::mem::forget(file), // The system releases it when the process ends in any way.
         Err(std::fs::TryLockError::WouldBlock) => {
             let message = format!("--out {}: another run uses this folder; give another one", folder.display());
-            return Err(BadArgument(message).into());
+            return Err(Error::BadInput(message).into());
         }
         Err(std::fs::TryLockError::Error(error)) => log::debug!("cannot lock {}: {error}", path.display()),
     }
@@ -263,7 +260,7 @@ fn lock(folder: &Path) -> anyhow::Result<()> {
 }
 
 /// Saves a model in a temporary subfolder and moves its files into place once it is complete.
-pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Result<()> {
+pub fn save_model(method: &mut dyn Method, folder: &Path) -> crate::Result<()> {
     let partial_folder = folder.join(PARTIAL_MODEL);
     if partial_folder.exists() {
         // Left by a run that was killed while saving.
@@ -285,24 +282,24 @@ pub(crate) fn save_model(method: &mut dyn Method, folder: &Path) -> anyhow::Resu
 }
 
 /// Writes a report as indented JSON.
-pub(crate) fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
+pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
     let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
     text.push('\n');
     write_atomic(path, &text)
 }
 
 /// Writes a file that is either complete or absent.
-pub(crate) fn write_atomic(path: &Path, text: &str) -> anyhow::Result<()> {
+pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
     Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
 }
 
 /// Writes the keyframes of a run and their splits, for `--keyframes`.
-pub(crate) fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
     write_atomic(path, &crate::keyframe::list_text(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.
-pub(crate) fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
+pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
     let mut hash = Sha256::new();
     let mut n_files = 0;
     for name in MODEL_FILES {
@@ -320,7 +317,7 @@ pub(crate) fn checkpoint_sha256(folder: &Path) -> anyhow::Result<String> {
 }
 
 /// Lower-case hexadecimal digits.
-pub(crate) fn hex(bytes: &[u8]) -> String {
+pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
@@ -350,7 +347,7 @@ fn date_from_days(mut days: u64) -> (u64, usize, u64) {
 }
 
 /// Whether the file name is that of a recording.
-pub(crate) fn is_recording(path: &Path) -> bool {
+pub fn is_recording(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
 }
 
@@ -411,7 +408,7 @@ mod tests {
         std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
         assert!(
             check_no_unfinished_run(out.path())
-                .is_err_and(|error| error.0.contains("splat contains an interrupted run"))
+                .is_err_and(|error| error.to_string().contains("splat contains an interrupted run"))
         );
         assert!(check_no_unfinished_run(&run).is_err());
     }
@@ -421,21 +418,20 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
         std::fs::create_dir(&foreign_folder).expect("disk space");
-        let refused = || Err::<(), _>(anyhow::Error::new(BadArgument("too small".into())));
         for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
             let mut created = CreatedFolders::default();
             created.make_each(Some(requested), &[ModelKind::Tsdf, ModelKind::Splat], None).expect("it is free");
-            assert!(created.keep_or_remove(refused()).is_err());
+            created.keep_unless(true);
             assert_eq!((requested.exists(), requested.join("tsdf").exists()), (is_left, false), "{requested:?}");
         }
         assert!(!folder.path().join("a").exists());
-        let failed = Err(anyhow::anyhow!("the disk is full"));
-        for (result, file) in [(refused(), CHECKPOINT), (refused(), "scan.mcap"), (failed, "keyframes.txt")] {
+        for (is_rejected, file) in [(true, CHECKPOINT), (true, "scan.mcap"), (false, "keyframes.txt")] {
             let mut created = CreatedFolders::default();
             let out = folder.path().join(file);
             created.make(Some(&out)).expect("it is free");
             std::fs::write(out.join(file), b"x").expect("file");
-            assert!(created.keep_or_remove(result).is_err() && out.exists(), "{file}");
+            created.keep_unless(is_rejected);
+            assert!(out.exists(), "{file}");
         }
     }
 

@@ -1,10 +1,10 @@
 //! The first view: around the point that the cameras look at, or without cameras around the model.
 
-use crate::model_bounds::Bounds;
 use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::sync::Arc;
+use trainer::Bounds;
 use viz::SceneHint;
 
 /// Assumed distance of the scene ahead of the cameras where their axes do not determine it, meters.
@@ -19,12 +19,12 @@ const DISTANCE_RADII: f64 = 2.0;
 const VIEW_DIRECTION: [f64; 3] = [0.5, -0.707, 0.5];
 
 /// The point nearest to all optical axes, from the first camera; `None` without keyframes.
-pub(crate) fn from_keyframes(keyframes: &[Arc<Keyframe>]) -> Option<SceneHint> {
+pub fn from_keyframes(keyframes: &[Arc<Keyframe>]) -> Option<SceneHint> {
     from_cameras(keyframes.iter().map(|keyframe| keyframe.world_from_camera).collect())
 }
 
 /// The point nearest to all optical axes, from the first camera; `None` without cameras.
-pub(crate) fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
+pub fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHint> {
     let world_from_camera = *world_from_cameras.first()?;
     let center = nearest_to_axes(&world_from_cameras)?;
     let distances_m = world_from_cameras.iter().map(|pose| (center.coords - pose.translation.vector).norm());
@@ -36,7 +36,7 @@ pub(crate) fn from_cameras(world_from_cameras: Vec<Transform>) -> Option<SceneHi
 }
 
 /// A view of the whole model from outside and slightly above, z up.
-pub(crate) fn from_bounds(bounds: &Bounds) -> SceneHint {
+pub fn from_bounds(bounds: &Bounds) -> SceneHint {
     let view_direction = Vector3::from(VIEW_DIRECTION).normalize();
     let forward = -view_direction;
     let right = forward.cross(&Vector3::z()).normalize();
@@ -66,8 +66,8 @@ fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use nalgebra::{Translation3, UnitQuaternion};
+    use super::*;
 
     fn camera_at(position: [f64; 3], target: Point3<f64>) -> Transform {
         let position = Point3::from(position);

@@ -1,37 +1,31 @@
 //! A training session: one model with its keyframes, clock, evaluation schedule and reports.
 
-use keyframe::counted;
-use crate::checkpoints::{Checkpoints, Snapshot};
+use calibration::{Alignment, CalibratedCamera, TrialReport};
+use capture::{chain, Stop};
+use crate::{camera_list, gpu_loss, report, run_folder};
+use crate::checkpoints::{self, Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
+use crate::error::Context;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::evaluation_schedule::EvaluationSchedule;
-use keyframe::split_name;
-use crate::method::{self, FailedModel, ModelKind};
 use crate::next_commands::{self, DataSource, SavedModel};
-use crate::open_gpu;
+use crate::observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
 use crate::pending_evaluation::PendingEvaluation;
 use crate::recovery::{self, Recovery};
-use capture::Stop;
-use crate::{camera_list, checkpoints, exit, print, report, run_folder};
-use anyhow::Context;
-use calibration::Alignment;
-use calibration::CalibratedCamera;
-use calibration::TrialReport;
-use indicatif::ProgressBar;
-use keyframe::{DepthMap, Keyframe, Split};
+use keyframe::{counted, split_name, DepthMap, Keyframe, Split};
 use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::{Method, Picture, Progress, RenderRequest};
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
-pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
+pub const TIME_SLICE: Duration = Duration::from_millis(40);
 /// Number of steps in a profile, which reports medians.
 const N_PROFILED: usize = 21;
 /// Drivers are slow for a while after large buffers have been freed.
@@ -41,16 +35,16 @@ const MAX_HISTORY: usize = 512;
 
 /// When to stop training.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Limits {
+pub struct Limits {
     /// Seconds on the session's clock.
-    pub(crate) seconds: Option<f64>,
+    pub seconds: Option<f64>,
     /// Number of optimizer updates.
-    pub(crate) steps: Option<u64>,
+    pub steps: Option<u64>,
 }
 
 impl Limits {
     /// The limits as text, such as `8 s` or `500 steps`.
-    pub(crate) fn describe(self) -> String {
+    pub fn describe(self) -> String {
         let parts =
             [self.seconds.map(|seconds| format!("{seconds} s")), self.steps.map(|steps| format!("{steps} steps"))];
         parts.into_iter().flatten().collect::<Vec<_>>().join(" or ")
@@ -59,37 +53,17 @@ impl Limits {
 
 /// How a session is evaluated.
 #[derive(Clone)]
-pub(crate) struct Evaluators {
+pub struct Evaluators {
     /// Evaluator for scheduled evaluations: thorough in `train`, quick in a live run.
-    pub(crate) during_training: Evaluator,
+    pub during_training: Evaluator,
     /// Maximum number of test keyframes in a scheduled evaluation, spread evenly over all. All are scored at the end.
-    pub(crate) max_images_during_training: usize,
+    pub max_images_during_training: usize,
     /// Evaluator for the end of training.
-    pub(crate) at_end: Evaluator,
-}
-
-/// What a session prints.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum OutputMode {
-    /// A line per evaluation, and a progress bar if stderr is a terminal.
-    Lines,
-    /// A JSON object per evaluation.
-    Json,
-    /// Only the progress bar; the caller reports the result.
-    Bar,
-    /// Nothing at all.
-    Nothing,
-}
-
-impl OutputMode {
-    /// The output mode of a command with one session.
-    pub(crate) fn of_command(json: bool) -> Self {
-        if json { Self::Json } else { Self::Lines }
-    }
+    pub at_end: Evaluator,
 }
 
 /// A model in training.
-pub(crate) struct Session {
+pub struct Session {
     kind: ModelKind,
     method: Box<dyn Method>,
     checkpoints: Option<Checkpoints>,
@@ -124,62 +98,22 @@ pub(crate) struct Session {
     history: Vec<(f64, f64)>,
     /// Latest PSNR of each test keyframe, by camera and stamp.
     newest_psnr: BTreeMap<(String, i64), f64>,
-    output: OutputMode,
+    observer: Box<dyn Observer>,
     /// Whether a stop was requested; an evaluation is then aborted.
     stop: Stop,
     profiles: bool,
-    bar: ProgressBar,
-}
-
-/// Report of a scheduled evaluation.
-#[derive(Clone, Debug, Serialize)]
-pub(crate) struct Evaluation {
-    event: &'static str,
-    method: &'static str,
-    pub(crate) seconds: f64,
-    pub(crate) step: u64,
-    #[serde(flatten)]
-    pub(crate) scores: Scores,
-    /// Number of test images in the mean scores.
-    n_images: usize,
-    pub(crate) primitives: u64,
-    pub(crate) bytes: u64,
-    step_millis: Option<f64>,
 }
 
 /// Result of training.
-pub(crate) struct TrainingOutcome {
-    pub(crate) seconds: f64,
-    pub(crate) steps: u64,
-    pub(crate) scores: Scores,
-    pub(crate) primitives: u64,
-    pub(crate) bytes: u64,
+pub struct TrainingOutcome {
+    pub seconds: f64,
+    pub steps: u64,
+    pub scores: Scores,
+    pub primitives: u64,
+    pub bytes: u64,
     /// The scheduled evaluations.
-    pub(crate) evaluations: Vec<Evaluation>,
+    pub evaluations: Vec<Evaluation>,
     per_image: Vec<ImageScores>,
-}
-
-/// Report at the end of training.
-#[derive(Clone, Debug, Serialize)]
-struct DoneEvent<'a> {
-    event: &'static str,
-    method: &'static str,
-    seconds: f64,
-    steps: u64,
-    #[serde(flatten)]
-    scores: Scores,
-    primitives: u64,
-    bytes: u64,
-    out: &'a Path,
-    checkpoint_sha256: &'a str,
-}
-
-/// GPU time of each kernel in a step, milliseconds.
-#[derive(Debug, Serialize)]
-struct ProfileEvent<'a> {
-    event: &'static str,
-    method: &'static str,
-    passes: &'a [(&'static str, f64)],
 }
 
 /// The content of `report.json`.
@@ -206,44 +140,45 @@ struct NamedScores<'a> {
 }
 
 /// A trained model that has been saved and scored and is still in GPU memory.
-pub(crate) struct FinishedModel {
-    pub(crate) kind: ModelKind,
-    pub(crate) method: Box<dyn Method>,
-    pub(crate) folder: PathBuf,
+pub struct FinishedModel {
+    pub kind: ModelKind,
+    pub method: Box<dyn Method>,
+    pub folder: PathBuf,
     /// Training time, seconds.
-    pub(crate) seconds: f64,
+    pub seconds: f64,
     /// Scores of the saved model on the test images.
-    pub(crate) scores: Scores,
+    pub scores: Scores,
     data: DataSource,
     n_tests: usize,
-    output: OutputMode,
 }
 
 impl FinishedModel {
-    fn saved(&self) -> SavedModel<'_> {
+    /// The saved model, for commands that use it.
+    #[must_use]
+    pub fn saved(&self) -> SavedModel<'_> {
         SavedModel { kind: self.kind, folder: &self.folder, data: &self.data, n_tests: self.n_tests }
     }
 }
 
 /// One of several sessions that end together, with its output folder and the report details specific to the command.
-pub(crate) struct EndingSession<P> {
-    pub(crate) session: Session,
-    pub(crate) out: PathBuf,
-    pub(crate) details: P,
+pub struct EndingSession<P> {
+    pub session: Session,
+    pub out: PathBuf,
+    pub details: P,
 }
 
 /// Saves the models, then scores each one, writes its report, and reports the end. Returns the models so that they can
 /// be shown.
-pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow::Result<Vec<FinishedModel>> {
+pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<Vec<FinishedModel>> {
     // All models are saved before scoring, so that a second Ctrl-C during scoring loses nothing.
     let ended_secs: Vec<f64> =
-        endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<anyhow::Result<_>>()?;
+        endings.iter_mut().map(|ending| ending.session.stop_training()).collect::<crate::Result<_>>()?;
     let mut saved = Vec::new();
     // The first error is returned, the others are logged.
     let mut failed = Ok(());
-    let mut record_error = |error: anyhow::Error| match failed {
+    let mut record_error = |error: crate::Error| match failed {
         Ok(()) => failed = Err(error),
-        Err(_) => log::error!("{error:#}"),
+        Err(_) => log::error!("{}", chain(&error)),
     };
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // If one model cannot be saved, the others still are.
@@ -260,7 +195,7 @@ pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow:
     for (ending, ..) in &mut saved {
         if let Some(Err(error)) = ending.session.checkpoints.as_mut().map(Checkpoints::wait) {
             record_error(
-                error.context(format!("the model was saved in {}, but not the last checkpoint", ending.out.display())),
+                error.with_context(format!("the model was saved in {}, but not the last checkpoint", ending.out.display())),
             );
         }
     }
@@ -274,12 +209,6 @@ pub(crate) fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> anyhow:
             Err(error) => record_error(error),
         }
     }
-    if finished.iter().any(|model| model.output == OutputMode::Lines) {
-        let models: Vec<SavedModel<'_>> = finished.iter().map(FinishedModel::saved).collect();
-        for line in next_commands::lines(&next_commands::for_models(&models)) {
-            print::report(line);
-        }
-    }
     failed.map(|()| finished)
 }
 
@@ -288,20 +217,18 @@ struct Saved {
     folder: PathBuf,
     sha256: String,
     /// Error of saving in the run folder, if the model was saved elsewhere.
-    failed: Option<anyhow::Error>,
+    failed: Option<crate::Error>,
 }
 
 impl Session {
     /// A session with a new model. Its clock does not run until [`Self::start_clock`].
-    pub(crate) fn new(
+    pub fn new(
         gpu: Arc<Gpu>,
         (kind, method): (ModelKind, Box<dyn Method>),
         evaluators: Evaluators,
         limits: Limits,
-        output: OutputMode,
+        observer: Box<dyn Observer>,
     ) -> Self {
-        let length = limits.steps.or(limits.seconds.map(whole_secs));
-        let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
         Self {
             kind,
             method,
@@ -327,90 +254,89 @@ impl Session {
             reported: Vec::new(),
             history: Vec::new(),
             newest_psnr: BTreeMap::new(),
-            output,
+            observer,
             stop: Stop::default(),
             profiles: false,
-            bar: print::bar(length, template, matches!(output, OutputMode::Json | OutputMode::Nothing)),
         }
     }
 
     /// Enables checkpoints.
-    pub(crate) fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
+    pub fn with_checkpoints(self, checkpoints: Option<Checkpoints>) -> Self {
         Self { checkpoints, ..self }
     }
 
     /// Aborts an evaluation without a report if a stop is requested.
-    pub(crate) fn with_stop(self, stop: &Stop) -> Self {
+    pub fn with_stop(self, stop: &Stop) -> Self {
         Self { stop: stop.clone(), ..self }
     }
 
     /// Leaves scoring to [`Self::score_next`], so that the caller can draw pictures in between. The caller must neither
     /// train nor push keyframes while [`Self::is_scoring`], so that all images of an evaluation are scored on the same
     /// model state.
-    pub(crate) fn with_stepwise_scoring(self) -> Self {
+    pub fn with_stepwise_scoring(self) -> Self {
         Self { scores_stepwise: true, ..self }
     }
 
     /// Reports the GPU time of each pass at the end, if `profiles` is set.
-    pub(crate) fn with_profile(self, profiles: bool) -> Self {
+    pub fn with_profile(self, profiles: bool) -> Self {
         Self { profiles, ..self }
     }
 
     /// Enables the log of timing-dependent decisions.
-    pub(crate) fn with_decisions(self, decisions: DecisionLog) -> Self {
+    pub fn with_decisions(self, decisions: DecisionLog) -> Self {
         Self { decisions: Some(decisions), ..self }
     }
 
     /// Sets the data source for the report and the next commands.
-    pub(crate) fn with_data(self, data: DataSource) -> Self {
+    pub fn with_data(self, data: DataSource) -> Self {
         Self { data, ..self }
     }
 
     /// Enables recovery on another device if the GPU fails.
-    pub(crate) fn with_recovery(self, recovery: Recovery) -> Self {
+    pub fn with_recovery(self, recovery: Recovery) -> Self {
         Self { recovery: Some(recovery), ..self }
     }
 
     /// Continues from the training time of earlier runs, without repeating their evaluations.
-    pub(crate) fn with_elapsed_secs(mut self, previous_secs: f64) -> Self {
+    pub fn with_elapsed_secs(mut self, previous_secs: f64) -> Self {
         self.clock = Clock::with_elapsed(previous_secs);
         self.schedule.reached(previous_secs);
         self
     }
 
-    /// Makes this one of several sessions with a common clock. Hides the progress bar, because several bars would
-    /// overwrite each other.
-    pub(crate) fn with_shared_clock(self, clock: Clock) -> Self {
-        Self { clock, bar: ProgressBar::hidden(), ..self }
+    /// Makes this one of several sessions with a common clock.
+    #[must_use]
+    pub fn with_shared_clock(self, clock: Clock) -> Self {
+        Self { clock, ..self }
     }
 
     /// The kind of model.
-    pub(crate) fn kind(&self) -> ModelKind {
+    pub fn kind(&self) -> ModelKind {
         self.kind
     }
 
     /// Starts the clock unless it is already running.
-    pub(crate) fn start_clock(&mut self, at: Instant) {
+    pub fn start_clock(&mut self, at: Instant) {
         self.clock.start(at);
     }
 
     /// Time at which the clock was started, if it was.
-    pub(crate) fn clock_started(&self) -> Option<Instant> {
+    pub fn clock_started(&self) -> Option<Instant> {
         self.clock.started()
     }
 
     /// Keyframes in the store, in order of arrival.
-    pub(crate) fn keyframes(&self) -> &[Arc<Keyframe>] {
+    pub fn keyframes(&self) -> &[Arc<Keyframe>] {
         &self.keyframes
     }
 
     /// Training time so far, seconds.
-    pub(crate) fn secs(&self) -> f64 {
+    pub fn secs(&self) -> f64 {
         self.clock.secs()
     }
 
     /// Adds a keyframe to the model. Test keyframes are also kept for evaluation.
-    pub(crate) fn push(&mut self, keyframe: &Arc<Keyframe>) -> anyhow::Result<()> {
+    pub fn push(&mut self, keyframe: &Arc<Keyframe>) -> crate::Result<()> {
         self.hold(keyframe);
         self.method.push(keyframe.clone())?;
         if let Some(decisions) = &mut self.decisions {
@@ -420,7 +346,7 @@ impl Session {
     }
 
     /// Adds a keyframe that the model was already trained on in the resumed run.
-    pub(crate) fn hold(&mut self, keyframe: &Arc<Keyframe>) {
+    pub fn hold(&mut self, keyframe: &Arc<Keyframe>) {
         if keyframe.split == Split::Test {
             if keyframe.rgba_srgb.chunks_exact(4).any(|pixel| pixel[3] > 0) {
                 self.tests.push_back(keyframe.clone());
@@ -433,7 +359,7 @@ impl Session {
     }
 
     /// Removes a keyframe.
-    pub(crate) fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> anyhow::Result<()> {
+    pub fn remove(&mut self, camera: &str, stamp: kinematics::Stamp) -> crate::Result<()> {
         let is_other = |held: &Arc<Keyframe>| held.camera.as_ref() != camera || held.stamp != stamp;
         if self.recovery.is_some() {
             let evicted = self.keyframes.iter().filter(|held| !is_other(held));
@@ -450,114 +376,114 @@ impl Session {
     }
 
     /// Creates splats for the keyframes so far.
-    pub(crate) fn seed(&mut self) -> anyhow::Result<()> {
+    pub fn seed(&mut self) -> crate::Result<()> {
         self.note_render();
         Ok(self.method.seed()?)
     }
 
     /// Draws a picture.
-    pub(crate) fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
+    pub fn render(&mut self, request: &RenderRequest) -> Result<Picture, trainer::Error> {
         self.note_render();
         self.method.render(request)
     }
 
     /// Waits for queued work and returns the total number of updates, including trials.
-    pub(crate) fn n_total_steps(&mut self) -> anyhow::Result<u64> {
+    pub fn n_total_steps(&mut self) -> crate::Result<u64> {
         Ok(self.method.n_total_steps()?)
     }
 
     /// Whether a limit was reached.
-    pub(crate) fn is_over(&self) -> bool {
+    pub fn is_over(&self) -> bool {
         self.limits.seconds.is_some_and(|secs| self.secs() >= secs) || self.has_finished_steps()
     }
 
     /// Number of steps left until the step limit; `None` without a step limit.
-    pub(crate) fn n_steps_remaining(&self) -> Option<u64> {
+    pub fn n_steps_remaining(&self) -> Option<u64> {
         Some(self.limits.steps?.saturating_sub(self.method.progress().step))
     }
 
     /// Whether the step limit was reached, so that the model no longer changes.
-    pub(crate) fn has_finished_steps(&self) -> bool {
+    pub fn has_finished_steps(&self) -> bool {
         self.limits.steps.is_some_and(|steps| self.method.progress().step >= steps)
     }
 
     /// Whether the model needs another keyframe before it can train further.
-    pub(crate) fn is_idle(&self) -> bool {
+    pub fn is_idle(&self) -> bool {
         self.method.is_idle()
     }
 
     /// Trains for at most `max_steps` steps, and evaluates if an evaluation is due.
-    pub(crate) fn step(&mut self, max_steps: u64) -> anyhow::Result<u64> {
+    pub fn step(&mut self, max_steps: u64) -> crate::Result<u64> {
         let n = self.train_steps(max_steps)?;
         self.evaluate_when_due()?;
         Ok(n)
     }
 
     /// Trains for at most `max_steps` steps.
-    pub(crate) fn train_steps(&mut self, max_steps: u64) -> anyhow::Result<u64> {
+    pub fn train_steps(&mut self, max_steps: u64) -> crate::Result<u64> {
         let left = self.limits.steps.map_or(u64::MAX, |steps| steps.saturating_sub(self.method.progress().step));
         if let Some(decisions) = &mut self.decisions {
             decisions.step_requested();
         }
         let n = self.method.step(max_steps.min(left))?;
-        open_gpu::lose_for_tests(&self.gpu, self.method.progress().step);
+        gpu_loss::lose_when_due(&self.gpu, self.method.progress().step);
         Ok(n)
     }
 
     /// Returns an error if the GPU failed.
-    pub(crate) fn check_gpu(&self) -> anyhow::Result<()> {
+    pub fn check_gpu(&self) -> crate::Result<()> {
         Ok(self.gpu.check()?)
     }
 
     /// Waits for queued work.
-    pub(crate) fn wait(&self) -> anyhow::Result<()> {
+    pub fn wait(&self) -> crate::Result<()> {
         Ok(self.gpu.wait()?)
     }
 
     /// What is needed to continue on another device, if anything is.
-    pub(crate) fn recovery(&self) -> Option<&Recovery> {
+    pub fn recovery(&self) -> Option<&Recovery> {
         self.recovery.as_ref()
     }
 
     /// Waits until no checkpoint is being written.
-    pub(crate) fn wait_for_checkpoint(&mut self) {
+    pub fn wait_for_checkpoint(&mut self) {
         if let Some(Err(error)) = self.checkpoints.as_mut().map(Checkpoints::wait) {
-            log::debug!("the last checkpoint was not written: {error:#}");
+            log::debug!("the last checkpoint was not written: {}", chain(&error));
         }
     }
 
     /// Whether this run has written a checkpoint.
-    pub(crate) fn has_checkpoint(&mut self) -> bool {
+    pub fn has_checkpoint(&mut self) -> bool {
         self.checkpoints.as_mut().is_some_and(|checkpoints| checkpoints.newest().is_some())
     }
 
     /// Excludes this much from the training time.
-    pub(crate) fn exclude(&self, spent: Duration) {
+    pub fn exclude(&self, spent: Duration) {
         self.clock.exclude(spent);
     }
 
     /// Drops the model on a failed device; [`Self::restart_on`] makes a new one.
-    pub(crate) fn drop_model(&mut self) {
+    pub fn drop_model(&mut self) {
         self.method = Box::new(FailedModel);
     }
 
     /// Restores the model on another device from the newest checkpoint or, without one, from the start.
-    pub(crate) fn restart_on(&mut self, gpu: &Arc<Gpu>) -> anyhow::Result<()> {
-        let Some(recovery) = &self.recovery else { anyhow::bail!("this run cannot continue on another device") };
+    pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
+        let Some(recovery) = &self.recovery else { crate::error::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
         let checkpoint = match (written, &recovery.resumed) {
-            (Some(path), _) => Some(Checkpoint::read(&path).map_err(anyhow::Error::from)),
+            (Some(path), _) => Some(Checkpoint::read(&path).map_err(crate::Error::from)),
             (None, Some(folder)) => Some(checkpoints::read(folder)),
             (None, None) => None,
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint?, &all)).transpose();
+        let resumed = checkpoint.map(|checkpoint| trainer::resume(gpu.clone(), &checkpoint?, &all)).transpose();
         let resumed = resumed.or_else(|error| {
-            if recovery::is_gpu_error(&error) {
+            if error.is_gpu_error() {
                 return Err(error);
             }
-            log::warn!("cannot resume from the newest checkpoint: {error:#}");
+            log::warn!("cannot resume from the newest checkpoint: {}", chain(&error));
             Ok(None)
         })?;
         let is_resumed = resumed.is_some();
@@ -600,11 +526,11 @@ impl Session {
     /// returns.
     ///
     /// `is_render_pending`: whether a picture waits for the end of the slice; called after each submit.
-    pub(crate) fn run_time_slice(
+    pub fn run_time_slice(
         &mut self,
         max_steps: impl Fn(&Self) -> u64,
         is_render_pending: impl Fn() -> bool,
-    ) -> anyhow::Result<()> {
+    ) -> crate::Result<()> {
         let started = Instant::now();
         let mut n_steps = 0;
         loop {
@@ -625,23 +551,23 @@ impl Session {
     }
 
     /// Time that this session has used a shared device.
-    pub(crate) fn device_time(&self) -> Duration {
+    pub fn device_time(&self) -> Duration {
         self.device_time
     }
 
     /// Raises the device time to at least this, so that an idle session does not catch up later.
-    pub(crate) fn raise_device_time(&mut self, device_time: Duration) {
+    pub fn raise_device_time(&mut self, device_time: Duration) {
         self.device_time = self.device_time.max(device_time);
     }
 
     /// Marks the session as finished at the current training time.
-    pub(crate) fn mark_finished(&mut self) {
+    pub fn mark_finished(&mut self) {
         let secs = self.secs();
         self.finished_secs.get_or_insert(secs);
     }
 
     /// Writes a checkpoint if one is due, and evaluates if an evaluation is due. A finished session does neither.
-    pub(crate) fn evaluate_when_due(&mut self) -> anyhow::Result<()> {
+    pub fn evaluate_when_due(&mut self) -> crate::Result<()> {
         if self.finished_secs.is_some() {
             return Ok(());
         }
@@ -668,17 +594,17 @@ impl Session {
                 self.score_next()?;
             }
         }
-        self.update_bar();
+        self.report_progress();
         Ok(())
     }
 
     /// Whether an evaluation is in progress.
-    pub(crate) fn is_scoring(&self) -> bool {
+    pub fn is_scoring(&self) -> bool {
         self.pending_evaluation.is_some()
     }
 
     /// Scores one more test image of the evaluation in progress, and reports the evaluation after its last image.
-    pub(crate) fn score_next(&mut self) -> anyhow::Result<()> {
+    pub fn score_next(&mut self) -> crate::Result<()> {
         let Some(mut evaluation) = self.pending_evaluation.take() else { return Ok(()) };
         if self.stop.requested() {
             return Ok(());
@@ -697,13 +623,13 @@ impl Session {
     }
 
     /// Sets whether pictures are requested during training; submits are shorter then.
-    pub(crate) fn set_watched(&mut self, watched: bool) {
+    pub fn set_watched(&mut self, watched: bool) {
         self.method.set_watched(watched);
     }
 
     /// Scores the test keyframe whose score is oldest, for the curve between scheduled evaluations; counts as training
     /// time.
-    pub(crate) fn refresh_psnr(&mut self) -> anyhow::Result<()> {
+    pub fn refresh_psnr(&mut self) -> crate::Result<()> {
         let Some(oldest) = self.tests.pop_front() else { return Ok(()) };
         self.tests.push_back(oldest.clone());
         self.note_render();
@@ -715,33 +641,33 @@ impl Session {
     }
 
     /// Mean of the latest PSNR of all test keyframes, dB.
-    pub(crate) fn psnr(&self) -> Option<f64> {
+    pub fn psnr(&self) -> Option<f64> {
         let n = self.newest_psnr.len();
         (n > 0).then(|| self.newest_psnr.values().sum::<f64>() / n as f64)
     }
 
     /// The history of [`Self::psnr`]: training seconds and dB.
-    pub(crate) fn psnr_history(&self) -> &[(f64, f64)] {
+    pub fn psnr_history(&self) -> &[(f64, f64)] {
         &self.history
     }
 
     /// The result of keyframe alignment, once it is decided.
-    pub(crate) fn alignment(&self) -> Option<&Alignment> {
+    pub fn alignment(&self) -> Option<&Alignment> {
         self.method.alignment()
     }
 
     /// The training progress.
-    pub(crate) fn progress(&self) -> Progress {
+    pub fn progress(&self) -> Progress {
         self.method.progress()
     }
 
     /// Saves the model after this many seconds of training. If its folder cannot be written, saves it in a temporary
     /// folder.
-    fn save(&mut self, out: &Path, seconds: f64) -> anyhow::Result<Saved> {
+    fn save(&mut self, out: &Path, seconds: f64) -> crate::Result<Saved> {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_total_steps()?)
         {
-            log::warn!("{error:#}");
+            log::warn!("{}", chain(&error));
         }
         let progress = self.method.progress();
         if progress.step > 0 && progress.primitives == 0 {
@@ -757,7 +683,7 @@ impl Session {
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                log::warn!("cannot write a checkpoint of the last state: {error:#}"); // Still save the model.
+                log::warn!("cannot write a checkpoint of the last state: {}", chain(&error)); // Still save the model.
                 None
             }
         };
@@ -767,13 +693,13 @@ impl Session {
         }
         match saved {
             Ok(sha256) => Ok(Saved { folder: out.to_owned(), sha256, failed: None }),
-            Err(error) if exit::is_io(&error) => self.save_elsewhere(out, error),
+            Err(error) if error.is_io() => self.save_elsewhere(out, error),
             Err(error) => Err(error),
         }
     }
 
     /// Saves the model in a temporary folder, because the folder of its run could not be written.
-    fn save_elsewhere(&mut self, out: &Path, save_error: anyhow::Error) -> anyhow::Result<Saved> {
+    fn save_elsewhere(&mut self, out: &Path, save_error: crate::Error) -> crate::Result<Saved> {
         let save = |method: &mut dyn Method| {
             let folder = run_folder::make_fallback_folder()?;
             run_folder::save_model(method, &folder)?;
@@ -784,12 +710,12 @@ impl Session {
             Ok((folder, sha256)) => {
                 let context =
                     format!("cannot save the model in {}; it was saved in {}", out.display(), folder.display());
-                Ok(Saved { folder, sha256, failed: Some(save_error.context(context)) })
+                Ok(Saved { folder, sha256, failed: Some(save_error.with_context(context)) })
             }
             Err(error) => {
-                let error: anyhow::Error = error;
-                log::error!("cannot save the model in a temporary folder either: {error:#}");
-                Err(save_error.context(format!(
+                let error: crate::Error = error;
+                log::error!("cannot save the model in a temporary folder either: {}", chain(&error));
+                Err(save_error.with_context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
                     self.describe_recoverable()
@@ -813,7 +739,7 @@ impl Session {
         seconds: f64,
         checkpoint_sha256: &str,
         details: &impl Serialize,
-    ) -> anyhow::Result<FinishedModel> {
+    ) -> crate::Result<FinishedModel> {
         let outcome = self.score_at_end(seconds)?;
         let done = DoneEvent {
             event: "done",
@@ -841,39 +767,20 @@ impl Session {
         let written = run_folder::write_json(&out.join("report.json"), &report);
         let page = comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
         if let Err(error) = &page {
-            log::warn!("{} was not written: {error:#}", report::FILE);
+            log::warn!("{} was not written: {}", report::FILE, chain(error));
         }
-        match self.output {
-            OutputMode::Json => {
-                if self.profiles {
-                    let passes = &report.passes;
-                    print::report_json(&ProfileEvent { event: "profile", method: self.kind.name(), passes })?;
-                }
-                print::report_json(&done)?;
-            }
-            OutputMode::Lines => {
-                for (name, millis) in &report.passes {
-                    print::report(format_args!("{millis:9.3} ms  {name}"));
-                }
-                print::report(format_args!(
-                    "{seconds:.1} s, {}, {}, {:.1} MB: {}",
-                    counted(done.steps, "step"),
-                    counted(done.primitives, self.method.primitive()),
-                    done.bytes as f64 / 1e6,
-                    done.scores
-                ));
-                let with_page = if page.is_ok() { ", with pictures and scores in report.html" } else { "" };
-                print::report(format_args!("saved in {}{with_page}", out.display()));
-            }
-            OutputMode::Bar | OutputMode::Nothing => {}
-        }
+        let passes = &report.passes;
+        let profile = self.profiles.then(|| ProfileEvent { event: "profile", method: self.kind.name(), passes });
+        let primitive = self.method.primitive();
+        let finished = FinishedReport { done: &done, profile, primitive, has_page: page.is_ok() };
+        self.observer.on_event(&SessionEvent::Finished(&finished));
         written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))?;
         Ok(self.finished(out, (seconds, done.scores), outcome.per_image.len()))
     }
 
     fn finished(self, out: &Path, (seconds, scores): (f64, Scores), n_tests: usize) -> FinishedModel {
-        let Self { kind, method, data, output, .. } = self;
-        FinishedModel { kind, method, folder: out.to_owned(), seconds, scores, data, n_tests, output }
+        let Self { kind, method, data, .. } = self;
+        FinishedModel { kind, method, folder: out.to_owned(), seconds, scores, data, n_tests }
     }
 
     fn named<'a>(&self, images: &'a [ImageScores]) -> Vec<NamedScores<'a>> {
@@ -882,7 +789,7 @@ impl Session {
     }
 
     /// Renders test images for the report. `scores` belong to the test images, in the same order.
-    fn compare(&mut self, scores: &[ImageScores]) -> anyhow::Result<Vec<report::Comparison>> {
+    fn compare(&mut self, scores: &[ImageScores]) -> crate::Result<Vec<report::Comparison>> {
         let name = |scores: &ImageScores| self.data.image_name(&scores.camera, scores.stamp_nanos);
         let scored = self.tests.iter().zip(scores).map(|(keyframe, scores)| report::Scored {
             keyframe,
@@ -899,7 +806,7 @@ impl Session {
         out: &Path,
         report: &Report<'_, impl Serialize>,
         comparisons: &[report::Comparison],
-    ) -> anyhow::Result<()> {
+    ) -> crate::Result<()> {
         let n_tests = report.per_image.len();
         let model = SavedModel { kind: self.kind, folder: out, data: &self.data, n_tests };
         let page = report::Page {
@@ -934,13 +841,13 @@ impl Session {
             });
         }
         if let Err(error) = camera_list::write(out, &cameras) {
-            log::warn!("{} was not written: {error:#}", camera_list::FILE);
+            log::warn!("{} was not written: {}", camera_list::FILE, chain(&error));
         }
     }
 
     /// GPU time of each kernel in a step in milliseconds: medians over [`N_PROFILED`] steps, in order of first
     /// execution.
-    fn profile(&mut self) -> anyhow::Result<Vec<(&'static str, f64)>> {
+    fn profile(&mut self) -> crate::Result<Vec<(&'static str, f64)>> {
         let mut names: Vec<&'static str> = Vec::new();
         let mut by_name: BTreeMap<&'static str, Vec<f64>> = BTreeMap::new();
         let began = Instant::now();
@@ -961,20 +868,20 @@ impl Session {
     }
 
     /// Scores the final model without saving it.
-    pub(crate) fn score_without_saving(mut self) -> anyhow::Result<TrainingOutcome> {
+    pub fn score_without_saving(mut self) -> crate::Result<TrainingOutcome> {
         let seconds = self.stop_training()?;
         self.score_at_end(seconds)
     }
 
     /// Waits for queued work and returns the training time in seconds.
-    fn stop_training(&mut self) -> anyhow::Result<f64> {
+    fn stop_training(&mut self) -> crate::Result<f64> {
         self.gpu.wait()?;
         let seconds = self.finished_secs.unwrap_or_else(|| self.secs());
-        self.bar.finish_and_clear();
+        self.observer.on_event(&SessionEvent::TrainingEnded);
         Ok(seconds)
     }
 
-    fn score_at_end(&mut self, seconds: f64) -> anyhow::Result<TrainingOutcome> {
+    fn score_at_end(&mut self, seconds: f64) -> crate::Result<TrainingOutcome> {
         std::mem::swap(&mut self.evaluator, &mut self.final_evaluator);
         let per_image = self.without_clock(Self::score_all)?;
         let progress = self.method.progress();
@@ -990,13 +897,13 @@ impl Session {
     }
 
     /// Scores all test keyframes.
-    fn score_all(&mut self) -> anyhow::Result<Vec<ImageScores>> {
+    fn score_all(&mut self) -> crate::Result<Vec<ImageScores>> {
         let tests: Vec<Arc<Keyframe>> = self.tests.iter().cloned().collect();
         self.evaluator.score_all(self.method.as_mut(), tests.iter())
     }
 
     /// Runs work that does not count as training time.
-    fn without_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> anyhow::Result<T>) -> anyhow::Result<T> {
+    fn without_clock<T>(&mut self, work: impl FnOnce(&mut Self) -> crate::Result<T>) -> crate::Result<T> {
         self.gpu.wait()?;
         self.note_render();
         let before = Instant::now();
@@ -1007,7 +914,7 @@ impl Session {
     }
 
     /// Begins the evaluation that is due. It scores the model after all steps queued so far.
-    fn begin_evaluation(&mut self) -> anyhow::Result<()> {
+    fn begin_evaluation(&mut self) -> crate::Result<()> {
         self.method.n_total_steps()?;
         self.pending_evaluation =
             Some(PendingEvaluation::new(self.secs(), self.tests.iter(), self.max_images_during_training));
@@ -1015,7 +922,7 @@ impl Session {
     }
 
     /// Reports a completed evaluation.
-    fn report_evaluation(&mut self, evaluation: PendingEvaluation) -> anyhow::Result<()> {
+    fn report_evaluation(&mut self, evaluation: PendingEvaluation) -> crate::Result<()> {
         let seconds = evaluation.seconds;
         let images = evaluation.into_images();
         for image in &images {
@@ -1033,18 +940,10 @@ impl Session {
             primitives: progress.primitives,
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),
+            primitive: self.method.primitive(),
+            smoothed_step_millis: progress.step_millis,
         };
-        match self.output {
-            OutputMode::Json => print::report_json(&eval)?,
-            OutputMode::Lines => print::report(format_args!(
-                "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
-                eval.step,
-                counted(eval.primitives, self.method.primitive()),
-                progress.step_millis,
-                eval.scores
-            )),
-            OutputMode::Bar | OutputMode::Nothing => {}
-        }
+        self.observer.on_event(&SessionEvent::Evaluated(&eval));
         self.reported.push(eval);
         Ok(())
     }
@@ -1068,13 +967,14 @@ impl Session {
         }
     }
 
-    fn update_bar(&self) {
-        let progress = self.method.progress();
-        let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
-        self.bar.set_position(position);
-        let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
-        let primitives = counted(progress.primitives, self.method.primitive());
-        self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
+    fn report_progress(&mut self) {
+        let progress = SessionProgress {
+            primitive: self.method.primitive(),
+            seconds: self.secs(),
+            progress: self.method.progress(),
+            psnr: self.psnr(),
+        };
+        self.observer.on_event(&SessionEvent::Progress(&progress));
     }
 }
 
@@ -1082,12 +982,6 @@ impl Session {
 fn without_pixels(keyframe: &Keyframe) -> Keyframe {
     let depth = keyframe.depth.as_ref().map(|depth| DepthMap { depth_m: [].into(), ..depth.clone() });
     Keyframe { rgba_srgb: [].into(), depth, truth: None, ..keyframe.clone() }
-}
-
-/// Whole seconds for the progress bar.
-#[expect(clippy::cast_possible_truncation, reason = "float casts saturate")]
-fn whole_secs(secs: f64) -> u64 {
-    secs as u64
 }
 
 #[cfg(test)]

@@ -3,12 +3,10 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
 //! as PNG. Ground truth from a simulator is left out.
 
-use keyframe::split_from_name;
-use keyframe::split_name;
-use anyhow::{Context, ensure};
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use crate::error::{ensure, Context};
 use image::{ExtendedColorType, ImageEncoder};
-use keyframe::{BaseState, DepthMap, Keyframe};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use keyframe::{split_from_name, split_name, BaseState, DepthMap, Keyframe};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -18,7 +16,7 @@ use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
 
 /// Name of the folder in the folder of a run.
-pub(crate) const FOLDER: &str = "keyframes";
+pub const FOLDER: &str = "keyframes";
 const EXTENSION: &str = "keyframe";
 const METHOD: &str = "keyframe";
 const COLOR: &str = "rgba_srgb.png";
@@ -26,7 +24,7 @@ const DEPTH: &str = "depth_m.png";
 
 /// A folder of keyframes.
 #[derive(Clone, Debug)]
-pub(crate) struct StoredKeyframes {
+pub struct StoredKeyframes {
     folder: PathBuf,
 }
 
@@ -67,12 +65,12 @@ struct BaseDescription {
 
 impl StoredKeyframes {
     /// The stored keyframes of the run in this folder; nothing is read or written yet.
-    pub(crate) fn of_run(run: &Path) -> Self {
+    pub fn of_run(run: &Path) -> Self {
         Self { folder: run.join(FOLDER) }
     }
 
     /// Writes the keyframes that are not stored yet.
-    pub(crate) fn add(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+    pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
         std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot create {}", self.folder.display()))?;
         let existing = self.names()?;
         for keyframe in keyframes {
@@ -85,7 +83,7 @@ impl StoredKeyframes {
     }
 
     /// Removes all files except those of these keyframes.
-    pub(crate) fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> anyhow::Result<()> {
+    pub fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
         let stored: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
         for name in self.names()?.difference(&stored) {
             let path = self.folder.join(name);
@@ -95,7 +93,7 @@ impl StoredKeyframes {
     }
 
     /// Reads all keyframes, ordered by stamp.
-    pub(crate) fn read(&self) -> anyhow::Result<Vec<Arc<Keyframe>>> {
+    pub fn read(&self) -> crate::Result<Vec<Arc<Keyframe>>> {
         let mut keyframes = Vec::new();
         for name in self.names()? {
             let path = self.folder.join(name);
@@ -106,7 +104,7 @@ impl StoredKeyframes {
         Ok(keyframes)
     }
 
-    fn names(&self) -> anyhow::Result<BTreeSet<String>> {
+    fn names(&self) -> crate::Result<BTreeSet<String>> {
         let list = || {
             let names = std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
             names.collect::<std::io::Result<Vec<_>>>()
@@ -121,7 +119,7 @@ fn name_of(keyframe: &Keyframe) -> String {
     format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
 }
 
-fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
+fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
     let description = Description {
         camera: keyframe.camera.to_string(),
         stamp_nanos: keyframe.stamp.0,
@@ -161,7 +159,7 @@ fn to_checkpoint(keyframe: &Keyframe) -> anyhow::Result<Checkpoint> {
     })
 }
 
-fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
+fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
     ensure!(checkpoint.method == METHOD, "it contains a {}, expected a {METHOD}", checkpoint.method);
     let metadata: Description = serde_json::from_value(checkpoint.state.clone())?;
     let pixels = |name: &str, size_px: [u32; 2]| {
@@ -174,7 +172,7 @@ fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
     let depth = metadata.depth.map(|depth| {
         let bytes = pixels(DEPTH, depth.size_px)?;
         let depth_m = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
-        Ok::<_, anyhow::Error>(DepthMap {
+        Ok::<_, crate::Error>(DepthMap {
             size_px: depth.size_px,
             focal_px: depth.focal_px,
             principal_px: depth.principal_px,
@@ -207,7 +205,7 @@ fn keyframe_of(checkpoint: &Checkpoint) -> anyhow::Result<Keyframe> {
 
 /// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between
 /// neighbors.
-fn png([width, height]: [u32; 2], bytes: &[u8]) -> anyhow::Result<Vec<u8>> {
+fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
     let mut png = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
     encoder.write_image(bytes, width, height, ExtendedColorType::Rgba8)?;
@@ -237,8 +235,8 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use keyframe::Split;
+    use super::*;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
         let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));

@@ -11,11 +11,11 @@ use std::time::Duration;
 ///
 /// `max_steps`: maximum number of steps of a session in this slice, given its index. `is_render_pending`: whether a
 /// picture waits; the slice then ends after the current submit.
-pub(crate) fn train_next(
+pub fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
     is_render_pending: impl Fn() -> bool,
-) -> anyhow::Result<()> {
+) -> crate::Result<()> {
     let can_train =
         |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0;
     let device_time: Vec<Option<Duration>> = sessions

@@ -1,58 +1,60 @@
 //! Trains models from keyframes on disk: once in `train`, many times in `bench`.
 
-use capture::config::DEFAULT_SEED;
-use capture::config::Rig;
-use crate::data::{Data, DataArgs};
-use crate::exit::{BadArgument, InsufficientData};
-use crate::method::{self, ModelKind, ModelSpec};
-use crate::recoveries::Recoveries;
-use crate::run_folder;
-use crate::session::{Evaluators, Limits, OutputMode, Session};
 use capture::Stop;
-use crate::time_slices;
-use crate::training_args::{AvailableData, CountArg, Refine, RefineSettings, TrainingArgs};
+use capture::config::{DEFAULT_SEED, Rig};
+use crate::{run_folder, time_slices, Error};
+use crate::data::{Data, DataOptions};
+use crate::observer::Observer;
+use crate::recoveries::{OpenGpu, Recoveries};
+use crate::session::{Evaluators, Limits, Session};
+use crate::train_settings::{methods_of, options_of};
+use crate::training_options::{AvailableData, Refine, RefineSettings, TrainingOptions};
 use keyframe::Keyframe;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::{self, ModelKind, ModelSpec};
 use trainer::gpu::Gpu;
-use trainer::splat::SplatOptions;
+use trainer::splat::{CountPolicy, SplatOptions};
 
 /// Everything that determines a training besides its keyframes.
-pub(crate) struct TrainingPlan {
-    pub(crate) model_spec: ModelSpec,
-    pub(crate) evaluators: Evaluators,
-    pub(crate) limits: Limits,
-    pub(crate) output: OutputMode,
+pub struct TrainingPlan {
+    pub model_spec: ModelSpec,
+    pub evaluators: Evaluators,
+    pub limits: Limits,
+    /// Receives the reports.
+    pub observer: Box<dyn Observer>,
 }
 
 /// Trains a new model until a limit or until `stop` is requested.
 ///
 /// The clock starts once all pipelines are compiled; seeding counts.
-pub(crate) fn train(
+pub fn train(
     gpu: Arc<Gpu>,
     plan: TrainingPlan,
     keyframes: &[Arc<Keyframe>],
     preparation_time: Duration,
     stop: &Stop,
-) -> anyhow::Result<Session> {
+    open_gpu: OpenGpu,
+) -> crate::Result<Session> {
     let kind = plan.model_spec.kind;
     let mut method = plan.model_spec.start(gpu.clone())?;
     method.prepare()?;
-    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.output).with_stop(stop);
-    drive(std::slice::from_mut(&mut session), keyframes, preparation_time, stop)?;
+    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.observer).with_stop(stop);
+    drive(std::slice::from_mut(&mut session), keyframes, preparation_time, stop, open_gpu)?;
     Ok(session)
 }
 
 /// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until `stop` is requested.
 ///
 /// `preparation_time`: time already spent on preparing the keyframes, which counts as training time.
-pub(crate) fn drive(
+pub fn drive(
     sessions: &mut [Session],
     keyframes: &[Arc<Keyframe>],
     preparation_time: Duration,
     stop: &Stop,
-) -> anyhow::Result<()> {
+    open_gpu: OpenGpu,
+) -> crate::Result<()> {
     let now = Instant::now();
     let began = now.checked_sub(preparation_time).unwrap_or(now);
     for session in &mut *sessions {
@@ -62,15 +64,13 @@ pub(crate) fn drive(
         }
         if session.is_idle() && session.progress().step == 0 {
             let name = session.kind().name();
-            return Err(InsufficientData(format!(
+            return Err(Error::InsufficientData(format!(
                 "the method {name} needs depth, but no training image has depth: \
-                 use --depth-from to render it from another model of the scene, or the method splat or nerf"
-            ))
-            .into());
+                 use --depth-from to render it from another model of the scene, or the method splat or nerf" )) .into());
         }
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
-    let mut recoveries = Recoveries::default();
+    let mut recoveries = Recoveries::new(open_gpu);
     loop {
         while !stop.requested() && !sessions.iter().all(is_done) {
             if let Err(error) = time_slices::train_next(sessions, |_, _| u64::MAX, || false) {
@@ -87,15 +87,15 @@ pub(crate) fn drive(
 
 /// The methods and their options. For a recording, its rig file sets them and flags override it; for a folder, only
 /// flags set them.
-pub(crate) fn model_specs(
-    args: &TrainingArgs,
+pub fn model_specs(
+    options: &TrainingOptions,
     data: &Data,
     steps: Option<u64>,
     software: bool,
-) -> Result<Vec<ModelSpec>, BadArgument> {
-    let rig_methods = data.rig.as_ref().map(|rig| rig.train.methods.as_slice());
-    let kinds = rig_methods.or(args.methods()).unwrap_or(&[ModelKind::Splat]);
-    args.check_for(kinds)?;
+) -> Result<Vec<ModelSpec>, Error> {
+    let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
+    let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::Splat]);
+    options.check_for(&kinds)?;
     // A trial takes hundreds of additional steps, which take minutes on a CPU.
     let available = AvailableData {
         joints: data.rig.is_some(),
@@ -104,17 +104,17 @@ pub(crate) fn model_specs(
         depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
     };
     let RefineSettings { align, with_scene: cameras } =
-        args.refining(available, if software { Refine::None } else { Refine::Auto })?;
-    args.check_learned(kinds, available)?;
-    let count = args.count(if software { CountArg::ToCap } else { CountArg::Tested });
-    let options = if let Some(rig) = &data.rig {
-        SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? }
+        options.refining(available, if software { Refine::None } else { Refine::Auto })?;
+    options.check_learned(&kinds, available)?;
+    let count = options.count.unwrap_or(if software { CountPolicy::ToCap } else { CountPolicy::Tested });
+    let model_options = if let Some(rig) = &data.rig {
+        SplatOptions { cameras, align, count, ..options_of(&rig.train, steps)? }
     } else {
         let defaults = SplatOptions::default();
         SplatOptions {
-            seed: args.seed.unwrap_or(DEFAULT_SEED),
-            max_splats: args.max_splats.map_or(defaults.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-            max_bytes: args.max_bytes,
+            seed: options.seed.unwrap_or(DEFAULT_SEED),
+            max_splats: options.max_splats.map_or(defaults.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
+            max_bytes: options.max_bytes,
             cameras,
             count,
             align,
@@ -122,20 +122,20 @@ pub(crate) fn model_specs(
             ..defaults
         }
     };
-    Ok(kinds.iter().map(|kind| ModelSpec { kind: *kind, options: options.clone() }).collect())
+    Ok(kinds.iter().map(|kind| ModelSpec { kind: *kind, options: model_options.clone() }).collect())
 }
 
 /// Checks flags that do not depend on the contents of the data, before all data are read.
-pub(crate) fn check_before_data(args: &TrainingArgs, path: &Path, images: &DataArgs) -> anyhow::Result<()> {
+pub fn check_before_data(options: &TrainingOptions, path: &Path, images: &DataOptions) -> crate::Result<()> {
     let defaults = || Data::default_methods(path, images);
-    let kinds = args.methods().map_or_else(defaults, |kinds| Ok(kinds.to_vec()))?;
-    Ok(args.check_before_data(&kinds, run_folder::is_recording(path))?)
+    let kinds = options.methods.clone().map_or_else(defaults, Ok)?;
+    options.check_before_data(&kinds, run_folder::is_recording(path))
 }
 
 /// When to stop, from `--seconds` and `--steps`; `default_secs` if neither is given.
-pub(crate) fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, BadArgument> {
+pub fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, Error> {
     if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
-        return Err(BadArgument("--seconds: must be a number of at least 0".into()));
+        return Err(Error::BadInput("--seconds: must be a number of at least 0".into()));
     }
     Ok(Limits { seconds: seconds.or(steps.is_none().then_some(default_secs)), steps })
 }

@@ -1,23 +1,22 @@
 //! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
 
-use crate::method::ModelKind;
 use capture::Stop;
 use kinematics::Transform;
 use std::time::Duration;
-use trainer::{Aabb, Method, RenderRequest};
+use trainer::{Aabb, Method, ModelKind, RenderRequest};
 use viz::{Hub, PendingRender};
 
 /// Longest time until Ctrl-C is noticed while no client requests a picture.
 const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
-pub(crate) struct ServedModel {
-    pub(crate) kind: ModelKind,
-    pub(crate) method: Box<dyn Method>,
+pub struct ServedModel {
+    pub kind: ModelKind,
+    pub method: Box<dyn Method>,
 }
 
 /// Models that no longer change, and the hub of clients that view them.
-pub(crate) struct ModelViewer {
+pub struct ModelViewer {
     /// The first is drawn for clients that name no method.
     models: Vec<ServedModel>,
     hub: Hub,
@@ -27,17 +26,17 @@ pub(crate) struct ModelViewer {
 
 impl ModelViewer {
     /// A viewer of models whose z axis points up.
-    pub(crate) fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
+    pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
         Self { models, hub, model_from_page: Transform::identity() }
     }
 
     /// Rotates the models so that they are upright in the page's world, which is z up.
-    pub(crate) fn with_model_from_page(self, model_from_page: Transform) -> Self {
+    pub fn with_model_from_page(self, model_from_page: Transform) -> Self {
         Self { model_from_page, ..self }
     }
 
     /// Draws requested pictures until a signal requests a stop.
-    pub(crate) fn serve(&mut self, stop: &Stop) {
+    pub fn serve(&mut self, stop: &Stop) {
         while !stop.signaled() {
             if self.hub.wait_for_request(POLL_PERIOD)
                 && let Some(pending) = self.hub.next_request()

@@ -1,23 +1,21 @@
 //! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
 //! repeat it.
 
-use crate::signals;
-use crate::data::{Data, DataArgs, Purpose};
-use crate::evaluate::Evaluator;
-use crate::exit::{BadArgument, InsufficientData};
-use crate::method::{self, ModelKind, ModelSpec};
-use crate::run_folder::CreatedFolders;
-use crate::session::{Evaluation, Evaluators, Limits, OutputMode, TrainingOutcome};
+use anyhow::{bail, Context};
 use capture::Stop;
-use crate::training::{self, TrainingPlan};
+use crate::{print, signals};
+use crate::console::OutputMode;
+use crate::data_args::DataArgs;
+use crate::exit::{BadArgument, InsufficientData};
 use crate::training_args::TrainingArgs;
-use crate::{print, run_folder};
-use anyhow::{Context, bail};
 use keyframe::{Keyframe, Split};
 use serde::{Deserialize, Serialize};
+use session::{Data, Evaluation, Evaluator, Evaluators, Limits, Purpose, TrainingOutcome, TrainingPlan};
+use session::run_folder::{self, CreatedFolders};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use trainer::{ModelKind, ModelSpec};
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
 
@@ -176,7 +174,7 @@ impl NamedData {
 
     fn methods(&self) -> String {
         let kinds: Vec<ModelKind> = self.model_specs.iter().map(|model_spec| model_spec.kind).collect();
-        method::describe(&kinds)
+        trainer::describe(&kinds)
     }
 }
 
@@ -218,14 +216,14 @@ impl<'a> Runs<'a> {
 
     /// Loads data and chooses a name that is not in `used_names`.
     pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> anyhow::Result<NamedData> {
-        training::check_before_data(&self.args.training, path, &self.args.images)?;
+        session::check_before_data(&self.args.training, path, &self.args.images)?;
         let overrides = self.args.training.overrides();
         let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
             return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
         }
-        let model_specs = training::model_specs(&self.args.training, &data, None, self.gpu.is_software())?;
+        let model_specs = session::model_specs(&self.args.training, &data, None, self.gpu.is_software())?;
         Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
@@ -284,7 +282,7 @@ impl<'a> Runs<'a> {
             output: if self.args.json { OutputMode::Nothing } else { OutputMode::Bar },
         };
         let session =
-            training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.preparation_time, &self.stop)?;
+            session::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.preparation_time, &self.stop)?;
         if self.stop.requested() && !session.is_over() {
             bail!("stopped early; the same command with --out {} continues the bench", self.out.display());
         }

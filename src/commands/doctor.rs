@@ -3,19 +3,12 @@
 mod franka;
 mod listen;
 
-use crate::signals;
-use super::number_in_range;
-use capture::config::ArmDriver;
-use capture::config::BaseDriver;
-use capture::config::Camera;
-use capture::config::CameraDriver;
-use capture::config::Rig;
-use capture::config::ScannerDriver;
+use capture::{open, Stop};
+use capture::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use crate::{print, signals};
 use crate::exit::Exit;
-use capture::open;
 use crate::open_gpu::open_gpu;
-use crate::print;
-use capture::Stop;
+use super::number_in_range;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
@@ -379,7 +372,7 @@ fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
 /// Checks the settings of CAN interfaces: those in the rig against the rig file, the others in general.
 #[cfg(target_os = "linux")]
 fn can(rig: Option<&Rig>) -> Vec<Finding> {
-    use drivers::can::{BusConfig, Link, interfaces};
+    use drivers::can::{interfaces, BusConfig, Link};
     let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
     let others =
         interfaces(Path::new("/sys")).into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));

@@ -1,15 +1,14 @@
 //! `fieldrig eval`: scores a saved model on test images.
 
-use capture::config::Override;
-use capture::config::Rig;
-use crate::data::{self, Data, DataArgs, Purpose};
-use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
+use capture::config::{Override, Rig};
+use crate::print;
+use crate::data_args::DataArgs;
 use crate::exit::{self, Exit};
-use keyframe::KeyframeList;
 use crate::open_gpu::open_gpu;
-use crate::{method, print};
-use keyframe::{Keyframe, Split};
+use keyframe::{Keyframe, KeyframeList, Split};
 use serde::Serialize;
+use session::{Data, Evaluator, Purpose};
+use session::evaluate::{warn_if_hardly_covered, ImageScores, Scores};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -50,8 +49,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     // Checked before the data, which takes long to read.
     args.images.holdout()?;
-    data::expect(&args.data)?;
-    let mut model = method::load(open_gpu()?, &args.model)?;
+    session::expect(&args.data)?;
+    let mut model = trainer::load(open_gpu()?, &args.model)?;
     let overrides = training_overrides(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);

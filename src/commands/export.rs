@@ -1,26 +1,19 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use crate::signals;
-use keyframe::counted;
+use anyhow::{ensure, Context};
+use capture::{open, Join, SampleUse, Stations};
 use capture::config::Override;
+use crate::signals;
 use crate::exit::{self, BadArgument, Exit};
-use session::{Written, write_nerfstudio};
-use capture::Join;
-use keyframe::KeyframeList;
-use capture::SampleUse;
-use crate::method::{self, ModelKind};
-use capture::open;
 use crate::open_gpu::open_gpu;
-use session::partial;
-use session::partial::Partial;
 use crate::print::{self, counted};
-use crate::run_folder;
-use crate::splat_file;
-use capture::Stations;
-use anyhow::{Context, ensure};
+use keyframe::{counted, KeyframeList};
+use session::{run_folder, write_nerfstudio, Written};
+use session::partial::{self, Partial};
 use std::path::{Path, PathBuf};
+use trainer::{splat_file, ModelKind};
 use trainer::tsdf::TsdfModel;
-use trainer::tsdf::mesh::{Mesh, write_glb, write_ply};
+use trainer::tsdf::mesh::{write_glb, write_ply, Mesh};
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -109,7 +102,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {
     ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
-    match method::kind_in(path)? {
+    match trainer::kind_in(path)? {
         Some(ModelKind::Tsdf) => return Ok(Contents::DistanceField),
         Some(ModelKind::Nerf) => return Ok(Contents::NeuralField),
         Some(ModelKind::Splat) | None => {}

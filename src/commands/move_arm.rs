@@ -1,14 +1,12 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use crate::signals;
+use anyhow::{bail, Context};
+use capture::{open, Stop};
 use capture::config::Rig;
+use crate::{print, signals};
 use crate::exit::{BadArgument, Exit};
-use capture::open;
-use crate::print;
-use capture::Stop;
-use anyhow::{Context, bail};
+use drivers::{clock, Error, MovableArm};
 use drivers::motion::{JointTarget, Motion, OnLoss};
-use drivers::{Error, MovableArm, clock};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
 use serde::Serialize;

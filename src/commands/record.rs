@@ -1,23 +1,17 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
-use crate::signals;
-use super::number_in_range;
-use capture::config::ArmDriver;
-use capture::config::BaseDriver;
-use capture::config::Override;
-use capture::config::Rig;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use capture::open;
-use capture::open::Devices;
-use capture::open::Opened;
-use crate::print;
 use capture::Stop;
-use drivers::recording::Recording;
+use capture::config::{ArmDriver, BaseDriver, Override, Rig};
+use capture::open::{self, Devices, Opened};
+use crate::{print, signals};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use drivers::{Image, Sample, Source};
+use drivers::recording::Recording;
 use kinematics::Stamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use super::number_in_range;
 
 /// Flags of `record`.
 #[derive(Debug, clap::Args)]

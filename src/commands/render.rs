@@ -1,17 +1,15 @@
 //! `fieldrig render`: renders images of a saved model.
 
-use crate::signals;
-use keyframe::counted;
-use crate::camera_path::{CameraPath, PathCamera};
-use crate::evaluate::{covered_frac, warn_if_hardly_covered};
+use anyhow::Context;
+use crate::{print, signals};
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use session::partial;
-use session::partial::Partial;
-use crate::run_folder::expect_model;
-use crate::{method, print};
-use anyhow::Context;
+use keyframe::counted;
 use serde::Serialize;
+use session::camera_path::{CameraPath, PathCamera};
+use session::evaluate::{covered_frac, warn_if_hardly_covered};
+use session::partial::{self, Partial};
+use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::{Aabb, Picture, Projection, RenderRequest};
@@ -110,7 +108,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
-    let mut model = method::load(open_gpu()?, &args.model)?;
+    let mut model = trainer::load(open_gpu()?, &args.model)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();

@@ -1,52 +1,32 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
-use crate::signals;
-use keyframe::counted;
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
-use crate::clock::Clock;
-use capture::config::ArmDriver;
-use capture::config::Override;
-use capture::config::Rig;
-use crate::decisions::{DecisionLog, RunDescription, Settings};
-use crate::evaluate::Evaluator;
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use capture::Feed;
-use capture::Input;
-use capture::Counts;
-use capture::Join;
-use capture::Rejection;
-use capture::SampleUse;
-use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
-use crate::next_commands::{DataSource, quoted};
-use capture::open;
-use capture::open::Devices;
-use capture::open::Opened;
-use crate::open_gpu::open_gpu;
-use crate::print;
-use crate::recovery::{self, GpuUnrecoverable, Recovery};
-use crate::run_folder::{self, CreatedFolders};
-use crate::session::{self, EndingSession, Evaluators, FinishedModel, Limits, OutputMode, Session};
-use capture::StationReport;
-use capture::Stations;
-use capture::Stop;
-use crate::stored_keyframes::StoredKeyframes;
-use crate::training_args::{AvailableData, CountArg, REALIGN, Refine, TrainingArgs};
-use crate::viewer::{ModelViewer, ServedModel};
 use anyhow::Context;
+use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
+use capture::config::{ArmDriver, Override, Rig};
+use capture::open::{self, Devices, Opened};
+use crate::{print, signals};
+use crate::checkpoint_args::CheckpointArgs;
+use crate::console::{print_next_commands, Console, OutputMode};
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::open_gpu::open_gpu;
+use crate::training_args::TrainingArgs;
 use drivers::Source;
-use keyframe::{Keyframe, Split};
+use keyframe::{counted, Keyframe, Split};
 use kinematics::Stamp;
 use serde::Serialize;
+use session::{checkpoints, methods_of, recovery, AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers};
+use session::next_commands::{quoted, DataSource};
+use session::run_folder::{self, CreatedFolders};
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
+use trainer::{ModelKind, ModelSpec, Resumed};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::splat::SplatOptions;
+use trainer::splat::{CountPolicy, SplatOptions};
 use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -153,7 +133,8 @@ struct RunDetails {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
     let result = drive(args, &mut created);
-    created.keep_or_remove(result)
+    created.keep_unless(result.as_ref().is_err_and(exit::is_rejection));
+    result
 }
 
 fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
@@ -184,7 +165,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let hub = live.hub();
     if let Err(error) = result {
         stop.request();
-        if recovery::is_gpu_error(&error) || error.is::<GpuUnrecoverable>() {
+        if error.is_gpu_error() || error.is_gpu_unrecoverable() {
             return Err(keep_input(live, &folders, error));
         }
         log::error!("training failed; saving the model so far: {error:#}");
@@ -278,17 +259,17 @@ pub(super) fn start(
     let mut overrides = args.overrides();
     overrides.extend(previous.map(PreviousRun::overrides).into_iter().flatten());
     let rig = Rig::load(&args.rig_file, &overrides)?;
-    let kinds = rig.train.methods.clone();
-    args.training.check_for(&kinds)?;
+    let kinds = methods_of(&rig)?;
+    args.training.options().check_for(&kinds)?;
     let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
-    args.training.check_learned(&kinds, available)?;
-    let cameras = args.training.refining(available, Refine::None)?.with_scene;
-    let count = args.training.count(CountArg::ToCap);
-    let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
+    args.training.options().check_learned(&kinds, available)?;
+    let cameras = args.training.options().refining(available, Refine::None)?.with_scene;
+    let count = args.training.options().count.unwrap_or(CountPolicy::ToCap);
+    let options = SplatOptions { cameras, count, ..session::options_of(&rig.train, args.steps)? };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let models: Vec<Resumed> = match previous {
-        Some(previous) => vec![method::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
+        Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
             let start = |kind: &ModelKind| {
                 let model_spec = ModelSpec { kind: *kind, options: options.clone() };
@@ -306,7 +287,7 @@ pub(super) fn start(
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, source, held)?;
-    let feed = Feed::start(input, hub.clone(), stop.clone())?;
+    let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
         during_training: Evaluator::psnr_only(),
@@ -343,10 +324,10 @@ pub(super) fn start(
             settings,
             resume_command: args.resume_command(folder),
         };
-        let output = OutputMode::of_command(args.json);
-        let checkpoints = Checkpoints::new(folder, args.checkpoints);
+        let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
+        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
         let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
             .with_stepwise_scoring()
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
@@ -366,7 +347,7 @@ pub(super) fn start(
         }
         sessions.push(session);
     }
-    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes };
+    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes, open_gpu };
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);
@@ -392,7 +373,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
         }
         Err(error) => log::error!("{error:#}"),
     }
-    let is_already_reported = recoverable.is_empty() || error.is::<GpuUnrecoverable>();
+    let is_already_reported = recoverable.is_empty() || error.is_gpu_unrecoverable();
     if is_already_reported { error } else { error.context(format!("the run stopped early; {recoverable}")) }
 }
 
@@ -460,6 +441,9 @@ fn save(
     if n_train > 0 {
         let finished = session::finish(sessions.into_iter().zip(folders).map(ending).collect());
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+        if !args.json {
+            print_next_commands(&models);
+        }
     }
     publish_end(&hub, &models);
     listed?;
@@ -513,7 +497,7 @@ impl PreviousRun {
 
 impl Args {
     fn overrides(&self) -> Vec<Override> {
-        let mut overrides = self.training.overrides();
+        let mut overrides = self.training.options().overrides();
         if self.lockstep {
             overrides.push(Override::new("sim.lockstep", true));
         }
@@ -536,10 +520,10 @@ impl Args {
             (SIM, is_on(self.sim)),
             (LOCKSTEP, is_on(self.lockstep)),
             (RECORD, self.record.as_ref().map(|file| file.display().to_string())),
-            (REALIGN, self.training.realign().map(|is_on| is_on.to_string())),
+            (REALIGN, self.training.options().realign().map(|is_on| is_on.to_string())),
         ];
         let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
-        flags.chain(self.checkpoints.flag()).collect()
+        flags.chain(self.checkpoints.options().flag()).collect()
     }
 
     /// These flags, with missing ones taken from the previous run.
@@ -558,7 +542,7 @@ impl Args {
             steps_per_keyframe: self.steps_per_keyframe.or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
             sim: self.sim || flag(SIM).is_some(),
             lockstep: self.lockstep || flag(LOCKSTEP).is_some(),
-            checkpoints: self.checkpoints.or_previous(&previous.checkpoint.flags),
+            checkpoints: self.checkpoints.options().or_previous(&previous.checkpoint.flags).into(),
             ..self.clone()
         }
     }

@@ -1,37 +1,26 @@
 //! `fieldrig train`: trains models on a dataset folder or a recording.
 
-use crate::signals;
-use keyframe::counted;
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
-use crate::clock::Clock;
-use capture::config::Override;
-use capture::config::Rig;
-use crate::corrected_rig;
-use crate::data::{Data, DataArgs, Purpose};
-use crate::decisions::{DecisionLog, RunDescription, Settings};
-use crate::depth_from::{self, DepthSource, RenderedDepth};
-use crate::evaluate::Evaluator;
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
-use crate::next_commands::{DataSource, quoted};
-use crate::open_gpu::open_gpu;
-use crate::print;
-use crate::recoveries;
-use crate::recovery::{self, Recovery};
-use crate::replay::Replay;
-use crate::run_folder::{self, CreatedFolders};
-use crate::session::{self, EndingSession, Evaluators, Limits, OutputMode, Session};
-use capture::StationReport;
-use capture::Stop;
-use crate::training;
-use crate::training_args::{REALIGN, TrainingArgs};
 use calibration::Alignment;
-use keyframe::{Keyframe, Split};
+use capture::{StationReport, Stop};
+use capture::config::{Override, Rig};
+use crate::{print, signals};
+use crate::checkpoint_args::CheckpointArgs;
+use crate::console::{print_next_commands, Console, OutputMode, ReadBar};
+use crate::data_args::DataArgs;
+use crate::exit::{self, BadArgument, Exit};
+use crate::open_gpu::open_gpu;
+use crate::training_args::TrainingArgs;
+use keyframe::{counted, Keyframe, Split};
 use serde::Serialize;
+use session::{checkpoints, corrected_rig, recoveries, recovery, Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, Limits, Purpose, REALIGN, Recovery, Replay, RunDescription, RunFlags, Session, Settings};
+use session::depth_from::{self, DepthSource, RenderedDepth};
+use session::next_commands::{quoted, DataSource};
+use session::run_folder::{self, CreatedFolders};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::{ModelKind, ModelSpec, Resumed};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 
@@ -123,13 +112,14 @@ struct TrainDetails<'a> {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
     let result = train(args, &mut created);
-    created.keep_or_remove(result)
+    created.keep_unless(result.as_ref().is_err_and(exit::is_rejection));
+    result
 }
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
-    training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
+    session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
     if let Some(out) = &args.out {
         run_folder::check_no_model(out)?;
         run_folder::check_not_data_folder(out, &args.data)?;
@@ -156,7 +146,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         (Some(_), _) => Limits::default(),
         (None, checkpoint) => {
             let previous_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
-            training::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
+            session::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
         }
     };
     let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
@@ -164,8 +154,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(replay) = &replay {
         replay.check_depth_from(depth_model_sha256)?;
     }
-    let (mut images, mut overrides) = (args.images.clone(), args.training.overrides());
-    let mut realign = args.training.realign();
+    let (mut images, mut overrides) = (args.images.options(), args.training.options().overrides());
+    let mut realign = args.training.options().realign();
     if let Some(replay) = &replay {
         images.scale = Some(replay.decisions.settings.scale);
     }
@@ -177,14 +167,15 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         realign = checkpoint.flags.get(REALIGN).map(|is_on| is_on == "true");
         overrides.extend(realign.map(|is_on| Override::new(REALIGN, is_on)));
     } else if replay.is_none() {
-        training::check_before_data(&args.training, &args.data, &images)?;
+        session::check_before_data(&args.training.options(), &args.data, &images)?;
     }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators =
         Evaluators { during_training: evaluator.clone(), max_images_during_training: usize::MAX, at_end: evaluator };
+    let bar = ReadBar::new(args.json);
     let mut data = match &replay {
-        Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
-        None => Data::load(&args.data, &images, Purpose::Training, &overrides, args.json)?,
+        Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| bar.show(read))?,
+        None => Data::load(&args.data, &images, Purpose::Training, &overrides, &|read| bar.show(read))?,
     };
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
@@ -195,7 +186,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let gpu = open_gpu()?;
     if let Some(source) = &depth_from {
-        data.render_depth(gpu.clone(), source, args.json)?;
+        data.render_depth(gpu.clone(), source, &|read| bar.show(read))?;
     }
     if let Some(replay) = &replay {
         replay.check_data(&args.data, &data)?;
@@ -251,9 +242,9 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         for keyframe in data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)) {
             decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
-        let output = OutputMode::of_command(args.json);
-        let checkpoints = Checkpoints::new(folder, args.checkpoints);
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
+        let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
+        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
@@ -271,7 +262,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
-        None => training::drive(&mut sessions, &untrained, preparation_time, &stop)?,
+        None => session::drive(&mut sessions, &untrained, preparation_time, &stop, open_gpu)?,
     }
 
     let alignment = sessions.iter().find_map(Session::alignment).cloned();
@@ -295,7 +286,10 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     };
     let recoverable = recoveries::describe_recoverable(&mut sessions);
     let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
-    finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+    let finished = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+    if !args.json {
+        print_next_commands(&finished);
+    }
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
@@ -328,11 +322,11 @@ impl Args {
         checkpoint: Option<&Checkpoint>,
     ) -> anyhow::Result<Vec<Resumed>> {
         if let Some(checkpoint) = checkpoint {
-            return Ok(vec![self.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
+            return Ok(vec![self.resumed(trainer::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
-            None => training::model_specs(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
+            None => session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?,
         };
         let start = |model_spec: ModelSpec| {
             let method = model_spec.clone().start(gpu.clone())?;
@@ -356,7 +350,7 @@ impl Args {
             (PROFILE, self.profile.then(|| true.to_string())),
         ];
         let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
-        flags.chain(self.checkpoints.flag()).collect()
+        flags.chain(self.checkpoints.options().flag()).collect()
     }
 
     /// These flags, with missing ones taken from the previous run.
@@ -372,7 +366,7 @@ impl Args {
             lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
             write_rig: self.write_rig.clone().or_else(|| path(WRITE_RIG)),
             profile: self.profile || flag(PROFILE).is_some(),
-            checkpoints: self.checkpoints.or_previous(&checkpoint.flags),
+            checkpoints: self.checkpoints.options().or_previous(&checkpoint.flags).into(),
             ..self.clone()
         }
     }

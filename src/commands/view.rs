@@ -1,20 +1,17 @@
 //! `fieldrig view`: serves saved models on the web page.
 
-use crate::signals;
-use super::run::{address, notes};
-use crate::exit::{BadArgument, Exit};
-use crate::method::{self, LoadedModel};
-use crate::model_bounds::Bounds;
-use crate::open_gpu::open_gpu;
 use capture::Stop;
-use crate::viewer::{ModelViewer, ServedModel};
-use crate::{camera_list, print, run_folder, scene_hint};
+use crate::{print, signals};
+use crate::exit::{BadArgument, Exit};
+use crate::open_gpu::open_gpu;
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
-use serde_json::{Value, json};
+use serde_json::{json, Value};
+use session::{camera_list, run_folder, scene_hint, ModelViewer, ServedModel};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use trainer::Progress;
+use super::run::{address, notes};
+use trainer::{Bounds, LoadedModel, Progress};
 use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 /// Flags of `view`.
@@ -70,7 +67,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
-    let models = paths.iter().map(|path| method::load_with_bounds(gpu.clone(), path, cameras.is_empty()));
+    let models = paths.iter().map(|path| trainer::load_with_bounds(gpu.clone(), path, cameras.is_empty()));
     let models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
     let mut statuses =
         paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind.name(), &model.method.progress()));
@@ -198,8 +195,8 @@ fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus 
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use nalgebra::Point3;
+    use super::*;
 
     #[test]
     fn up_axis_is_up_on_the_page() {

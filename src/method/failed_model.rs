@@ -1,15 +1,13 @@
 //! Placeholder for a model whose GPU failed.
 
-use calibration::Alignment;
-use calibration::CalibratedCamera;
-use calibration::TrialReport;
+use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
+use trainer::{Error, Method, Picture, Progress, RenderRequest};
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::PassTiming;
-use trainer::{Error, Method, Picture, Progress, RenderRequest};
 
 /// Every operation returns [`Error::DeviceLost`].
 pub(crate) struct FailedModel;

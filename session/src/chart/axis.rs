@@ -2,7 +2,7 @@
 
 /// How values map to positions.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Scale {
+pub enum Scale {
     Linear,
     /// Values are above 0.
     Log,
@@ -12,12 +12,12 @@ pub(crate) enum Scale {
 
 /// One axis.
 #[derive(Clone, Debug)]
-pub(crate) struct Axis {
+pub struct Axis {
     /// Quantity and unit.
-    pub(crate) label: String,
-    pub(crate) scale: Scale,
+    pub label: String,
+    pub scale: Scale,
     /// Tick values; chosen automatically if empty. Ticks outside the data are omitted.
-    pub(crate) ticks: Vec<f64>,
+    pub ticks: Vec<f64>,
 }
 
 /// An axis with the range of its data.
@@ -125,7 +125,7 @@ fn log_ticks(low: f64, high: f64) -> Vec<f64> {
 }
 
 /// Formats a number for an axis: at most three decimals, thousands as k, millions as M.
-pub(crate) fn compact_number(value: f64) -> String {
+pub fn compact_number(value: f64) -> String {
     let (value, suffix) = match value.abs() {
         size if size >= 1e6 => (value / 1e6, "M"),
         size if size >= 1e3 => (value / 1e3, "k"),

@@ -3,18 +3,18 @@
 use std::fmt::Write;
 
 /// `[red, green, blue]`, sRGB.
-pub(crate) type Color = [u8; 3];
+pub type Color = [u8; 3];
 
 /// Text sizes, for which the bitmap font has letters.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum TextSize {
+pub enum TextSize {
     Normal,
     Title,
 }
 
 impl TextSize {
     /// Height of a line of text.
-    pub(crate) fn height(self) -> f64 {
+    pub fn height(self) -> f64 {
         match self {
             Self::Normal => 12.0,
             Self::Title => 16.0,
@@ -24,7 +24,7 @@ impl TextSize {
 
 /// Which point of a text is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Anchor {
+pub enum Anchor {
     Start,
     Middle,
     End,
@@ -32,7 +32,7 @@ pub(crate) enum Anchor {
 
 /// A shape; y points down.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum VectorShape {
+pub enum VectorShape {
     /// A line through points; `dash` is the length of dashes and gaps.
     Line { points: Vec<[f64; 2]>, color: Color, width: f64, dash: Option<[f64; 2]> },
     /// A filled polygon.
@@ -43,14 +43,14 @@ pub(crate) enum VectorShape {
 
 /// Shapes in drawing order, on a white background.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Drawing {
-    pub(crate) size: [f64; 2],
-    pub(crate) shapes: Vec<VectorShape>,
+pub struct Drawing {
+    pub size: [f64; 2],
+    pub shapes: Vec<VectorShape>,
 }
 
 impl Drawing {
     /// The drawing as an SVG file. Text is kept as text, so that it can be searched and read aloud.
-    pub(crate) fn svg(&self) -> String {
+    pub fn svg(&self) -> String {
         let [width, height] = self.size;
         let mut svg = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" \
@@ -109,7 +109,7 @@ fn hex([red, green, blue]: Color) -> String {
 }
 
 /// Escapes text for SVG and HTML, inside elements and quoted attributes.
-pub(crate) fn escaped(text: &str) -> String {
+pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

@@ -4,54 +4,54 @@
 //! differ in shape, for grayscale prints.
 
 mod axis;
-pub(crate) mod drawing;
-pub(crate) mod raster;
+pub mod drawing;
+pub mod raster;
 
-pub(crate) use axis::{Axis, Scale, compact_number};
+pub use axis::{Axis, Scale, compact_number};
 use drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
 use raster::text_width;
 
 /// Contents of a chart.
 #[derive(Clone, Debug)]
-pub(crate) struct Chart {
-    pub(crate) title: String,
+pub struct Chart {
+    pub title: String,
     /// Explanation of the points and bands.
-    pub(crate) subtitle: String,
-    pub(crate) x: Axis,
-    pub(crate) y: Axis,
-    pub(crate) lines: Vec<Line>,
+    pub subtitle: String,
+    pub x: Axis,
+    pub y: Axis,
+    pub lines: Vec<Line>,
     /// Values on the y axis to mark with a dashed line, with their labels.
-    pub(crate) thresholds: Vec<(f64, String)>,
+    pub thresholds: Vec<(f64, String)>,
     /// Values on the x axis to mark with a dashed line.
-    pub(crate) markers: Vec<Marker>,
+    pub markers: Vec<Marker>,
 }
 
 /// One line of a chart.
 #[derive(Clone, Debug)]
-pub(crate) struct Line {
-    pub(crate) label: String,
+pub struct Line {
+    pub label: String,
     /// Points, ordered by x.
-    pub(crate) points: Vec<Point>,
+    pub points: Vec<Point>,
     /// Whether it is drawn dashed, as the line of another trainer.
-    pub(crate) is_peer: bool,
+    pub is_peer: bool,
 }
 
 /// A point and the range of the values it summarizes.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Point {
-    pub(crate) x: f64,
-    pub(crate) y: f64,
-    pub(crate) low: f64,
-    pub(crate) high: f64,
+pub struct Point {
+    pub x: f64,
+    pub y: f64,
+    pub low: f64,
+    pub high: f64,
 }
 
 /// A marked value on the x axis, with a label above the plot.
 #[derive(Clone, Debug)]
-pub(crate) struct Marker {
-    pub(crate) x: f64,
-    pub(crate) label: String,
+pub struct Marker {
+    pub x: f64,
+    pub label: String,
     /// The line to which it belongs.
-    pub(crate) line_ix: usize,
+    pub line_ix: usize,
 }
 
 const COLORS: [Color; 7] =
@@ -99,7 +99,7 @@ impl Plot {
 
 impl Chart {
     /// Draws the chart; the legend is next to the plot and never covers it.
-    pub(crate) fn draw(&self) -> Drawing {
+    pub fn draw(&self) -> Drawing {
         let legend = self.legend();
         let longest = legend.iter().flat_map(|entry| &entry.rows).map(|row| text_width(row, TextSize::Normal));
         let legend_width = LEGEND_SWATCH + longest.fold(0.0, f64::max);

@@ -1,9 +1,10 @@
 //! Draws a drawing as a PNG image. The bitmap font is part of the program, so no system fonts are needed.
 
+use crate::error::Context;
+use image::{ExtendedColorType, ImageEncoder};
+use image::codecs::png::PngEncoder;
+use noto_sans_mono_bitmap::{get_raster, get_raster_width, FontWeight, RasterHeight};
 use super::drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
-use anyhow::Context;
-use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
-use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
 /// Pixels per unit of the drawing; the font heights match it.
@@ -17,13 +18,13 @@ fn raster_height(size: TextSize) -> RasterHeight {
 }
 
 /// Width of a text in units of the drawing; the font is monospaced.
-pub(crate) fn text_width(text: &str, size: TextSize) -> f64 {
+pub fn text_width(text: &str, size: TextSize) -> f64 {
     let width = get_raster_width(FontWeight::Regular, raster_height(size)) as f64;
     text.chars().count() as f64 * width / f64::from(PIXELS_PER_UNIT)
 }
 
 /// The drawing as the bytes of a PNG file.
-pub(crate) fn png(drawing: &Drawing) -> anyhow::Result<Vec<u8>> {
+pub fn png(drawing: &Drawing) -> crate::Result<Vec<u8>> {
     #[expect(clippy::cast_possible_truncation, reason = "a chart is a few thousand pixels wide")]
     let [width, height] = drawing.size.map(|units| (units.ceil() as u32) * PIXELS_PER_UNIT);
     let mut picture = Pixmap::new(width, height).context("a chart has a size")?;

@@ -4,41 +4,40 @@
 
 mod pictures;
 
-pub(crate) use pictures::{Comparison, Scored, compare};
+pub use pictures::{Comparison, Scored, compare};
 
-use crate::bench::page::Table;
-use crate::chart::drawing::escaped;
+use crate::{evaluation_schedule, run_folder};
 use crate::chart::{Axis, Chart, Line, Point, Scale};
-use crate::evaluation_schedule;
+use crate::chart::drawing::escaped;
 use crate::next_commands::NextCommand;
-use crate::run_folder;
+use crate::table::Table;
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::Path;
 
 /// Name of the page in the folder of a run.
-pub(crate) const FILE: &str = "report.html";
+pub const FILE: &str = "report.html";
 /// Tables with more rows than this are collapsed.
 const MAX_OPEN_ROWS: usize = 16;
 
 /// The content of the page.
-pub(crate) struct Page<'a> {
-    pub(crate) folder: &'a Path,
+pub struct Page<'a> {
+    pub folder: &'a Path,
     /// The content of `report.json`.
-    pub(crate) report: &'a Value,
+    pub report: &'a Value,
     /// Name of the model's primitive, in the singular.
-    pub(crate) primitive: &'a str,
-    pub(crate) comparisons: &'a [Comparison],
-    pub(crate) next: &'a [NextCommand],
+    pub primitive: &'a str,
+    pub comparisons: &'a [Comparison],
+    pub next: &'a [NextCommand],
     /// Settings of the model from the decision log; `Null` if there is no log.
-    pub(crate) settings: Value,
+    pub settings: Value,
     /// The command line of the training.
-    pub(crate) command: String,
+    pub command: String,
 }
 
 impl Page<'_> {
     /// Writes the page into the folder.
-    pub(crate) fn write(&self) -> anyhow::Result<()> {
+    pub fn write(&self) -> crate::Result<()> {
         run_folder::write_atomic(&self.folder.join(FILE), &self.html())
     }
 
@@ -398,7 +397,7 @@ fn array(value: &Value) -> &[Value] {
 }
 
 /// The settings in the decision log of a folder, which are its first line; `Null` if there is no log.
-pub(crate) fn settings_in(folder: &Path) -> Value {
+pub fn settings_in(folder: &Path) -> Value {
     let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let newest = names.filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path()))).max();
@@ -412,8 +411,8 @@ pub(crate) fn settings_in(folder: &Path) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use serde_json::json;
+    use super::*;
 
     fn page(report: &Value) -> String {
         let next = NextCommand { purpose: "view the model", command: "fieldrig view 'a <b>'".into() };

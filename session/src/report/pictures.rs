@@ -2,7 +2,7 @@
 
 use capture::downscale;
 use crate::evaluate;
-use anyhow::Context;
+use crate::error::Context;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use keyframe::Keyframe;
@@ -30,10 +30,10 @@ const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
 const MAX_ERROR: u8 = 64;
 
 /// One test image and the model's render of it.
-pub(crate) struct Comparison {
-    pub(crate) name: String,
-    pub(crate) psnr: f64,
-    pub(crate) ssim: Option<f64>,
+pub struct Comparison {
+    pub name: String,
+    pub psnr: f64,
+    pub ssim: Option<f64>,
     /// Size of the larger pictures in CSS pixels.
     pub(super) size_px: [u32; 2],
     pub(super) image: String,
@@ -50,15 +50,15 @@ pub(super) struct DepthPicture {
 }
 
 /// A test image with its name and scores.
-pub(crate) struct Scored<'a> {
-    pub(crate) keyframe: &'a Arc<Keyframe>,
-    pub(crate) name: String,
-    pub(crate) psnr: f64,
-    pub(crate) ssim: Option<f64>,
+pub struct Scored<'a> {
+    pub keyframe: &'a Arc<Keyframe>,
+    pub name: String,
+    pub psnr: f64,
+    pub ssim: Option<f64>,
 }
 
 /// Draws test images spread over all of them, including the best and the worst, in the order of `scored`.
-pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> anyhow::Result<Vec<Comparison>> {
+pub fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::Result<Vec<Comparison>> {
     let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
@@ -96,7 +96,7 @@ fn selected(psnr: &[f64]) -> Vec<usize> {
 }
 
 impl Comparison {
-    fn of(method: &mut dyn Method, scored: &Scored<'_>) -> anyhow::Result<Self> {
+    fn of(method: &mut dyn Method, scored: &Scored<'_>) -> crate::Result<Self> {
         let keyframe = scored.keyframe;
         let rendered = evaluate::draw(method, keyframe, true)?;
         let [size_px, small_px] = [MAX_SIDE_PX, MAX_SMALL_SIDE_PX].map(|side| fit_size(keyframe.size_px, side));
@@ -124,7 +124,7 @@ impl Comparison {
 
 impl DepthPicture {
     /// `None` if nothing was drawn.
-    fn of(picture: &Picture, size_px: [u32; 2]) -> anyhow::Result<Option<Self>> {
+    fn of(picture: &Picture, size_px: [u32; 2]) -> crate::Result<Option<Self>> {
         let subsampled = nearest_pixels(&picture.depth_m, picture.size_px, size_px);
         let valid = subsampled.iter().copied().filter(|z| *z > 0.0 && z.is_finite());
         let mut known: Vec<f64> = valid.map(f64::from).collect();
@@ -209,7 +209,7 @@ fn nearest_pixels(values: &[f32], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<f32
 }
 
 /// A JPEG as a data URI for `<img>`.
-fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> anyhow::Result<String> {
+fn data_uri(rgb: &[u8], [width, height]: [u32; 2], quality: u8) -> crate::Result<String> {
     let mut bytes = Vec::new();
     let mut encoder = JpegEncoder::new_with_quality(&mut bytes, quality);
     encoder.encode(rgb, width, height, ExtendedColorType::Rgb8).context("cannot encode a picture as JPEG")?;

@@ -5,13 +5,12 @@ use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::sample_std;
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{ModelKind, ModelSpec};
 use crate::open_gpu::open_gpu;
-use crate::training;
 use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::PathBuf;
+use trainer::{ModelKind, ModelSpec};
 use trainer::splat::{CountPolicy, SplatOptions};
 
 /// Training time of a run if no flag limits it.
@@ -81,7 +80,7 @@ struct VariantResult {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
+    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
@@ -189,7 +188,7 @@ fn findings(
     data: &NamedData,
     rows: &[VariantResult],
 ) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["trained".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
     head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
@@ -224,8 +223,8 @@ fn findings(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::bench::runs::tests::run;
+    use super::*;
 
     #[test]
     fn gains_are_computed_per_seed() {

@@ -4,15 +4,15 @@ use crate::bench::page::{Findings, Table};
 use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{extent, sample_std, secs_to};
-use crate::chart::{Axis, Chart, Line, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{ModelKind, ModelSpec};
 use crate::open_gpu::open_gpu;
-use crate::{evaluation_schedule, training};
 use kinematics::quantile::median;
 use serde::Serialize;
+use session::evaluation_schedule;
+use session::chart::{compact_number, Axis, Chart, Line, Point, Scale};
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
+use trainer::{ModelKind, ModelSpec};
 use trainer::splat::SplatOptions;
 
 /// PSNR levels for which the time to reach them is reported, dB.
@@ -101,7 +101,7 @@ struct TimeToQuality {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
+    let limits = session::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
     if args.seconds == 0.0 {
         return Err(BadArgument("--seconds: must be above 0".into()).into());
     }

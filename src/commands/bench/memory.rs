@@ -1,18 +1,18 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
-use keyframe::counted;
-use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
+use anyhow::Context;
+use clap::Parser;
+use crate::print;
+use crate::bench::memory::{resident_bytes, Excluded, Growth, Sample};
 use crate::bench::page::{Findings, Table};
 use crate::bench::statistics::extent;
 use crate::bench::viewer::Viewer;
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::commands::run::{self, Running};
 use crate::exit::{BadArgument, Exit};
-use crate::print;
-use crate::run_folder::CreatedFolders;
-use anyhow::Context;
-use clap::Parser;
-use kinematics::quantile::{Rank, quantile};
+use keyframe::counted;
+use kinematics::quantile::{quantile, Rank};
+use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
+use session::run_folder::CreatedFolders;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};

@@ -1,23 +1,22 @@
 //! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
 
+use anyhow::ensure;
 use crate::bench::disturb::Disturbance;
 use crate::bench::page::{Findings, Table};
 use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{Interpolation, break_point, extent};
+use crate::bench::statistics::{break_point, extent, Interpolation};
 use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::ModelSpec;
 use crate::open_gpu::open_gpu;
-use crate::session::Limits;
-use crate::training;
-use anyhow::ensure;
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
 use serde::Serialize;
+use session::Limits;
+use session::chart::{compact_number, Axis, Chart, Line, Marker, Point, Scale};
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
+use trainer::ModelSpec;
 use trainer::splat::SplatOptions;
 
 /// Training time of a run if no flag limits it.
@@ -118,7 +117,7 @@ struct Break {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
+    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     args.check()?;
     let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
@@ -404,7 +403,7 @@ fn findings(
     data: &NamedData,
     results: &[DisturbanceResult],
 ) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds; band: minimum to maximum", args.seeds)
     } else {
@@ -463,8 +462,8 @@ fn findings(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::bench::runs::tests::run;
+    use super::*;
 
     #[test]
     fn levels_start_undisturbed_and_clip_to_available_keyframes() {

@@ -2,12 +2,12 @@
 //! jitter.
 
 use crate::bench::page::{Findings, Table};
-use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::exit::{BadArgument, Exit};
-use kinematics::quantile::{Rank, median, quantile};
-use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
+use kinematics::quantile::{median, quantile, Rank};
+use kinematics::random::Random;
 use serde::Serialize;
+use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -232,8 +232,8 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use clap::Parser;
+    use super::*;
 
     #[derive(Parser)]
     struct Flags {

@@ -1,21 +1,15 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
-use super::Finding;
-use capture::config::BaseDriver;
-use capture::config::Rig;
-use capture::Join;
-use capture::JoinEvent;
-use capture::Rejection;
-use capture::open;
-use capture::open::Devices;
-use capture::open::Opened;
-use capture::Stop;
-use drivers::{Sample, clock};
+use capture::{Join, JoinEvent, Rejection, Stop};
+use capture::config::{BaseDriver, Rig};
+use capture::open::{self, Devices, Opened};
+use drivers::{clock, Sample};
 use kinematics::Stamp;
-use kinematics::quantile::{Rank, quantile};
+use kinematics::quantile::{quantile, Rank};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
+use super::Finding;
 
 /// A device slower than this fraction of the rate in the rig file is reported.
 const MIN_RATE_FRAC: f64 = 0.95;

@@ -1,12 +1,10 @@
 //! Writes the images of a recording as files of a RealSense camera.
 
-use capture::config::Camera;
-use capture::config::CameraDriver;
-use capture::config::Rig;
 use anyhow::Context;
+use capture::config::{Camera, CameraDriver, Rig};
+use drivers::{Image, PixelFormat};
 use drivers::realsense::Pace;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
-use drivers::{Image, PixelFormat};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -1,31 +1,22 @@
 //! Emulates the devices of a rig file on the wire.
 
-use crate::signals;
-use super::Args;
-use super::bag::CameraFiles;
-use capture::config::ArmDriver;
-use capture::config::BaseDriver;
-use capture::config::Rig;
-use capture::config::ScannerDriver;
-use crate::exit::{BadArgument, Exit};
-use capture::open;
-use capture::open::Devices;
-use capture::open::FCI_PORT;
-use capture::open::Opened;
-use crate::print;
+use anyhow::{bail, Context};
 use capture::Stop;
-use anyhow::{Context, bail};
+use capture::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use capture::open::{self, Devices, FCI_PORT, Opened};
+use crate::{print, signals};
+use crate::exit::{BadArgument, Exit};
+use drivers::{can, clock, Sample};
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
-use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
-use sim::wire::{
-    DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock, emulate_fci,
-};
+use sim::wire::{emulate_fci, DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use super::Args;
+use super::bag::CameraFiles;
 
 /// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
