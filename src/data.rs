@@ -6,7 +6,6 @@ use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::exit::{BadArgument, InsufficientData};
 use crate::holdout::Holdout;
 use crate::join::{Join, JoinEvent, KeyframeList, SampleUse};
-use crate::method::ModelKind;
 use crate::open::{self, Opened};
 use crate::run_folder::is_recording;
 use crate::stations::{StationReport, Stations};
@@ -17,6 +16,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use trainer::ModelKind;
 use trainer::gpu::Gpu;
 
 /// Which images are used, and for what.
@@ -224,7 +224,7 @@ impl Data {
     /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
     pub(crate) fn default_methods(path: &Path, args: &DataArgs) -> anyhow::Result<Vec<ModelKind>> {
         expect(path)?;
-        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![ModelKind::Splat] })
+        Ok(if is_recording(path) { Self::rig_as_given(path, args)?.train.methods } else { vec![ModelKind::default()] })
     }
 
     /// Keyframes of one split.

@@ -55,7 +55,7 @@ impl DepthSource {
         quiet: bool,
     ) -> anyhow::Result<RenderedDepth> {
         let model_name = self.model.display();
-        let mut model = method::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?;
+        let mut model = method::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?.method;
         let bar = print::bar(Some(keyframes.len() as u64), "{bar:30} {pos} of {len} depth images", quiet);
         let mut totals = Filled::default();
         let mut n_images = 0;

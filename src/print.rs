@@ -184,6 +184,14 @@ pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
+/// Words with commas and a conjunction before the last one: `ply or spz`.
+pub(crate) fn listed(words: &[&str], conjunction: &str) -> String {
+    match words.split_last() {
+        Some((last, others)) if !others.is_empty() => format!("{} {conjunction} {last}", others.join(", ")),
+        _ => words.concat(),
+    }
+}
+
 /// A count and its noun: `1 image`, `2 images`.
 pub(crate) fn counted(n: u64, noun: &str) -> String {
     match noun.strip_suffix('y') {

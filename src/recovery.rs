@@ -1,11 +1,11 @@
 //! What a model needs to recover from a GPU failure, and the errors of one.
 
 use crate::decisions::Settings;
-use crate::method::ModelSpec;
 use crate::run_folder::CHECKPOINT;
 use keyframe::Keyframe;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use trainer::ModelSpec;
 
 /// What a session needs to continue on another device.
 pub(crate) struct Recovery {

@@ -1,10 +1,10 @@
 //! The first view: around the point that the cameras look at, or without cameras around the model.
 
-use crate::model_bounds::Bounds;
 use keyframe::Keyframe;
 use kinematics::Transform;
 use nalgebra::{Matrix3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::sync::Arc;
+use trainer::Bounds;
 use viz::SceneHint;
 
 /// Assumed distance of the scene ahead of the cameras where their axes do not determine it, meters.

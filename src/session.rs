@@ -7,7 +7,6 @@ use crate::decisions::DecisionLog;
 use crate::evaluate::{Evaluator, ImageScores, Scores};
 use crate::evaluation_schedule::EvaluationSchedule;
 use crate::join::split_name;
-use crate::method::{self, FailedModel, ModelKind};
 use crate::next_commands::{self, DataSource, SavedModel};
 use crate::open_gpu;
 use crate::pending_evaluation::PendingEvaluation;
@@ -27,7 +26,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
-use trainer::{Method, Picture, Progress, RenderRequest};
+use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
@@ -551,7 +550,8 @@ impl Session {
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed = checkpoint.map(|checkpoint| method::resume(gpu.clone(), &checkpoint?, &all)).transpose();
+        let resumed =
+            checkpoint.map(|checkpoint| anyhow::Ok(trainer::resume(gpu.clone(), &checkpoint?, &all)?)).transpose();
         let resumed = resumed.or_else(|error| {
             if recovery::is_gpu_error(&error) {
                 return Err(error);
@@ -562,7 +562,7 @@ impl Session {
         let is_resumed = resumed.is_some();
         let (mut method, untrained) = match resumed {
             Some(resumed) => (resumed.method, resumed.untrained),
-            None => (recovery.model_spec.clone().start(gpu.clone())?, held.clone()),
+            None => (recovery.model_spec.start(gpu.clone())?, held.clone()),
         };
         method.prepare()?;
         let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
@@ -857,7 +857,7 @@ impl Session {
                 print::report(format_args!(
                     "{seconds:.1} s, {}, {}, {:.1} MB: {}",
                     print::counted(done.steps, "step"),
-                    print::counted(done.primitives, self.method.primitive()),
+                    print::counted(done.primitives, self.kind.entry().primitive),
                     done.bytes as f64 / 1e6,
                     done.scores
                 ));
@@ -904,7 +904,7 @@ impl Session {
         let page = report::Page {
             folder: out,
             report: &serde_json::to_value(report)?,
-            primitive: self.method.primitive(),
+            primitive: self.kind.entry().primitive,
             comparisons,
             next: &next_commands::for_models(&[model]),
             settings: report::settings_in(out),
@@ -1038,7 +1038,7 @@ impl Session {
             OutputMode::Lines => print::report(format_args!(
                 "{seconds:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
                 eval.step,
-                print::counted(eval.primitives, self.method.primitive()),
+                print::counted(eval.primitives, self.kind.entry().primitive),
                 progress.step_millis,
                 eval.scores
             )),
@@ -1072,7 +1072,7 @@ impl Session {
         let position = if self.limits.steps.is_some() { progress.step } else { whole_secs(self.secs()) };
         self.bar.set_position(position);
         let psnr = self.psnr().map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
-        let primitives = print::counted(progress.primitives, self.method.primitive());
+        let primitives = print::counted(progress.primitives, self.kind.entry().primitive);
         self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
     }
 }

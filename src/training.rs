@@ -3,7 +3,8 @@
 use crate::config::{DEFAULT_SEED, Rig};
 use crate::data::{Data, DataArgs};
 use crate::exit::{BadArgument, InsufficientData};
-use crate::method::{self, ModelKind, ModelSpec};
+use crate::method::{self, COUNT, MAX_SPLATS, Settings};
+use crate::print;
 use crate::recoveries::Recoveries;
 use crate::run_folder;
 use crate::session::{Evaluators, Limits, OutputMode, Session};
@@ -15,7 +16,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::gpu::Gpu;
-use trainer::splat::SplatOptions;
+use trainer::{CommonOptions, ModelKind, ModelSpec};
 
 /// Everything that determines a training besides its keyframes.
 pub(crate) struct TrainingPlan {
@@ -60,10 +61,13 @@ pub(crate) fn drive(
             session.push(keyframe)?;
         }
         if session.is_idle() && session.progress().step == 0 {
-            let name = session.kind().name();
+            let others: Vec<&str> =
+                ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
             return Err(InsufficientData(format!(
-                "the method {name} needs depth, but no training image has depth: \
-                 use --depth-from to render it from another model of the scene, or the method splat or nerf"
+                "the method {} needs depth, but no training image has depth: \
+                 use --depth-from to render it from another model of the scene, or the method {}",
+                session.kind().name(),
+                print::listed(&others, "or")
             ))
             .into());
         }
@@ -93,7 +97,7 @@ pub(crate) fn model_specs(
     software: bool,
 ) -> Result<Vec<ModelSpec>, BadArgument> {
     let rig_methods = data.rig.as_ref().map(|rig| rig.train.methods.as_slice());
-    let kinds = rig_methods.or(args.methods()).unwrap_or(&[ModelKind::Splat]);
+    let kinds = rig_methods.or(args.methods()).unwrap_or(&[ModelKind::default()]);
     args.check_for(kinds)?;
     // A trial takes hundreds of additional steps, which take minutes on a CPU.
     let available = AvailableData {
@@ -106,22 +110,24 @@ pub(crate) fn model_specs(
         args.refining(available, if software { Refine::None } else { Refine::Auto })?;
     args.check_learned(kinds, available)?;
     let count = args.count(if software { CountArg::ToCap } else { CountArg::Tested });
-    let options = if let Some(rig) = &data.rig {
-        SplatOptions { cameras, align, count, ..method::options(&rig.train, steps)? }
-    } else {
-        let defaults = SplatOptions::default();
-        SplatOptions {
-            seed: args.seed.unwrap_or(DEFAULT_SEED),
-            max_splats: args.max_splats.map_or(defaults.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-            max_bytes: args.max_bytes,
-            cameras,
-            count,
-            align,
-            n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
-            ..defaults
-        }
+    let (common, mut settings) = match &data.rig {
+        Some(rig) => method::options(&rig.train, steps),
+        None => options_without_rig(args, steps),
     };
-    Ok(kinds.iter().map(|kind| ModelSpec { kind: *kind, options: options.clone() }).collect())
+    settings.push((COUNT, serde_json::json!(count)));
+    method::specs(kinds, &CommonOptions { cameras, align, ..common }, &settings)
+}
+
+/// Options from flags alone.
+fn options_without_rig(args: &TrainingArgs, steps: Option<u64>) -> (CommonOptions, Settings) {
+    let defaults = CommonOptions::default();
+    let common = CommonOptions {
+        seed: args.seed.unwrap_or(DEFAULT_SEED),
+        max_bytes: args.max_bytes,
+        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
+        ..defaults
+    };
+    (common, args.max_splats.map(|n| (MAX_SPLATS, n.into())).into_iter().collect())
 }
 
 /// Checks flags that do not depend on the contents of the data, before all data are read.

@@ -2,22 +2,33 @@
 
 use crate::config::{self, MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, SEED_RANGE};
 use crate::exit::BadArgument;
-use crate::method::{self, ModelKind};
+use crate::method::{self, COUNT, MAX_SPLATS};
+use crate::print;
 use calibration::candidates;
 use calibration::{CameraRefinement, ParamSet};
 use clap::{ValueEnum, value_parser};
+use std::sync::LazyLock;
+use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
 /// The rig file key that `--refine` sets.
 pub(crate) const REALIGN: &str = "base.realign";
 
+/// Help of `--method`.
+static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
+    let described = ModelKind::ALL.iter().map(|kind| format!("{} ({})", kind.name(), kind.entry().description));
+    format!(
+        "Scene model: {}, or several separated by commas. `train` and `run` train several at once, `bench curve` one \
+         after the other [default: train.method of the rig file, else {}]",
+        described.collect::<Vec<_>>().join(", "),
+        ModelKind::default().name()
+    )
+});
+
 /// Which models to train, and their limits.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat (Gaussian splats), nerf (neural radiance field), tsdf (signed distance field with a mesh), or
-    /// several separated by commas. `train` and `run` train several at once, `bench curve` one after the other
-    /// [default: train.method of the rig file, else splat]
-    #[arg(long, value_name = "METHOD", value_parser = methods)]
+    #[arg(long, value_name = "METHOD", value_parser = methods, help = METHOD_HELP.as_str())]
     pub(crate) method: Option<Methods>,
     /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same result
     /// [default: the rig file's, else 1]
@@ -51,7 +62,7 @@ fn methods(text: &str) -> Result<Methods, String> {
     let mut kinds = Vec::new();
     for name in text.split(',') {
         let kind = ModelKind::from_name(name)
-            .ok_or_else(|| format!("unknown method {name:?}, expected {}", method::describe(&ModelKind::ALL)))?;
+            .ok_or_else(|| format!("unknown method {name:?}, expected {}", method::describe(ModelKind::ALL)))?;
         if kinds.contains(&kind) {
             return Err(format!("{name} is listed twice"));
         }
@@ -118,14 +129,19 @@ impl TrainingArgs {
         self.method.as_ref().map(|Methods(kinds)| kinds.as_slice())
     }
 
-    /// Rejects flags that need splats if no scene model is splats.
+    /// Rejects flags that set an option which none of the methods has.
     pub(crate) fn check_for(&self, kinds: &[ModelKind]) -> Result<(), BadArgument> {
-        let of_splats = [(self.max_splats.is_some(), "--max-splats"), (self.count.is_some(), "--count")];
-        match of_splats.into_iter().find(|(is_given, _)| *is_given && !kinds.contains(&ModelKind::Splat)) {
-            Some((_, flag)) => Err(BadArgument(format!(
-                "{flag}: needs the method splat, but the method is {}",
-                method::describe(kinds)
-            ))),
+        let flags = [(self.max_splats.is_some(), "--max-splats", MAX_SPLATS), (self.count.is_some(), "--count", COUNT)];
+        let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
+        match flags.into_iter().find(|(is_given, _, option)| *is_given && is_unused(option)) {
+            Some((_, flag, option)) => {
+                let having = ModelKind::ALL.iter().filter(|kind| kind.has_option(option)).map(|kind| kind.name());
+                Err(BadArgument(format!(
+                    "{flag}: needs the method {}, but the method is {}",
+                    print::listed(&having.collect::<Vec<_>>(), "or"),
+                    method::describe(kinds)
+                )))
+            }
             None => Ok(()),
         }
     }
@@ -142,13 +158,11 @@ impl TrainingArgs {
     pub(crate) fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), BadArgument> {
         let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
         let can_learn = |param: &Refine| {
-            kinds.contains(&ModelKind::Nerf) && matches!(param, Refine::ImagePoses | Refine::ImageGains)
+            let set = param_set(std::slice::from_ref(param));
+            set.any() && kinds.iter().any(|kind| kind.entry().learnable.and(set) == kind.entry().learnable)
         };
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
-        if kinds.contains(&ModelKind::Splat) {
-            return Ok(());
-        }
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
         let known: Vec<String> =
             Refine::value_variants().iter().filter(|param| is_known(param)).map(Refine::name).collect();
@@ -183,17 +197,7 @@ impl TrainingArgs {
         if has(Refine::Joints) && !available.joints {
             return Err(BadArgument("--refine joints: needs a recording of an arm".into()));
         }
-        let set = ParamSet {
-            extrinsics: has(Refine::Extrinsics),
-            time_offset: has(Refine::TimeOffset),
-            lens: has(Refine::Lens),
-            image_poses: has(Refine::ImagePoses),
-            image_gains: has(Refine::ImageGains),
-            joints: has(Refine::Joints),
-            depth_pose: has(Refine::DepthPose),
-            depth_scale: has(Refine::DepthScale),
-            readout: has(Refine::Readout),
-        };
+        let set = param_set(requested);
         if !available.depth {
             return Ok(RefineSettings {
                 align: CameraRefinement::default(),
@@ -242,6 +246,22 @@ impl TrainingArgs {
     }
 }
 
+/// The requested camera parameters.
+fn param_set(requested: &[Refine]) -> ParamSet {
+    let has = |param| requested.contains(&param);
+    ParamSet {
+        extrinsics: has(Refine::Extrinsics),
+        time_offset: has(Refine::TimeOffset),
+        lens: has(Refine::Lens),
+        image_poses: has(Refine::ImagePoses),
+        image_gains: has(Refine::ImageGains),
+        joints: has(Refine::Joints),
+        depth_pose: has(Refine::DepthPose),
+        depth_scale: has(Refine::DepthScale),
+        readout: has(Refine::Readout),
+    }
+}
+
 impl AvailableData {
     /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
     fn auto_settings(self) -> RefineSettings {
@@ -264,6 +284,10 @@ impl AvailableData {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn kind(name: &str) -> ModelKind {
+        ModelKind::from_name(name).expect("registered")
+    }
 
     fn no_flags() -> TrainingArgs {
         TrainingArgs { method: None, seed: None, max_bytes: None, max_splats: None, refine: Vec::new(), count: None }
@@ -305,18 +329,18 @@ mod tests {
 
     #[test]
     fn methods_are_unique_and_splat_flags_need_splats() {
-        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![ModelKind::Tsdf, ModelKind::Splat]));
+        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![kind("tsdf"), kind("splat")]));
         for (text, message) in [("mesh", "\"mesh\""), ("splat,splat", "listed twice"), ("splat,", "\"\""), ("", "\"\"")]
         {
             assert!(methods(text).is_err_and(|error| error.contains(message)), "{text}");
         }
         let args = TrainingArgs { max_splats: Some(5), refine: vec![Refine::ImageGains], ..no_flags() };
         let available = AvailableData { joints: true, drifts: false, depth: true };
-        let both = [ModelKind::Tsdf, ModelKind::Splat];
+        let both = [kind("tsdf"), kind("splat")];
         assert!(args.check_for(&both).is_ok() && args.check_learned(&both, available).is_ok());
-        let message = args.check_for(&[ModelKind::Tsdf, ModelKind::Nerf]).unwrap_err().0;
+        let message = args.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().0;
         assert!(message.contains("--max-splats") && message.contains("tsdf and nerf"), "{message}");
-        let message = args.check_learned(&[ModelKind::Tsdf], available).unwrap_err().0;
+        let message = args.check_learned(&[kind("tsdf")], available).unwrap_err().0;
         assert!(
             message.starts_with(
                 "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
@@ -324,15 +348,14 @@ mod tests {
             "{message}"
         );
         assert!(message.ends_with("readout, image-poses"), "{message}");
-        assert!(args.check_learned(&[ModelKind::Nerf], available).is_ok());
+        assert!(args.check_learned(&[kind("nerf")], available).is_ok());
         let args = TrainingArgs { refine: vec![Refine::Extrinsics], ..no_flags() };
-        assert!(args.check_before_data(&[ModelKind::Nerf], false).is_ok());
-        let message =
-            args.check_learned(&[ModelKind::Nerf], AvailableData { depth: false, ..available }).unwrap_err().0;
+        assert!(args.check_before_data(&[kind("nerf")], false).is_ok());
+        let message = args.check_learned(&[kind("nerf")], AvailableData { depth: false, ..available }).unwrap_err().0;
         assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
         let args = TrainingArgs { refine: vec![Refine::Joints], ..no_flags() };
-        assert!(args.check_before_data(&[ModelKind::Splat], true).is_ok());
-        assert!(args.check_before_data(&[ModelKind::Splat], false).is_err());
+        assert!(args.check_before_data(&[kind("splat")], true).is_ok());
+        assert!(args.check_before_data(&[kind("splat")], false).is_err());
     }
 
     #[test]

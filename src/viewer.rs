@@ -1,10 +1,9 @@
 //! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
 
-use crate::method::ModelKind;
 use crate::stop::Stop;
 use kinematics::Transform;
 use std::time::Duration;
-use trainer::{Aabb, Method, RenderRequest};
+use trainer::{Aabb, Method, ModelKind, RenderRequest};
 use viz::{Hub, PendingRender};
 
 /// Longest time until Ctrl-C is noticed while no client requests a picture.

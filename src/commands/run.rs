@@ -9,7 +9,7 @@ use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::feed::{Feed, Input};
 use crate::join::{Counts, Join, Refusal, SampleUse};
 use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
+use crate::method::{self, COUNT};
 use crate::next_commands::{DataSource, quoted};
 use crate::open::{self, Devices, Opened};
 use crate::open_gpu::open_gpu;
@@ -35,7 +35,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::splat::SplatOptions;
+use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -270,21 +270,22 @@ pub(super) fn start(
     let kinds = rig.train.methods.clone();
     args.training.check_for(&kinds)?;
     let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
-    args.training.check_learned(&kinds, available)?;
     let cameras = args.training.refining(available, Refine::None)?.with_scene;
-    let count = args.training.count(CountArg::ToCap);
-    let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
+    args.training.check_learned(&kinds, available)?;
+    let (common, mut settings) = method::options(&rig.train, args.steps);
+    settings.push((COUNT, serde_json::json!(args.training.count(CountArg::ToCap))));
+    let common = CommonOptions { cameras, ..common };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let models: Vec<Resumed> = match previous {
-        Some(previous) => vec![method::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
+        Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
-            let start = |kind: &ModelKind| {
-                let model_spec = ModelSpec { kind: *kind, options: options.clone() };
-                let method = model_spec.clone().start(gpu.clone())?;
+            let start = |model_spec: ModelSpec| {
+                let method = model_spec.start(gpu.clone())?;
                 Ok(Resumed { model_spec, method, untrained: Vec::new() })
             };
-            kinds.iter().map(start).collect::<anyhow::Result<_>>()?
+            let model_specs = method::specs(&kinds, &common, &settings)?;
+            model_specs.into_iter().map(start).collect::<anyhow::Result<_>>()?
         }
     };
     let hub = Hub::new();

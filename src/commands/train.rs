@@ -9,7 +9,6 @@ use crate::decisions::{DecisionLog, RunDescription, Settings};
 use crate::depth_from::{self, DepthSource, RenderedDepth};
 use crate::evaluate::Evaluator;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
 use crate::next_commands::{DataSource, quoted};
 use crate::open_gpu::open_gpu;
 use crate::print;
@@ -31,6 +30,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
+use trainer::{ModelKind, ModelSpec, Resumed};
 
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -226,7 +226,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
     for (Resumed { model_spec: ModelSpec { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
-        seeds.push(options.seed);
+        seeds.push(options.common.seed);
         let description = RunDescription {
             method: kind.name(),
             data: Some(&args.data),
@@ -325,14 +325,14 @@ impl Args {
         checkpoint: Option<&Checkpoint>,
     ) -> anyhow::Result<Vec<Resumed>> {
         if let Some(checkpoint) = checkpoint {
-            return Ok(vec![self.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
+            return Ok(vec![self.resumed(trainer::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
             None => training::model_specs(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
         };
         let start = |model_spec: ModelSpec| {
-            let method = model_spec.clone().start(gpu.clone())?;
+            let method = model_spec.start(gpu.clone())?;
             Ok(Resumed { model_spec, method, untrained: data.keyframes.clone() })
         };
         model_specs.into_iter().map(start).collect()
@@ -416,7 +416,7 @@ impl Args {
 
     /// Logs differences from an uninterrupted run.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.model_spec.options.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (resumed.model_spec.options.common.n_planned_steps, resumed.method.progress().step);
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!("the learning rate was planned to decay over {planned} steps: later steps change little");

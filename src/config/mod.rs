@@ -16,7 +16,6 @@ pub(crate) use error::ConfigError;
 pub(crate) use motion::ArmMotion;
 pub(crate) use write::methods;
 
-use crate::method::ModelKind;
 use drivers::can::{BusConfig, MotorConfig};
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::tags::{Family, TagPlacement};
@@ -27,6 +26,7 @@ use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use trainer::ModelKind;
 
 /// Range of `max_splats`, as a key and as a flag.
 pub(crate) const MAX_SPLATS_RANGE: RangeInclusive<u64> = 1..=100_000_000;

@@ -6,7 +6,6 @@ use super::{
     MAX_BYTES_RANGE, MAX_SPLATS_RANGE, Override, Parent, Realsense, Rig, SEED_RANGE, Scanner, ScannerDriver,
     ScannerSim, Sim, TimeOffset, Train, UnknownCalibration, V4l2,
 };
-use crate::method::ModelKind;
 use drivers::can::MotorConfig;
 use drivers::realsense::{Filter, Pace, Stream};
 use drivers::tags::{Family, TagPlacement};
@@ -16,6 +15,7 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
+use trainer::ModelKind;
 
 pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 5] = [
     ("none", ArmDriver::None),
@@ -514,8 +514,8 @@ fn join(mut keys: Section<'_>) -> JoinConfig {
 fn train(mut keys: Section<'_>) -> Train {
     let train = Train {
         methods: keys
-            .choices("method", &ModelKind::ALL.map(|kind| (kind.name(), kind)))
-            .unwrap_or_else(|| vec![ModelKind::Splat]),
+            .choices("method", &ModelKind::ALL.iter().map(|kind| (kind.name(), *kind)).collect::<Vec<_>>())
+            .unwrap_or_else(|| vec![ModelKind::default()]),
         max_splats: keys.whole("max_splats", MAX_SPLATS_RANGE),
         max_bytes: keys.whole("max_bytes", MAX_BYTES_RANGE),
         seed: keys.whole("seed", SEED_RANGE).unwrap_or(DEFAULT_SEED),

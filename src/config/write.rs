@@ -8,10 +8,10 @@ use super::values::{is, name_of, table, whole};
 use super::{
     Arm, Base, Camera, CameraSim, Depth, JoinConfig, Realsense, Rig, Scanner, Sim, Train, UnknownCalibration, V4l2,
 };
-use crate::method::ModelKind;
 use drivers::tags::TagPlacement;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
+use trainer::ModelKind;
 
 pub(super) fn rig(rig: &Rig) -> String {
     let cameras =

@@ -111,7 +111,6 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -120,7 +119,11 @@ mod tests {
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { count, max_splats: 4000, n_planned_steps: 1500, ..options() };
+        let options = options().with(|options| {
+            options.common.n_planned_steps = 1500;
+            options.specific.count = count;
+            options.specific.max_splats = 4000;
+        });
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();
