@@ -4,16 +4,26 @@ use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
 use clap::value_parser;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use session::{Refine, TrainingOptions};
+use session::methods::describe;
+use std::sync::LazyLock;
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
+
+/// Help of `--method`.
+static METHOD_HELP: LazyLock<String> = LazyLock::new(|| {
+    let described = ModelKind::ALL.iter().map(|kind| format!("{} ({})", kind.name(), kind.entry().description));
+    format!(
+        "Scene model: {}, or several separated by commas. `train` and `run` train several at once, `bench curve` one \
+         after the other [default: train.method of the rig file, else {}]",
+        described.collect::<Vec<_>>().join(", "),
+        ModelKind::default().name()
+    )
+});
 
 /// Which models to train, and their limits.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct TrainingArgs {
-    /// Scene model: splat (Gaussian splats), nerf (neural radiance field), tsdf (signed distance field with a mesh), or
-    /// several separated by commas. `train` and `run` train several at once, `bench curve` one after the other
-    /// [default: train.method of the rig file, else splat]
-    #[arg(long, value_name = "METHOD", value_parser = methods)]
+    #[arg(long, value_name = "METHOD", value_parser = methods, help = METHOD_HELP.as_str())]
     pub(crate) method: Option<Methods>,
     /// Random seed, 0 to 2^63 - 1. With the same number of steps, the same seed gives the same result
     /// [default: the rig file's, else 1]
@@ -47,7 +57,7 @@ fn methods(text: &str) -> Result<Methods, String> {
     let mut kinds = Vec::new();
     for name in text.split(',') {
         let kind = ModelKind::from_name(name)
-            .ok_or_else(|| format!("unknown method {name:?}, expected {}", trainer::describe(&ModelKind::ALL)))?;
+            .ok_or_else(|| format!("unknown method {name:?}, expected {}", describe(ModelKind::ALL)))?;
         if kinds.contains(&kind) {
             return Err(format!("{name} is listed twice"));
         }
@@ -90,9 +100,13 @@ impl TrainingArgs {
 mod tests {
     use super::*;
 
+    fn kind(name: &str) -> ModelKind {
+        ModelKind::from_name(name).expect("registered")
+    }
+
     #[test]
     fn methods_are_distinct() {
-        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![ModelKind::Tsdf, ModelKind::Splat]));
+        assert_eq!(methods("tsdf,splat").map(|Methods(kinds)| kinds), Ok(vec![kind("tsdf"), kind("splat")]));
         for (text, message) in [("mesh", "\"mesh\""), ("splat,splat", "listed twice"), ("splat,", "\"\""), ("", "\"\"")]
         {
             assert!(methods(text).is_err_and(|error| error.contains(message)), "{text}");

@@ -42,7 +42,7 @@ mod range_points;
 pub mod scenes;
 mod shutter;
 
-pub use counted::counted;
+pub use counted::{counted, listed};
 pub use error::Error;
 pub use error_class::ErrorClass;
 pub use fingerprint::fingerprint;

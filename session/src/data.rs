@@ -8,7 +8,7 @@ use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::error::ensure;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::is_recording;
-use crate::train_settings::methods_of;
+use crate::methods::methods_of;
 use keyframe::{counted, Holdout, Keyframe, KeyframeList, Split};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -216,7 +216,7 @@ impl Data {
     /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
     pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
         expect(path)?;
-        if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::Splat]) }
+        if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::default()]) }
     }
 
     /// Keyframes of one split.

@@ -15,9 +15,9 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{sync_channel, SyncSender};
 use std::thread::JoinHandle;
-use trainer::splat::SplatOptions;
+use trainer::ModelOptions;
 
-const VERSION: u64 = 2;
+const VERSION: u64 = 3;
 /// Name of the log in the run folder.
 const FILE: &str = "decisions.jsonl";
 /// Maximum number of decisions that wait for the disk. When the queue is full, training waits.
@@ -40,7 +40,7 @@ pub struct Settings {
     pub depth_from: Option<String>,
     /// Number of earlier updates if the run continued from a checkpoint.
     pub from_step: Option<u64>,
-    pub options: SplatOptions,
+    pub options: ModelOptions,
 }
 
 /// Everything that determines a training result besides its data.
@@ -51,7 +51,7 @@ pub struct RunDescription<'a> {
     pub scale: f64,
     pub depth_from: Option<String>,
     pub from_step: Option<u64>,
-    pub options: SplatOptions,
+    pub options: ModelOptions,
 }
 
 impl Settings {
@@ -405,7 +405,12 @@ mod tests {
             scale: 0.5,
             depth_from: from_step.map(|_| "5ad1".to_owned()),
             from_step,
-            options: SplatOptions { seed: 7, max_bytes: Some(5_000_000), ..SplatOptions::default() },
+            options: ModelOptions::<SplatOptions>::default()
+                .with(|options| {
+                    options.common.seed = 7;
+                    options.common.max_bytes = Some(5_000_000);
+                })
+                .to_json(),
         })
     }
 
@@ -517,7 +522,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let text = written(folder.path());
         for (was, is, expected_error) in [
-            ("\"version\":2", "\"version\":9", "version 9, expected 2"),
+            ("\"version\":3", "\"version\":9", "version 9, expected 3"),
             ("\"version\"", "\"varsion\"", "line 1 has no version"),
             ("\"scale\"", "\"skale\"", "line 1: "),
             ("\"begin\":true", "\"begin\":false", "line 5: must be true"),

@@ -56,7 +56,7 @@ impl DepthSource {
         progress: OnReadProgress<'_>,
     ) -> crate::Result<RenderedDepth> {
         let model_name = self.model.display();
-        let mut model = trainer::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?;
+        let mut model = methods::load(gpu, &self.model).with_context(|| format!("--depth-from {model_name}"))?.method;
         let n_all = Some(keyframes.len());
         let mut totals = Filled::default();
         let mut n_images = 0;

@@ -419,6 +419,7 @@ fn model_status(session: &Session) -> ModelStatus {
         step: progress.step,
         step_millis: (progress.step > 0).then_some(progress.step_millis),
         primitives: progress.primitives,
+        primitives_label: session.kind().entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         psnr: session.psnr(),
         psnr_history: session.psnr_history().to_vec(),

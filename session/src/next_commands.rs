@@ -35,7 +35,7 @@ pub struct SavedModel<'a> {
 /// A command and its purpose.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NextCommand {
-    pub purpose: &'static str,
+    pub purpose: String,
     pub command: String,
 }
 
@@ -43,9 +43,9 @@ pub struct NextCommand {
 pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
     let program = std::env::args_os().next().map_or("fieldrig".into(), |word| word.to_string_lossy().into_owned());
     let mut commands = Vec::new();
-    let mut add = |purpose, words: &[&str]| {
+    let mut add = |purpose: &str, words: &[&str]| {
         let words: Vec<String> = std::iter::once(&*program).chain(words.iter().copied()).map(quoted).collect();
-        commands.push(NextCommand { purpose, command: words.join(" ") });
+        commands.push(NextCommand { purpose: purpose.to_owned(), command: words.join(" ") });
     };
     if let Some(folder) = common_folder(models) {
         add("view the model", &["view", &argument(folder)]);
@@ -60,13 +60,10 @@ pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
             words.extend(model.data.flags.iter().map(String::as_str));
             add("score it again", &words);
         }
-        let (format, purpose) = match model.kind {
-            ModelKind::Splat => ("spz", "export the splats"),
-            ModelKind::Tsdf => ("glb", "export the mesh"),
-            ModelKind::Nerf => continue, // Other programs cannot read it.
-        };
-        let out = argument(&unused_file(&model_name(model.folder), format));
-        add(purpose, &["export", &folder, "--to", format, "--out", &out]);
+        if let Some(Export { format, contents, .. }) = model.kind.entry().exports.first() {
+            let out = argument(&unused_file(&model_name(model.folder), format));
+            add(&format!("export the {contents}"), &["export", &folder, "--to", format, "--out", &out]);
+        }
     }
     commands
 }
@@ -139,14 +136,15 @@ mod tests {
             flags: vec!["--scale".into(), "0.5".into()],
             ..DataSource::default()
         };
-        let model = |kind, folder| SavedModel { kind, folder: Path::new(folder), data: &data, n_tests: 3 };
+        let kind = |name| ModelKind::from_name(name).expect("registered");
+        let model = |name, folder| SavedModel { kind: kind(name), folder: Path::new(folder), data: &data, n_tests: 3 };
         let commands = |models: &[SavedModel<'_>]| -> Vec<String> {
             let program = quoted(&std::env::args().next().expect("a program"));
             let strip = |next: NextCommand| next.command.trim_start_matches(&format!("{program} ")).to_owned();
             for_models(models).into_iter().map(strip).collect()
         };
         assert_eq!(
-            commands(&[model(ModelKind::Splat, "runs/a b")]),
+            commands(&[model("splat", "runs/a b")]),
             [
                 "view 'runs/a b'",
                 "eval 'runs/a b' 'my data' --keyframes 'runs/a b/keyframes.txt' --scale 0.5",
@@ -154,7 +152,7 @@ mod tests {
             ]
         );
         assert_eq!(
-            commands(&[model(ModelKind::Nerf, "both/nerf"), model(ModelKind::Tsdf, "both/tsdf")]),
+            commands(&[model("nerf", "both/nerf"), model("tsdf", "both/tsdf")]),
             [
                 "view both",
                 "eval both/nerf 'my data' --keyframes both/nerf/keyframes.txt --scale 0.5",
@@ -163,7 +161,7 @@ mod tests {
             ]
         );
         let live = DataSource::default();
-        let unscored = SavedModel { data: &live, ..model(ModelKind::Nerf, "-out") };
+        let unscored = SavedModel { data: &live, ..model("nerf", "-out") };
         assert_eq!(commands(&[unscored]), ["view ./-out"]);
         assert_eq!(commands(&[]), Vec::<String>::new());
     }

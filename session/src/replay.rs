@@ -19,7 +19,7 @@ use trainer::{ModelKind, ModelSpec};
 pub struct Replay {
     path: PathBuf,
     pub decisions: Decisions,
-    kind: ModelKind,
+    model_spec: ModelSpec,
 }
 
 impl Replay {
@@ -29,7 +29,9 @@ impl Replay {
         let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
             Error::BadInput(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
         })?;
-        let replay = Self { path: path.to_owned(), decisions, kind };
+        let model_spec = ModelSpec { kind, options: decisions.settings.options.clone() };
+        model_spec.check().map_err(|error| BadArgument(format!("{}: line 1: {error}", path.display())))?;
+        let replay = Self { path: path.to_owned(), decisions, model_spec };
         if replay.decisions.pushed().next().is_none() {
             return Err(Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into());
         }
@@ -102,7 +104,7 @@ impl Replay {
 
     /// The method and options of the logged run.
     pub fn model_spec(&self) -> ModelSpec {
-        ModelSpec { kind: self.kind, options: self.decisions.settings.options.clone() }
+        self.model_spec.clone()
     }
 
     /// Warns if the GPU adapter differs from that of the log.
@@ -152,14 +154,15 @@ impl Replay {
 
     /// The settings as keys of a rig file, so that the resolved rig file that is written is correct.
     fn overrides(&self) -> Vec<Override> {
-        let options = &self.decisions.settings.options;
+        let ModelSpec { kind, options } = &self.model_spec;
+        let specific = |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));
         let mut overrides = vec![
-            Override::new("train.method", self.kind.name()),
-            Override::new("train.seed", options.seed.cast_signed()),
-            Override::new("train.max_splats", i64::from(options.max_splats)),
-            Override::new("train.sh_degree", i64::from(options.sh_degree)),
+            Override::new("train.method", kind.name()),
+            Override::new("train.seed", options.common.seed.cast_signed()),
         ];
-        overrides.extend(options.max_bytes.map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())));
+        overrides.extend(specific("train.max_splats", MAX_SPLATS));
+        overrides.extend(specific("train.sh_degree", SH_DEGREE));
+        overrides.extend(options.common.max_bytes.map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())));
         overrides
     }
 

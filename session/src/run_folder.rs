@@ -14,10 +14,6 @@ use trainer::{splat_file, Method, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
-/// The files of a saved model, in the order in which `checkpoint_sha256` covers them.
-const MODEL_FILES: [&str; 6] = ["model.json", "mesh.ply", "mesh.glb", "field.blocks", "field.nerf", SPLATS];
-/// The only one of them that is a complete model on its own.
-const SPLATS: &str = "splats.ply";
 /// Parent folder of runs without `--out`.
 const RUNS: &str = "runs";
 /// Folder in which a model is saved until it is complete.
@@ -30,8 +26,9 @@ const SECS_PER_DAY: u64 = 86_400;
 
 /// Returns an error if a folder contains one or several models, so that results are never mixed or overwritten.
 pub fn check_no_model(folder: &Path) -> Result<(), Error> {
-    let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.map(|kind| PathBuf::from(kind.name())));
-    let mut files = subfolders.flat_map(|path| MODEL_FILES.map(|name| path.join(name)));
+    let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
+    let mut files =
+        subfolders.flat_map(|path| ModelKind::model_files().map(|name| path.join(name)).collect::<Vec<_>>());
     match files.find(|file| folder.join(file).exists()) {
         Some(file) => Err(Error::BadInput(format!(
             "--out {}: the folder already contains a model ({}); give another folder",
@@ -45,7 +42,7 @@ pub fn check_no_model(folder: &Path) -> Result<(), Error> {
 /// Returns an error if a folder contains one or several interrupted runs, because a new run would replace their
 /// checkpoints.
 pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
-    let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.into_iter().map(|kind| out.join(kind.name())));
+    let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
     match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
         Some(folder) => Err(Error::BadInput(format!(
             "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
@@ -69,9 +66,9 @@ pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
 
 /// Returns an error that names the subfolders if a folder contains models of several methods where one model is needed.
 pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
-    let holds_one = |folder: &Path| MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists());
+    let holds_one = |folder: &Path| holds_model(folder) || folder.join(CHECKPOINT).exists();
     let inside: Vec<String> = ModelKind::ALL
-        .into_iter()
+        .iter()
         .map(|kind| folder.join(kind.name()))
         .filter(|folder| holds_one(folder))
         .map(|folder| folder.display().to_string())
@@ -88,27 +85,38 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
     ensure!(model.exists(), "{shown} does not exist");
     if model.is_dir() {
         expect_one_model(model)?;
-        if MODEL_FILES.iter().any(|name| model.join(name).exists()) {
+        if holds_model(model) {
             return Ok(());
         }
         let has_checkpoint = model.join(CHECKPOINT).exists();
         let hint = if has_checkpoint { " but has a checkpoint: train --resume continues from it" } else { "" };
         bail!("{shown} contains no model{hint}");
     }
-    let is_model_part =
-        model.file_name().is_some_and(|name| name != SPLATS && MODEL_FILES.iter().any(|file| name == *file));
-    if is_model_part || splat_file::Format::of(model).is_none() {
-        let message = format!("{shown} is not a file of splats (.ply, .spz); for a saved model, give its folder");
+    // A part of a model may have the extension of a complete one.
+    let is_part = |kind: &ModelKind| {
+        let is_complete = |file: &str| kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file);
+        kind.entry().files.iter().any(|file| model.ends_with(file) && !is_complete(file))
+    };
+    if ModelKind::ALL.iter().any(is_part) || ModelKind::of_single_file(model).is_none() {
+        let single_files = ModelKind::ALL.iter().filter_map(|kind| kind.entry().single_file);
+        let described: Vec<String> =
+            single_files.map(|file| format!("{} (.{})", file.description, file.extensions.join(", ."))).collect();
+        let described = listed(&described.iter().map(String::as_str).collect::<Vec<_>>(), "or");
+        let message = format!("{shown} is not {described}; for a saved model, give its folder");
         return Err(Error::BadInput(message).into());
     }
     Ok(())
 }
 
+/// Whether a folder contains any file of a saved model.
+fn holds_model(folder: &Path) -> bool {
+    ModelKind::model_files().any(|name| folder.join(name).exists())
+}
+
 /// The models at a path: the path itself, or the models in the folder of a run of several methods. Returns the same
 /// errors as [`expect_model`]. Methods without a model are left out, unless none has one.
 pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
-    let holds_model = |folder: &Path| MODEL_FILES.iter().any(|name| folder.join(name).exists());
-    let inside = ModelKind::ALL.into_iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
+    let inside = ModelKind::ALL.iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
     let inside: Vec<PathBuf> = inside.collect();
     if path.is_dir() && !holds_model(path) && !inside.is_empty() {
         return Ok(inside);
@@ -181,9 +189,8 @@ impl CreatedFolders {
             let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
             entries.map(|entry| entry.path()).any(|path| is_recording(&path))
         };
-        let must_keep = |folder: &PathBuf| {
-            holds_recording(folder) || MODEL_FILES.iter().chain([&CHECKPOINT]).any(|name| folder.join(name).exists())
-        };
+        let must_keep =
+            |folder: &PathBuf| holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists();
         if self.leaves.iter().any(must_keep) {
             return;
         }
@@ -271,8 +278,8 @@ pub fn save_model(method: &mut dyn Method, folder: &Path) -> crate::Result<()> {
         let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and wastes space.
         return Err(error.into());
     }
-    // Splats and blocks come last: a folder that contains them contains the complete model.
-    for name in MODEL_FILES.iter().filter(|name| partial_folder.join(name).exists()) {
+    // The last file of a method completes its model.
+    for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
         let path = folder.join(name);
         std::fs::rename(partial_folder.join(name), &path)
             .with_context(|| format!("cannot write {}", path.display()))?;
@@ -302,7 +309,7 @@ pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::R
 pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
     let mut hash = Sha256::new();
     let mut n_files = 0;
-    for name in MODEL_FILES {
+    for name in ModelKind::model_files() {
         let path = folder.join(name);
         if !path.exists() {
             continue;
@@ -355,6 +362,10 @@ pub fn is_recording(path: &Path) -> bool {
 mod tests {
     use super::*;
 
+    fn tsdf_and_splat() -> [ModelKind; 2] {
+        ["tsdf", "splat"].map(|name| ModelKind::from_name(name).expect("registered"))
+    }
+
     #[test]
     fn folders_are_named_by_utc() {
         assert_eq!(name_from_time(Duration::ZERO), "19700101-000000");
@@ -379,8 +390,8 @@ mod tests {
     fn models_of_several_methods_are_found_in_subfolders() {
         let folder = tempfile::tempdir().expect("folder");
         let requested = folder.path().join("out");
-        let kinds = [ModelKind::Tsdf, ModelKind::Splat];
-        let created = CreatedFolders::default().make_each(Some(&requested), &kinds, None).expect("it is free");
+        let created =
+            CreatedFolders::default().make_each(Some(&requested), &tsdf_and_splat(), None).expect("it is free");
         assert_eq!(created, [requested.join("tsdf"), requested.join("splat")]);
         expect_one_model(&requested).expect("there is none yet");
         std::fs::write(created[0].join(CHECKPOINT), b"{}").expect("file");
@@ -402,7 +413,7 @@ mod tests {
     fn unfinished_run_is_not_overwritten() {
         let out = tempfile::tempdir().expect("a folder");
         check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
-        let run = out.path().join(ModelKind::Splat.name());
+        let run = out.path().join(ModelKind::default().name());
         std::fs::create_dir(&run).expect("disk space");
         check_no_unfinished_run(out.path()).expect("no checkpoint");
         std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
@@ -420,7 +431,7 @@ mod tests {
         std::fs::create_dir(&foreign_folder).expect("disk space");
         for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
             let mut created = CreatedFolders::default();
-            created.make_each(Some(requested), &[ModelKind::Tsdf, ModelKind::Splat], None).expect("it is free");
+            created.make_each(Some(requested), &tsdf_and_splat(), None).expect("it is free");
             created.keep_unless(true);
             assert_eq!((requested.exists(), requested.join("tsdf").exists()), (is_left, false), "{requested:?}");
         }
@@ -449,8 +460,8 @@ mod tests {
                 assert!(message("").contains("--resume"));
             }
         }
-        std::fs::write(at(SPLATS), b"x").expect("file");
-        expect_model(&at(SPLATS)).expect("a file of splats");
+        std::fs::write(at("splats.ply"), b"x").expect("file");
+        expect_model(&at("splats.ply")).expect("a file of splats");
         expect_model(folder.path()).expect("a folder with splats");
     }
 

@@ -478,7 +478,8 @@ impl Session {
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed = checkpoint.map(|checkpoint| trainer::resume(gpu.clone(), &checkpoint?, &all)).transpose();
+        let resumed =
+            checkpoint.map(|checkpoint| Ok::<_, crate::Error>(trainer::resume(gpu.clone(), &checkpoint?, &all)?)).transpose();
         let resumed = resumed.or_else(|error| {
             if error.is_gpu_error() {
                 return Err(error);
@@ -489,7 +490,7 @@ impl Session {
         let is_resumed = resumed.is_some();
         let (mut method, untrained) = match resumed {
             Some(resumed) => (resumed.method, resumed.untrained),
-            None => (recovery.model_spec.clone().start(gpu.clone())?, held.clone()),
+            None => (recovery.model_spec.start(gpu.clone())?, held.clone()),
         };
         method.prepare()?;
         let is_in = |keyframes: &[Arc<Keyframe>], keyframe_ref: &Arc<Keyframe>| {
@@ -812,7 +813,7 @@ impl Session {
         let page = report::Page {
             folder: out,
             report: &serde_json::to_value(report)?,
-            primitive: self.method.primitive(),
+            primitive: self.kind.entry().primitive,
             comparisons,
             next: &next_commands::for_models(&[model]),
             settings: report::settings_in(out),
@@ -969,7 +970,7 @@ impl Session {
 
     fn report_progress(&mut self) {
         let progress = SessionProgress {
-            primitive: self.method.primitive(),
+            primitive: self.kind.entry().primitive,
             seconds: self.secs(),
             progress: self.method.progress(),
             psnr: self.psnr(),

@@ -7,7 +7,8 @@ use crate::data::{Data, DataOptions};
 use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session};
-use crate::train_settings::{methods_of, options_of};
+use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
+use keyframe::listed;
 use crate::training_options::{AvailableData, Refine, RefineSettings, TrainingOptions};
 use keyframe::Keyframe;
 use std::path::Path;
@@ -15,7 +16,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::{self, ModelKind, ModelSpec};
 use trainer::gpu::Gpu;
-use trainer::splat::{CountPolicy, SplatOptions};
+use trainer::CommonOptions;
+use trainer::splat::CountPolicy;
 
 /// Everything that determines a training besides its keyframes.
 pub struct TrainingPlan {
@@ -63,10 +65,14 @@ pub fn drive(
             session.push(keyframe)?;
         }
         if session.is_idle() && session.progress().step == 0 {
-            let name = session.kind().name();
+            let others: Vec<&str> =
+                ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
             return Err(Error::InsufficientData(format!(
-                "the method {name} needs depth, but no training image has depth: \
-                 use --depth-from to render it from another model of the scene, or the method splat or nerf" )) .into());
+                "the method {} needs depth, but no training image has depth: \
+                 use --depth-from to render it from another model of the scene, or the method {}",
+                session.kind().name(),
+                listed(&others, "or")
+            )));
         }
     }
     let is_done = |session: &Session| session.is_over() || session.is_idle();
@@ -94,7 +100,7 @@ pub fn model_specs(
     software: bool,
 ) -> Result<Vec<ModelSpec>, Error> {
     let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
-    let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::Splat]);
+    let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::default()]);
     options.check_for(&kinds)?;
     // A trial takes hundreds of additional steps, which take minutes on a CPU.
     let available = AvailableData {
@@ -107,22 +113,24 @@ pub fn model_specs(
         options.refining(available, if software { Refine::None } else { Refine::Auto })?;
     options.check_learned(&kinds, available)?;
     let count = options.count.unwrap_or(if software { CountPolicy::ToCap } else { CountPolicy::Tested });
-    let model_options = if let Some(rig) = &data.rig {
-        SplatOptions { cameras, align, count, ..options_of(&rig.train, steps)? }
-    } else {
-        let defaults = SplatOptions::default();
-        SplatOptions {
-            seed: options.seed.unwrap_or(DEFAULT_SEED),
-            max_splats: options.max_splats.map_or(defaults.max_splats, |n| n.try_into().unwrap_or(u32::MAX)),
-            max_bytes: options.max_bytes,
-            cameras,
-            count,
-            align,
-            n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
-            ..defaults
-        }
+    let (common, mut settings) = match &data.rig {
+        Some(rig) => methods::options(&rig.train, steps),
+        None => options_without_rig(options, steps),
     };
-    Ok(kinds.iter().map(|kind| ModelSpec { kind: *kind, options: model_options.clone() }).collect())
+    settings.push((COUNT, serde_json::json!(count)));
+    methods::specs(&kinds, &CommonOptions { cameras, align, ..common }, &settings)
+}
+
+/// Options from flags alone.
+fn options_without_rig(options: &TrainingOptions, steps: Option<u64>) -> (CommonOptions, Settings) {
+    let defaults = CommonOptions::default();
+    let common = CommonOptions {
+        seed: options.seed.unwrap_or(DEFAULT_SEED),
+        max_bytes: options.max_bytes,
+        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
+        ..defaults
+    };
+    (common, options.max_splats.map(|n| (MAX_SPLATS, n.into())).into_iter().collect())
 }
 
 /// Checks flags that do not depend on the contents of the data, before all data are read.

@@ -3,7 +3,11 @@
 use calibration::{candidates, CameraRefinement, ParamSet};
 use capture::Override;
 use crate::Error;
-use trainer::{self, ModelKind};
+use crate::methods::{COUNT, MAX_SPLATS, describe};
+use calibration::{CameraRefinement, ParamSet, candidates};
+use capture::Override;
+use keyframe::listed;
+use trainer::ModelKind;
 use trainer::splat::CountPolicy;
 
 /// The rig file key that `--refine` sets.
@@ -94,14 +98,19 @@ impl TrainingOptions {
         self.methods.as_deref()
     }
 
-    /// Rejects flags that need splats if no scene model is splats.
+    /// Rejects flags that set an option which none of the methods has.
     pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
-        let of_splats = [(self.max_splats.is_some(), "--max-splats"), (self.count.is_some(), "--count")];
-        match of_splats.into_iter().find(|(is_given, _)| *is_given && !kinds.contains(&ModelKind::Splat)) {
-            Some((_, flag)) => Err(Error::BadInput(format!(
-                "{flag}: needs the method splat, but the method is {}",
-                trainer::describe(kinds)
-            ))),
+        let flags = [(self.max_splats.is_some(), "--max-splats", MAX_SPLATS), (self.count.is_some(), "--count", COUNT)];
+        let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
+        match flags.into_iter().find(|(is_given, _, option)| *is_given && is_unused(option)) {
+            Some((_, flag, option)) => {
+                let having = ModelKind::ALL.iter().filter(|kind| kind.has_option(option)).map(|kind| kind.name());
+                Err(Error::BadInput(format!(
+                    "{flag}: needs the method {}, but the method is {}",
+                    listed(&having.collect::<Vec<_>>(), "or"),
+                    describe(kinds)
+                )))
+            }
             None => Ok(()),
         }
     }
@@ -118,13 +127,11 @@ impl TrainingOptions {
     pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
         let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
         let can_learn = |param: &Refine| {
-            kinds.contains(&ModelKind::Nerf) && matches!(param, Refine::ImagePoses | Refine::ImageGains)
+            let set = param_set(std::slice::from_ref(param));
+            set.any() && kinds.iter().any(|kind| kind.entry().learnable.and(set) == kind.entry().learnable)
         };
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
-        if kinds.contains(&ModelKind::Splat) {
-            return Ok(());
-        }
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
         let known: Vec<&str> =
             Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
@@ -132,7 +139,7 @@ impl TrainingOptions {
         Err(Error::BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
             unknown.name(),
-            trainer::describe(kinds),
+            describe(kinds),
             known.join(", ")
         )))
     }
@@ -159,17 +166,7 @@ impl TrainingOptions {
         if has(Refine::Joints) && !available.joints {
             return Err(Error::BadInput("--refine joints: needs a recording of an arm".into()));
         }
-        let set = ParamSet {
-            extrinsics: has(Refine::Extrinsics),
-            time_offset: has(Refine::TimeOffset),
-            lens: has(Refine::Lens),
-            image_poses: has(Refine::ImagePoses),
-            image_gains: has(Refine::ImageGains),
-            joints: has(Refine::Joints),
-            depth_pose: has(Refine::DepthPose),
-            depth_scale: has(Refine::DepthScale),
-            readout: has(Refine::Readout),
-        };
+        let set = param_set(requested);
         if !available.depth {
             return Ok(RefineSettings {
                 align: CameraRefinement::default(),
@@ -218,6 +215,22 @@ fn method_names(kinds: &[ModelKind]) -> toml::Value {
     }
 }
 
+/// The requested camera parameters.
+fn param_set(requested: &[Refine]) -> ParamSet {
+    let has = |param| requested.contains(&param);
+    ParamSet {
+        extrinsics: has(Refine::Extrinsics),
+        time_offset: has(Refine::TimeOffset),
+        lens: has(Refine::Lens),
+        image_poses: has(Refine::ImagePoses),
+        image_gains: has(Refine::ImageGains),
+        joints: has(Refine::Joints),
+        depth_pose: has(Refine::DepthPose),
+        depth_scale: has(Refine::DepthScale),
+        readout: has(Refine::Readout),
+    }
+}
+
 impl AvailableData {
     /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
     fn auto_settings(self) -> RefineSettings {
@@ -240,6 +253,10 @@ impl AvailableData {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn kind(name: &str) -> ModelKind {
+        ModelKind::from_name(name).expect("registered")
+    }
 
     fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
         let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
@@ -279,11 +296,11 @@ mod tests {
     fn flags_of_splats_need_splats() {
         let options = TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
         let available = AvailableData { joints: true, drifts: false, depth: true };
-        let both = [ModelKind::Tsdf, ModelKind::Splat];
+        let both = [kind("tsdf"), kind("splat")];
         assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
-        let message = options.check_for(&[ModelKind::Tsdf, ModelKind::Nerf]).unwrap_err().to_string();
+        let message = options.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().to_string();
         assert!(message.contains("--max-splats") && message.contains("tsdf and nerf"), "{message}");
-        let message = options.check_learned(&[ModelKind::Tsdf], available).unwrap_err().to_string();
+        let message = options.check_learned(&[kind("tsdf")], available).unwrap_err().to_string();
         assert!(
             message.starts_with(
                 "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
@@ -291,15 +308,15 @@ mod tests {
             "{message}"
         );
         assert!(message.ends_with("readout, image-poses"), "{message}");
-        assert!(options.check_learned(&[ModelKind::Nerf], available).is_ok());
+        assert!(options.check_learned(&[kind("nerf")], available).is_ok());
         let options = TrainingOptions { refine: vec![Refine::Extrinsics], ..TrainingOptions::default() };
-        assert!(options.check_before_data(&[ModelKind::Nerf], false).is_ok());
+        assert!(options.check_before_data(&[kind("nerf")], false).is_ok());
         let message =
-            options.check_learned(&[ModelKind::Nerf], AvailableData { depth: false, ..available }).unwrap_err().to_string();
+            options.check_learned(&[kind("nerf")], AvailableData { depth: false, ..available }).unwrap_err().to_string();
         assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
         let options = TrainingOptions { refine: vec![Refine::Joints], ..TrainingOptions::default() };
-        assert!(options.check_before_data(&[ModelKind::Splat], true).is_ok());
-        assert!(options.check_before_data(&[ModelKind::Splat], false).is_err());
+        assert!(options.check_before_data(&[kind("splat")], true).is_ok());
+        assert!(options.check_before_data(&[kind("splat")], false).is_err());
     }
 
     #[test]

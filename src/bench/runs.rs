@@ -18,6 +18,7 @@ use std::sync::Arc;
 use trainer::{ModelKind, ModelSpec};
 use trainer::gpu::Gpu;
 use trainer::splat::SplatOptions;
+use trainer::{MethodOptions, ModelKind, ModelOptions, ModelSpec};
 
 /// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";
@@ -44,7 +45,8 @@ pub(crate) struct RunSettings {
     pub(crate) data: PathBuf,
     pub(crate) method: String,
     pub(crate) seed: u64,
-    pub(crate) max_splats: u32,
+    /// `None` if the method has no such limit.
+    pub(crate) max_splats: Option<u64>,
     pub(crate) max_bytes: Option<u64>,
     pub(crate) seconds: Option<f64>,
     pub(crate) steps: Option<u64>,
@@ -162,14 +164,17 @@ impl NamedData {
     /// The training options of splats, for a bench of splats.
     ///
     /// # Errors If the method is another one.
-    pub(crate) fn splats(&self) -> Result<&SplatOptions, BadArgument> {
-        match &self.model_specs[..] {
-            [ModelSpec { kind: ModelKind::Splat, options }] => Ok(options),
-            _ => {
-                let (data, methods) = (&self.name, self.methods());
-                Err(BadArgument(format!("{data}: this bench needs the method splat, but the method is {methods}")))
-            }
-        }
+    pub(crate) fn splats(&self) -> anyhow::Result<ModelOptions<SplatOptions>> {
+        let options = match &self.model_specs[..] {
+            [one] => one.options_of()?,
+            _ => None,
+        };
+        let wrong_method = || {
+            let (data, methods) = (&self.name, self.methods());
+            let needed = SplatOptions::METHOD;
+            BadArgument(format!("{data}: this bench needs the method {needed}, but the method is {methods}"))
+        };
+        Ok(options.ok_or_else(wrong_method)?)
     }
 
     fn methods(&self) -> String {
@@ -273,10 +278,12 @@ impl<'a> Runs<'a> {
     fn train(&self, job: &Job<'_>) -> anyhow::Result<TrainingOutcome> {
         let thorough = Evaluator::thorough(None)?;
         let during_training = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
-        let ModelSpec { kind, options } = job.model_spec.clone();
-        let n_planned_steps = job.limits.steps.unwrap_or(options.n_planned_steps);
+        let mut model_spec = job.model_spec.clone();
+        if let Some(steps) = job.limits.steps {
+            model_spec.options.common.n_planned_steps = steps;
+        }
         let plan = TrainingPlan {
-            model_spec: ModelSpec { kind, options: SplatOptions { n_planned_steps, ..options } },
+            model_spec,
             evaluators: Evaluators { during_training, max_images_during_training: usize::MAX, at_end: thorough },
             limits: job.limits,
             output: if self.args.json { OutputMode::Nothing } else { OutputMode::Bar },
@@ -295,9 +302,9 @@ impl<'a> Runs<'a> {
         RunSettings {
             data: job.data.path.clone(),
             method: job.model_spec.kind.name().to_owned(),
-            seed: job.model_spec.options.seed,
-            max_splats: job.model_spec.options.max_splats,
-            max_bytes: job.model_spec.options.max_bytes,
+            seed: job.model_spec.options.common.seed,
+            max_splats: job.model_spec.options.specific.get(MAX_SPLATS).and_then(serde_json::Value::as_u64),
+            max_bytes: job.model_spec.options.common.max_bytes,
             seconds: job.limits.seconds,
             steps: job.limits.steps,
             scale: self.args.images.scale,
@@ -408,7 +415,7 @@ pub(crate) mod tests {
             data: "fox".into(),
             method: "splat".into(),
             seed: 1,
-            max_splats: 1000,
+            max_splats: Some(1000),
             max_bytes: None,
             seconds: Some(4.0),
             steps: None,
@@ -441,7 +448,7 @@ pub(crate) mod tests {
     fn settings_difference_names_the_setting() {
         let cached = run("a", &[(1.0, 20.0)], 1).settings;
         assert_eq!(difference(&cached, &cached).expect("plain"), None);
-        let requested = RunSettings { max_splats: 2000, ..cached.clone() };
+        let requested = RunSettings { max_splats: Some(2000), ..cached.clone() };
         let message = difference(&cached, &requested).expect("plain").expect("one differs");
         assert_eq!(message, "max_splats (1000 saved, 2000 now)");
     }

@@ -50,7 +50,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     // Checked before the data, which takes long to read.
     args.images.holdout()?;
     session::expect(&args.data)?;
-    let mut model = trainer::load(open_gpu()?, &args.model)?;
+    let mut model = methods::load(open_gpu()?, &args.model)?.method;
     let overrides = training_overrides(&args.model);
     let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
     let tests = data.of_split(Split::Test);

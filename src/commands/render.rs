@@ -108,7 +108,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
     signals::remove_partial_files_on_signals()?;
-    let mut model = trainer::load(open_gpu()?, &args.model)?;
+    let mut model = methods::load(open_gpu()?, &args.model)?.method;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();

@@ -262,21 +262,23 @@ pub(super) fn start(
     let kinds = methods_of(&rig)?;
     args.training.options().check_for(&kinds)?;
     let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
-    args.training.options().check_learned(&kinds, available)?;
-    let cameras = args.training.options().refining(available, Refine::None)?.with_scene;
-    let count = args.training.options().count.unwrap_or(CountPolicy::ToCap);
-    let options = SplatOptions { cameras, count, ..session::options_of(&rig.train, args.steps)? };
+    let training = args.training.options();
+    let cameras = training.refining(available, Refine::None)?.with_scene;
+    training.check_learned(&kinds, available)?;
+    let (common, mut settings) = methods::options(&rig.train, args.steps);
+    settings.push((COUNT, serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap))));
+    let common = CommonOptions { cameras, ..common };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
-            let start = |kind: &ModelKind| {
-                let model_spec = ModelSpec { kind: *kind, options: options.clone() };
-                let method = model_spec.clone().start(gpu.clone())?;
+            let start = |model_spec: ModelSpec| {
+                let method = model_spec.start(gpu.clone())?;
                 Ok(Resumed { model_spec, method, untrained: Vec::new() })
             };
-            kinds.iter().map(start).collect::<anyhow::Result<_>>()?
+            let model_specs = method::specs(&kinds, &common, &settings)?;
+            model_specs.into_iter().map(start).collect::<anyhow::Result<_>>()?
         }
     };
     let hub = Hub::new();

@@ -23,6 +23,7 @@ use std::time::{Duration, Instant};
 use trainer::{ModelKind, ModelSpec, Resumed};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
+use trainer::{ModelKind, ModelSpec, Resumed};
 
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -220,7 +221,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
     for (Resumed { model_spec: ModelSpec { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
-        seeds.push(options.seed);
+        seeds.push(options.common.seed);
         let description = RunDescription {
             method: kind.name(),
             data: Some(&args.data),
@@ -329,7 +330,7 @@ impl Args {
             None => session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?,
         };
         let start = |model_spec: ModelSpec| {
-            let method = model_spec.clone().start(gpu.clone())?;
+            let method = model_spec.start(gpu.clone())?;
             Ok(Resumed { model_spec, method, untrained: data.keyframes.clone() })
         };
         model_specs.into_iter().map(start).collect()
@@ -413,7 +414,7 @@ impl Args {
 
     /// Logs differences from an uninterrupted run.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.model_spec.options.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (resumed.model_spec.options.common.n_planned_steps, resumed.method.progress().step);
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!("the learning rate was planned to decay over {planned} steps: later steps change little");

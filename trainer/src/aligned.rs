@@ -4,9 +4,10 @@
 //! Splats, which support more trials of camera parameters, implement alignment separately.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::gpu::PassTiming;
-use crate::model_metadata::read_metadata;
-use crate::{Error, Method, Picture, Progress, RenderRequest};
+use crate::gpu::{Gpu, PassTiming};
+use crate::model_metadata::{METADATA_FILE, read_metadata};
+use crate::model_options::CommonOptions;
+use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
@@ -73,9 +74,17 @@ impl<M: Restartable + 'static> Aligned<M> {
         }
     }
 
+    /// The model itself if no alignment is requested, otherwise with alignment.
+    pub fn if_requested(model: M, common: &CommonOptions, gpu: &Gpu) -> Box<dyn Method> {
+        if common.align == CameraRefinement::default() {
+            return Box::new(model);
+        }
+        Box::new(Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps))
+    }
+
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
-        let alignment_task = AlignmentTask::Done(read_metadata(&folder.join("model.json"))?.alignment);
+        let alignment_task = AlignmentTask::Done(read_metadata(folder)?.alignment);
         Ok(Self {
             model,
             choice: CameraRefinement::default(),
@@ -177,10 +186,6 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
         self.model.is_idle() && (self.alignment_task.is_done() || self.model.progress().step == 0)
     }
 
-    fn primitive(&self) -> &'static str {
-        self.model.primitive()
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.n_steps_before_restart + self.model.n_total_steps()?)
     }
@@ -209,6 +214,10 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
         self.model.depth_stride()
     }
 
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        self.model.bounds()
+    }
+
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.model.learned_correction(&keyframe.camera)?;
         Ok(self.alignment_task.calibrated_camera(keyframe, learned.as_ref()))
@@ -233,7 +242,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.model.save(folder)?;
         let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         let invalid_file =
             |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
         let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
@@ -268,10 +277,11 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::{Gpu, GpuOptions};
+    use crate::gpu::GpuOptions;
+    use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
     use crate::test_scenes as scenes;
-    use crate::tsdf::{TsdfModel, TsdfOptions};
+    use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
     use keyframe::Split;
@@ -281,16 +291,15 @@ mod tests {
     const EXTRINSICS: ParamSet = ParamSet { extrinsics: true, ..ParamSet::NONE };
 
     fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
-        TsdfModel::new(gpu.clone(), TsdfOptions::default()).unwrap()
+        TsdfModel::new(gpu.clone(), ModelOptions::default()).unwrap()
     }
 
     fn nerf(gpu: &Arc<Gpu>) -> NerfModel {
         let nerf_budget =
             NerfBudget { n_rays: 64, n_samples: 1 << 10, n_cells: 32, max_log2_entries: 10, ..NerfBudget::SMALL };
-        let options = NerfOptions {
-            nerf_budget: Some(nerf_budget),
-            n_planned_steps: 4 * ALIGNMENT_STEP,
-            ..NerfOptions::default()
+        let options = ModelOptions {
+            common: CommonOptions { n_planned_steps: 4 * ALIGNMENT_STEP, ..CommonOptions::default() },
+            specific: NerfOptions { nerf_budget: Some(nerf_budget), ..NerfOptions::default() },
         };
         NerfModel::new(gpu.clone(), options).unwrap()
     }
@@ -371,7 +380,7 @@ mod tests {
         uninterrupted.save(folder.path()).unwrap();
         let loaded = || Aligned::load(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
         assert_eq!(loaded().calibrated_camera(test).unwrap(), correction.apply(test));
-        std::fs::remove_file(folder.path().join("model.json")).unwrap();
+        std::fs::remove_file(folder.path().join(METADATA_FILE)).unwrap();
         assert_eq!(
             loaded().calibrated_camera(test).unwrap(),
             CalibratedCamera::of(test),

@@ -158,11 +158,17 @@ fn publish_updates(hub: &Hub) {
             step: 1520,
             step_millis: Some(41.7),
             primitives: 84_512,
+            primitives_label: "Splats".to_owned(),
             bytes: 61_210_112,
             psnr: Some(26.76),
             psnr_history: (0..50).map(curve).collect(),
         },
-        others: vec![ModelStatus { method: "tsdf".to_owned(), step: 143, ..ModelStatus::default() }],
+        others: vec![ModelStatus {
+            method: "tsdf".to_owned(),
+            step: 143,
+            primitives_label: "Voxel blocks".to_owned(),
+            ..ModelStatus::default()
+        }],
         notes: Vec::new(),
         result: None,
     });
@@ -217,14 +223,14 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     };
     assert!(render_thread.methods().iter().all(Option::is_none), "no model was chosen");
     press(browser, "tsdf");
-    wait_for(browser, "the other model's values", |browser| browser.text("primitives-name") == "Voxel blocks");
+    wait_for(browser, "the other model's values", |browser| browser.text("primitives-label") == "Voxel blocks");
     wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
     press(browser, "splat");
     wait_for(browser, "the first model's picture", |_| {
         render_thread.methods().last() == Some(&Some("splat".to_owned()))
     });
     wait_for(browser, "a full picture of it", |browser| browser.text("picture-text").contains("100 %"));
-    assert_eq!(browser.text("primitives-name"), "Splats");
+    assert_eq!(browser.text("primitives-label"), "Splats");
 }
 
 /// The live camera's frustum is drawn according to the request's projection.

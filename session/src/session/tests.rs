@@ -36,10 +36,6 @@ impl Method for Gray {
         false
     }
 
-    fn primitive(&self) -> &'static str {
-        "level"
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.level.into())
     }
@@ -121,7 +117,7 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
     };
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     let mut session =
-        Session::new(gpu, (ModelKind::Splat, Box::new(method)), evaluators, Limits::default(), OutputMode::Nothing)
+        Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, Limits::default(), OutputMode::Nothing)
             .with_stop(stop);
     for ix in 0..N_TESTS {
         session.push(&test_keyframe(ix)).expect("held");

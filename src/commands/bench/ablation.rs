@@ -12,6 +12,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
 use trainer::splat::{CountPolicy, SplatOptions};
+use trainer::{MethodOptions, ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 16.0;
@@ -19,26 +20,20 @@ const DEFAULT_SECONDS: f64 = 16.0;
 const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 
 /// The unchanged method, with which all variants are compared.
-const BASELINE: Variant = Variant { name: "baseline", change: |options| options };
+const BASELINE: Variant<SplatOptions> = Variant { name: "baseline", change: |_| () };
 
-const VARIANTS: &[Variant] = &[
-    Variant { name: "no seeds from depth", change: |options| SplatOptions { seeds_per_image: Some(0.0), ..options } },
-    Variant { name: "no depth loss", change: |options| SplatOptions { depth_per_m: 0.0, ..options } },
-    Variant { name: "no structure loss", change: |options| SplatOptions { dssim_frac: 0.0, ..options } },
-    Variant {
-        name: "full resolution from the start",
-        change: |options| SplatOptions { coarse_steps: Some([0; 2]), ..options },
-    },
-    Variant { name: "black background", change: |options| SplatOptions { random_background: 0.0, ..options } },
-    Variant {
-        name: "no opacity and size regularization",
-        change: |options| SplatOptions { cost_images: 0.0, ..options },
-    },
-    Variant { name: "no growth", change: |options| SplatOptions { growth_frac: 0.0, ..options } },
-    Variant { name: "no position noise", change: |options| SplatOptions { noise: 0.0, ..options } },
-    Variant { name: "constant color per splat", change: |options| SplatOptions { sh_degree: 0, ..options } },
-    Variant { name: "grown to the cap", change: |options| SplatOptions { count: CountPolicy::ToCap, ..options } },
-    CAMERAS_AS_GIVEN,
+const VARIANTS: &[Variant<SplatOptions>] = &[
+    Variant { name: "no seeds from depth", change: |options| options.specific.seeds_per_image = Some(0.0) },
+    Variant { name: "no depth loss", change: |options| options.specific.depth_per_m = 0.0 },
+    Variant { name: "no structure loss", change: |options| options.specific.dssim_frac = 0.0 },
+    Variant { name: "full resolution from the start", change: |options| options.specific.coarse_steps = Some([0; 2]) },
+    Variant { name: "black background", change: |options| options.specific.random_background = 0.0 },
+    Variant { name: "no opacity and size regularization", change: |options| options.specific.cost_images = 0.0 },
+    Variant { name: "no growth", change: |options| options.specific.growth_frac = 0.0 },
+    Variant { name: "no position noise", change: |options| options.specific.noise = 0.0 },
+    Variant { name: "constant color per splat", change: |options| options.specific.sh_degree = 0 },
+    Variant { name: "grown to the cap", change: |options| options.specific.count = CountPolicy::ToCap },
+    Variant::CAMERAS_AS_GIVEN,
 ];
 
 /// Flags of `bench ablation`.
@@ -84,10 +79,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
-    let is_selected =
-        |change: &&Variant| args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word));
-    let changes: Vec<&Variant> =
-        VARIANTS.iter().filter(|change| is_change(change, base_options)).filter(is_selected).collect();
+    let is_selected = |change: &&Variant<SplatOptions>| {
+        args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word))
+    };
+    let changes: Vec<&Variant<SplatOptions>> =
+        VARIANTS.iter().filter(|change| is_change(change, &base_options)).filter(is_selected).collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
         return Err(BadArgument(format!("--only: no row has such a name; rows: {}", names.join(", "))).into());
@@ -101,14 +97,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut page = None;
     for change in std::iter::once(&BASELINE).chain(changes) {
         let mut finished = Vec::new();
-        for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
+        let first_seed = base_options.common.seed;
+        for seed in first_seed..first_seed.saturating_add(args.seeds) {
+            let options = base_options.clone().with(|options| options.common.seed = seed);
             finished.push(runs.run(Job {
                 name: format!("ablation {} {} seed {seed}", data.name, change.name),
                 data: &data,
-                model_spec: ModelSpec {
-                    kind: ModelKind::Splat,
-                    options: change.options(&SplatOptions { seed, ..base_options.clone() }),
-                },
+                model_spec: ModelSpec::of(&change.options(&options))?,
                 limits,
                 disturbed: None,
                 variant: Some(change.name.to_owned()),
@@ -129,7 +124,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 /// Whether the variant changes any of these options.
-fn is_change(change: &Variant, options: &SplatOptions) -> bool {
+fn is_change(change: &Variant<SplatOptions>, options: &ModelOptions<SplatOptions>) -> bool {
     change.options(options) != *options
 }
 
@@ -212,7 +207,7 @@ fn findings(
         numbers: serde_json::json!({
             "bench": "ablation",
             "data": data.path,
-            "method": ModelKind::Splat.name(),
+            "method": SplatOptions::METHOD,
             "adapter": runs.adapter(),
             "changes": rows,
         }),
@@ -237,7 +232,7 @@ mod tests {
 
     #[test]
     fn variants_without_effect_are_skipped() {
-        let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() };
+        let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() }.into();
         let tried: Vec<&str> =
             VARIANTS.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
         assert!(!tried.contains(&"no depth loss") && tried.contains(&"no growth"), "{tried:?}");

@@ -12,6 +12,7 @@ use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
 use trainer::splat::{CountPolicy, SplatOptions};
+use trainer::{MethodOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
@@ -90,18 +91,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     for cap in caps {
         let mut finished = Vec::new();
         let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
-        for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
-            let (max_splats, count) = match cap {
-                Some(cap) => (cap, CountPolicy::ToCap),
-                None => (base_options.max_splats, CountPolicy::Tested),
-            };
+        let first_seed = base_options.common.seed;
+        for seed in first_seed..first_seed.saturating_add(args.seeds) {
+            let options = base_options.clone().with(|options| {
+                options.common.seed = seed;
+                options.specific.count = if cap.is_some() { CountPolicy::ToCap } else { CountPolicy::Tested };
+                options.specific.max_splats = cap.unwrap_or(options.specific.max_splats);
+            });
             finished.push(runs.run(Job {
                 name: format!("budget {} {cap_name} seed {seed}", data.name),
                 data: &data,
-                model_spec: ModelSpec {
-                    kind: ModelKind::Splat,
-                    options: SplatOptions { seed, max_splats, count, ..base_options.clone() },
-                },
+                model_spec: ModelSpec::of(&options)?,
                 limits,
                 disturbed: None,
                 variant: None,
@@ -208,7 +208,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
                 "Each point is a model trained for {length} with a cap on its splats and scored on test images. \
  In the run without a cap, the trainer chooses the number (at most {}): it is halved as long as \
  that costs less than {MIN_GAIN_DB} dB on validation images.",
-                data.splats()?.max_splats
+                data.splats()?.specific.max_splats
             ),
             format!("Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
@@ -218,7 +218,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
         numbers: serde_json::json!({
             "bench": "budget",
             "data": data.path,
-            "method": ModelKind::Splat.name(),
+            "method": SplatOptions::METHOD,
             "adapter": runs.adapter(),
             "automatic": chosen,
             "caps": by_cap,

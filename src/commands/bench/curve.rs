@@ -118,13 +118,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         for model_spec in model_specs {
             let mut finished = Vec::new();
             bench.results.push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
-            for seed in model_spec.options.seed..model_spec.options.seed.saturating_add(args.seeds) {
+            let first_seed = model_spec.options.common.seed;
+            for seed in first_seed..first_seed.saturating_add(args.seeds) {
                 finished.push(runs.run(Job {
                     name: format!("curve {} {} seed {seed}", data.name, model_spec.kind.name()),
                     data: &data,
                     model_spec: ModelSpec {
                         kind: model_spec.kind,
-                        options: SplatOptions { seed, ..model_spec.options.clone() },
+                        options: model_spec.options.clone().with(|options| options.common.seed = seed),
                     },
                     limits,
                     disturbed: None,
@@ -280,8 +281,10 @@ impl Bench<'_> {
     /// The methods that these data support. If there is only one method, it is returned anyway and reports the problem
     /// itself.
     fn applicable<'a>(&mut self, data: &'a NamedData) -> Vec<&'a ModelSpec> {
-        let (applicable, without_depth): (Vec<_>, Vec<_>) =
-            data.model_specs.iter().partition(|model_spec| data.data.has_depth() || model_spec.kind != ModelKind::Tsdf);
+        let (applicable, without_depth): (Vec<_>, Vec<_>) = data
+            .model_specs
+            .iter()
+            .partition(|model_spec| data.data.has_depth() || !model_spec.kind.entry().needs_depth);
         if applicable.is_empty() {
             return without_depth;
         }

@@ -28,7 +28,7 @@ const NANOS_PER_SEC: f64 = 1e9;
 const NANOS_PER_COUNT: f64 = 1e6;
 
 /// All variants are trained on the same disturbed data; each gives one line per chart.
-const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |options| options }, CAMERAS_AS_GIVEN];
+const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |_| () }, Variant::CAMERAS_AS_GIVEN];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
@@ -154,7 +154,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 }
 
 /// The variants that differ for these options. If no camera parameters are refined, there is only one.
-fn distinguished(options: &SplatOptions) -> Vec<&'static Variant> {
+fn distinguished(options: &ModelOptions) -> Vec<&'static Variant> {
     let mut distinguished: Vec<&Variant> = Vec::new();
     for variant in VARIANTS {
         let changed = variant.options(options);
@@ -194,14 +194,13 @@ fn measure(
     });
     let mut finished = Vec::new();
     let ModelSpec { kind, options: base_options } = data.single_model_spec()?;
-    for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
+    let first_seed = base_options.common.seed;
+    for seed in first_seed..first_seed.saturating_add(args.seeds) {
+        let options = base_options.clone().with(|options| options.common.seed = seed);
         finished.push(runs.run(Job {
             name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
             data,
-            model_spec: ModelSpec {
-                kind: *kind,
-                options: variant.options(&SplatOptions { seed, ..base_options.clone() }),
-            },
+            model_spec: ModelSpec { kind: *kind, options: variant.options(&options) },
             limits,
             disturbed: disturbed.clone(),
             variant: Some(variant.name.to_owned()),

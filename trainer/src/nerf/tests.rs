@@ -9,6 +9,7 @@ use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
+use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
 use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
 use calibration::{CameraRefinement, ParamSet, rigid_transform};
@@ -21,7 +22,7 @@ use std::sync::Arc;
 const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 const N_STEPS: u64 = 160;
 
-fn options() -> NerfOptions {
+fn options() -> ModelOptions<NerfOptions> {
     let nerf_budget = NerfBudget {
         n_rays: 256,
         n_samples: 1 << 13,
@@ -32,7 +33,18 @@ fn options() -> NerfOptions {
         max_levels: 6,
         picture_rays: 1 << 10,
     };
-    NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: 300, ..NerfOptions::default() }
+    ModelOptions {
+        common: CommonOptions { n_planned_steps: 300, ..CommonOptions::default() },
+        specific: NerfOptions { nerf_budget: Some(nerf_budget), ..NerfOptions::default() },
+    }
+}
+
+/// Options for a number of planned steps with these camera parameters.
+fn with_cameras(cameras: CameraRefinement, n_planned_steps: u64) -> ModelOptions<NerfOptions> {
+    options().with(|options| {
+        options.common.cameras = cameras;
+        options.common.n_planned_steps = n_planned_steps;
+    })
 }
 
 /// The ball alone: the pixels around it are black and have no depth.
@@ -55,7 +67,7 @@ fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
-fn model_with(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
+fn model_with(options: ModelOptions<NerfOptions>, keyframes: &[Arc<Keyframe>]) -> NerfModel {
     let mut model = NerfModel::new(gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -121,7 +133,7 @@ fn novel_view_is_accurate_and_deterministic() {
         one_by_one.step(1).unwrap();
     }
     assert!(state(&mut model) == state(&mut one_by_one), "results must not depend on the number of steps per submit");
-    let mut other = model_with(NerfOptions { seed: 1, ..options() }, &seen);
+    let mut other = model_with(options().with(|options| options.common.seed = 1), &seen);
     train_until(&mut other, 4);
     let mut first = model_with(options(), &seen);
     train_until(&mut first, 4);
@@ -207,8 +219,11 @@ fn renders_crop_range_and_equirectangular() {
 fn occupancy_cells_are_refined() {
     const PLANNED: u64 = 40;
     const END: u64 = 8;
-    let nerf_budget = NerfBudget { n_cells: NerfBudget::FULL.n_cells, ..options().nerf_budget.unwrap() };
-    let options = NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: PLANNED, ..options() };
+    let nerf_budget = NerfBudget { n_cells: NerfBudget::FULL.n_cells, ..options().specific.nerf_budget.unwrap() };
+    let options = options().with(|options| {
+        options.common.n_planned_steps = PLANNED;
+        options.specific.nerf_budget = Some(nerf_budget);
+    });
     let keyframes = ball_on_floor(5);
     let mut whole = model_with(options.clone(), &keyframes);
     let mut parts = Vec::new();
@@ -258,7 +273,7 @@ fn drifting_poses_are_corrected() {
         off.sum::<f64>() / given.len() as f64
     };
     let poses = ParamSet { image_poses: true, ..ParamSet::NONE };
-    let options = |cameras| NerfOptions { cameras, n_planned_steps: 600, ..options() };
+    let options = |cameras| with_cameras(cameras, 600);
     let mut model = model_with(options(CameraRefinement::Try(vec![poses])), &drifted_keyframes);
     let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
     train_until(&mut model, 90); // In the middle of the trial.
@@ -310,7 +325,7 @@ fn drifting_poses_are_corrected() {
 #[test]
 fn changing_light_is_modeled() {
     const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
-    let options = |cameras| NerfOptions { cameras, n_planned_steps: 480, ..options() };
+    let options = |cameras| with_cameras(cameras, 480);
     let is_validation = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
     let even: Vec<Arc<Keyframe>> = ball_on_floor(32)
         .iter()
@@ -497,11 +512,11 @@ fn outgrown_field_restarts_and_budget_is_enforced() {
     assert_eq!(model.progress().step, 6);
 
     let bytes = model.progress().bytes;
-    let mut small = model_with(NerfOptions { max_bytes: Some(bytes / 2), ..options() }, &near);
+    let mut small = model_with(options().with(|options| options.common.max_bytes = Some(bytes / 2)), &near);
     train_until(&mut small, 1);
     let keyframes = || near.iter().map(|keyframe| &**keyframe);
     let sizes = |max_bytes| {
-        let options = NerfOptions { max_bytes: Some(max_bytes), ..options() };
+        let options = options().with(|options| options.common.max_bytes = Some(max_bytes));
         Sizes::choose(&options, options.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
     };
     let n_entries = |sizes: &Sizes| sizes.shape().n_entries_total();

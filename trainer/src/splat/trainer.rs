@@ -7,12 +7,15 @@ mod model_size;
 mod scoring;
 
 use super::arrays::SplatArrays;
+use super::file::IN_FOLDER;
+use super::bounds::bounds;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_params::CameraParams;
 use super::kernels::{DrawPipelines, TrainPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
+use super::ply;
 use super::seed::{self, Density, Seeder};
 use super::snapshot::{Seeding, Snapshot};
 use super::trials::{Due, SecondHalf, SplatTrials, TrialContext, TrialEnd, ValidationImage};
@@ -20,9 +23,10 @@ use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
 use crate::method::submit_millis;
-use crate::model_metadata::read_metadata;
+use crate::model_metadata::{METADATA_FILE, read_metadata};
+use crate::model_options::{MethodOptions, ModelOptions};
 use crate::view::projections;
-use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, ply};
+use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask};
 use calibration::{CalibratedCamera, CameraCorrection, ParamSet};
@@ -69,7 +73,7 @@ const MAX_COST: f64 = 0.1;
 #[derive(Debug)]
 pub struct SplatTrainer {
     gpu: Arc<Gpu>,
-    options: SplatOptions,
+    options: ModelOptions<SplatOptions>,
     draw: DrawPipelines,
     train: TrainPipelineState,
     splats: SplatBuffers,
@@ -166,7 +170,7 @@ impl Drop for Compiling {
 }
 
 /// The resources of one training step.
-struct TrainView<'a> {
+struct PreparedView<'a> {
     view: ViewPasses<'a>,
     level: &'a Level,
     /// Present if camera parameters are optimized.
@@ -182,19 +186,19 @@ struct InFlight {
 
 impl SplatTrainer {
     /// Creates an empty model. It can draw at once; the training pipelines are compiled on another thread.
-    pub fn new(gpu: Arc<Gpu>, options: SplatOptions) -> Result<Self, Error> {
+    pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
         let train = TrainPipelineState::Compiling(Compiling::start(&gpu));
         Self::with_pipelines(gpu, options, train)
     }
 
-    fn with_pipelines(gpu: Arc<Gpu>, options: SplatOptions, train: TrainPipelineState) -> Result<Self, Error> {
+    fn with_pipelines(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>, train: TrainPipelineState) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let zeros = [0u8; 4 * status::LEN];
         let software = gpu.is_software();
         Ok(Self {
             draw,
             train,
-            splats: SplatBuffers::new(&gpu, 1, options.sh_degree)?,
+            splats: SplatBuffers::new(&gpu, 1, options.specific.sh_degree)?,
             scratch: None,
             training_buffers: None,
             drawing_buffers: None,
@@ -206,36 +210,37 @@ impl SplatTrainer {
                 "splat.supervision",
                 &Supervision {
                     background_srgb: [0.0; 4],
-                    dssim_frac: f32_of(options.dssim_frac),
-                    depth_weight: f32_of(options.depth_per_m),
+                    dssim_frac: f32_of(options.specific.dssim_frac),
+                    depth_weight: f32_of(options.specific.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
-                    random_background: f32_of(options.random_background),
+                    random_background: f32_of(options.specific.random_background),
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             cameras: CameraParams::new(
                 &gpu,
-                match &options.cameras {
+                match &options.common.cameras {
                     CameraRefinement::Always(params) => *params,
                     CameraRefinement::Try(_) => ParamSet::default(),
                 },
             )?,
             saved_corrections: BTreeMap::new(),
-            alignment_task: AlignmentTask::new(&options.align),
-            trials: SplatTrials::new(&options.cameras, options.count),
+            alignment_task: AlignmentTask::new(&options.common.align),
+            trials: SplatTrials::new(&options.common.cameras, options.specific.count),
             passes: Passes::default(),
             seeder: Seeder::default(),
             pending: Vec::new(),
             unseeded: Vec::new(),
             seeds_per_image: options
+                .specific
                 .seeds_per_image
                 .unwrap_or(if software { 4_000.0 } else { 20_000.0 })
                 .min(f64::from(options.cap()) * SEED_SHARE),
-            coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
+            coarse_steps: options.specific.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
             max_image_bytes: if software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
             n_image_requests: 0,
-            order: Order::new(options.seed),
+            order: Order::new(options.common.seed),
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
@@ -256,8 +261,12 @@ impl SplatTrainer {
 
     /// Creates a model of given splats, for drawing or training. The training pipelines are compiled at the first
     /// step.
-    pub fn from_arrays(gpu: Arc<Gpu>, options: SplatOptions, arrays: &SplatArrays) -> Result<Self, Error> {
-        let options = SplatOptions { sh_degree: arrays.sh_degree, ..options };
+    pub fn from_arrays(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        arrays: &SplatArrays,
+    ) -> Result<Self, Error> {
+        let options = options.with(|options| options.specific.sh_degree = arrays.sh_degree);
         let mut trainer = Self::with_pipelines(gpu, options, TrainPipelineState::OnDemand)?;
         trainer.add(arrays)?;
         Ok(trainer)
@@ -265,7 +274,7 @@ impl SplatTrainer {
 
     /// Loads the camera corrections of a saved model from its `model.json`.
     pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
-        let metadata = read_metadata(&folder.join("model.json"))?;
+        let metadata = read_metadata(folder)?;
         self.saved_corrections = metadata.cameras;
         self.alignment_task = AlignmentTask::Done(metadata.alignment);
         Ok(self)
@@ -279,7 +288,7 @@ impl SplatTrainer {
     }
 
     /// The options.
-    pub fn options(&self) -> &SplatOptions {
+    pub fn options(&self) -> &ModelOptions<SplatOptions> {
         &self.options
     }
 
@@ -454,7 +463,7 @@ impl SplatTrainer {
         }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
-            let cloud = seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize);
+            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, self.options.cap() as usize);
             self.add(&cloud)?;
         }
         Ok(())
@@ -478,11 +487,11 @@ impl SplatTrainer {
             // it.
             let step = self.step - self.step % GROWTH_PERIOD;
             let completed =
-                step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+                step.saturating_sub(self.schedule_start) as f64 / self.options.common.n_planned_steps.max(1) as f64;
             self.cameras.write_rule(&self.gpu, completed, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
-        let cost = (self.options.cost_images / self.views.len().max(1) as f64).powi(2).min(MAX_COST);
+        let cost = (self.options.specific.cost_images / self.views.len().max(1) as f64).powi(2).min(MAX_COST);
         let cost = f32_of(cost / f64::from(self.splats.n_splats.max(1)));
         let rule = Rule {
             mean_rate_m: 1.6e-4 * size,
@@ -491,16 +500,16 @@ impl SplatTrainer {
             opacity_rate: 5e-2,
             sh_dc_rate: 2.5e-3,
             sh_rest_rate: 2.5e-3 / 20.0,
-            noise: f32_of(self.options.noise),
+            noise: f32_of(self.options.specific.noise),
             final_mean_rate_frac: 0.01,
             betas: [0.9, 0.999],
             epsilon: 1e-15,
-            n_planned_steps: f32_of(self.options.n_planned_steps as f64),
+            n_planned_steps: f32_of(self.options.common.n_planned_steps as f64),
             schedule_start: f32_of(self.schedule_start as f64),
             opacity_cost: cost,
             scale_cost: cost,
             log_scale_range: [(1e-5 * size).ln(), (2.0 * size).ln()],
-            seed: (self.options.seed ^ (self.options.seed >> 32)) as u32,
+            seed: (self.options.common.seed ^ (self.options.common.seed >> 32)) as u32,
             update_all: u32::from(!self.has_depth),
             unused: 0,
         };
@@ -581,13 +590,13 @@ impl SplatTrainer {
         pipelines: &TrainPipelines,
         view_level: (usize, usize),
     ) -> Result<(), Error> {
-        let TrainView { view, level, lens } = self.train_view(list, pipelines, view_level)?;
+        let PreparedView { view, level, lens } = self.prepared_view(list, pipelines, view_level)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
             supervision: &self.supervision,
             gains: &self.cameras.gains,
-            ssim: self.options.dssim_frac > 0.0,
+            ssim: self.options.specific.dssim_frac > 0.0,
         };
         view.draw(list, &self.draw);
         view.compare(list, pipelines, &target);
@@ -621,12 +630,12 @@ impl SplatTrainer {
     }
 
     /// A prepared view and level with its current camera parameters; records the pass that computes the view.
-    fn train_view(
+    fn prepared_view(
         &self,
         list: &mut Passes,
         pipelines: &TrainPipelines,
         (view_ix, level_ix): (usize, usize),
-    ) -> Result<TrainView<'_>, Error> {
+    ) -> Result<PreparedView<'_>, Error> {
         let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
         let lens = lens.filter(|_| self.cameras.set.any());
         let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
@@ -644,7 +653,7 @@ impl SplatTrainer {
             view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px: level.size_px,
         };
-        Ok(TrainView { view, level, lens })
+        Ok(PreparedView { view, level, lens })
     }
 
     /// Ensures that a view of this size can be drawn, or trained on.
@@ -731,7 +740,7 @@ impl SplatTrainer {
 
     /// Step at which growth ends.
     fn growth_end(&self) -> u64 {
-        let end = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
+        let end = self.schedule_start + (GROWTH_END_FRAC * self.options.common.n_planned_steps as f64) as u64;
         end.next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
     }
 
@@ -751,7 +760,7 @@ impl SplatTrainer {
         self.last_growth_step = self.step;
         let n_before = self.splats.n_splats;
         let more = if self.trials.may_grow() && !self.is_full {
-            (f64::from(n_before) * self.options.growth_frac).ceil() as u32
+            (f64::from(n_before) * self.options.specific.growth_frac).ceil() as u32
         } else {
             0
         };
@@ -760,7 +769,7 @@ impl SplatTrainer {
         let growth = Growth {
             n_before,
             n_after,
-            key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.seed as u32,
+            key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.common.seed as u32,
             capacity: self.splats.capacity,
             n_sh_rest: n_sh_rest(self.splats.sh_degree),
             child_spread: CHILD_SPREAD,
@@ -916,7 +925,8 @@ impl SplatTrainer {
     fn add_keyframe(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // At least half of the schedule remains for a late keyframe, so that learning rates are large enough and
         // growth continues.
-        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
+        self.schedule_start =
+            self.schedule_start.max(self.step.saturating_sub(self.options.common.n_planned_steps / 2));
         self.add_view(keyframe)
     }
 
@@ -1083,10 +1093,6 @@ impl Method for SplatTrainer {
         false // There are always steps to take, or it is not known yet that there are none.
     }
 
-    fn primitive(&self) -> &'static str {
-        "splat"
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
         Ok(self.step.wrapping_add(self.n_reverted_steps))
@@ -1126,6 +1132,10 @@ impl Method for SplatTrainer {
         self.psnr_of_view(&Camera::from_request(request, focal_px, principal_px), request.background_srgb, keyframe)
     }
 
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        Ok(bounds(&self.arrays()?))
+    }
+
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.camera_corrections()?;
         Ok(self.alignment_task.calibrated_camera(keyframe, learned.get(keyframe.camera.as_ref())))
@@ -1156,18 +1166,18 @@ impl Method for SplatTrainer {
         }
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
-        ply::write(&folder.join("splats.ply"), &arrays)?;
+        ply::write(&folder.join(IN_FOLDER), &arrays)?;
         let metadata = serde_json::json!({
-            "method": "splat",
+            "method": SplatOptions::METHOD,
             "steps": self.step,
             "splats": arrays.n_splats(),
             "sh_degree": arrays.sh_degree,
-            "seed": self.options.seed,
+            "seed": self.options.common.seed,
             "trials": self.report(),
             "alignment": self.alignment_task.result(),
             "cameras": self.camera_corrections()?,
         });
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
     }
 

@@ -1,9 +1,9 @@
 //! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no seed is lost, and a
 //! checkpoint contains the whole trial.
 
+use super::SplatTrainer;
 use super::training_tests::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
-use super::{SplatOptions, SplatTrainer};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
@@ -17,14 +17,13 @@ const END: u64 = TRIAL_START + 2 * HALF;
 
 fn trainer_with_candidate(gpu: &Arc<Gpu>, candidate: ParamSet) -> SplatTrainer {
     // The splat count changes only when seeds are added.
-    let options = SplatOptions {
-        cameras: CameraRefinement::Try(vec![candidate]),
-        growth_frac: 0.0,
-        n_planned_steps: 1500,
-        max_splats: 20_000,
-        seeds_per_image: Some(300.0),
-        ..options()
-    };
+    let options = options().with(|options| {
+        options.common.cameras = CameraRefinement::Try(vec![candidate]);
+        options.common.n_planned_steps = 1500;
+        options.specific.growth_frac = 0.0;
+        options.specific.max_splats = 20_000;
+        options.specific.seeds_per_image = Some(300.0);
+    });
     SplatTrainer::new(gpu.clone(), options).unwrap()
 }
 

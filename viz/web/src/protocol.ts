@@ -25,6 +25,7 @@ export interface ModelStatus {
   step: number;
   step_millis: number | null;
   primitives: number;
+  primitives_label: string;
   bytes: number;
   psnr: number | null;
   psnr_history: [number, number][];

@@ -117,7 +117,7 @@ impl Trials {
 impl NerfModel {
     /// Image parameters that the next step optimizes.
     pub(super) fn current_params(&self) -> ParamSet {
-        if self.step >= self.options.n_planned_steps / POSE_START_DIVISOR {
+        if self.step >= self.options.common.n_planned_steps / POSE_START_DIVISOR {
             self.learned_params
         } else {
             ParamSet::NONE
@@ -126,7 +126,7 @@ impl NerfModel {
 
     /// The step at which a trial starts or changes its phase.
     fn next_trial_step(&self) -> Option<u64> {
-        let share = |of: u64| (self.options.n_planned_steps / of).max(1);
+        let share = |of: u64| (self.options.common.n_planned_steps / of).max(1);
         let at = match &self.trials.trial_phase {
             TrialPhase::Waiting => share(TRIAL_START_DIVISOR),
             TrialPhase::Variant { before } | TrialPhase::Baseline { before, .. } => {

@@ -1,7 +1,7 @@
 //! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
 //! degrees.
 
-use super::{SplatTrainer, TrainView, VIEWS_AT_ONCE};
+use super::{PreparedView, SplatTrainer, VIEWS_AT_ONCE};
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
@@ -35,7 +35,7 @@ impl SplatTrainer {
             }
             loop {
                 let mut list = std::mem::take(&mut self.passes);
-                let TrainView { view, .. } = self.train_view(&mut list, pipelines, (view_ix, 0))?;
+                let PreparedView { view, .. } = self.prepared_view(&mut list, pipelines, (view_ix, 0))?;
                 view.draw(&mut list, &self.draw);
                 view.backward(&mut list, pipelines);
                 view.contribute(&mut list, pipelines, &contributions); // Adds nothing if a buffer was too small.
@@ -111,7 +111,6 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -121,7 +120,11 @@ mod tests {
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { count, max_splats: 4000, n_planned_steps: 1500, ..options() };
+        let options = options().with(|options| {
+            options.common.n_planned_steps = 1500;
+            options.specific.count = count;
+            options.specific.max_splats = 4000;
+        });
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();

@@ -274,7 +274,6 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::GpuOptions;
-    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
@@ -282,7 +281,10 @@ mod tests {
     const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
 
     fn trained(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { cameras: CameraRefinement::Try(vec![GAINS]), n_planned_steps: 1000, ..options() };
+        let options = options().with(|options| {
+            options.common.cameras = CameraRefinement::Try(vec![GAINS]);
+            options.common.n_planned_steps = 1000;
+        });
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();

@@ -1,8 +1,8 @@
 //! Tests of reading and writing `.spz` files.
 
 use super::*;
+use crate::spherical_harmonics as sh;
 use crate::splat::cloud::synthetic_cloud;
-use crate::splat::reference::sh;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 /// Splats of a cloud, with fewer color coefficients.

@@ -1,16 +1,17 @@
 //! Placeholder for a model whose GPU failed.
 
+use crate::checkpoint::PendingCheckpoint;
+use crate::gpu::PassTiming;
+use crate::{Error, Method, Picture, Progress, RenderRequest};
 use calibration::{Alignment, CalibratedCamera, TrialReport};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use std::path::Path;
 use std::sync::Arc;
-use trainer::{Error, Method, Picture, Progress, RenderRequest};
-use trainer::checkpoint::PendingCheckpoint;
-use trainer::gpu::PassTiming;
 
-/// Every operation returns [`Error::DeviceLost`].
-pub(crate) struct FailedModel;
+/// A model whose GPU failed: every operation returns [`Error::DeviceLost`].
+#[derive(Clone, Copy, Debug)]
+pub struct FailedModel;
 
 impl Method for FailedModel {
     fn push(&mut self, _: Arc<Keyframe>) -> Result<(), Error> {
@@ -30,10 +31,6 @@ impl Method for FailedModel {
     }
 
     fn set_watched(&mut self, _: bool) {}
-
-    fn primitive(&self) -> &'static str {
-        "primitive"
-    }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Err(Error::DeviceLost)

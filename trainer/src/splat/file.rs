@@ -1,16 +1,16 @@
 //! Files of splats: a `.ply`, a `.spz`, or the folder of a saved model.
 
-use anyhow::Context;
+use super::arrays::SplatArrays;
+use super::{ply, spz};
+use crate::Error;
 use std::path::{Path, PathBuf};
-use trainer::{ply, spz};
-use trainer::splat::arrays::SplatArrays;
 
 /// The file of splats in the folder of a model.
-const IN_FOLDER: &str = "splats.ply";
+pub(super) const IN_FOLDER: &str = "splats.ply";
 
 /// Format of a file of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Format {
+pub(super) enum Format {
     /// All values at full precision.
     Ply,
     /// Values quantized and compressed.
@@ -19,7 +19,7 @@ pub(crate) enum Format {
 
 impl Format {
     /// The format for a file name extension.
-    pub(crate) fn of(path: &Path) -> Option<Self> {
+    fn of(path: &Path) -> Option<Self> {
         let extension = path.extension()?.to_str()?.to_ascii_lowercase();
         match extension.as_str() {
             "ply" => Some(Self::Ply),
@@ -29,13 +29,8 @@ impl Format {
     }
 }
 
-/// Whether this is a folder with splats, or a file with the extension of a splat format.
-pub(crate) fn is_splat_file(path: &Path) -> bool {
-    path.join(IN_FOLDER).is_file() || (path.is_file() && Format::of(path).is_some())
-}
-
 /// Reads splats from the folder of a model or from a file.
-pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
+pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
     let is_file = model.is_file();
     let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };
     let splats = match Format::of(&path) {
@@ -43,11 +38,11 @@ pub(crate) fn read(model: &Path) -> anyhow::Result<SplatArrays> {
         Some(Format::Ply) | None => ply::read(&path),
     };
     let hint = if is_file { "; for a saved model, give its folder" } else { "" };
-    splats.with_context(|| format!("no splats in {}{hint}", model.display()))
+    splats.map_err(|source| Error::NoSplats { path: model.to_owned(), hint, source: Box::new(source) })
 }
 
 /// Writes splats to a file.
-pub(crate) fn write(path: &Path, format: Format, splats: &SplatArrays) -> Result<(), trainer::Error> {
+pub(super) fn write(path: &Path, format: Format, splats: &SplatArrays) -> Result<(), Error> {
     match format {
         Format::Ply => ply::write(path, splats),
         Format::Spz => spz::write(path, splats),
