@@ -1,6 +1,6 @@
 //! Flags for checkpoints.
 
-use session::{parse_period, CheckpointOptions};
+use session::{CheckpointOptions, parse_period};
 use std::time::Duration;
 
 /// How often checkpoints are written.

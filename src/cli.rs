@@ -1,8 +1,10 @@
 //! The subcommands and their `--help` summaries. The flags of each subcommand are at the top of its own file.
 
-use clap::{ArgAction, Parser, Subcommand};
-use crate::commands::{bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view};
+use crate::commands::{
+    bench, devices, doctor, eval, export, fk, metrics, move_arm, record, render, run, sim, train, view,
+};
 use crate::exit::Exit;
+use clap::{ArgAction, Parser, Subcommand};
 
 /// Turns a robot's cameras and joints into a live radiance field.
 #[derive(Debug, Parser)]

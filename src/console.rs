@@ -3,8 +3,9 @@
 use crate::print;
 use indicatif::ProgressBar;
 use keyframe::counted;
-use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
+use serde::Serialize;
 use session::next_commands::{self, SavedModel};
+use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
 use std::sync::{Mutex, PoisonError};
 
 /// What is printed about a session.
@@ -49,7 +50,7 @@ impl Observer for Console {
     fn on_event(&mut self, event: &SessionEvent<'_>) {
         match (event, self.output) {
             (SessionEvent::Progress(session), _) => {
-                let progress = session.progress;
+                let progress = &session.progress;
                 let has_steps = self.limits.steps.is_some();
                 self.bar.set_position(if has_steps { progress.step } else { whole_secs(session.seconds) });
                 let psnr = session.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
@@ -57,7 +58,7 @@ impl Observer for Console {
                 self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
             }
             (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
-            (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print::report_json(evaluation),
+            (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
             (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => print::report(format_args!(
                 "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
                 evaluation.seconds,
@@ -67,8 +68,8 @@ impl Observer for Console {
                 evaluation.scores
             )),
             (SessionEvent::Finished(finished), OutputMode::Json) => {
-                finished.profile.iter().for_each(print::report_json);
-                print::report_json(finished.done);
+                finished.profile.iter().for_each(print_json);
+                print_json(finished.done);
             }
             (SessionEvent::Finished(finished), OutputMode::Lines) => {
                 for (name, millis) in finished.profile.iter().flat_map(|profile| profile.passes) {
@@ -88,6 +89,12 @@ impl Observer for Console {
             }
             (SessionEvent::Evaluated(_) | SessionEvent::Finished(_), OutputMode::Bar | OutputMode::Nothing) => {}
         }
+    }
+}
+
+fn print_json(value: &impl Serialize) {
+    if let Err(error) = print::report_json(value) {
+        log::error!("{error:#}");
     }
 }
 

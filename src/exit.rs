@@ -1,7 +1,7 @@
 //! Exit codes and the errors that lead to them.
 
-use capture::ConfigError;
 use crate::print;
+use capture::ConfigError;
 use keyframe::ErrorClass;
 use std::io::ErrorKind;
 use std::process::ExitCode;
@@ -95,8 +95,8 @@ pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use anyhow::Context;
     use super::*;
+    use anyhow::Context;
 
     #[test]
     fn bad_argument_keeps_its_code_under_context() {

@@ -1,19 +1,19 @@
 //! Opens the GPU with the settings from environment variables.
 
-use crate::{allocator, Error};
-use std::sync::{Arc, Once};
+use crate::allocator;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Once};
 use trainer::gpu::{Gpu, GpuOptions};
 
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
 /// and `no-matrices` only cooperative matrices.
-pub fn open_gpu() -> crate::Result<Arc<Gpu>> {
+pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
         Ok(text) => {
-            let invalid = |_| Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            let invalid = |_| session::Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
             Some(text.parse().map_err(invalid)?)
         }
         Err(_) => None,

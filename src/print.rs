@@ -12,9 +12,9 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, T
 use serde::Serialize;
 use std::fmt::Display;
 use std::io::Write;
-use std::sync::{LazyLock, Mutex, PoisonError};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{sync_channel, SyncSender};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::{LazyLock, Mutex, PoisonError};
 use std::time::Duration;
 
 /// Writing to stdout failed.
@@ -190,11 +190,13 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
 }
 
 /// Prints one JSON object on its own line, as [`report`] does.
-pub(crate) fn report_json(value: &impl Serialize) {
-    match json_text(value) {
-        Ok(text) => report(text),
-        Err(error) => log::error!("{error:#}"),
-    }
+///
+/// # Errors
+///
+/// If the value cannot be serialized as JSON.
+pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
+    report(json_text(value)?);
+    Ok(())
 }
 
 fn json_text(value: &impl Serialize) -> anyhow::Result<String> {

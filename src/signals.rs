@@ -5,9 +5,10 @@
 //! group, the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
 
 use anyhow::Context;
-use capture::{partial, Stop};
-use signal_hook::flag;
+use capture::Stop;
+use session::partial;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::flag;
 use signal_hook::iterator::Signals;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

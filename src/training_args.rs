@@ -1,10 +1,10 @@
 //! Flags shared by all commands that train. They override the keys of the same name in a rig file.
 
 use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
-use clap::value_parser;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use session::{Refine, TrainingOptions};
+use clap::value_parser;
 use session::methods::describe;
+use session::{Refine, TrainingOptions};
 use std::sync::LazyLock;
 use trainer::ModelKind;
 use trainer::splat::CountPolicy;
@@ -69,7 +69,8 @@ fn methods(text: &str) -> Result<Methods, String> {
 /// Parses a value of `--refine`.
 fn refine() -> impl TypedValueParser<Value = Refine> {
     let find = |name: String| Refine::ALL.into_iter().find(|(known, _)| *known == name).map(|(_, refine)| refine);
-    PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name)).try_map(move |name| find(name).ok_or("unknown parameter"))
+    PossibleValuesParser::new(Refine::ALL.map(|(name, _)| name))
+        .try_map(move |name| find(name).ok_or("unknown parameter"))
 }
 
 /// Values of `--count`.

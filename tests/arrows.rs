@@ -15,10 +15,7 @@ const ALLOWED: [(&str, &[&str]); 10] = [
     ("trainer", &["calibration", "keyframe", "kinematics"]),
     ("viz", &["keyframe", "kinematics", "trainer"]),
     ("session", &["calibration", "capture", "drivers", "keyframe", "kinematics", "trainer", "viz"]),
-    (
-        "fieldrig",
-        &["calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"],
-    ),
+    ("fieldrig", &["calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"]),
 ];
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.

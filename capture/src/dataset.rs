@@ -1,10 +1,10 @@
 //! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
 use crate::downscale;
-use keyframe::Holdout;
-use keyframe::counted;
 use crate::error::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage};
+use keyframe::Holdout;
+use keyframe::counted;
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Intrinsics, Undistortion};
 use rayon::prelude::*;

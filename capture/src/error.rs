@@ -3,6 +3,7 @@
 use crate::config::ConfigError;
 use keyframe::ErrorClass;
 use std::error::Error as StdError;
+use std::fmt::{Display, Formatter};
 
 /// The result of a fallible operation of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -10,39 +11,29 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 /// Why a rig cannot be opened, read or joined.
 ///
 /// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its outermost
-/// context; [`chain`] gives the message with all causes.
-#[derive(Debug, thiserror::Error)]
+/// context; `{:#}` gives the message with all causes.
+#[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
     /// The arguments, or a file they name, are invalid.
-    #[error("{0}")]
     BadInput(String),
     /// The input is not sufficient for a result.
-    #[error("{0}")]
     InsufficientData(String),
     /// Something failed.
-    #[error("{0}")]
     Failed(String),
     /// The rig file is invalid.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
+    Config(ConfigError),
     /// A list of keyframes, a selection of test images, or a keyframe is invalid.
-    #[error(transparent)]
-    Keyframe(#[from] keyframe::Error),
+    Keyframe(keyframe::Error),
     /// A device, recording or dataset failed.
-    #[error(transparent)]
-    Driver(#[from] drivers::Error),
+    Driver(drivers::Error),
     /// A lens, pose or robot description is invalid.
-    #[error(transparent)]
-    Kinematics(#[from] kinematics::Error),
+    Kinematics(kinematics::Error),
     /// A file cannot be read or written.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
+    Io(std::io::Error),
     /// An error of another library.
-    #[error(transparent)]
     Other(Box<dyn StdError + Send + Sync>),
     /// The operation that failed, with the cause.
-    #[error("{context}")]
     Context {
         /// What was being done, or the file, device or image concerned.
         context: String,
@@ -72,6 +63,78 @@ impl Error {
     }
 }
 
+/// Writes the message; in the alternate form `{:#}`, followed by those of all causes.
+impl Display for Error {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) => f.write_str(text),
+            Self::Config(error) => write_chain(f, error),
+            Self::Keyframe(error) => write_chain(f, error),
+            Self::Driver(error) => write_chain(f, error),
+            Self::Kinematics(error) => write_chain(f, error),
+            Self::Io(error) => write_chain(f, error),
+            Self::Other(error) => write_chain(f, error.as_ref()),
+            Self::Context { context, source } if f.alternate() => write!(f, "{context}: {source:#}"),
+            Self::Context { context, .. } => f.write_str(context),
+        }
+    }
+}
+
+fn write_chain(f: &mut Formatter<'_>, error: &(dyn StdError + 'static)) -> std::fmt::Result {
+    write!(f, "{error}")?;
+    let mut cause = error.source().filter(|_| f.alternate());
+    while let Some(error) = cause {
+        write!(f, ": {error}")?;
+        cause = error.source();
+    }
+    Ok(())
+}
+
+impl StdError for Error {
+    fn source(&self) -> Option<&(dyn StdError + 'static)> {
+        match self {
+            Self::BadInput(_) | Self::InsufficientData(_) | Self::Failed(_) => None,
+            Self::Config(error) => error.source(),
+            Self::Keyframe(error) => error.source(),
+            Self::Driver(error) => error.source(),
+            Self::Kinematics(error) => error.source(),
+            Self::Io(error) => error.source(),
+            Self::Other(error) => error.source(),
+            Self::Context { source, .. } => Some(source.as_ref()),
+        }
+    }
+}
+
+impl From<ConfigError> for Error {
+    fn from(error: ConfigError) -> Self {
+        Self::Config(error)
+    }
+}
+
+impl From<keyframe::Error> for Error {
+    fn from(error: keyframe::Error) -> Self {
+        Self::Keyframe(error)
+    }
+}
+
+impl From<drivers::Error> for Error {
+    fn from(error: drivers::Error) -> Self {
+        Self::Driver(error)
+    }
+}
+
+impl From<kinematics::Error> for Error {
+    fn from(error: kinematics::Error) -> Self {
+        Self::Kinematics(error)
+    }
+}
+
+impl From<std::io::Error> for Error {
+    fn from(error: std::io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
 macro_rules! from_other {
     ($($error:ty),*) => { $(impl From<$error> for Error {
         fn from(error: $error) -> Self {
@@ -82,18 +145,6 @@ macro_rules! from_other {
 from_other!(image::ImageError, std::str::Utf8Error, std::net::AddrParseError);
 #[cfg(feature = "sim")]
 from_other!(sim::Error);
-
-/// The message of an error followed by those of its causes, separated by colons.
-#[must_use]
-pub fn chain(error: &(dyn StdError + 'static)) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        text += &format!(": {error}");
-        cause = error.source();
-    }
-    text
-}
 
 /// Adds the operation that failed to an error.
 pub(crate) trait Context<T> {
@@ -141,9 +192,9 @@ mod tests {
     fn context_keeps_the_class_and_the_causes() {
         let error = Err::<(), _>(Error::BadInput("scale is 2".into())).context("rig.toml").expect_err("an error");
         assert_eq!(error.class(), ErrorClass::BadInput);
-        assert_eq!(chain(&error), "rig.toml: scale is 2");
+        assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
         let missing = std::fs::read("no/such/file").with_context(|| "the list").expect_err("no file");
         assert_eq!(missing.class(), ErrorClass::Failed);
-        assert!(chain(&missing).starts_with("the list: "));
+        assert!(format!("{missing:#}").starts_with("the list: "));
     }
 }

@@ -1,11 +1,11 @@
 //! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
 //! come out of a bounded queue.
 
+use crate::error::{Context, Error};
 use crate::join::Change;
 use crate::join::{Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
 use crate::stop::Stop;
-use crate::error::{Context, Error, chain};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
 use kinematics::{Stamp, Transform};
@@ -189,7 +189,7 @@ impl Pump {
                 && let Err(error) = recorder.write(&sample)
             {
                 let error = Error::from(error);
-                log::error!("the recording ends here, the run continues: {}", chain(&error));
+                log::error!("the recording ends here, the run continues: {error:#}");
                 recording_error = Some(error);
             }
             if matches!(sample, Sample::Image(_)) {

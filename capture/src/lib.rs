@@ -41,7 +41,7 @@ mod stop;
 mod test_data;
 
 pub use config::{ConfigError, Override, Rig};
-pub use error::{Error, Result, chain};
+pub use error::{Error, Result};
 pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
 pub use join::{CameraPose, Change, Counts, Join, JoinEvent, Motion, PosedImage, Rejection, SampleUse};
 pub use stations::{StationReport, Stations};

@@ -1,8 +1,8 @@
 //! The list of camera poses of a run, `cameras.json` next to the model. Viewers draw the cameras and choose their first
 //! view from them.
 
-use crate::{camera_path, run_folder};
 use crate::error::Context;
+use crate::{camera_path, run_folder};
 use kinematics::Transform;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -68,8 +68,8 @@ pub fn row_major(pose: &Transform) -> [f64; 16] {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Isometry3, Vector3};
     use super::*;
+    use nalgebra::{Isometry3, Vector3};
 
     fn camera() -> PosedCamera {
         let pose = Isometry3::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));

@@ -1,7 +1,7 @@
 //! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
 use crate::Error;
-use crate::error::{ensure, Context};
+use crate::error::{Context, ensure};
 use kinematics::Transform;
 use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use serde::Deserialize;
@@ -99,8 +99,8 @@ pub fn rigid(numbers: &[f64]) -> crate::Result<Transform> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Point3;
     use super::*;
+    use nalgebra::Point3;
 
     const IDENTITY: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 

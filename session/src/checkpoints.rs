@@ -1,9 +1,8 @@
 //! Checkpoints of a model in training: taken periodically and written on a separate thread.
 
-use capture::chain;
 use crate::Error;
 use crate::error::Context;
-use crate::run_folder::{expect_one_model, CHECKPOINT};
+use crate::run_folder::{CHECKPOINT, expect_one_model};
 use crate::stored_keyframes::StoredKeyframes;
 use keyframe::Keyframe;
 use std::collections::BTreeMap;
@@ -59,11 +58,7 @@ pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
 }
 
 /// Rejects a limit in seconds that earlier training has already reached.
-pub fn check_limit_not_passed(
-    seconds: Option<f64>,
-    checkpoint: &Checkpoint,
-    subject: &str,
-) -> Result<(), Error> {
+pub fn check_limit_not_passed(seconds: Option<f64>, checkpoint: &Checkpoint, subject: &str) -> Result<(), Error> {
     match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
         Some(seconds) => Err(Error::BadInput(format!(
             "--seconds {seconds}: {subject} has already been trained for {:.1} s, which count; give a larger limit",
@@ -209,17 +204,17 @@ impl Checkpoints {
             Ok(()) => {}
             Err(error) if is_checkpoint => {
                 let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
-                log::warn!("cannot write a checkpoint{previous}: {}", chain(&error));
+                log::warn!("cannot write a checkpoint{previous}: {error:#}");
             }
             // The next checkpoint stores them too, and warns if that fails.
-            Err(error) => log::debug!("cannot store keyframes: {}", chain(&error)),
+            Err(error) => log::debug!("cannot store keyframes: {error:#}"),
         }
     }
 
     /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one is used.
     pub fn newest(&mut self) -> Option<&Path> {
         if let Err(error) = self.wait() {
-            log::warn!("the checkpoint in progress failed: {}", chain(&error));
+            log::warn!("the checkpoint in progress failed: {error:#}");
         }
         self.has_any.then_some(&self.path)
     }
@@ -281,8 +276,8 @@ mod tests {
 
     #[test]
     fn resumed_run_keeps_the_checkpoint_period() {
-        let [none, one, two] = [None, Some(1.0), Some(2.5)]
-            .map(|secs| CheckpointOptions { period: secs.map(Duration::from_secs_f64) });
+        let [none, one, two] =
+            [None, Some(1.0), Some(2.5)].map(|secs| CheckpointOptions { period: secs.map(Duration::from_secs_f64) });
         let flags = |options: CheckpointOptions| options.flag().into_iter().collect();
         assert_eq!(none.or_previous(&flags(two)).period, two.period);
         assert_eq!(one.or_previous(&flags(two)).period, one.period);
@@ -292,7 +287,7 @@ mod tests {
     #[test]
     fn missing_checkpoint_error_names_the_folder() {
         let folder = tempfile::tempdir().expect("a folder");
-        let message = chain(&read(folder.path()).expect_err("none"));
+        let message = format!("{:#}", read(folder.path()).expect_err("none"));
         assert!(message.contains(folder.path().to_str().expect("plain")) && message.contains(CHECKPOINT), "{message}");
     }
 }

@@ -1,9 +1,9 @@
 //! Writes the rig file with the calibration corrections that alignment found.
 
-use calibration::{Alignment, CameraCorrection, Estimate};
-use capture::config::{Camera, Rig, TimeOffset};
 use crate::Error;
 use crate::error::Context;
+use calibration::{Alignment, CameraCorrection, Estimate};
+use capture::config::{Camera, Rig, TimeOffset};
 use kinematics::{Chain, Intrinsics, Transform};
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::path::{Path, PathBuf};
@@ -108,9 +108,9 @@ fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Align
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use calibration::ScalarEstimate;
     use std::collections::BTreeMap;
-    use super::*;
 
     const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
 

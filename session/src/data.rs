@@ -1,15 +1,15 @@
 //! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
 
-use capture::{dataset, downscale, Join, JoinEvent, SampleUse, StationReport, Stations};
-use capture::config::{Override, Rig};
-use capture::open::{self, Opened};
 use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
 use crate::error::ensure;
+use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::is_recording;
-use crate::methods::methods_of;
-use keyframe::{counted, Holdout, Keyframe, KeyframeList, Split};
+use capture::config::{Override, Rig};
+use capture::open::{self, Opened};
+use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
+use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -33,7 +33,7 @@ pub struct DataOptions {
 impl DataOptions {
     /// The test images selected by `--holdout`, if it is given.
     pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
-        self.holdout.as_deref().map(Holdout::from_argument).transpose()
+        Ok(self.holdout.as_deref().map(Holdout::from_argument).transpose()?)
     }
 
     /// The given flags that affect keyframes: names and values, with absolute paths for files.
@@ -236,7 +236,12 @@ impl Data {
     }
 
     /// Renders depth for images without depth from a model.
-    pub fn render_depth(&mut self, gpu: Arc<Gpu>, source: &DepthSource, progress: OnReadProgress<'_>) -> crate::Result<()> {
+    pub fn render_depth(
+        &mut self,
+        gpu: Arc<Gpu>,
+        source: &DepthSource,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<()> {
         let started = Instant::now();
         self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, progress)?);
         self.preparation_time += started.elapsed();

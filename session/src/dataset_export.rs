@@ -1,12 +1,12 @@
 //! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
 
-use crate::error::{bail, ensure, Context};
+use crate::error::{Context, bail, ensure};
 use crate::partial::Partial;
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
-use kinematics::{transform, Transform};
-use serde_json::{json, Map, Value};
+use kinematics::{Transform, transform};
+use serde_json::{Map, Value, json};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -162,11 +162,11 @@ fn write_text(path: &Path, text: &str) -> crate::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use super::*;
     use capture::dataset;
     use keyframe::Holdout;
     use kinematics::Stamp;
     use nalgebra::{UnitQuaternion, Vector3};
-    use super::*;
 
     /// A keyframe of 32 x 24 pixels with depth.
     fn keyframe(ix: usize) -> Keyframe {

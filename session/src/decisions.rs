@@ -5,7 +5,7 @@
 
 use crate::Error;
 use crate::error::Context;
-use keyframe::{split_from_name, split_name, Keyframe, Split};
+use keyframe::{Keyframe, Split, split_from_name, split_name};
 use kinematics::{Stamp, Transform};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ use std::fs::File;
 use std::io::Write;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::mpsc::{sync_channel, SyncSender};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use trainer::ModelOptions;
 
@@ -281,7 +281,7 @@ impl DecisionLog {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::End(True) }));
         drop(self.sender);
-        let written = self.thread.join().map_err(|_| crate::error::failed!("the log thread panicked: this is a bug"))?;
+        let written = self.thread.join().map_err(|_| Error::Failed("the log thread panicked: this is a bug".into()))?;
         written.context("the decision log is incomplete")
     }
 
@@ -357,7 +357,7 @@ impl Decisions {
     }
 
     fn parse(text: &str) -> crate::Result<Self> {
-        let invalid = |reason: String| (Error::BadInput(reason));
+        let invalid = Error::BadInput;
         let mut lines = text.split_inclusive('\n').zip(1..);
         let first = lines.next().map_or("", |(line, _)| line);
         let description: serde_json::Value =
@@ -394,8 +394,8 @@ impl Decisions {
 
 #[cfg(test)]
 mod tests {
-    use kinematics::Transform;
     use super::*;
+    use kinematics::Transform;
 
     fn settings(from_step: Option<u64>) -> Settings {
         Settings::new(RunDescription {

@@ -1,17 +1,16 @@
 //! `--depth-from`: renders depth for images without depth from a saved model.
 
-use capture::chain;
-use crate::{run_folder, Error};
 use crate::error::Context;
 use crate::evaluate::{self, CHECK_SAME_SCENE, MIN_ALPHA, MIN_COVERED_FRAC};
 use crate::read_progress::{OnReadProgress, ReadProgress};
-use keyframe::{counted, DepthMap, Keyframe, Split};
+use crate::{Error, methods, run_folder};
+use keyframe::{DepthMap, Keyframe, Split, counted};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::{Method, Picture};
 use trainer::gpu::Gpu;
+use trainer::{Method, Picture};
 
 /// A saved model from which depth is rendered.
 #[derive(Clone, Debug)]
@@ -36,7 +35,7 @@ pub struct RenderedDepth {
 impl DepthSource {
     /// The model in a folder, or in a single file of splats.
     pub fn find(model: &Path) -> crate::Result<Self> {
-        let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {}", chain(&error)));
+        let invalid = |error: crate::Error| Error::BadInput(format!("--depth-from: {error:#}"));
         run_folder::expect_model(model).map_err(invalid)?;
         let sha256 = if model.is_file() {
             let bytes = std::fs::read(model).with_context(|| format!("cannot read {}", model.display()))?;
@@ -72,7 +71,9 @@ impl DepthSource {
         }
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into());
+            return Err(
+                Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into()
+            );
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");

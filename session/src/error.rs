@@ -2,6 +2,7 @@
 
 use keyframe::ErrorClass;
 use std::error::Error as StdError;
+use std::fmt::{Display, Formatter};
 
 /// The result of a fallible operation of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -9,45 +10,33 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 /// Why a session cannot train, evaluate, save or resume.
 ///
 /// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its outermost
-/// context; [`capture::chain`] gives the message with all causes.
-#[derive(Debug, thiserror::Error)]
+/// context; `{:#}` gives the message with all causes.
+#[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {
     /// The arguments, or a file they name, are invalid.
-    #[error("{0}")]
     BadInput(String),
     /// The input is not sufficient for a result.
-    #[error("{0}")]
     InsufficientData(String),
     /// Something failed.
-    #[error("{0}")]
     Failed(String),
     /// The rig file is invalid, or a device or recording failed.
-    #[error(transparent)]
-    Capture(#[from] capture::Error),
+    Capture(capture::Error),
     /// A model cannot be created, trained, saved or loaded.
-    #[error(transparent)]
-    Trainer(#[from] trainer::Error),
+    Trainer(trainer::Error),
     /// A list of keyframes, a selection of test images, or a keyframe is invalid.
-    #[error(transparent)]
-    Keyframe(#[from] keyframe::Error),
+    Keyframe(keyframe::Error),
     /// A device, recording or dataset failed.
-    #[error(transparent)]
-    Driver(#[from] drivers::Error),
+    Driver(drivers::Error),
     /// A lens, pose or robot description is invalid.
-    #[error(transparent)]
-    Kinematics(#[from] kinematics::Error),
+    Kinematics(kinematics::Error),
     /// A file cannot be read or written.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
+    Io(std::io::Error),
     /// An error of another library.
-    #[error(transparent)]
     Other(Box<dyn StdError + Send + Sync>),
     /// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
-    #[error("{0}")]
     GpuUnrecoverable(String),
     /// The operation that failed, with the cause.
-    #[error("{context}")]
     Context {
         /// What was being done, or the file, device or image concerned.
         context: String,
@@ -78,37 +67,46 @@ impl Error {
             | Self::Driver(_)
             | Self::Kinematics(_)
             | Self::Io(_)
-            | Self::Other(_) => {
-                ErrorClass::Failed
-            }
+            | Self::Other(_) => ErrorClass::Failed,
         }
     }
 
     /// The error without the operations that failed.
-    fn cause(&self) -> &Self {
+    fn root(&self) -> &Self {
         match self {
-            Self::Context { source, .. } => source.cause(),
-            cause => cause,
+            Self::Context { source, .. } => source.root(),
+            _ => self,
         }
     }
 
     /// Whether the GPU caused the error: it was lost or out of memory.
     #[must_use]
     pub fn is_gpu_error(&self) -> bool {
-        matches!(self.cause(), Self::Trainer(error) if error.is_gpu_error())
+        matches!(self.root(), Self::Trainer(error) if error.is_gpu_error())
     }
 
     /// Whether the GPU failed and could not be reopened.
     #[must_use]
     pub fn is_gpu_unrecoverable(&self) -> bool {
-        matches!(self.cause(), Self::GpuUnrecoverable(_))
+        matches!(self.root(), Self::GpuUnrecoverable(_))
     }
 
     /// Whether reading or writing a file failed, for example on a full disk.
     #[must_use]
     pub fn is_io(&self) -> bool {
-        std::iter::successors(Some(self.cause() as &(dyn StdError + 'static)), |error| error.source())
-            .any(|error| error.is::<std::io::Error>() || matches!(error.downcast_ref(), Some(Self::Io(_))))
+        let mut cause: Option<&(dyn StdError + 'static)> = Some(self.root());
+        while let Some(error) = cause {
+            let is_io = match error.downcast_ref() {
+                Some(Self::Io(_)) => true,
+                Some(Self::Trainer(error)) => error.source().is_some_and(|source| source.is::<std::io::Error>()),
+                _ => error.is::<std::io::Error>(),
+            };
+            if is_io {
+                return true;
+            }
+            cause = error.source();
+        }
+        false
     }
 
     /// Adds the operation that failed.
@@ -120,6 +118,88 @@ impl Error {
     /// An error of a library that is not part of this interface.
     pub(crate) fn other(error: impl StdError + Send + Sync + 'static) -> Self {
         Self::Other(Box::new(error))
+    }
+}
+
+/// Writes the message; in the alternate form `{:#}`, followed by those of all causes.
+impl Display for Error {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) | Self::GpuUnrecoverable(text) => {
+                f.write_str(text)
+            }
+            Self::Capture(error) => write_chain(f, error),
+            Self::Trainer(error) => write_chain(f, error),
+            Self::Keyframe(error) => write_chain(f, error),
+            Self::Driver(error) => write_chain(f, error),
+            Self::Kinematics(error) => write_chain(f, error),
+            Self::Io(error) => write_chain(f, error),
+            Self::Other(error) => write_chain(f, error.as_ref()),
+            Self::Context { context, source } if f.alternate() => write!(f, "{context}: {source:#}"),
+            Self::Context { context, .. } => f.write_str(context),
+        }
+    }
+}
+
+fn write_chain(f: &mut Formatter<'_>, error: &(dyn StdError + 'static)) -> std::fmt::Result {
+    write!(f, "{error}")?;
+    let mut cause = error.source().filter(|_| f.alternate());
+    while let Some(error) = cause {
+        write!(f, ": {error}")?;
+        cause = error.source();
+    }
+    Ok(())
+}
+
+impl StdError for Error {
+    fn source(&self) -> Option<&(dyn StdError + 'static)> {
+        match self {
+            Self::BadInput(_) | Self::InsufficientData(_) | Self::Failed(_) | Self::GpuUnrecoverable(_) => None,
+            Self::Capture(error) => error.source(),
+            Self::Trainer(error) => error.source(),
+            Self::Keyframe(error) => error.source(),
+            Self::Driver(error) => error.source(),
+            Self::Kinematics(error) => error.source(),
+            Self::Io(error) => error.source(),
+            Self::Other(error) => error.source(),
+            Self::Context { source, .. } => Some(source.as_ref()),
+        }
+    }
+}
+
+impl From<capture::Error> for Error {
+    fn from(error: capture::Error) -> Self {
+        Self::Capture(error)
+    }
+}
+
+impl From<trainer::Error> for Error {
+    fn from(error: trainer::Error) -> Self {
+        Self::Trainer(error)
+    }
+}
+
+impl From<keyframe::Error> for Error {
+    fn from(error: keyframe::Error) -> Self {
+        Self::Keyframe(error)
+    }
+}
+
+impl From<drivers::Error> for Error {
+    fn from(error: drivers::Error) -> Self {
+        Self::Driver(error)
+    }
+}
+
+impl From<kinematics::Error> for Error {
+    fn from(error: kinematics::Error) -> Self {
+        Self::Kinematics(error)
+    }
+}
+
+impl From<std::io::Error> for Error {
+    fn from(error: std::io::Error) -> Self {
+        Self::Io(error)
     }
 }
 
@@ -172,16 +252,15 @@ pub(crate) use ensure;
 
 #[cfg(test)]
 mod tests {
-    use capture::chain;
     use super::*;
 
     #[test]
     fn context_keeps_the_class_and_the_causes() {
         let error = Err::<(), _>(Error::BadInput("scale is 2".into())).context("rig.toml").expect_err("an error");
         assert_eq!(error.class(), ErrorClass::BadInput);
-        assert_eq!(chain(&error), "rig.toml: scale is 2");
+        assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
         let missing = std::fs::read("no/such/file").with_context(|| "the list").expect_err("no file");
         assert_eq!(missing.class(), ErrorClass::Failed);
-        assert!(chain(&missing).starts_with("the list: "));
+        assert!(format!("{missing:#}").starts_with("the list: "));
     }
 }

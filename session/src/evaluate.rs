@@ -2,16 +2,16 @@
 //!
 //! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
 
-use calibration::CalibratedCamera;
 use crate::error::Context;
-use keyframe::{counted, DepthMap, Keyframe};
+use calibration::CalibratedCamera;
+use keyframe::{DepthMap, Keyframe, counted};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::{Display, Formatter};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
 use trainer::{Method, Picture, Projection, RenderRequest};
-use trainer::eval::{depth_rmse_m, psnr, ssim, surface_error, Lpips, PixelPair, SurfaceError};
 
 /// Environment variable with the path of the LPIPS weights, used if no flag gives one.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";

@@ -65,9 +65,8 @@ pub use error::{Error, Result};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use live::{Live, LiveOptions, Pace};
-pub use observer::{
-    DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress,
-};
+pub use methods::methods_of;
+pub use observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
 pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
 pub use recoveries::OpenGpu;
 pub use recovery::Recovery;
@@ -75,7 +74,6 @@ pub use replay::Replay;
 pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish};
 pub use stored_keyframes::StoredKeyframes;
 pub use table::Table;
-pub use methods::methods_of;
 pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
 pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
 pub use viewer::{ModelViewer, ServedModel};

@@ -1,10 +1,10 @@
 //! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
 
-use capture::{Change, Feed, InputResult};
-use crate::{scene_hint, time_slices};
 use crate::recoveries::{self, OpenGpu, Recoveries};
 use crate::render_budget::RenderBudget;
 use crate::session::Session;
+use crate::{scene_hint, time_slices};
+use capture::{Change, Feed, InputResult};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -324,7 +324,7 @@ impl Live {
     pub fn finish(self) -> (Vec<Session>, crate::Result<InputResult>) {
         // The status stays visible, because viewers wait for the scores.
         self.hub.set_state("saving");
-        (self.sessions, self.feed.finish())
+        (self.sessions, self.feed.finish().map_err(Into::into))
     }
 
     fn is_scoring(&self) -> bool {

@@ -64,11 +64,7 @@ pub fn options(train: &Train, steps: Option<u64>) -> (CommonOptions, Settings) {
 }
 
 /// Models of these kinds with common options, and with the settings that each of them has.
-pub fn specs(
-    kinds: &[ModelKind],
-    common: &CommonOptions,
-    settings: &Settings,
-) -> Result<Vec<ModelSpec>, Error> {
+pub fn specs(kinds: &[ModelKind], common: &CommonOptions, settings: &Settings) -> Result<Vec<ModelSpec>, Error> {
     let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
     kinds.iter().map(spec).collect::<Result<_, _>>().map_err(|error| Error::BadInput(error.to_string()))
 }

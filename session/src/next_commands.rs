@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
+use trainer::method_entry::Export;
 
 /// The images that a model was trained on, for commands that need them.
 #[derive(Clone, Debug, Default)]

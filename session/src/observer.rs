@@ -30,7 +30,7 @@ pub enum SessionEvent<'a> {
 }
 
 /// The state of training.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct SessionProgress {
     /// Name of the model's primitive, in the singular.
     pub primitive: &'static str,

@@ -22,11 +22,7 @@ pub struct PendingEvaluation {
 
 impl PendingEvaluation {
     /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
-    pub fn new<'a>(
-        seconds: f64,
-        tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
-        max_images: usize,
-    ) -> Self {
+    pub fn new<'a>(seconds: f64, tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>, max_images: usize) -> Self {
         let stride = tests.len().div_ceil(max_images).max(1);
         let mut selected: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());

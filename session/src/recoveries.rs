@@ -1,6 +1,5 @@
 //! Recovery from a GPU failure during a run: every model continues on a reopened device from its newest checkpoint.
 
-use capture::chain;
 use crate::Error;
 use crate::error::Context;
 use crate::session::Session;
@@ -58,7 +57,7 @@ impl Recoveries {
                 std::thread::sleep(RETRY_DELAY);
             }
             self.n += 1;
-            log::warn!("{}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", chain(&error), self.n);
+            log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
             match restart_all(sessions, self.open_gpu) {
                 Ok(()) => {
                     // Several sessions share one clock.
@@ -71,8 +70,7 @@ impl Recoveries {
         }
         let recoverable = describe_recoverable(sessions);
         Err(Error::GpuUnrecoverable(format!(
-            "{}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}",
-            chain(&error)
+            "{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}"
         )))
     }
 }

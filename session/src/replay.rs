@@ -1,12 +1,13 @@
 //! `train --replay-decisions`: trains with the decisions of a log.
 
-use capture::Stop;
-use capture::config::Override;
-use crate::{depth_from, Error};
 use crate::data::Data;
 use crate::decisions::{Decision, Decisions, Pushed};
+use crate::methods::{MAX_SPLATS, SH_DEGREE};
 use crate::read_progress::OnReadProgress;
 use crate::session::Session;
+use crate::{Error, depth_from};
+use capture::Stop;
+use capture::config::Override;
 use keyframe::{Keyframe, KeyframeList};
 use kinematics::Stamp;
 use std::collections::HashMap;
@@ -30,10 +31,12 @@ impl Replay {
             Error::BadInput(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
         })?;
         let model_spec = ModelSpec { kind, options: decisions.settings.options.clone() };
-        model_spec.check().map_err(|error| BadArgument(format!("{}: line 1: {error}", path.display())))?;
+        model_spec.check().map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
         let replay = Self { path: path.to_owned(), decisions, model_spec };
         if replay.decisions.pushed().next().is_none() {
-            return Err(Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into());
+            return Err(
+                Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into()
+            );
         }
         Ok(replay)
     }

@@ -1,16 +1,16 @@
 //! The folder of a run, and the files in it.
 
-use capture::config::Rig;
 use crate::Error;
-use crate::error::{bail, ensure, Context};
-use keyframe::Keyframe;
+use crate::error::{Context, bail, ensure};
+use capture::config::Rig;
+use keyframe::{Keyframe, listed};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
-use trainer::{splat_file, Method, ModelKind};
+use trainer::{Method, ModelKind};
 
 /// File extension of recordings.
 const RECORDING_EXTENSION: &str = "mcap";
@@ -57,9 +57,10 @@ pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
 pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
     let canonical = |path: &Path| path.canonicalize().ok();
     match (canonical(out), canonical(data)) {
-        (Some(folder), Some(data)) if folder == data => {
-            Err(Error::BadInput(format!("--out {}: this is the folder of the data; give another folder", out.display())))
-        }
+        (Some(folder), Some(data)) if folder == data => Err(Error::BadInput(format!(
+            "--out {}: this is the folder of the data; give another folder",
+            out.display()
+        ))),
         _ => Ok(()),
     }
 }
@@ -76,7 +77,11 @@ pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
     if inside.is_empty() || holds_one(folder) {
         return Ok(());
     }
-    Err(Error::BadInput(format!("{}: the folder contains several methods; give {}", folder.display(), inside.join(" or "))))
+    Err(Error::BadInput(format!(
+        "{}: the folder contains several methods; give {}",
+        folder.display(),
+        inside.join(" or ")
+    )))
 }
 
 /// Returns an error unless the path is a model: an existing folder with exactly one model, or a file of splats.
@@ -156,7 +161,7 @@ impl CreatedFolders {
         if let Some(rig) = rig {
             write(rig, &out)?;
             for (kind, folder) in kinds.iter().zip(&folders) {
-                write(&rig.with_method(*kind), folder)?;
+                write(&rig.with_method(kind.name()), folder)?;
             }
         }
         Ok(folders)
@@ -302,7 +307,7 @@ pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
 
 /// Writes the keyframes of a run and their splits, for `--keyframes`.
 pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
-    write_atomic(path, &crate::keyframe::list_text(keyframes.iter()))
+    write_atomic(path, &keyframe::list_text(keyframes.iter()))
 }
 
 /// SHA-256 over the model files of a folder, each preceded by its name and length.

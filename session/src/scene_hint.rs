@@ -66,8 +66,8 @@ fn nearest_to_axes(world_from_cameras: &[Transform]) -> Option<Point3<f64>> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Translation3, UnitQuaternion};
     use super::*;
+    use nalgebra::{Translation3, UnitQuaternion};
 
     fn camera_at(position: [f64; 3], target: Point3<f64>) -> Transform {
         let position = Point3::from(position);

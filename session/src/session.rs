@@ -1,8 +1,5 @@
 //! A training session: one model with its keyframes, clock, evaluation schedule and reports.
 
-use calibration::{Alignment, CalibratedCamera, TrialReport};
-use capture::{chain, Stop};
-use crate::{camera_list, gpu_loss, report, run_folder};
 use crate::checkpoints::{self, Checkpoints, Snapshot};
 use crate::clock::Clock;
 use crate::decisions::DecisionLog;
@@ -12,17 +9,20 @@ use crate::evaluation_schedule::EvaluationSchedule;
 use crate::next_commands::{self, DataSource, SavedModel};
 use crate::observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
 use crate::pending_evaluation::PendingEvaluation;
-use crate::recovery::{self, Recovery};
-use keyframe::{counted, split_name, DepthMap, Keyframe, Split};
+use crate::recovery::Recovery;
+use crate::{camera_list, gpu_loss, report, run_folder};
+use calibration::{Alignment, CalibratedCamera, TrialReport};
+use capture::Stop;
+use keyframe::{DepthMap, Keyframe, Split, split_name};
 use kinematics::quantile::median;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::{Gpu, PassTiming};
+use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
 pub const TIME_SLICE: Duration = Duration::from_millis(40);
@@ -178,7 +178,7 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<
     let mut failed = Ok(());
     let mut record_error = |error: crate::Error| match failed {
         Ok(()) => failed = Err(error),
-        Err(_) => log::error!("{}", chain(&error)),
+        Err(_) => log::error!("{error:#}"),
     };
     for (mut ending, seconds) in endings.into_iter().zip(ended_secs) {
         // If one model cannot be saved, the others still are.
@@ -195,7 +195,10 @@ pub fn finish(mut endings: Vec<EndingSession<impl Serialize>>) -> crate::Result<
     for (ending, ..) in &mut saved {
         if let Some(Err(error)) = ending.session.checkpoints.as_mut().map(Checkpoints::wait) {
             record_error(
-                error.with_context(format!("the model was saved in {}, but not the last checkpoint", ending.out.display())),
+                error.with_context(format!(
+                    "the model was saved in {}, but not the last checkpoint",
+                    ending.out.display()
+                )),
             );
         }
     }
@@ -448,7 +451,7 @@ impl Session {
     /// Waits until no checkpoint is being written.
     pub fn wait_for_checkpoint(&mut self) {
         if let Some(Err(error)) = self.checkpoints.as_mut().map(Checkpoints::wait) {
-            log::debug!("the last checkpoint was not written: {}", chain(&error));
+            log::debug!("the last checkpoint was not written: {error:#}");
         }
     }
 
@@ -478,13 +481,14 @@ impl Session {
         };
         let held: Vec<Arc<Keyframe>> = recovery.known.iter().chain(&self.keyframes).cloned().collect();
         let all = [&held[..], &self.evicted[..]].concat();
-        let resumed =
-            checkpoint.map(|checkpoint| Ok::<_, crate::Error>(trainer::resume(gpu.clone(), &checkpoint?, &all)?)).transpose();
+        let resumed = checkpoint
+            .map(|checkpoint| Ok::<_, crate::Error>(trainer::resume(gpu.clone(), &checkpoint?, &all)?))
+            .transpose();
         let resumed = resumed.or_else(|error| {
             if error.is_gpu_error() {
                 return Err(error);
             }
-            log::warn!("cannot resume from the newest checkpoint: {}", chain(&error));
+            log::warn!("cannot resume from the newest checkpoint: {error:#}");
             Ok(None)
         })?;
         let is_resumed = resumed.is_some();
@@ -668,7 +672,7 @@ impl Session {
         if let Some(decisions) = self.decisions.take()
             && let Err(error) = decisions.end(self.method.n_total_steps()?)
         {
-            log::warn!("{}", chain(&error));
+            log::warn!("{error:#}");
         }
         let progress = self.method.progress();
         if progress.step > 0 && progress.primitives == 0 {
@@ -684,7 +688,7 @@ impl Session {
         let checkpoint = match self.checkpoints.as_mut().map(|checkpoints| checkpoints.take(snapshot)).transpose() {
             Ok(checkpoint) => checkpoint,
             Err(error) => {
-                log::warn!("cannot write a checkpoint of the last state: {}", chain(&error)); // Still save the model.
+                log::warn!("cannot write a checkpoint of the last state: {error:#}"); // Still save the model.
                 None
             }
         };
@@ -715,7 +719,7 @@ impl Session {
             }
             Err(error) => {
                 let error: crate::Error = error;
-                log::error!("cannot save the model in a temporary folder either: {}", chain(&error));
+                log::error!("cannot save the model in a temporary folder either: {error:#}");
                 Err(save_error.with_context(format!(
                     "cannot save the model in {}; {}",
                     out.display(),
@@ -768,11 +772,11 @@ impl Session {
         let written = run_folder::write_json(&out.join("report.json"), &report);
         let page = comparisons.and_then(|comparisons| self.write_page(out, &report, &comparisons));
         if let Err(error) = &page {
-            log::warn!("{} was not written: {}", report::FILE, chain(error));
+            log::warn!("{} was not written: {error:#}", report::FILE);
         }
         let passes = &report.passes;
         let profile = self.profiles.then(|| ProfileEvent { event: "profile", method: self.kind.name(), passes });
-        let primitive = self.method.primitive();
+        let primitive = self.kind.entry().primitive;
         let finished = FinishedReport { done: &done, profile, primitive, has_page: page.is_ok() };
         self.observer.on_event(&SessionEvent::Finished(&finished));
         written.with_context(|| format!("the model was saved in {}, but its report was not", out.display()))?;
@@ -842,7 +846,7 @@ impl Session {
             });
         }
         if let Err(error) = camera_list::write(out, &cameras) {
-            log::warn!("{} was not written: {}", camera_list::FILE, chain(&error));
+            log::warn!("{} was not written: {error:#}", camera_list::FILE);
         }
     }
 
@@ -941,7 +945,7 @@ impl Session {
             primitives: progress.primitives,
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),
-            primitive: self.method.primitive(),
+            primitive: self.kind.entry().primitive,
             smoothed_step_millis: progress.step_millis,
         };
         self.observer.on_event(&SessionEvent::Evaluated(&eval));

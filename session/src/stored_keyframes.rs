@@ -3,10 +3,10 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
 //! as PNG. Ground truth from a simulator is left out.
 
-use crate::error::{ensure, Context};
-use image::{ExtendedColorType, ImageEncoder};
+use crate::error::{Context, ensure};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use keyframe::{split_from_name, split_name, BaseState, DepthMap, Keyframe};
+use image::{ExtendedColorType, ImageEncoder};
+use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -235,8 +235,8 @@ fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
 
 #[cfg(test)]
 mod tests {
-    use keyframe::Split;
     use super::*;
+    use keyframe::Split;
 
     fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
         let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));

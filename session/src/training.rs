@@ -1,23 +1,21 @@
 //! Trains models from keyframes on disk: once in `train`, many times in `bench`.
 
-use capture::Stop;
-use capture::config::{DEFAULT_SEED, Rig};
-use crate::{run_folder, time_slices, Error};
 use crate::data::{Data, DataOptions};
+use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
 use crate::observer::Observer;
 use crate::recoveries::{OpenGpu, Recoveries};
 use crate::session::{Evaluators, Limits, Session};
-use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
-use keyframe::listed;
 use crate::training_options::{AvailableData, Refine, RefineSettings, TrainingOptions};
-use keyframe::Keyframe;
+use crate::{Error, run_folder, time_slices};
+use capture::Stop;
+use capture::config::{DEFAULT_SEED, Rig};
+use keyframe::{Keyframe, listed};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{self, ModelKind, ModelSpec};
 use trainer::gpu::Gpu;
-use trainer::CommonOptions;
 use trainer::splat::CountPolicy;
+use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
 /// Everything that determines a training besides its keyframes.
 pub struct TrainingPlan {

@@ -1,7 +1,5 @@
 //! Options shared by everything that trains. They override the keys of the same name in a rig file.
 
-use calibration::{candidates, CameraRefinement, ParamSet};
-use capture::Override;
 use crate::Error;
 use crate::methods::{COUNT, MAX_SPLATS, describe};
 use calibration::{CameraRefinement, ParamSet, candidates};
@@ -133,8 +131,7 @@ impl TrainingOptions {
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
         let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
-        let known: Vec<&str> =
-            Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
+        let known: Vec<&str> = Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
         let without = if available.depth { "" } else { " without depth at the start" };
         Err(Error::BadInput(format!(
             "--refine {}: the method {} cannot estimate this{without}; it supports {}",
@@ -145,11 +142,7 @@ impl TrainingOptions {
     }
 
     /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
-    pub fn refining(
-        &self,
-        available: AvailableData,
-        default_value: Refine,
-    ) -> Result<RefineSettings, Error> {
+    pub fn refining(&self, available: AvailableData, default_value: Refine) -> Result<RefineSettings, Error> {
         let requested = if self.refine.is_empty() { std::slice::from_ref(&default_value) } else { &self.refine };
         let has = |param| requested.contains(&param);
         if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
@@ -260,7 +253,9 @@ mod tests {
 
     fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
         let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
-        options.refining(AvailableData { joints, drifts: !joints, depth }, Refine::None).map_err(|error| error.to_string())
+        options
+            .refining(AvailableData { joints, drifts: !joints, depth }, Refine::None)
+            .map_err(|error| error.to_string())
     }
 
     #[test]
@@ -294,7 +289,8 @@ mod tests {
 
     #[test]
     fn flags_of_splats_need_splats() {
-        let options = TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
+        let options =
+            TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
         let available = AvailableData { joints: true, drifts: false, depth: true };
         let both = [kind("tsdf"), kind("splat")];
         assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
@@ -311,8 +307,10 @@ mod tests {
         assert!(options.check_learned(&[kind("nerf")], available).is_ok());
         let options = TrainingOptions { refine: vec![Refine::Extrinsics], ..TrainingOptions::default() };
         assert!(options.check_before_data(&[kind("nerf")], false).is_ok());
-        let message =
-            options.check_learned(&[kind("nerf")], AvailableData { depth: false, ..available }).unwrap_err().to_string();
+        let message = options
+            .check_learned(&[kind("nerf")], AvailableData { depth: false, ..available })
+            .unwrap_err()
+            .to_string();
         assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
         let options = TrainingOptions { refine: vec![Refine::Joints], ..TrainingOptions::default() };
         assert!(options.check_before_data(&[kind("splat")], true).is_ok());

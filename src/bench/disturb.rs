@@ -9,7 +9,7 @@
 
 use crate::bench::statistics::Interpolation;
 use keyframe::{Keyframe, Split};
-use kinematics::{transform, Stamp, Transform, Twist};
+use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{UnitQuaternion, Vector3};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;

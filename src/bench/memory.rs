@@ -1,9 +1,9 @@
 //! Memory of this process over time, and its growth rate once all bounded stores are full.
 
-use anyhow::{anyhow, Context};
+use super::statistics::slope;
+use anyhow::{Context, anyhow};
 use kinematics::quantile::median;
 use serde::Serialize;
-use super::statistics::slope;
 
 /// Time after the keyframe store is full that is ignored, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;

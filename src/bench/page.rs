@@ -1,11 +1,11 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
-use anyhow::Context;
 use crate::print;
+use anyhow::Context;
 use serde_json::Value;
-use session::{run_folder, Table};
-use session::chart::{raster, Chart};
 use session::chart::drawing::escaped;
+use session::chart::{Chart, raster};
+use session::{Table, run_folder};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 

@@ -2,10 +2,10 @@
 //!
 //! It runs in the measured process, so it reads through one small buffer.
 
-use anyhow::{bail, ensure, Context};
+use anyhow::{Context, bail, ensure};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
-use serde_json::{json, Value};
+use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::Arc;
@@ -222,8 +222,8 @@ impl Client {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Instant;
     use super::*;
+    use std::time::Instant;
     use trainer::Picture;
     use viz::{Hub, Server, ServerConfig};
 

@@ -1,8 +1,8 @@
 //! `fieldrig devices`: lists connected devices, as reported by the kernel, with the values to use in a rig file.
 
-use crate::print;
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
+use crate::print;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;

@@ -3,12 +3,12 @@
 mod franka;
 mod listen;
 
-use capture::{open, Stop};
-use capture::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
-use crate::{print, signals};
+use super::number_in_range;
 use crate::exit::Exit;
 use crate::open_gpu::open_gpu;
-use super::number_in_range;
+use crate::{print, signals};
+use capture::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use capture::open;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
@@ -372,7 +372,7 @@ fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
 /// Checks the settings of CAN interfaces: those in the rig against the rig file, the others in general.
 #[cfg(target_os = "linux")]
 fn can(rig: Option<&Rig>) -> Vec<Finding> {
-    use drivers::can::{interfaces, BusConfig, Link};
+    use drivers::can::{BusConfig, Link, interfaces};
     let named = rig.map_or(&[][..], |rig| &rig.arm.buses);
     let others =
         interfaces(Path::new("/sys")).into_iter().filter(|name| !named.iter().any(|bus| bus.interface == *name));
@@ -569,8 +569,7 @@ mod tests {
     #[test]
     fn invalid_rig_is_reported_without_opening_devices() {
         let rig = |name: &str, overrides: &[(&'static str, &'static str)]| {
-            let overrides: Vec<_> =
-                overrides.iter().map(|(key, value)| capture::Override::new(key, *value)).collect();
+            let overrides: Vec<_> = overrides.iter().map(|(key, value)| capture::Override::new(key, *value)).collect();
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
             Rig::load(&path, &overrides).expect("a bundled rig file")
         };

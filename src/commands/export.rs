@@ -1,19 +1,19 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use anyhow::{ensure, Context};
-use capture::{open, Join, SampleUse, Stations};
-use capture::config::Override;
-use crate::signals;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::print::{self, counted};
-use keyframe::{counted, KeyframeList};
-use session::{run_folder, write_nerfstudio, Written};
-use session::partial::{self, Partial};
+use crate::{print, signals};
+use anyhow::{Context, ensure};
+use capture::config::Override;
+use capture::{Join, SampleUse, Stations, open};
+use clap::builder::{PossibleValue, PossibleValuesParser};
+use keyframe::{KeyframeList, counted, listed};
+use session::partial::Partial;
+use session::{Written, methods, run_folder, write_nerfstudio};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use trainer::{splat_file, ModelKind};
-use trainer::tsdf::TsdfModel;
-use trainer::tsdf::mesh::{write_glb, write_ply, Mesh};
+use trainer::ModelKind;
+use trainer::method_entry::{Export, ExportRequest, ExportWriter, Exported};
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -46,7 +46,7 @@ fn formats() -> Vec<PossibleValue> {
         contents.entry(export.format).or_default().push(export.contents);
     }
     let format = |(format, contents): (_, Vec<&str>)| {
-        let contents = print::listed(&contents, "or");
+        let contents = listed(&contents, "or");
         PossibleValue::new(format).help(format!("From a model: its {contents}, as .{format}"))
     };
     let nerfstudio = PossibleValue::new(NERFSTUDIO).help(
@@ -103,7 +103,7 @@ fn describe_exports(kind: ModelKind, format: &str) -> String {
     if formats.is_empty() {
         return format!("{model} cannot be exported");
     }
-    format!("{model} cannot be exported as {format}, only as {}", print::listed(&formats, "or"))
+    format!("{model} cannot be exported as {format}, only as {}", listed(&formats, "or"))
 }
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {

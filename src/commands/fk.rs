@@ -1,9 +1,9 @@
 //! `fieldrig fk`: forward kinematics of a robot.
 
-use anyhow::{bail, ensure, Context};
 use crate::print;
-use kinematics::{transform, Chain};
+use anyhow::{Context, bail, ensure};
 use kinematics::urdf::Robot;
+use kinematics::{Chain, transform};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

@@ -1,11 +1,11 @@
 //! `fieldrig metrics`: compares two images.
 
-use anyhow::{bail, Context};
 use crate::print;
+use anyhow::{Context, bail};
 use image::DynamicImage;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use trainer::eval::{depth_rmse_m, psnr, ssim, Lpips, PixelPair};
+use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
 
 /// Environment variable with the path of the LPIPS weights; the flag takes precedence.
 const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";

@@ -1,12 +1,12 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use anyhow::{bail, Context};
-use capture::{open, Stop};
-use capture::config::Rig;
-use crate::{print, signals};
 use crate::exit::{BadArgument, Exit};
-use drivers::{clock, Error, MovableArm};
+use crate::{print, signals};
+use anyhow::{Context, bail};
+use capture::config::Rig;
+use capture::{Stop, open};
 use drivers::motion::{JointTarget, Motion, OnLoss};
+use drivers::{Error, MovableArm, clock};
 use indicatif::ProgressBar;
 use kinematics::{JointState, Stamp};
 use serde::Serialize;

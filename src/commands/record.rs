@@ -1,17 +1,16 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
-use capture::Stop;
+use super::number_in_range;
+use crate::exit::{self, BadArgument, Exit, InsufficientData};
+use crate::{print, signals};
 use capture::config::{ArmDriver, BaseDriver, Override, Rig};
 use capture::open::{self, Devices, Opened};
-use crate::{print, signals};
-use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use drivers::{Image, Sample, Source};
 use drivers::recording::Recording;
+use drivers::{Image, Sample, Source};
 use kinematics::Stamp;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use super::number_in_range;
 
 /// Flags of `record`.
 #[derive(Debug, clap::Args)]

@@ -1,14 +1,15 @@
 //! `fieldrig render`: renders images of a saved model.
 
-use anyhow::Context;
-use crate::{print, signals};
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
+use crate::{print, signals};
+use anyhow::Context;
 use keyframe::counted;
 use serde::Serialize;
 use session::camera_path::{CameraPath, PathCamera};
 use session::evaluate::{covered_frac, warn_if_hardly_covered};
-use session::partial::{self, Partial};
+use session::methods;
+use session::partial::Partial;
 use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
 use std::time::Instant;

@@ -1,32 +1,37 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
-use anyhow::Context;
-use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
-use capture::config::{ArmDriver, Override, Rig};
-use capture::open::{self, Devices, Opened};
-use crate::{print, signals};
 use crate::checkpoint_args::CheckpointArgs;
-use crate::console::{print_next_commands, Console, OutputMode};
+use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
 use crate::open_gpu::open_gpu;
 use crate::training_args::TrainingArgs;
+use crate::{print, signals};
+use anyhow::Context;
+use capture::config::{ArmDriver, Override, Rig};
+use capture::open::{self, Devices, Opened};
+use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
 use drivers::Source;
-use keyframe::{counted, Keyframe, Split};
+use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
 use serde::Serialize;
-use session::{checkpoints, methods_of, recovery, AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers};
-use session::next_commands::{quoted, DataSource};
+use session::methods::{self, COUNT};
+use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
+use session::{
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
+    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session,
+    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
+};
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use trainer::{ModelKind, ModelSpec, Resumed};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::splat::{CountPolicy, SplatOptions};
+use trainer::splat::CountPolicy;
+use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -166,13 +171,13 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Err(error) = result {
         stop.request();
         if error.is_gpu_error() || error.is_gpu_unrecoverable() {
-            return Err(keep_input(live, &folders, error));
+            return Err(keep_input(live, &folders, error).into());
         }
         log::error!("training failed; saving the model so far: {error:#}");
         if let Err(error) = save(live, args, &rig, folders, &damage) {
             log::error!("{error:#}");
         }
-        return Err(error);
+        return Err(error.into());
     }
     if live.has_exhausted_input() {
         log::info!("the devices have ended and all their data is in the model");
@@ -225,7 +230,7 @@ pub(super) struct Running {
 impl Running {
     /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false` when the run is over or
     /// interrupted.
-    pub(super) fn run_time_slice(&mut self) -> anyhow::Result<bool> {
+    pub(super) fn run_time_slice(&mut self) -> session::Result<bool> {
         if self.stop.requested() || self.live.is_over() {
             return Ok(false);
         }
@@ -277,8 +282,8 @@ pub(super) fn start(
                 let method = model_spec.start(gpu.clone())?;
                 Ok(Resumed { model_spec, method, untrained: Vec::new() })
             };
-            let model_specs = method::specs(&kinds, &common, &settings)?;
-            model_specs.into_iter().map(start).collect::<anyhow::Result<_>>()?
+            let model_specs = methods::specs(&kinds, &common, &settings)?;
+            model_specs.into_iter().map(start).collect::<session::Result<_>>()?
         }
     };
     let hub = Hub::new();
@@ -358,7 +363,7 @@ pub(super) fn start(
 
 /// Closes the recording and writes the keyframe lists after a GPU failure; returns the error, extended by what was
 /// saved.
-fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
+fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
@@ -376,7 +381,7 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
         Err(error) => log::error!("{error:#}"),
     }
     let is_already_reported = recoverable.is_empty() || error.is_gpu_unrecoverable();
-    if is_already_reported { error } else { error.context(format!("the run stopped early; {recoverable}")) }
+    if is_already_reported { error } else { error.with_context(format!("the run stopped early; {recoverable}")) }
 }
 
 /// Saves the models, then reports errors of the input.
@@ -402,7 +407,7 @@ fn save(
             if n_train > 0 {
                 session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
             }
-            return Err(error);
+            return Err(error.into());
         }
     };
     // A disk that is too full for the lists may still have space for the models.
@@ -600,8 +605,8 @@ impl Args {
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
-            Some(recording) => open::recording(recording, Some(rig), &[]),
-            None => open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real }),
+            Some(recording) => Ok(open::recording(recording, Some(rig), &[])?),
+            None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
         }
     }
 

@@ -1,26 +1,28 @@
 //! `fieldrig train`: trains models on a dataset folder or a recording.
 
-use calibration::Alignment;
-use capture::{StationReport, Stop};
-use capture::config::{Override, Rig};
-use crate::{print, signals};
 use crate::checkpoint_args::CheckpointArgs;
-use crate::console::{print_next_commands, Console, OutputMode, ReadBar};
+use crate::console::{Console, OutputMode, ReadBar, print_next_commands};
 use crate::data_args::DataArgs;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use crate::training_args::TrainingArgs;
-use keyframe::{counted, Keyframe, Split};
+use crate::{print, signals};
+use calibration::Alignment;
+use capture::StationReport;
+use capture::config::{Override, Rig};
+use keyframe::{Keyframe, Split, counted};
 use serde::Serialize;
-use session::{checkpoints, corrected_rig, recoveries, recovery, Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, Limits, Purpose, REALIGN, Recovery, Replay, RunDescription, RunFlags, Session, Settings};
 use session::depth_from::{self, DepthSource, RenderedDepth};
-use session::next_commands::{quoted, DataSource};
+use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
+use session::{
+    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, Limits, Purpose, REALIGN, Recovery,
+    Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, recoveries, recovery,
+};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use trainer::{ModelKind, ModelSpec, Resumed};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
 use trainer::{ModelKind, ModelSpec, Resumed};
@@ -327,7 +329,9 @@ impl Args {
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
-            None => session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?,
+            None => {
+                session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?
+            }
         };
         let start = |model_spec: ModelSpec| {
             let method = model_spec.start(gpu.clone())?;
@@ -383,7 +387,7 @@ impl Args {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()
             || self.replay_decisions.is_some()
-            || !self.images.flags().is_empty();
+            || !self.images.options().flags().is_empty();
         let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::check_no_model(folder).is_err());
         checkpoint.is_finished && !asks_for_more && has_model()
     }

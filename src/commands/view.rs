@@ -1,17 +1,16 @@
 //! `fieldrig view`: serves saved models on the web page.
 
-use capture::Stop;
-use crate::{print, signals};
+use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
+use crate::{print, signals};
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
-use serde_json::{json, Value};
-use session::{camera_list, run_folder, scene_hint, ModelViewer, ServedModel};
+use serde_json::{Value, json};
+use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use super::run::{address, notes};
-use trainer::{Bounds, LoadedModel, Progress};
+use trainer::{Bounds, LoadedModel, ModelKind, Progress};
 use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 /// Flags of `view`.
@@ -207,8 +206,8 @@ fn model_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStat
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Point3;
     use super::*;
+    use nalgebra::Point3;
 
     #[test]
     fn up_axis_is_up_on_the_page() {

@@ -25,7 +25,6 @@ use std::net::SocketAddr;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use trainer::ModelKind;
 
 /// Range of `max_splats`, as a key and as a flag.
 pub const MAX_SPLATS_RANGE: RangeInclusive<u64> = 1..=100_000_000;

@@ -15,7 +15,6 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use toml::{Table, Value};
-use trainer::ModelKind;
 
 pub(super) const ARM_DRIVERS: [(&str, ArmDriver); 5] = [
     ("none", ArmDriver::None),

@@ -11,7 +11,6 @@ use super::{
 use drivers::tags::TagPlacement;
 use kinematics::{Intrinsics, Lens, Transform};
 use toml::{Table, Value};
-use trainer::ModelKind;
 
 pub(super) fn rig(rig: &Rig) -> String {
     let cameras =

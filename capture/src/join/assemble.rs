@@ -1,9 +1,9 @@
 //! Converts device images to the arrays of a keyframe: decoded, undistorted, depth in meters.
 
 use super::motion::CameraPose;
+use crate::Error;
 use crate::config;
 use crate::downscale;
-use crate::Error;
 use crate::error::Context;
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};

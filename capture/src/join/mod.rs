@@ -21,10 +21,10 @@ pub use change::Change;
 pub use motion::{CameraPose, Motion};
 pub use rejection::{Counts, Rejection, SampleUse};
 
-use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use crate::Error;
-use accept::Acceptance;
+use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use crate::error::Context;
+use accept::Acceptance;
 use assemble::Undistorter;
 use drivers::{Image, Sample, TruthImage};
 use keyframe::{Keyframe, KeyframeList, RangePoints, Split};

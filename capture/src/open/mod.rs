@@ -13,7 +13,7 @@ pub use real::franka_chain;
 pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use crate::error::{Context, Error, bail, chain};
+use crate::error::{Context, Error, bail};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::{Live, Sample, Source};
 use kinematics::Chain;
@@ -68,7 +68,7 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
     if devices == Devices::Sim {
         check_intrinsics(&rig)?;
     }
-    let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{}; {SIM_HINT}", chain(&error))))?;
+    let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")))?;
     let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
     let source = match rig.base.driver {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),

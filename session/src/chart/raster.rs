@@ -1,10 +1,10 @@
 //! Draws a drawing as a PNG image. The bitmap font is part of the program, so no system fonts are needed.
 
-use crate::error::Context;
-use image::{ExtendedColorType, ImageEncoder};
-use image::codecs::png::PngEncoder;
-use noto_sans_mono_bitmap::{get_raster, get_raster_width, FontWeight, RasterHeight};
 use super::drawing::{Anchor, Color, Drawing, TextSize, VectorShape};
+use crate::error::Context;
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder};
+use noto_sans_mono_bitmap::{FontWeight, RasterHeight, get_raster, get_raster_width};
 use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
 /// Pixels per unit of the drawing; the font heights match it.

@@ -6,11 +6,11 @@ mod pictures;
 
 pub use pictures::{Comparison, Scored, compare};
 
-use crate::{evaluation_schedule, run_folder};
-use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::chart::drawing::escaped;
+use crate::chart::{Axis, Chart, Line, Point, Scale};
 use crate::next_commands::NextCommand;
 use crate::table::Table;
+use crate::{evaluation_schedule, run_folder};
 use serde_json::{Map, Value};
 use std::fmt::Write;
 use std::path::Path;
@@ -138,7 +138,7 @@ fn data_losses(data_losses: &Value) -> String {
 
 fn commands(next: &[NextCommand]) -> String {
     let entry = |next: &NextCommand| {
-        format!("<dt>{}</dt><dd><code>{}</code></dd>\n", escaped(next.purpose), escaped(&next.command))
+        format!("<dt>{}</dt><dd><code>{}</code></dd>\n", escaped(&next.purpose), escaped(&next.command))
     };
     let entries: String = next.iter().map(entry).collect();
     if entries.is_empty() {
@@ -411,8 +411,8 @@ pub fn settings_in(folder: &Path) -> Value {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
     use super::*;
+    use serde_json::json;
 
     fn page(report: &Value) -> String {
         let next = NextCommand { purpose: "view the model", command: "fieldrig view 'a <b>'".into() };

@@ -1,8 +1,8 @@
 //! Test images next to the model's renders, small enough to embed in a page.
 
-use capture::downscale;
-use crate::evaluate;
 use crate::error::Context;
+use crate::evaluate;
+use capture::downscale;
 use image::ExtendedColorType;
 use image::codecs::jpeg::JpegEncoder;
 use keyframe::Keyframe;

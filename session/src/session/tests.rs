@@ -1,8 +1,8 @@
 //! Scoring image by image gives the same result as scoring all at once.
 
+use super::*;
 use calibration::CalibratedCamera;
 use kinematics::{Stamp, Transform};
-use super::*;
 use trainer::Error;
 use trainer::checkpoint::PendingCheckpoint;
 use trainer::gpu::GpuOptions;

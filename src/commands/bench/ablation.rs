@@ -1,16 +1,16 @@
 //! `fieldrig bench ablation`: measures the contribution of each part of the method by training without it.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::sample_std;
-use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
+use crate::bench::variant::Variant;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use kinematics::quantile::median;
 use serde::Serialize;
+use session::Table;
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::{ModelKind, ModelSpec};
 use trainer::splat::{CountPolicy, SplatOptions};
 use trainer::{MethodOptions, ModelOptions, ModelSpec};
 
@@ -218,8 +218,8 @@ fn findings(
 
 #[cfg(test)]
 mod tests {
-    use crate::bench::runs::tests::run;
     use super::*;
+    use crate::bench::runs::tests::run;
 
     #[test]
     fn gains_are_computed_per_seed() {

@@ -1,16 +1,16 @@
 //! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{db_per_doubling, extent};
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use kinematics::quantile::median;
 use serde::Serialize;
+use session::Table;
 use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use std::collections::HashSet;
 use std::path::PathBuf;
-use trainer::{ModelKind, ModelSpec};
 use trainer::splat::{CountPolicy, SplatOptions};
 use trainer::{MethodOptions, ModelSpec};
 
@@ -231,8 +231,8 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
 
 #[cfg(test)]
 mod tests {
-    use crate::bench::runs::tests::run;
     use super::*;
+    use crate::bench::runs::tests::run;
 
     #[test]
     fn gains_are_between_caps_that_were_reached() {

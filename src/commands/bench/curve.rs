@@ -1,6 +1,6 @@
 //! `fieldrig bench curve`: accuracy over time, with several seeds, compared with other trainers.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
 use crate::bench::statistics::{extent, sample_std, secs_to};
@@ -8,12 +8,11 @@ use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
 use kinematics::quantile::median;
 use serde::Serialize;
-use session::evaluation_schedule;
-use session::chart::{compact_number, Axis, Chart, Line, Point, Scale};
+use session::chart::{Axis, Chart, Line, Point, Scale, compact_number};
+use session::{Table, evaluation_schedule};
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
-use trainer::splat::SplatOptions;
 
 /// PSNR levels for which the time to reach them is reported, dB.
 const TARGET_DB: [f64; 3] = [25.0, 28.0, 30.0];

@@ -1,8 +1,8 @@
 //! `fieldrig bench field`: measures the training speed of a neural field.
 
-use anyhow::Context;
-use crate::print;
 use crate::open_gpu::open_gpu;
+use crate::print;
+use anyhow::Context;
 use serde::Serialize;
 use trainer::nerf::bench::time_steps;
 

@@ -1,13 +1,13 @@
 //! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
-use anyhow::Context;
 use crate::open_gpu::open_gpu;
+use anyhow::Context;
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
 use trainer::splat::arrays::SplatArrays;
-use trainer::splat::bench::{time_kernels, Eye, Repeats};
+use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
 /// Maximum number of splats in a rig file.

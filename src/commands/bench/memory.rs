@@ -1,16 +1,17 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
-use anyhow::Context;
-use clap::Parser;
-use crate::print;
-use crate::bench::memory::{resident_bytes, Excluded, Growth, Sample};
-use crate::bench::page::{Findings, Table};
+use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
+use crate::bench::page::Findings;
 use crate::bench::statistics::extent;
 use crate::bench::viewer::Viewer;
 use crate::commands::run::{self, Running};
 use crate::exit::{BadArgument, Exit};
+use crate::print;
+use anyhow::Context;
+use clap::Parser;
 use keyframe::counted;
-use kinematics::quantile::{quantile, Rank};
+use kinematics::quantile::{Rank, quantile};
+use session::Table;
 use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use session::run_folder::CreatedFolders;
 use std::collections::BTreeMap;

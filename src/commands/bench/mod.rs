@@ -9,8 +9,8 @@ mod memory;
 mod stability;
 mod stamps;
 
-use clap::{Parser, Subcommand};
 use crate::exit::Exit;
+use clap::{Parser, Subcommand};
 use trainer::gpu::PassTiming;
 
 /// Flags of `bench`.

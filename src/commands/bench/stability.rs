@@ -1,23 +1,22 @@
 //! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
 
-use anyhow::ensure;
 use crate::bench::disturb::Disturbance;
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{break_point, extent, Interpolation};
-use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
+use crate::bench::statistics::{Interpolation, break_point, extent};
+use crate::bench::variant::Variant;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
+use anyhow::ensure;
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
 use serde::Serialize;
-use session::Limits;
-use session::chart::{compact_number, Axis, Chart, Line, Marker, Point, Scale};
+use session::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
+use session::{Limits, Table};
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
-use trainer::ModelSpec;
-use trainer::splat::SplatOptions;
+use trainer::{ModelOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 30.0;
@@ -461,8 +460,8 @@ fn findings(
 
 #[cfg(test)]
 mod tests {
-    use crate::bench::runs::tests::run;
     use super::*;
+    use crate::bench::runs::tests::run;
 
     #[test]
     fn levels_start_undisturbed_and_clip_to_available_keyframes() {

@@ -1,12 +1,13 @@
 //! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock and a link with
 //! jitter.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::exit::{BadArgument, Exit};
-use kinematics::{ClockMap, JointHistory, JointState, Stamp};
-use kinematics::quantile::{median, quantile, Rank};
+use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
+use kinematics::{ClockMap, JointHistory, JointState, Stamp};
 use serde::Serialize;
+use session::Table;
 use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -232,8 +233,8 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
 
 #[cfg(test)]
 mod tests {
-    use clap::Parser;
     use super::*;
+    use clap::Parser;
 
     #[derive(Parser)]
     struct Flags {

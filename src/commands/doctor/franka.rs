@@ -1,6 +1,7 @@
 //! Checks of this computer and the network for a rig with a Franka arm. They do not occupy the robot's only client
 //! connection.
 
+use super::{Finding, Verdict, field};
 use capture::config::{ArmDriver, Rig};
 use capture::open::FCI_PORT;
 use std::io::ErrorKind;
@@ -8,7 +9,6 @@ use std::net::{TcpStream, ToSocketAddrs};
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
-use super::{field, Finding, Verdict};
 
 /// Franka requires a lower latency between a state and its response.
 const MAX_PING_MILLIS: f64 = 1.0;

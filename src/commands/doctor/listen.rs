@@ -1,15 +1,15 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
-use capture::{Join, JoinEvent, Rejection, Stop};
+use super::Finding;
 use capture::config::{BaseDriver, Rig};
 use capture::open::{self, Devices, Opened};
-use drivers::{clock, Sample};
+use capture::{Join, JoinEvent, Rejection, Stop};
+use drivers::{Sample, clock};
 use kinematics::Stamp;
-use kinematics::quantile::{quantile, Rank};
+use kinematics::quantile::{Rank, quantile};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
-use super::Finding;
 
 /// A device slower than this fraction of the rate in the rig file is reported.
 const MIN_RATE_FRAC: f64 = 0.95;

@@ -2,9 +2,9 @@
 
 use anyhow::Context;
 use capture::config::{Camera, CameraDriver, Rig};
-use drivers::{Image, PixelFormat};
 use drivers::realsense::Pace;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
+use drivers::{Image, PixelFormat};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

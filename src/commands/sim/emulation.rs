@@ -1,22 +1,24 @@
 //! Emulates the devices of a rig file on the wire.
 
-use anyhow::{bail, Context};
+use super::Args;
+use super::bag::CameraFiles;
+use crate::exit::{BadArgument, Exit};
+use crate::{print, signals};
+use anyhow::{Context, bail};
 use capture::Stop;
 use capture::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use capture::open::{self, Devices, FCI_PORT, Opened};
-use crate::{print, signals};
-use crate::exit::{BadArgument, Exit};
-use drivers::{can, clock, Sample};
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
+use drivers::{Sample, can, clock};
 use kinematics::{Stamp, Transform};
 use serde::Serialize;
-use sim::wire::{emulate_fci, DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock};
+use sim::wire::{
+    DatagramTargets, DeviceScript, EmulatedMotors, EmulatedSenders, JointTrack, PlaybackClock, emulate_fci,
+};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
-use super::Args;
-use super::bag::CameraFiles;
 
 /// Recording of the simulation, next to the rig file.
 const SIMULATION_FILE: &str = "script.mcap";
@@ -257,7 +259,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     };
     let address = fci_address(&rig.arm.address)?;
     let chain = open::franka_chain(rig)?;
-    Ok(RobotConfig { address, version, chain, flange_from_ee: Transform::identity(), limits })
+    Ok(RobotConfig { address, version, chain, flange_from_tool: Transform::identity(), limits })
 }
 
 /// Address at which a controller listens; it must be one of this computer.

@@ -1,7 +1,7 @@
 //! The stages of drawing and training, as lists of passes.
 
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, TrainPipelines, Ssim};
+use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 

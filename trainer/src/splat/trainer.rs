@@ -7,10 +7,10 @@ mod model_size;
 mod scoring;
 
 use super::arrays::SplatArrays;
-use super::file::IN_FOLDER;
 use super::bounds::bounds;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_params::CameraParams;
+use super::file::IN_FOLDER;
 use super::kernels::{DrawPipelines, TrainPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
@@ -191,7 +191,11 @@ impl SplatTrainer {
         Self::with_pipelines(gpu, options, train)
     }
 
-    fn with_pipelines(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>, train: TrainPipelineState) -> Result<Self, Error> {
+    fn with_pipelines(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        train: TrainPipelineState,
+    ) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let zeros = [0u8; 4 * status::LEN];
         let software = gpu.is_software();
