@@ -160,7 +160,9 @@ fn curve_bench_skips_methods_without_sufficient_data() {
             assert!(line["summary"][known].as_f64() > Some(0.0), "{known}: {line}");
         }
     }
-    assert!(lines[1]["summary"]["seconds"].as_f64() < Some(0.4), "a distance field finishes early: {}", lines[1]);
+    // A distance field is finished when each training image is fused, whatever the time limit.
+    let tsdf = &lines[1]["runs"][0];
+    assert_eq!(tsdf["end"]["step"], tsdf["settings"]["n_train"], "{tsdf}");
     assert_chart(&folder.join("c"), "curve");
     assert_chart(&folder.join("c"), "curve-size");
     let page = std::fs::read_to_string(folder.join("c/curve.html")).expect("a page");

@@ -388,7 +388,7 @@ mod tests {
         assert_eq!(names, ["keyframes", "scale"]);
         let same = DataOptions { scale: Some(0.25), ..none.clone() };
         assert_eq!(again(&same).expect("the same").flags(), first.flags());
-        let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").0;
+        let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").to_string();
         assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
         assert!(again(&DataOptions { holdout: Some("2".into()), ..none }).is_err());
     }

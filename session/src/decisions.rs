@@ -395,6 +395,7 @@ impl Decisions {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use trainer::splat::SplatOptions;
     use kinematics::Transform;
 
     fn settings(from_step: Option<u64>) -> Settings {

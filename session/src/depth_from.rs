@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn different_depth_model_is_rejected() {
-        let message = |before, now| check_same("the log", before, now).map_err(|error| error.0);
+        let message = |before, now| check_same("the log", before, now).map_err(|error| error.to_string());
         assert_eq!((message(None, None), message(Some("5ad1"), Some("5ad1"))), (Ok(()), Ok(())));
         assert!(message(None, Some("5ad1")).is_err_and(|message| message.contains("remove the flag")));
         assert!(message(Some("5ad1"), None).is_err_and(|message| message.contains("5ad1: give that model with")));

@@ -407,10 +407,10 @@ mod tests {
         assert_eq!(models_at(&requested).expect("both"), [requested.join("splat"), requested.join("tsdf")]);
         assert_eq!(models_at(&created[0]).expect("itself"), [requested.join("tsdf")]);
         std::fs::remove_file(created[0].join("model.json")).expect("file");
-        let message = expect_one_model(&requested).expect_err("two").0;
+        let message = expect_one_model(&requested).expect_err("two").to_string();
         assert!(message.contains("out/splat or ") && message.ends_with("out/tsdf"), "{message}");
         expect_one_model(&created[1]).expect("one");
-        let message = check_no_model(&requested).expect_err("one inside").0;
+        let message = check_no_model(&requested).expect_err("one inside").to_string();
         assert!(message.contains("splat/splats.ply"), "{message}");
     }
 

@@ -415,7 +415,7 @@ mod tests {
     use serde_json::json;
 
     fn page(report: &Value) -> String {
-        let next = NextCommand { purpose: "view the model", command: "fieldrig view 'a <b>'".into() };
+        let next = NextCommand { purpose: "view the model".into(), command: "fieldrig view 'a <b>'".into() };
         let page = Page {
             folder: Path::new("runs/a <b>"),
             report,

@@ -117,7 +117,7 @@ fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::
     };
     let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
     let mut session =
-        Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, Limits::default(), OutputMode::Nothing)
+        Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, Limits::default(), Box::new(()))
             .with_stop(stop);
     for ix in 0..N_TESTS {
         session.push(&test_keyframe(ix)).expect("held");
