@@ -12,8 +12,8 @@ use std::sync::Arc;
 
 fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let options = SplatOptions {
-        align: CameraRefinement::Try(vec![ParamSet { extrinsics: true, ..ParamSet::default() }]),
-        cameras: CameraRefinement::Try(vec![ParamSet { image_poses: true, ..ParamSet::default() }]),
+        align: CameraRefinement::Try(vec![ParamSet::EXTRINSICS]),
+        cameras: CameraRefinement::Try(vec![ParamSet::IMAGE_POSES]),
         max_splats: 2000,
         n_planned_steps: 120,
         coarse_steps: Some([1000, 1000]),

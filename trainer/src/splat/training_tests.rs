@@ -284,7 +284,7 @@ fn late_keyframe_resumes_growth() {
 
 /// A trainer on many images with a trial of lens parameters.
 fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
-    let cameras = CameraRefinement::Try(vec![ParamSet { lens: true, ..ParamSet::default() }]);
+    let cameras = CameraRefinement::Try(vec![ParamSet::LENS]);
     let options = SplatOptions { cameras, max_splats, n_planned_steps: 1500, ..options() };
     let mut trainer = SplatTrainer::new(gpu, options).unwrap();
     for keyframe in keyframes {
@@ -426,7 +426,7 @@ fn equirectangular_agrees_with_pinhole() {
 fn submit_length_changes_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
-    let params = ParamSet { extrinsics: true, time_offset: true, ..ParamSet::default() };
+    let params = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
     let learned = |train: fn(&mut SplatTrainer, u64)| {
         let options = SplatOptions { cameras: CameraRefinement::Always(params), ..options() };
         let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
