@@ -9,10 +9,11 @@ use anyhow::{Context, anyhow};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
 use kinematics::Stamp;
+use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 use viz::{Hub, LiveImage, LivePixels};
@@ -81,7 +82,7 @@ impl Feed {
 
     /// Number of refused images so far, by reason.
     pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
-        lock(&self.shared.refused).clone()
+        self.shared.refused.lock().clone()
     }
 
     /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
@@ -174,7 +175,7 @@ impl Pump {
                 JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
                 JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
                 JoinEvent::Refused { why, .. } => {
-                    *lock(&self.shared.refused).entry(why.name().to_owned()).or_default() += 1;
+                    *self.shared.refused.lock().entry(why.name().to_owned()).or_default() += 1;
                 }
             }
         }
@@ -250,9 +251,4 @@ impl Pump {
             now
         }
     }
-}
-
-/// Locks the mutex even if another thread panicked, because the data cannot be inconsistent.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

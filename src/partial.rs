@@ -4,10 +4,10 @@
 
 use crate::stop;
 use anyhow::Context;
+use parking_lot::Mutex;
 use signal_hook::iterator::Signals;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
@@ -36,20 +36,20 @@ impl Partial {
     /// Files that already exist belong to someone else and are not removed.
     fn register(paths: Vec<PathBuf>) -> Self {
         let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
-        in_progress().extend(paths.iter().cloned());
+        IN_PROGRESS.lock().extend(paths.iter().cloned());
         Self(paths)
     }
 
     /// Keeps the files, because they are complete.
     pub(crate) fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
-        in_progress().retain(|path| !paths.contains(path));
+        IN_PROGRESS.lock().retain(|path| !paths.contains(path));
     }
 }
 
 impl Drop for Partial {
     fn drop(&mut self) {
-        let mut in_progress = in_progress();
+        let mut in_progress = IN_PROGRESS.lock();
         for path in &self.0 {
             remove(path);
             in_progress.remove(path);
@@ -65,17 +65,13 @@ pub(crate) fn remove_on_signals() -> anyhow::Result<()> {
     let remove_all = move || {
         if let Some(signal) = signals.forever().next() {
             // Locked until the process exits, so that no new file is started.
-            let in_progress = in_progress();
+            let in_progress = IN_PROGRESS.lock();
             in_progress.iter().for_each(|path| remove(path));
             std::process::exit(SIGNAL_EXIT_BASE + signal);
         }
     };
     std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
     Ok(())
-}
-
-fn in_progress() -> MutexGuard<'static, BTreeSet<PathBuf>> {
-    IN_PROGRESS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn remove(path: &Path) {
