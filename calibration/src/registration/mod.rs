@@ -154,7 +154,7 @@ impl AlignmentScene {
 
     /// Estimates the corrections of a set of parameters, starting from those of another set.
     fn model(&self, set: ParamSet, from: &CalibrationModel) -> Option<CalibrationModel> {
-        let shared = ParamSet { image_poses: false, image_gains: false, ..set };
+        let shared = set - (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS);
         let layout = Layout::new(shared, &self.images, self.cameras.len());
         let mut fit = None;
         let mut corrections = self.restricted(&layout, &from.corrections);
