@@ -1,6 +1,7 @@
 //! Sets of calibration parameters.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::collections::BTreeMap;
 
 bitflags::bitflags! {
     /// The set of camera parameters to estimate.
@@ -12,7 +13,7 @@ bitflags::bitflags! {
     /// assert!(set.contains(ParamSet::LENS) && !set.contains(ParamSet::READOUT));
     /// assert_eq!(set.to_string(), "extrinsics, lenses");
     /// ```
-    #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+    #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
     pub struct ParamSet: u16 {
         /// Extrinsics of each camera: rotation and translation relative to its parent (hand-eye if the parent is the
         /// flange).
@@ -52,5 +53,38 @@ impl std::fmt::Display for ParamSet {
         ];
         let names: Vec<&str> = NAMES.iter().filter(|(param, _)| self.contains(*param)).map(|(_, name)| *name).collect();
         f.write_str(&if names.is_empty() { "nothing".to_owned() } else { names.join(", ") })
+    }
+}
+
+/// Written as a map from the names of all parameters, in lower case, to whether the set contains them.
+impl Serialize for ParamSet {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let all = Self::all();
+        serializer.collect_map(all.iter_names().map(|(name, param)| (name.to_lowercase(), self.contains(param))))
+    }
+}
+
+impl<'de> Deserialize<'de> for ParamSet {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let params = BTreeMap::<String, bool>::deserialize(deserializer)?;
+        let contained = params.into_iter().filter(|(_, is_contained)| *is_contained);
+        Ok(contained.filter_map(|(name, _)| Self::from_name(&name.to_uppercase())).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sets_are_maps_of_names_in_files() {
+        let set = ParamSet::TIME_OFFSET | ParamSet::IMAGE_GAINS;
+        let json = serde_json::to_string(&set).unwrap();
+        assert_eq!(
+            json,
+            r#"{"extrinsics":false,"time_offset":true,"lens":false,"image_poses":false,"image_gains":true,"joints":false,"depth_pose":false,"depth_scale":false,"readout":false}"#
+        );
+        assert_eq!(serde_json::from_str::<ParamSet>(&json).unwrap(), set);
+        assert_eq!(serde_json::from_str::<ParamSet>(r#"{"lens":true}"#).unwrap(), ParamSet::LENS);
     }
 }
