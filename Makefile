@@ -37,7 +37,7 @@ hil: cargo packages web ## Check the rig RIG=file.toml on the connected devices:
 check: check-packages deps realsense open-ends ## Check format, clippy, documentation, kernels, licenses, open ends
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets $(TEST_FEATURES) -- -D warnings
-	cargo clippy --workspace --exclude sim --all-targets -- -D warnings
+	cargo clippy --workspace --exclude sim --all-targets --no-default-features -- -D warnings
 	RUSTDOCFLAGS="-D warnings" cargo doc --workspace --no-deps $(TEST_FEATURES)
 	cargo test --workspace $(TEST_FEATURES) --lib every_kernel_is_valid
 	@cargo metadata --locked --manifest-path fuzz/Cargo.toml --format-version 1 >/dev/null || { echo "fuzz/Cargo.lock does not match fuzz/Cargo.toml; to update it, run: cargo metadata --manifest-path fuzz/Cargo.toml" >&2; exit 1; }

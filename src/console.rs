@@ -6,7 +6,7 @@ use keyframe::counted;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
 use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
-use std::sync::{Mutex, PoisonError};
+use parking_lot::Mutex;
 
 /// What is printed about a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -127,7 +127,7 @@ impl ReadBar {
 
     /// Shows the progress.
     pub(crate) fn show(&self, progress: ReadProgress) {
-        let mut current = self.bar.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut current = self.bar.lock();
         if current.as_ref().is_none_or(|(noun, _)| *noun != progress.noun) {
             clear(&mut current);
             let template = match progress.noun {
@@ -152,6 +152,6 @@ fn clear(bar: &mut Option<(&'static str, ProgressBar)>) {
 
 impl Drop for ReadBar {
     fn drop(&mut self) {
-        clear(&mut self.bar.lock().unwrap_or_else(PoisonError::into_inner));
+        clear(&mut self.bar.lock());
     }
 }

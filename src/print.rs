@@ -9,12 +9,13 @@
 use anyhow::Context;
 use console::Term;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
+use parking_lot::Mutex;
 use serde::Serialize;
 use std::fmt::Display;
 use std::io::Write;
+use std::sync::LazyLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
-use std::sync::{LazyLock, Mutex, PoisonError};
 use std::time::Duration;
 
 /// Writing to stdout failed.
@@ -100,7 +101,7 @@ struct BarTerm {
 
 impl BarTerm {
     fn draw(&self, text: &str) -> std::io::Result<()> {
-        self.buffered.lock().unwrap_or_else(PoisonError::into_inner).push_str(text);
+        self.buffered.lock().push_str(text);
         Ok(())
     }
 
@@ -147,7 +148,7 @@ impl TermLike for BarTerm {
     }
 
     fn flush(&self) -> std::io::Result<()> {
-        let buffered = std::mem::take(&mut *self.buffered.lock().unwrap_or_else(PoisonError::into_inner));
+        let buffered = std::mem::take(&mut *self.buffered.lock());
         if !buffered.is_empty() {
             let _ = WRITER.try_send(OutputChunk::Err(buffered.into_bytes())); // A lost bar is drawn again later.
         }

@@ -62,11 +62,24 @@ fn metrics_match_the_reference_values() {
     let [a, b, weights] =
         ["fox_a.png", "fox_b_noise.png", "lpips_squeeze_v0.1.safetensors"].map(|name| folder.join(name));
     let scores = json_of(&fieldrig(&["metrics", text(&a), text(&b), "--lpips-weights", text(&weights), "--json"]));
-    for (key, expected, tolerance) in
-        [("psnr", 26.664_521_996, 1e-6), ("ssim", 0.566_104_874, 1e-4), ("lpips", 0.270_175_07, 1e-4)]
-    {
+    let mut expected_scores = vec![("psnr", 26.664_521_996, 1e-6), ("ssim", 0.566_104_874, 1e-4)];
+    if cfg!(feature = "lpips") {
+        expected_scores.push(("lpips", 0.270_175_07, 1e-4));
+    }
+    for (key, expected, tolerance) in expected_scores {
         assert!((scores[key].as_f64().unwrap() - expected).abs() < tolerance, "{key}: {scores}");
     }
+}
+
+#[test]
+#[cfg(not(feature = "lpips"))]
+fn lpips_is_omitted_with_a_warning_if_not_built() {
+    let folder = tempfile::tempdir().unwrap();
+    let (a, b) = (picture(folder.path(), "a.png", 80, 6), picture(folder.path(), "b.png", 80, 0));
+    let output = fieldrig(&["metrics", text(&a), text(&b), "--lpips-weights", "weights.safetensors", "--json"]);
+    assert!(json_of(&output)["lpips"].is_null());
+    let warnings = String::from_utf8_lossy(&output.stderr);
+    assert!(warnings.contains("no LPIPS: this program was built without LPIPS (cargo feature `lpips`)"), "{warnings}");
 }
 
 #[test]

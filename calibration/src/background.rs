@@ -33,7 +33,7 @@ impl AlignmentTask {
     /// Requests alignment unless `choice` selects no parameter.
     pub fn new(choice: &CameraRefinement) -> Self {
         let is_requested = match choice {
-            CameraRefinement::Always(params) => params.any(),
+            CameraRefinement::Always(params) => !params.is_empty(),
             CameraRefinement::Try(candidates) => !candidates.is_empty(),
         };
         if is_requested { Self::Requested } else { Self::Done(None) }

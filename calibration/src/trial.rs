@@ -18,7 +18,7 @@ pub enum CameraRefinement {
 
 impl Default for CameraRefinement {
     fn default() -> Self {
-        Self::Always(ParamSet::default())
+        Self::Always(ParamSet::empty())
     }
 }
 

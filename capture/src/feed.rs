@@ -9,10 +9,11 @@ use crate::stop::Stop;
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
 use kinematics::{Stamp, Transform};
+use parking_lot::Mutex;
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -123,7 +124,7 @@ impl Feed {
 
     /// Number of rejected images so far, by reason.
     pub fn rejected(&self) -> BTreeMap<String, u64> {
-        lock(&self.shared.rejected).clone()
+        self.shared.rejected.lock().clone()
     }
 
     /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
@@ -220,7 +221,7 @@ impl Pump {
                 JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
                 JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
                 JoinEvent::Rejected { why, .. } => {
-                    *lock(&self.shared.rejected).entry(why.name().to_owned()).or_default() += 1;
+                    *self.shared.rejected.lock().entry(why.name().to_owned()).or_default() += 1;
                 }
             }
         }
@@ -296,9 +297,4 @@ impl Pump {
             now
         }
     }
-}
-
-/// Locks the mutex even if another thread panicked, because the data cannot be inconsistent.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -12,6 +12,7 @@ mod messages;
 mod pixels;
 mod recording;
 mod scratch;
+mod seeds;
 #[cfg(test)]
 mod tests;
 
@@ -24,3 +25,4 @@ pub use dataset::{nerfstudio, tum};
 pub use messages::messages;
 pub use pixels::pixels;
 pub use recording::recording;
+pub use seeds::{Seed, generated_seeds};

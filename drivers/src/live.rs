@@ -1,8 +1,9 @@
 //! Combines live devices into one source of samples. Each device has a thread and a bounded queue to the caller.
 
 use crate::{Arm, Base, Camera, Error, Image, RangeScanner, Sample, Source};
+use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -146,7 +147,7 @@ impl Live {
         let shared = Arc::clone(&self.shared);
         let thread = std::thread::Builder::new().name(device.clone()).spawn(move || {
             read(&shared);
-            shared.lock().n_running -= 1;
+            shared.state.lock().n_running -= 1;
             shared.arrived.notify_all();
         });
         self.threads.push(thread.map_err(|source| Error::Thread { device, source })?);
@@ -190,7 +191,7 @@ fn read_until_stopped(
     let mut waited = Duration::ZERO;
     loop {
         let sample = read();
-        let mut state = shared.lock();
+        let mut state = shared.state.lock();
         if state.stop {
             return;
         }
@@ -198,7 +199,7 @@ fn read_until_stopped(
             Ok(ReadOutcome::Sample(sample)) => {
                 waited = Duration::ZERO;
                 while policy.blocks_device && state.queues[device_ix].len() >= policy.capacity && !state.stop {
-                    state = shared.taken.wait(state).unwrap_or_else(PoisonError::into_inner);
+                    shared.taken.wait(&mut state);
                 }
                 state.put(device_ix, policy.capacity, sample);
                 shared.arrived.notify_all();
@@ -225,13 +226,6 @@ fn read_until_stopped(
             state.error = Some(error);
         }
         return;
-    }
-}
-
-impl Shared {
-    /// Locks the state. A poisoned lock is accepted because queues are never left half changed.
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -270,7 +264,7 @@ impl State {
 
 impl Source for Live {
     fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
-        let mut state = self.shared.lock();
+        let mut state = self.shared.state.lock();
         loop {
             if let Some(error) = state.error.take() {
                 return Err(error);
@@ -282,18 +276,18 @@ impl Source for Live {
             if state.failed || state.stop || state.n_running == 0 {
                 return Ok(None);
             }
-            state = self.shared.arrived.wait(state).unwrap_or_else(PoisonError::into_inner);
+            self.shared.arrived.wait(&mut state);
         }
     }
 
     fn n_other_samples_dropped(&self) -> u64 {
-        self.shared.lock().n_other_samples_dropped
+        self.shared.state.lock().n_other_samples_dropped
     }
 }
 
 impl Drop for Live {
     fn drop(&mut self) {
-        self.shared.lock().stop = true;
+        self.shared.state.lock().stop = true;
         self.shared.taken.notify_all();
         for thread in self.threads.drain(..) {
             // A thread that panicked has already printed its message and has stopped.
@@ -378,7 +372,7 @@ mod tests {
     fn slow_caller_gets_newest_images_and_drop_counts() {
         let mut live =
             Live::new(Devices { cameras: vec![fast_camera(101)], ..Devices::default() }).expect("threads start");
-        while live.shared.lock().n_running > 0 {
+        while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
         // Errors come first: samples that a broken device sent before are not worth waiting for.
@@ -420,7 +414,7 @@ mod tests {
         let camera = ReconnectingCamera { camera: FastCamera { intrinsics: LENS, n_images: 1, next: 0 }, n_tries: 0 };
         let devices = Devices { cameras: vec![Box::new(camera)], ..Devices::default() };
         let mut live = Live::new(devices).expect("threads start");
-        while live.shared.lock().n_running > 0 {
+        while live.shared.state.lock().n_running > 0 {
             std::thread::yield_now();
         }
         // The image comes after ten seconds of reconnecting. The error is the one after it.
@@ -476,7 +470,7 @@ mod tests {
         assert_eq!(stamps, [Stamp(1), Stamp(2), Stamp(3)]);
         let shared = Arc::clone(&live.shared);
         drop(live);
-        assert_eq!(shared.lock().n_running, 0);
+        assert_eq!(shared.state.lock().n_running, 0);
     }
 
     #[test]

@@ -210,7 +210,7 @@ macro_rules! from_other {
         }
     })* };
 }
-from_other!(image::ImageError, serde_json::Error);
+from_other!(image::ImageError, resvg::usvg::Error, serde_json::Error);
 
 /// Adds the operation that failed to an error.
 pub(crate) trait Context<T> {

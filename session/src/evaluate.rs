@@ -27,6 +27,19 @@ pub const MIN_COVERED_FRAC: f64 = 0.05;
 /// Hint for that case.
 pub const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
 
+/// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS logs a warning.
+pub(crate) fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
+    let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
+    let Some(weights) = flag.or(named.as_deref()) else { return Ok(None) };
+    match Lpips::load(weights) {
+        Err(error @ trainer::Error::LpipsNotBuilt) => {
+            log::warn!("no LPIPS: {error}");
+            Ok(None)
+        }
+        lpips => lpips.map(Some),
+    }
+}
+
 /// Computes scores of test images.
 #[derive(Clone)]
 pub struct Evaluator {
@@ -87,9 +100,7 @@ pub struct Scores {
 impl Evaluator {
     /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights, LPIPS.
     pub fn thorough(lpips_weights: Option<&Path>) -> crate::Result<Self> {
-        let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
-        let lpips = lpips_weights.or(named.as_deref()).map(Lpips::load).transpose()?;
-        Ok(Self { is_full: true, lpips: lpips.map(Arc::new) })
+        Ok(Self { is_full: true, lpips: load_lpips(lpips_weights)?.map(Arc::new) })
     }
 
     /// Computes PSNR only, with one render per image.

@@ -2,9 +2,9 @@
 //!
 //! A [`Partial`] removes its files unless they are kept, both after an error and after a signal.
 
+use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The files and folders that this process is writing.
 static IN_PROGRESS: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
@@ -31,20 +31,20 @@ impl Partial {
     /// Files that already exist belong to someone else and are not removed.
     fn register(paths: Vec<PathBuf>) -> Self {
         let paths: Vec<PathBuf> = paths.into_iter().filter(|path| !path.exists()).collect();
-        in_progress().extend(paths.iter().cloned());
+        IN_PROGRESS.lock().extend(paths.iter().cloned());
         Self(paths)
     }
 
     /// Keeps the files, because they are complete.
     pub fn keep(mut self) {
         let paths = std::mem::take(&mut self.0);
-        in_progress().retain(|path| !paths.contains(path));
+        IN_PROGRESS.lock().retain(|path| !paths.contains(path));
     }
 }
 
 impl Drop for Partial {
     fn drop(&mut self) {
-        let mut in_progress = in_progress();
+        let mut in_progress = IN_PROGRESS.lock();
         for path in &self.0 {
             remove(path);
             in_progress.remove(path);
@@ -60,13 +60,9 @@ pub struct NoNewFiles {
 
 /// Removes all partial files, before the process exits.
 pub fn remove_all() -> NoNewFiles {
-    let in_progress = in_progress();
+    let in_progress = IN_PROGRESS.lock();
     in_progress.iter().for_each(|path| remove(path));
     NoNewFiles { _in_progress: in_progress }
-}
-
-fn in_progress() -> MutexGuard<'static, BTreeSet<PathBuf>> {
-    IN_PROGRESS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn remove(path: &Path) {

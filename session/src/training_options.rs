@@ -126,7 +126,7 @@ impl TrainingOptions {
         let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
         let can_learn = |param: &Refine| {
             let set = param_set(std::slice::from_ref(param));
-            set.any() && kinds.iter().any(|kind| kind.entry().learnable.and(set) == kind.entry().learnable)
+            !set.is_empty() && kinds.iter().any(|kind| kind.entry().learnable.contains(set))
         };
         let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
         let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
@@ -166,11 +166,9 @@ impl TrainingOptions {
                 with_scene: CameraRefinement::Always(set),
             });
         }
-        let per_image_params =
-            ParamSet { image_poses: set.image_poses, image_gains: set.image_gains, ..ParamSet::default() };
         Ok(RefineSettings {
-            align: CameraRefinement::Always(ParamSet { image_gains: false, ..set }),
-            with_scene: CameraRefinement::Always(per_image_params),
+            align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
+            with_scene: CameraRefinement::Always(set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)),
         })
     }
 
@@ -211,29 +209,30 @@ fn method_names(kinds: &[ModelKind]) -> toml::Value {
 /// The requested camera parameters.
 fn param_set(requested: &[Refine]) -> ParamSet {
     let has = |param| requested.contains(&param);
-    ParamSet {
-        extrinsics: has(Refine::Extrinsics),
-        time_offset: has(Refine::TimeOffset),
-        lens: has(Refine::Lens),
-        image_poses: has(Refine::ImagePoses),
-        image_gains: has(Refine::ImageGains),
-        joints: has(Refine::Joints),
-        depth_pose: has(Refine::DepthPose),
-        depth_scale: has(Refine::DepthScale),
-        readout: has(Refine::Readout),
-    }
+    let params = [
+        (Refine::Extrinsics, ParamSet::EXTRINSICS),
+        (Refine::TimeOffset, ParamSet::TIME_OFFSET),
+        (Refine::Lens, ParamSet::LENS),
+        (Refine::ImagePoses, ParamSet::IMAGE_POSES),
+        (Refine::ImageGains, ParamSet::IMAGE_GAINS),
+        (Refine::Joints, ParamSet::JOINTS),
+        (Refine::DepthPose, ParamSet::DEPTH_POSE),
+        (Refine::DepthScale, ParamSet::DEPTH_SCALE),
+        (Refine::Readout, ParamSet::READOUT),
+    ];
+    params.into_iter().filter(|(param, _)| has(*param)).map(|(_, param)| param).collect()
 }
 
 impl AvailableData {
     /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
     fn auto_settings(self) -> RefineSettings {
-        let gains = ParamSet { image_gains: true, ..ParamSet::NONE };
-        let poses = ParamSet { image_poses: true, ..ParamSet::NONE };
+        let gains = ParamSet::IMAGE_GAINS;
+        let poses = ParamSet::IMAGE_POSES;
         let with_scene = match self {
             Self { drifts: true, .. } => vec![gains, poses],
             Self { depth: true, .. } => vec![gains],
             Self { depth: false, .. } => {
-                vec![gains, ParamSet { extrinsics: true, time_offset: true, ..ParamSet::NONE }]
+                vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET]
             }
         };
         RefineSettings {
@@ -260,10 +259,10 @@ mod tests {
 
     #[test]
     fn params_visible_in_depth_are_not_learned_with_scene() {
-        let extrinsics = ParamSet { extrinsics: true, ..ParamSet::NONE };
+        let extrinsics = ParamSet::EXTRINSICS;
         let by_depth = refining(&[Refine::Extrinsics, Refine::ImageGains], true, true).unwrap();
         assert_eq!(by_depth.align, CameraRefinement::Always(extrinsics));
-        assert_eq!(by_depth.with_scene, CameraRefinement::Always(ParamSet { image_gains: true, ..ParamSet::NONE }));
+        assert_eq!(by_depth.with_scene, CameraRefinement::Always(ParamSet::IMAGE_GAINS));
         let without = refining(&[Refine::Extrinsics], true, false).unwrap();
         assert_eq!(
             without,

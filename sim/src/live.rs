@@ -5,8 +5,9 @@ use crate::engine::{Delivery, Engine};
 use crate::rig_info::RigInfo;
 use drivers::{Arm, Base, BasePose, Camera, Devices, Image, PixelFormat, RangeScan, RangeScanner, Sample};
 use kinematics::{Intrinsics, JointState, Stamp};
+use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -39,7 +40,7 @@ pub struct LiveTruth {
 impl LiveTruth {
     /// Returns the oldest truth not taken yet, without waiting; poses first.
     pub fn take(&self) -> Option<Sample> {
-        let mut state = self.simulation.shared.lock();
+        let mut state = self.simulation.shared.state.lock();
         state.truth_poses.pop_front().or_else(|| state.truth_images.pop_front())
     }
 }
@@ -52,7 +53,7 @@ struct SimulationThread {
 
 impl Drop for SimulationThread {
     fn drop(&mut self) {
-        self.shared.lock().stop = true;
+        self.shared.state.lock().stop = true;
         if let Some(thread) = self.thread.take() {
             // A panic of the thread was reported by the panic hook.
             let _ = thread.join();
@@ -88,7 +89,7 @@ impl LiveRig {
         let names: Vec<Arc<str>> = info.cameras.iter().map(|camera| camera.name.as_str().into()).collect();
         let shared = Arc::new(SharedQueues::default());
         {
-            let mut state = shared.lock();
+            let mut state = shared.state.lock();
             state.images = vec![VecDeque::new(); names.len()];
             state.n_dropped = vec![[0; 2]; names.len()];
             state.scans = vec![VecDeque::new(); info.scanner_names.len()];
@@ -146,7 +147,7 @@ fn run_simulation(mut engine: Engine, shared: &SharedQueues, names: &DeviceNames
             Err(error) => break error.to_string(),
         }
     };
-    shared.lock().end = Some(end);
+    shared.state.lock().end = Some(end);
     shared.arrived.notify_all();
 }
 
@@ -160,14 +161,9 @@ fn stream_ix(image: &Image) -> usize {
 }
 
 impl SharedQueues {
-    /// Locks the state, even if a thread panicked while it held the lock. Queues are always consistent.
-    fn lock(&self) -> MutexGuard<'_, QueueState> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Queues a sample. Returns false once all devices are dropped.
     fn deliver(&self, (_, sample): Delivery, names: &DeviceNames) -> bool {
-        let mut state = self.lock();
+        let mut state = self.state.lock();
         match sample {
             Sample::Image(image) => {
                 if let Some(camera_ix) = names.cameras.iter().position(|name| *name == image.camera) {
@@ -200,7 +196,7 @@ impl SharedQueues {
         timeout_error: impl FnOnce() -> drivers::Error,
     ) -> Result<T, drivers::Error> {
         let until = Instant::now() + timeout;
-        let mut state = self.lock();
+        let mut state = self.state.lock();
         loop {
             if let Some(sample) = take(&mut state) {
                 return Ok(sample);
@@ -212,7 +208,7 @@ impl SharedQueues {
             if left.is_zero() {
                 return Err(timeout_error());
             }
-            state = self.arrived.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+            self.arrived.wait_for(&mut state, left);
         }
     }
 }

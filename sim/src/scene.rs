@@ -8,10 +8,11 @@ use crate::{Error, cabinet, lab, light, panda};
 use mujoco_rs::prelude::MjModel;
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use nalgebra::{Point3, Translation3};
+use parking_lot::Mutex;
 use rayon::prelude::{IntoParallelIterator, ParallelIterator};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 /// Group of the arm's geometry, so that it can be hidden.
 pub(crate) const ARM_GROUP: usize = 1;
@@ -125,7 +126,7 @@ struct SceneAssets {
 impl SceneAssets {
     fn get(scene: Scene) -> Result<Arc<Self>, Error> {
         static SCENE_ASSETS: Mutex<BTreeMap<&str, Arc<SceneAssets>>> = Mutex::new(BTreeMap::new());
-        let mut all = SCENE_ASSETS.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = SCENE_ASSETS.lock();
         if let Some(scene_assets) = all.get(scene.name()) {
             return Ok(Arc::clone(scene_assets));
         }

@@ -1,14 +1,12 @@
 //! `fieldrig metrics`: compares two images.
 
+use session::evaluate::load_lpips;
 use crate::print;
 use anyhow::{Context, bail};
 use image::DynamicImage;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use trainer::eval::{Lpips, PixelPair, depth_rmse_m, psnr, ssim};
-
-/// Environment variable with the path of the LPIPS weights; the flag takes precedence.
-const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
+use trainer::eval::{PixelPair, depth_rmse_m, psnr, ssim};
 
 /// Flags of `metrics`.
 #[derive(Debug, clap::Args)]
@@ -65,7 +63,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<()> {
         }
         (rendered, truth) => {
             let (rendered, truth) = (rendered.into_rgba8(), truth.into_rgba8());
-            color_scores(&PixelPair::new(size_px, &rendered, &truth)?, lpips_weights(&args).as_deref())?
+            color_scores(&PixelPair::new(size_px, &rendered, &truth)?, args.lpips_weights.as_deref())?
         }
     };
     if args.json { print::json(&scores) } else { Ok(print::line(scores.to_text())?) }
@@ -76,12 +74,8 @@ fn open(path: &Path) -> anyhow::Result<DynamicImage> {
     read().with_context(|| format!("cannot read the image {}", path.display()))
 }
 
-fn lpips_weights(args: &Args) -> Option<PathBuf> {
-    args.lpips_weights.clone().or_else(|| std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from))
-}
-
 fn color_scores(pair: &PixelPair<'_>, lpips_weights: Option<&Path>) -> anyhow::Result<Scores> {
-    let lpips = lpips_weights.map(|weights| Lpips::load(weights)?.distance(pair)).transpose()?;
+    let lpips = load_lpips(lpips_weights)?.map(|lpips| lpips.distance(pair)).transpose()?;
     Ok(Scores { psnr: Some(psnr(pair)?), ssim: Some(ssim(pair)?), lpips, depth_rmse_m: None })
 }
 

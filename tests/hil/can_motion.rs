@@ -11,11 +11,12 @@ use drivers::wire::can::{Frame, Id, canopen, odrive, robstride};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
 use kinematics::random::Random;
+use parking_lot::{Mutex, MutexGuard};
 use socketcan::{CanErrorFrame, CanSocket, Socket};
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -102,7 +103,7 @@ impl Motors {
                     let _ = bus.send(frame); // Errors of a link that is down are ignored, as above.
                 }
                 let state = emulated.iter().zip(&configs).zip(&commanded_rad);
-                *observed_by_thread.lock().unwrap_or_else(PoisonError::into_inner) = state
+                *observed_by_thread.lock() = state
                     .map(|((motor, config), commanded_rad)| MotorObservation {
                         state: motor.state(),
                         position_rad: joint_rad(config, motor.motion().position_rad),
@@ -119,7 +120,7 @@ impl Motors {
     }
 
     fn observed(&self) -> MutexGuard<'_, Vec<MotorObservation>> {
-        self.observed.lock().unwrap_or_else(PoisonError::into_inner)
+        self.observed.lock()
     }
 
     pub(crate) fn wait_until(&self, what: &str, condition: impl Fn(&[MotorObservation]) -> bool) {

@@ -9,12 +9,12 @@ use drivers::franka::emulated::{EmulatedRobot, JointSimulator, Joints, Limits, R
 use drivers::franka::{ArmConfig, ContactConfig, FciVersion, FrankaArm, MovableFrankaArm, N_JOINTS};
 use drivers::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::{Chain, Transform};
+use parking_lot::Mutex;
 use std::fs;
 use std::io::Write;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// If set to `demand`, the tests fail instead of being skipped on a machine that cannot run them. `.ci/run` sets it.

@@ -19,6 +19,7 @@ mod qemu;
 mod wire;
 mod wire_errors;
 
+use parking_lot::Mutex;
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -26,7 +27,6 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Mutex;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::Duration;
 
@@ -91,8 +91,7 @@ fn run_inside(extra_files: &[&str], boot: impl FnOnce() -> String) {
         let _ = writeln!(std::io::stderr(), "skipped: {reason}");
         return;
     }
-    // A poisoned lock is harmless: a failed test leaves no state behind.
-    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(|failed| failed.into_inner());
+    let _alone = ONE_AT_A_TIME.lock();
     let console = boot();
     // Bypasses the test harness, so that the report is also visible if all tests pass.
     std::io::stderr().write_all(console.as_bytes()).expect("stderr is open");

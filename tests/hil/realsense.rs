@@ -1,139 +1,23 @@
 //! Tests of RealSense cameras without hardware: files that the library records from a software device are played back
 //! through the production driver, and our depth alignment is compared with that of the library.
 
+mod realsense_scene;
+
 use drivers::align::DepthAlignment;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::realsense::{Config, Filter, Pace, RealsenseCamera, Settings, Stream};
-use drivers::{Camera, Devices, Error, Image, Live, PixelFormat, Sample, Source};
-use kinematics::{Intrinsics, Lens, Stamp, Transform};
-use nalgebra::{Translation3, UnitQuaternion, Vector3};
-use realsense_rust::config::Config as PipelineConfig;
-use realsense_rust::context::Context;
-use realsense_rust::frame::{DepthFrame, FrameEx, PixelKind};
-use realsense_rust::kind::Rs2StreamKind;
-use realsense_rust::pipeline::InactivePipeline;
-use realsense_rust::processing_blocks::align::Align;
-use std::path::{Path, PathBuf};
+use drivers::{Camera, Devices, Error, Image, Live, Sample, Source};
+use kinematics::{Intrinsics, Lens, Stamp};
+use realsense_scene::{
+    BEGIN_NANOS, DEPTH_LATER_NANOS, PERIOD_NANOS, RATE_HZ, aligned_by_library, d435i, depth_image, depth_of, image,
+    record, scene_m,
+};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Timeout for steps that are slow on a busy machine.
 const TEST_TIMEOUT: Duration = Duration::from_secs(20);
-const RATE_HZ: u16 = 30;
-/// Whole microseconds, like the camera clock. After a few hours, they exceed 32 bits.
-const BEGIN_NANOS: i64 = 11_000_000_123_000;
-const PERIOD_NANOS: i64 = 33_333_000;
-/// Color and depth have different stamps.
-const DEPTH_LATER_NANOS: i64 = 4_567_000;
 const N_IMAGES: i64 = 12;
-
-/// A D435i: depth from two infrared cameras, and a color camera next to them.
-fn d435i(color_px: [u32; 2], lens: Lens) -> EmulatedCamera {
-    let focal_px = f64::from(color_px[1]) * 1.2625;
-    EmulatedCamera {
-        name: "Intel RealSense D435I".into(),
-        serial: "817612070000".into(),
-        rate_hz: RATE_HZ,
-        intrinsics: Intrinsics {
-            size_px: color_px,
-            focal_px: [focal_px, focal_px + 0.75],
-            principal_px: [f64::from(color_px[0]) * 0.5 + 3.25, f64::from(color_px[1]) * 0.5 - 2.125],
-            lens,
-            rectified: false,
-        },
-        format: PixelFormat::Rgb8,
-        depth: Some(EmulatedDepth {
-            intrinsics: Intrinsics {
-                size_px: [640, 480],
-                focal_px: [385.375, 385.375],
-                principal_px: [321.625, 238.875],
-                lens: Lens::Pinhole,
-                rectified: false,
-            },
-            camera_from_depth: Transform::from_parts(
-                Translation3::new(0.014_8, 0.000_2, 0.000_3),
-                UnitQuaternion::from_euler_angles(0.003, -0.006, 0.002),
-            ),
-            meters_per_count: 0.001,
-        }),
-    }
-}
-
-fn depth_of(camera: &EmulatedCamera) -> &EmulatedDepth {
-    camera.depth.as_ref().expect("the camera has depth")
-}
-
-/// Depth in meters along a ray of the plane `z` = 1: a slanted wall, a floor, and a box with a slanted front.
-fn scene_m(ray: &Vector3<f64>) -> f64 {
-    // normal * point = offset
-    let planes = [(Vector3::new(0.25, 0.05, 1.0), 1.6), (Vector3::new(0.0, 1.0, 0.1), 0.7)];
-    let distance_along_ray = |(normal, offset): &(Vector3<f64>, f64)| {
-        let along = normal.dot(ray);
-        if along > 0.0 { offset / along } else { f64::INFINITY }
-    };
-    let background = planes.iter().map(distance_along_ray).fold(f64::INFINITY, f64::min);
-    let front = distance_along_ray(&(Vector3::new(-0.3, 0.2, 1.0), 0.65));
-    let hit = ray * front;
-    if hit.x.abs() < 0.12 && (hit.y - 0.03).abs() < 0.1 { front.min(background) } else { background }
-}
-
-/// Depth counts of the scene, with some holes.
-fn counts_of(depth: &EmulatedDepth) -> Vec<u16> {
-    let [width, height] = depth.intrinsics.size_px;
-    let pixels = (0..height).flat_map(|row| (0..width).map(move |column| [column, row]));
-    let count = |[column, row]: [u32; 2]| {
-        if (column * 7 + row * 13) % 97 == 0 {
-            return 0;
-        }
-        let ray = depth.intrinsics.unproject([f64::from(column) + 0.5, f64::from(row) + 0.5]).expect("a pinhole");
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "a few meters are below 65535 counts"
-        )]
-        let count = (scene_m(&ray) / depth.meters_per_count).round() as u16;
-        count
-    };
-    pixels.map(count).collect()
-}
-
-fn image(camera: &EmulatedCamera, number: i64) -> Image {
-    let [width, height] = camera.intrinsics.size_px;
-    let bytes = (0..width * height * 3).map(|ix| (i64::from(ix) * 31 + number * 7).to_le_bytes()[0]);
-    Image {
-        camera: "wrist".into(),
-        stamp: Stamp(BEGIN_NANOS + number * PERIOD_NANOS),
-        size_px: [width, height],
-        format: camera.format,
-        data: bytes.collect(),
-        exposure_secs: Some(0.0083),
-        n_skipped: 0,
-    }
-}
-
-fn depth_image(camera: &EmulatedCamera, number: i64) -> Image {
-    let depth = depth_of(camera);
-    // Each image has a different value near the corner.
-    let mut counts = counts_of(depth);
-    counts[1] = 1000 + u16::try_from(number).expect("few images");
-    Image {
-        stamp: Stamp(BEGIN_NANOS + number * PERIOD_NANOS + DEPTH_LATER_NANOS),
-        size_px: depth.intrinsics.size_px,
-        format: PixelFormat::DepthU16 { meters_per_count: depth.meters_per_count },
-        data: counts.iter().flat_map(|count| count.to_le_bytes()).collect(),
-        exposure_secs: Some(0.007_123),
-        ..image(camera, number)
-    }
-}
-
-/// Writes a file with this number of images.
-fn record(path: &Path, camera: &EmulatedCamera, n_images: i64) {
-    let mut writer = BagWriter::create(path, camera).expect("a file to write");
-    for number in 0..n_images {
-        writer.write(&image(camera, number)).expect("writing an image");
-        writer.write(&depth_image(camera, number)).expect("writing an image");
-    }
-    writer.finish().expect("completing the file");
-}
 
 fn config(path: PathBuf, camera: &EmulatedCamera, pace: Pace) -> Config {
     Config {
@@ -360,41 +244,6 @@ fn missing_streams_are_errors_and_filters_fill_holes() {
     assert_eq!(stamps(&filtered), stamps(&images));
 }
 
-/// Aligns the depth of a file to color with the library. Returns the index of each image, the counts, and the time it
-/// took.
-fn aligned_by_library(path: &Path, n_images: usize) -> Vec<(i64, Vec<u16>, Duration)> {
-    let mut config = PipelineConfig::new();
-    config.enable_device_from_file(path, true).expect("the file is valid");
-    let mut pipeline = InactivePipeline::try_from(&Context::new().expect("the library starts"))
-        .expect("a pipeline")
-        .start(Some(config))
-        .expect("the file is valid");
-    let mut align = Align::new(Rs2StreamKind::Color, 1).expect("a block");
-    let mut aligned = Vec::new();
-    while aligned.len() < n_images {
-        let frames = pipeline.wait(Some(TEST_TIMEOUT)).expect("images arrive");
-        if frames.count() < 2 {
-            continue;
-        }
-        let start_time = Instant::now();
-        align.queue(frames).expect("depth and color");
-        let frames = align.wait(TEST_TIMEOUT).expect("the library aligns the images");
-        let elapsed = start_time.elapsed();
-        for depth in frames.frames_of_type::<DepthFrame>() {
-            let count = |pixel: PixelKind<'_>| match pixel {
-                PixelKind::Z16 { depth } => *depth,
-                other => panic!("{other:?} is not depth"),
-            };
-            aligned.push((
-                i64::try_from(depth.frame_number()).expect("few images") - 1,
-                depth.iter().map(count).collect(),
-                elapsed,
-            ));
-        }
-    }
-    aligned
-}
-
 fn counts(image: &Image) -> Vec<u16> {
     image.data.as_chunks::<2>().0.iter().map(|bytes| u16::from_le_bytes(*bytes)).collect()
 }
@@ -438,42 +287,5 @@ fn alignment_matches_library_except_half_pixel() {
             );
             assert!(library.iter().filter(|count| **count > 0).count() > library.len() / 2, "the scene is not visible");
         }
-    }
-}
-
-#[test]
-#[ignore = "benchmark: prints milliseconds; run it in release mode on one core (taskset -c 0)"]
-fn alignment_is_faster_than_library() {
-    let folder = tempfile::tempdir().unwrap();
-    for color_px in [[640, 480], [1280, 720]] {
-        let camera = d435i(color_px, Lens::Pinhole);
-        let path = folder.path().join("camera.bag");
-        record(&path, &camera, N_IMAGES);
-        let mut library: Vec<_> = aligned_by_library(&path, 60).into_iter().map(|(.., elapsed)| elapsed).collect();
-        let image = depth_image(&camera, 0);
-        let align = DepthAlignment::new(
-            &depth_of(&camera).intrinsics,
-            &camera.intrinsics,
-            &depth_of(&camera).camera_from_depth,
-        );
-        let mut own: Vec<_> = (0..60)
-            .map(|_| {
-                let start_time = Instant::now();
-                std::hint::black_box(align.align(std::hint::black_box(&image)).unwrap());
-                start_time.elapsed()
-            })
-            .collect();
-        library.sort();
-        own.sort();
-        let ratio = |at: usize| library[at].as_secs_f64() / own[at].as_secs_f64();
-        eprintln!(
-            "depth 640x480 to {color_px:?}: ours: minimum {:.2?}, median {:.2?}; library: {:.2?}, {:.2?}; ratio {:.1} and {:.1}",
-            own[0],
-            own[30],
-            library[0],
-            library[30],
-            ratio(0),
-            ratio(30)
-        );
     }
 }

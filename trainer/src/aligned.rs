@@ -288,7 +288,6 @@ mod tests {
 
     /// The step at which the result is applied.
     const ALIGNMENT_STEP: u64 = 6;
-    const EXTRINSICS: ParamSet = ParamSet { extrinsics: true, ..ParamSet::NONE };
 
     fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
         TsdfModel::new(gpu.clone(), ModelOptions::default()).unwrap()
@@ -328,7 +327,8 @@ mod tests {
         let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
         let keyframes = capture(&miscalibration);
         let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
-        let mut uninterrupted = Aligned::new(model, CameraRefinement::Always(EXTRINSICS), true, 4 * ALIGNMENT_STEP);
+        let mut uninterrupted =
+            Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
         keyframes.iter().for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
         train(&mut uninterrupted, ALIGNMENT_STEP - 2);
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
@@ -396,7 +396,7 @@ mod tests {
     }
 
     fn check_training_continues<M: Restartable + 'static>(model: M) {
-        let mut model = Aligned::new(model, CameraRefinement::Always(EXTRINSICS), true, 4 * ALIGNMENT_STEP);
+        let mut model = Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
         assert!(model.is_idle());
         for keyframe in scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 2) {
             model.push(keyframe).unwrap();

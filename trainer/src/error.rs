@@ -149,7 +149,11 @@ pub enum Error {
         /// Cause.
         source: std::io::Error,
     },
+    /// LPIPS was requested from a program that was built without it.
+    #[error("this program was built without LPIPS (cargo feature `lpips`)")]
+    LpipsNotBuilt,
     /// A file is not a valid file of LPIPS weights.
+    #[cfg(feature = "lpips")]
     #[error("{path:?} does not hold LPIPS weights for SqueezeNet: {source}")]
     LpipsWeights {
         /// The file.
@@ -158,6 +162,7 @@ pub enum Error {
         source: candle_core::Error,
     },
     /// The network of LPIPS failed.
+    #[cfg(feature = "lpips")]
     #[error("LPIPS network failed")]
     LpipsNetwork(#[source] candle_core::Error),
     /// A file of splats, or a model's metadata, is invalid.

@@ -3,10 +3,11 @@
 //! All peers have loopback addresses, so viewers and idle sockets differ only in their behavior. At a limit, a new
 //! connection replaces the least active one.
 
+use parking_lot::{Mutex, MutexGuard};
 use std::collections::BTreeMap;
 use std::io;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
@@ -183,7 +184,7 @@ impl Admission {
     /// Locks the registry. It holds plain values that are valid after every statement, so it stays usable after a
     /// panic elsewhere.
     fn registry(&self) -> MutexGuard<'_, Registry> {
-        self.registry.lock().unwrap_or_else(PoisonError::into_inner)
+        self.registry.lock()
     }
 }
 
@@ -283,7 +284,7 @@ impl Connection {
 
     /// See [`Admission::registry`].
     fn state(&self) -> MutexGuard<'_, ConnectionState> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock()
     }
 }
 

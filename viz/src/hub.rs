@@ -5,8 +5,9 @@ use crate::protocol::{PictureHeader, ProjectionMessage};
 use crate::queue::{Outgoing, Queue, RenderJob};
 use crate::updates::{KeyframePose, LiveImage, RunResult, SceneHint, Status};
 use crate::view_request::ViewRequest;
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::collections::BTreeMap;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{Notify, watch};
 use trainer::{Picture, Projection, RenderRequest};
@@ -103,8 +104,9 @@ impl Hub {
     ///
     /// For callers with nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
-        let waited = self.shared.work_arrived.wait_timeout_while(self.queue(), timeout, |queue| !queue.has_work());
-        waited.unwrap_or_else(PoisonError::into_inner).0.has_work()
+        let mut queue = self.queue();
+        self.shared.work_arrived.wait_while_for(&mut queue, |queue| !queue.has_work(), timeout);
+        queue.has_work()
     }
 
     pub(crate) fn join(&self) -> (u64, Arc<Notify>) {
@@ -148,7 +150,7 @@ impl Hub {
     /// Locks the queue. It holds plain values that are valid after every statement, so it stays usable after a panic
     /// elsewhere.
     fn queue(&self) -> MutexGuard<'_, Queue> {
-        self.shared.queue.lock().unwrap_or_else(PoisonError::into_inner)
+        self.shared.queue.lock()
     }
 }
 

@@ -88,16 +88,26 @@ impl Layout {
                 })
             };
             layout.by_camera.push(CameraParamOffsets {
-                extrinsics: allocate(set.extrinsics, 6, &|part| CalibrationParam::Extrinsics(camera, part)),
-                time_offset: allocate(set.time_offset && moves, 1, &|_| CalibrationParam::TimeOffset(camera)),
-                depth_pose: allocate(set.depth_pose, 6, &|part| CalibrationParam::DepthPose(camera, part)),
-                lens: allocate(set.lens, 4, &|part| CalibrationParam::Lens(camera, part)),
-                depth_scale: allocate(set.depth_scale, 1, &|_| CalibrationParam::DepthScale(camera)),
-                readout: allocate(set.readout && has_rolling_shutter, 1, &|_| CalibrationParam::Readout(camera)),
+                extrinsics: allocate(set.contains(ParamSet::EXTRINSICS), 6, &|part| {
+                    CalibrationParam::Extrinsics(camera, part)
+                }),
+                time_offset: allocate(set.contains(ParamSet::TIME_OFFSET) && moves, 1, &|_| {
+                    CalibrationParam::TimeOffset(camera)
+                }),
+                depth_pose: allocate(set.contains(ParamSet::DEPTH_POSE), 6, &|part| {
+                    CalibrationParam::DepthPose(camera, part)
+                }),
+                lens: allocate(set.contains(ParamSet::LENS), 4, &|part| CalibrationParam::Lens(camera, part)),
+                depth_scale: allocate(set.contains(ParamSet::DEPTH_SCALE), 1, &|_| {
+                    CalibrationParam::DepthScale(camera)
+                }),
+                readout: allocate(set.contains(ParamSet::READOUT) && has_rolling_shutter, 1, &|_| {
+                    CalibrationParam::Readout(camera)
+                }),
             });
         }
         let n_joints = images.iter().map(|image| image.keyframe.joint_twists.len()).max().unwrap_or(0);
-        if set.joints && n_joints > 0 {
+        if set.contains(ParamSet::JOINTS) && n_joints > 0 {
             layout.joints = Some(layout.params.len());
             layout.params.extend((0..n_joints).map(CalibrationParam::Joint));
         }

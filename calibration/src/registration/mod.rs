@@ -66,14 +66,14 @@ struct AlignmentScene {
 /// All parameter sets that alignment can estimate, the more likely ones first.
 pub fn candidates() -> Vec<ParamSet> {
     vec![
-        ParamSet { extrinsics: true, ..ParamSet::NONE },
-        ParamSet { time_offset: true, ..ParamSet::NONE },
-        ParamSet { joints: true, ..ParamSet::NONE },
-        ParamSet { depth_pose: true, ..ParamSet::NONE },
-        ParamSet { lens: true, ..ParamSet::NONE },
-        ParamSet { depth_scale: true, ..ParamSet::NONE },
-        ParamSet { readout: true, ..ParamSet::NONE },
-        ParamSet { image_poses: true, ..ParamSet::NONE },
+        ParamSet::EXTRINSICS,
+        ParamSet::TIME_OFFSET,
+        ParamSet::JOINTS,
+        ParamSet::DEPTH_POSE,
+        ParamSet::LENS,
+        ParamSet::DEPTH_SCALE,
+        ParamSet::READOUT,
+        ParamSet::IMAGE_POSES,
     ]
 }
 
@@ -84,7 +84,7 @@ pub fn candidates() -> Vec<ParamSet> {
 pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<Alignment> {
     let scene = AlignmentScene::new(keyframes, includes_image_poses(choice))?;
     let uncorrected =
-        CalibrationModel { set: ParamSet::default(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
+        CalibrationModel { set: ParamSet::empty(), fit: None, corrections: Corrections::none(scene.cameras.len()) };
     let (mut trials, mut unobservable) = (Vec::new(), Vec::new());
     let kept = match choice {
         CameraRefinement::Always(set) => {
@@ -99,14 +99,14 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
     if let Some(fit) = &kept.fit {
         unobservable.extend(report::unobservable(&scene, fit));
     }
-    let kept = if kept.set.image_poses { scene.with_validation_poses(kept) } else { kept };
+    let kept = if kept.set.contains(ParamSet::IMAGE_POSES) { scene.with_validation_poses(kept) } else { kept };
     Some(report::alignment(&scene, &kept, trials, unobservable))
 }
 
 fn includes_image_poses(choice: &CameraRefinement) -> bool {
     match choice {
-        CameraRefinement::Always(set) => set.image_poses,
-        CameraRefinement::Try(candidates) => candidates.iter().any(|set| set.image_poses),
+        CameraRefinement::Always(set) => set.contains(ParamSet::IMAGE_POSES),
+        CameraRefinement::Try(candidates) => candidates.iter().any(|set| set.contains(ParamSet::IMAGE_POSES)),
     }
 }
 
@@ -154,7 +154,7 @@ impl AlignmentScene {
 
     /// Estimates the corrections of a set of parameters, starting from those of another set.
     fn model(&self, set: ParamSet, from: &CalibrationModel) -> Option<CalibrationModel> {
-        let shared = ParamSet { image_poses: false, image_gains: false, ..set };
+        let shared = set - (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS);
         let layout = Layout::new(shared, &self.images, self.cameras.len());
         let mut fit = None;
         let mut corrections = self.restricted(&layout, &from.corrections);
@@ -163,7 +163,7 @@ impl AlignmentScene {
             corrections = found.corrections.clone();
             fit = Some(found);
         }
-        if set.image_poses {
+        if set.contains(ParamSet::IMAGE_POSES) {
             corrections = poses::fit(&self.images, &self.all_pairs, &corrections)?;
         }
         Some(CalibrationModel { set, fit, corrections })
@@ -217,25 +217,22 @@ impl AlignmentScene {
         let mut kept_sets: Vec<ParamSet> = Vec::new();
         for candidate in candidates {
             let layout = Layout::new(*candidate, &self.images, self.cameras.len());
-            if layout.n() == 0 && !candidate.image_poses {
+            if layout.n() == 0 && !candidate.contains(ParamSet::IMAGE_POSES) {
                 continue;
             }
-            let Some(variant) = self.model(kept.set.and(*candidate), &kept) else { continue };
+            let Some(variant) = self.model(kept.set | *candidate, &kept) else { continue };
             let mut trial = self.evaluate(*candidate, &kept, &variant);
-            trial.kept &= candidate.image_poses || variant.has_significant(&layout);
+            trial.kept &= candidate.contains(ParamSet::IMAGE_POSES) || variant.has_significant(&layout);
             if trial.kept {
                 kept_sets.push(*candidate);
                 kept = variant;
-            } else if candidate.extrinsics {
+            } else if candidate.contains(ParamSet::EXTRINSICS) {
                 unobservable.extend(variant.fit.iter().flat_map(|fit| report::unobservable(self, fit)));
             }
             trials.push(trial);
         }
         for kept_set in kept_sets.clone().into_iter().rev().skip(1) {
-            let other_params = kept_sets
-                .iter()
-                .filter(|other| **other != kept_set)
-                .fold(ParamSet::default(), |set, other| set.and(*other));
+            let other_params = kept_sets.iter().copied().filter(|other| *other != kept_set).collect();
             let Some(baseline) = self.model(other_params, &kept) else { continue };
             let trial = self.evaluate(kept_set, &baseline, &kept);
             if !trial.kept {
@@ -264,7 +261,7 @@ impl AlignmentScene {
             trial.kept &= trial.n_images >= MIN_VALIDATION_IMAGES;
             trial
         };
-        match (params.image_poses, baseline.set.image_poses) {
+        match (params.contains(ParamSet::IMAGE_POSES), baseline.set.contains(ParamSet::IMAGE_POSES)) {
             (true, _) => trial(comparison.scores_with_free_poses()),
             (false, false) => trial(comparison.scores()),
             // Individual image poses hide shared errors, so a parameter is rejected only if neither comparison shows

@@ -4,7 +4,7 @@ use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::{CameraCorrection, Candidate, Trial};
+use crate::{CameraCorrection, Candidate, ParamSet, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -125,7 +125,7 @@ pub(super) fn alignment(
             estimates.extend(self::estimate(scene, kept, &fit.solution, ix, *param));
         }
     }
-    if kept.set.image_poses {
+    if kept.set.contains(ParamSet::IMAGE_POSES) {
         estimates.extend(scene.cameras.iter().enumerate().map(|(camera, name)| {
             let drift = &kept.corrections.by_camera[camera].drift;
             let rms = |parts: std::ops::Range<usize>| {
@@ -145,7 +145,7 @@ pub(super) fn alignment(
         .iter()
         .zip(&kept.corrections.by_camera)
         .map(|(name, correction)| (name.to_string(), correction.clone()));
-    let corrections = if kept.set.any() { corrections.collect() } else { BTreeMap::new() };
+    let corrections = if kept.set.is_empty() { BTreeMap::new() } else { corrections.collect() };
     Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
 }
 
@@ -301,7 +301,8 @@ impl Alignment {
 
     /// Whether individual image poses were accepted.
     pub fn has_image_poses(&self) -> bool {
-        let is_image_poses = |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.image_poses);
+        let is_image_poses =
+            |params: &Candidate| matches!(params, Candidate::Cameras(params) if params.contains(ParamSet::IMAGE_POSES));
         self.trials.iter().any(|trial| trial.kept && is_image_poses(&trial.candidate))
     }
 

@@ -265,7 +265,7 @@ impl StationScene {
         let (baseline_db, variant_db) =
             validation::scores(&self.images, &self.validation_pairs, &views, noise, validation_image_of);
         log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-        Trial::of(Candidate::Cameras(ParamSet::NONE), &baseline_db, &variant_db)
+        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db)
     }
 }
 

@@ -8,9 +8,7 @@ use kinematics::quantile::{Rank, quantile};
 use kinematics::{Transform, Twist, transform};
 use nalgebra::Vector3;
 
-fn align_given(miscalibration: &Miscalibration, change: fn(&mut ParamSet)) -> Alignment {
-    let mut set = ParamSet::default();
-    change(&mut set);
+fn align_given(miscalibration: &Miscalibration, set: ParamSet) -> Alignment {
     align(&capture(miscalibration), &CameraRefinement::Always(set)).unwrap()
 }
 
@@ -21,7 +19,7 @@ fn align_by_trials(miscalibration: &Miscalibration) -> Alignment {
 #[test]
 fn wrong_extrinsics_are_found() {
     let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
-    let alignment = align_given(&miscalibration, |set| set.extrinsics = true);
+    let alignment = align_given(&miscalibration, ParamSet::EXTRINSICS);
     let (degrees, mm) = remaining(&alignment.corrections["wrist"], &miscalibration.extrinsics);
     assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
 }
@@ -29,14 +27,14 @@ fn wrong_extrinsics_are_found() {
 #[test]
 fn wrong_time_offset_is_found() {
     let alignment =
-        align_given(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }, |set| set.time_offset = true);
+        align_given(&Miscalibration { time_offset_secs: 0.02, ..Miscalibration::none() }, ParamSet::TIME_OFFSET);
     assert!((alignment.corrections["wrist"].time_offset_secs - 0.02).abs() < 5e-4);
 }
 
 #[test]
 fn wrong_joint_offsets_are_found() {
     let miscalibration = Miscalibration { joints: [0.0, 0.009, -0.007, 0.002], ..Miscalibration::none() };
-    let alignment = align_given(&miscalibration, |set| set.joints = true);
+    let alignment = align_given(&miscalibration, ParamSet::JOINTS);
     let offsets = &alignment.corrections["wrist"].joint_offsets;
     for joint in 1..4 {
         assert!((offsets[joint] - miscalibration.joints[joint]).abs() < 5e-4, "{offsets:?}");
@@ -50,7 +48,7 @@ fn wrong_joint_offsets_are_found() {
 fn wrong_depth_pose_is_found() {
     let deviation = Transform::new(Vector3::new(0.004, -0.003, 0.002), Vector3::new(-0.006, 0.008, 0.005));
     let alignment =
-        align_given(&Miscalibration { depth_pose: deviation, ..Miscalibration::none() }, |set| set.depth_pose = true);
+        align_given(&Miscalibration { depth_pose: deviation, ..Miscalibration::none() }, ParamSet::DEPTH_POSE);
     let correction = &alignment.corrections["wrist"];
     // The input is true * deviation; the correction is applied on the left of color_from_depth.
     let base = Transform::new(Vector3::new(0.02, 0.0, 0.0), Vector3::zeros());
@@ -66,7 +64,7 @@ fn wrong_depth_pose_is_found() {
 
 #[test]
 fn wrong_lens_is_found() {
-    let alignment = align_given(&Miscalibration { focal_frac: 0.01, ..Miscalibration::none() }, |set| set.lens = true);
+    let alignment = align_given(&Miscalibration { focal_frac: 0.01, ..Miscalibration::none() }, ParamSet::LENS);
     let correction = &alignment.corrections["wrist"];
     assert!(correction.log_focal.iter().all(|log| (log.exp() * 1.01 - 1.0).abs() < 1.5e-3), "{correction:?}");
     assert!(correction.principal_offset_focals.iter().all(|translation| translation.abs() < 1.5e-3), "{correction:?}");
@@ -74,15 +72,14 @@ fn wrong_lens_is_found() {
 
 #[test]
 fn wrong_depth_scale_is_found() {
-    let alignment =
-        align_given(&Miscalibration { depth_frac: 0.01, ..Miscalibration::none() }, |set| set.depth_scale = true);
+    let alignment = align_given(&Miscalibration { depth_frac: 0.01, ..Miscalibration::none() }, ParamSet::DEPTH_SCALE);
     assert!((alignment.corrections["wrist"].log_depth_scale.exp() * 0.99 - 1.0).abs() < 1e-3);
 }
 
 #[test]
 fn wrong_readout_time_is_found() {
     let miscalibration = Miscalibration { has_rolling_shutter: true, readout_secs: 0.012, ..Miscalibration::none() };
-    let alignment = align_given(&miscalibration, |set| set.readout = true);
+    let alignment = align_given(&miscalibration, ParamSet::READOUT);
     assert!((alignment.corrections["wrist"].readout_secs - 0.012).abs() < 1.5e-3);
 }
 
@@ -102,7 +99,7 @@ fn unobservable_extrinsics_are_reported_even_if_correct() {
 fn rotation_about_one_axis_leaves_extrinsics_unobservable() {
     let miscalibration =
         Miscalibration { extrinsics: wrong_extrinsics(), azimuth_only: true, ..Miscalibration::none() };
-    let alignment = align_given(&miscalibration, |set| set.extrinsics = true);
+    let alignment = align_given(&miscalibration, ParamSet::EXTRINSICS);
     assert_eq!(alignment.unobservable.len(), 2, "{:?}", alignment.unobservable);
     assert_eq!(alignment.unobservable[0].parts.len(), 1);
     assert!(alignment.unobservable[0].parts[0].starts_with("translation of camera \"wrist\" along"));
@@ -143,7 +140,7 @@ fn reported_sigmas_match_actual_errors() {
         let miscalibration =
             Miscalibration { extrinsics: wrong_extrinsics(), seed, noise: 3.0, ..Miscalibration::none() };
         let scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
-        let layout = Layout::new(ParamSet { extrinsics: true, ..ParamSet::default() }, &scene.images, 1);
+        let layout = Layout::new(ParamSet::EXTRINSICS, &scene.images, 1);
         let fit = fit::fit(&scene.images, &scene.pairs, layout, &Corrections::none(1)).unwrap();
         let correction = &fit.corrections.by_camera[0];
         let remaining = transform::log(
@@ -161,7 +158,7 @@ fn reported_sigmas_match_actual_errors() {
 #[test]
 fn result_does_not_depend_on_thread_count() {
     let keyframes = capture(&Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() });
-    let choice = CameraRefinement::Always(ParamSet { extrinsics: true, image_poses: true, ..ParamSet::default() });
+    let choice = CameraRefinement::Always(ParamSet::EXTRINSICS | ParamSet::IMAGE_POSES);
     let with_threads = |n: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         pool.install(|| align(&keyframes, &choice)).unwrap()
@@ -185,7 +182,7 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
     let miscalibration = Miscalibration { noise: 0.0, has_rolling_shutter, ..Miscalibration::none() };
     let mut scene = AlignmentScene::new(&capture(&miscalibration), false).unwrap();
     scene.images.iter_mut().for_each(set_linear_brightness);
-    let all = candidates().into_iter().fold(ParamSet::default(), ParamSet::and);
+    let all: ParamSet = candidates().into_iter().collect();
     let layout = Layout::new(all, &scene.images, 1);
     let mut here = Corrections::none(1);
     // Joint offsets are zero: their columns are those at the measured joint positions, to first order.
@@ -270,7 +267,7 @@ fn too_few_or_depthless_keyframes_give_none() {
         Split::Test => Arc::new(Keyframe { world_from_camera: Transform::identity(), ..keyframe.as_ref().clone() }),
         Split::Train | Split::Validation => keyframe.clone(),
     };
-    let align_given = CameraRefinement::Always(ParamSet { extrinsics: true, ..ParamSet::default() });
+    let align_given = CameraRefinement::Always(ParamSet::EXTRINSICS);
     assert_eq!(
         align(&keyframes, &align_given),
         align(&keyframes.iter().map(corrupted).collect::<Vec<_>>(), &align_given)
@@ -301,7 +298,7 @@ fn drifting_image_poses_are_corrected() {
         .collect();
     let alignment = align(&keyframes, &CameraRefinement::Try(candidates())).unwrap();
     let trial = alignment.trials.last().unwrap();
-    let has_poses = matches!(trial.candidate, Candidate::Cameras(params) if params.image_poses);
+    let has_poses = matches!(trial.candidate, Candidate::Cameras(params) if params.contains(ParamSet::IMAGE_POSES));
     assert!(has_poses && trial.kept && trial.gain_db > 3.0, "{:?}", alignment.lines());
 }
 

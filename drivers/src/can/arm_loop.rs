@@ -17,9 +17,10 @@ use crate::wire::can::Frame;
 use crate::wire::can::canopen::{self, NodeState};
 use crate::{Error, clock};
 use kinematics::Stamp;
+use parking_lot::Mutex;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 /// Fraction of the motors' timeout after which we stop. We stop before the motors do, so that no motor is commanded
@@ -169,7 +170,7 @@ impl ArmLoop {
                 let accepted = generator.set_target(&target).map_err(|reason| Error::Motion { reason });
                 if accepted.is_ok() {
                     // A requester may start waiting for the end of the motion as soon as its target is accepted.
-                    *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Moving;
+                    *self.motion.lock() = Motion::Moving;
                 }
                 let _ = answer.try_send(accepted);
             }
@@ -286,7 +287,7 @@ impl ArmLoop {
                 prepared.command(generator)?;
                 prepared.send_sync(self.plan.host)?;
                 let motion_now = if generator.is_at_rest() { Motion::Holding } else { Motion::Moving };
-                *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = motion_now;
+                *self.motion.lock() = motion_now;
                 return Ok(());
             }
         }
@@ -295,7 +296,7 @@ impl ArmLoop {
             std::mem::replace(&mut self.arm_state, ArmState::stopped(now, None))
         {
             self.arm_state = ArmState::Moving { generator };
-            *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Holding;
+            *self.motion.lock() = Motion::Holding;
             log::info!("the arm is enabled and holds its position");
             let _ = reply.try_send(Ok(()));
         }
@@ -366,7 +367,7 @@ impl ArmLoop {
         log::warn!("the arm stopped: {reason}");
         let stopped = ArmState::Stopped { since: clock::now(), reason: reason.to_owned(), pending_fail_safe };
         let before = std::mem::replace(&mut self.arm_state, stopped);
-        *self.motion.lock().unwrap_or_else(PoisonError::into_inner) = Motion::Stopped { reason: reason.to_owned() };
+        *self.motion.lock() = Motion::Stopped { reason: reason.to_owned() };
         if let ArmState::Measuring { reply, .. } | ArmState::Enabling { reply, .. } = before {
             let _ = reply.try_send(Err(motion(reason.to_owned())));
         }

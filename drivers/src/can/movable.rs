@@ -11,9 +11,10 @@ use super::watchdog::WatchdogPlan;
 use crate::motion::{JointTarget, Motion, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
+use parking_lot::Mutex;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -108,7 +109,7 @@ impl MovableArm for MovableCanArm {
     }
 
     fn motion(&self) -> Motion {
-        self.motion.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.motion.lock().clone()
     }
 
     fn stop(&mut self) -> Result<(), Error> {

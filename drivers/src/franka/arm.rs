@@ -12,9 +12,10 @@ use crate::wire::datagram::{Clock, DatagramHeader};
 use crate::{Arm, Error, clock};
 use franka::{FciVersion, RobotMode, RobotState};
 use kinematics::{Chain, JointState, Stamp, Transform};
+use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
 use std::net::SocketAddr;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -123,7 +124,7 @@ impl FrankaArm {
 
     /// Statistics of the states so far.
     pub fn statistics(&self) -> StateStatistics {
-        self.shared.lock().statistics.clone()
+        self.shared.state.lock().statistics.clone()
     }
 }
 
@@ -136,7 +137,7 @@ impl Arm for FrankaArm {
     /// gravity.
     fn read(&mut self, timeout: Duration) -> Result<JointState, Error> {
         let deadline = Instant::now() + timeout;
-        let mut state = self.shared.lock();
+        let mut state = self.shared.state.lock();
         loop {
             if let Some(joints) = state.queue.pop_front() {
                 return Ok(joints);
@@ -148,14 +149,14 @@ impl Arm for FrankaArm {
             if remaining.is_zero() {
                 return Err(Error::NoJoints { waited: timeout });
             }
-            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
+            self.shared.arrived.wait_for(&mut state, remaining);
         }
     }
 }
 
 impl Drop for FrankaArm {
     fn drop(&mut self) {
-        self.shared.lock().stop = true;
+        self.shared.state.lock().stop = true;
         if let Some(thread) = self.thread.take() {
             // A thread that panicked has already printed the panic message.
             let _ = thread.join();
@@ -235,7 +236,7 @@ impl StateReader {
             if let Some(motion_loop) = &mut self.motion_loop {
                 motion_loop.handle_disconnect(&reason);
             }
-            shared.lock().error = Some(Error::Fci { address: self.address, reason });
+            shared.state.lock().error = Some(Error::Fci { address: self.address, reason });
             shared.arrived.notify_all();
         }
     }
@@ -270,7 +271,7 @@ impl StateReader {
                 }
                 continue;
             }
-            if shared.lock().stop {
+            if shared.state.lock().stop {
                 return Ok(());
             }
             network.tcp.throw_if_connection_closed().map_err(|error| error_text(&error))?;
@@ -289,7 +290,7 @@ impl StateReader {
         at: Stamp,
         newest: &mut Option<(SocketAddr, NumberedState, Stamp)>,
     ) -> bool {
-        let mut state_queue = shared.lock();
+        let mut state_queue = shared.state.lock();
         match state {
             Some((from, numbered)) => {
                 if let Some(stamp) = self.take(&mut state_queue, &numbered, at) {
@@ -348,12 +349,5 @@ impl StateReader {
             }
             _ => log::info!("arm at {address}: mode {mode:?}"),
         }
-    }
-}
-
-impl Shared {
-    /// Locks the state. A poisoned lock is used anyway, because the queue is always in a consistent state.
-    fn lock(&self) -> MutexGuard<'_, StateQueue> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

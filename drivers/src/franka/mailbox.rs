@@ -3,7 +3,7 @@
 use super::MotionStatistics;
 use crate::motion::{JointTarget, Motion};
 use franka::RobotMode;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 /// Commands to the thread, and its results.
@@ -56,9 +56,9 @@ impl Default for MotionMailbox {
 }
 
 impl MotionMailbox {
-    /// Locks the state. A poisoned lock is used anyway, because the state is always consistent.
+    /// Locks the state.
     pub(super) fn lock(&self) -> MutexGuard<'_, MailboxState> {
-        self.mailbox_state.lock().unwrap_or_else(PoisonError::into_inner)
+        self.mailbox_state.lock()
     }
 
     /// Changes the state, and wakes up all waiting callers.
@@ -80,8 +80,7 @@ impl MotionMailbox {
             if remaining.is_zero() {
                 return None;
             }
-            mailbox_state =
-                self.changed.wait_timeout(mailbox_state, remaining).unwrap_or_else(PoisonError::into_inner).0;
+            self.changed.wait_for(&mut mailbox_state, remaining);
         }
         Some(mailbox_state)
     }

@@ -8,8 +8,9 @@ use nokhwa::Camera;
 use nokhwa::utils::{
     ApiBackend, CameraFormat, CameraIndex, CameraInfo, FrameFormat, RequestedFormat, RequestedFormatType, Resolution,
 };
+use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Capacity of the queue to the caller: a quarter of a second at 30 Hz.
@@ -86,7 +87,7 @@ impl Worker {
 
     /// Returns the oldest queued event, or `None` if none came until `until`.
     pub(super) fn next(&self, until: Instant) -> Option<WorkerEvent> {
-        let mut state = self.shared.lock();
+        let mut state = self.shared.state.lock();
         loop {
             if let Some(event) = state.queue.pop_front() {
                 return Some(event);
@@ -95,27 +96,22 @@ impl Worker {
             if remaining.is_zero() {
                 return None;
             }
-            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
+            self.shared.arrived.wait_for(&mut state, remaining);
         }
     }
 }
 
 impl Drop for Worker {
     fn drop(&mut self) {
-        self.shared.lock().stop = true;
+        self.shared.state.lock().stop = true;
     }
 }
 
 impl Shared {
-    /// Locks the state. A poisoned lock is accepted because the queue is never left half changed.
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Queues an event and returns whether the caller is still listening. If the queue is full, the oldest image is
     /// dropped; the gap is detected from the stamps.
     fn send(&self, event: WorkerEvent) -> bool {
-        let mut state = self.lock();
+        let mut state = self.state.lock();
         if state.queue.len() >= MAX_WAITING {
             state.queue.pop_front();
         }

@@ -4,6 +4,7 @@
 #![expect(unsafe_code, reason = "FFI to a C library")]
 
 use super::Problem;
+use parking_lot::{Mutex, MutexGuard};
 use realsense_rust::device::Device as Info;
 use realsense_rust::frame::{DepthFrame, FrameEx, ImageFrame, InfraredFrame};
 use realsense_rust::sensor::Sensor as Options;
@@ -13,7 +14,6 @@ use std::ffi::{CStr, CString};
 use std::mem::MaybeUninit;
 use std::path::Path;
 use std::ptr::{NonNull, null_mut};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// A frame of any image stream, despite the name of the wrapper type. Its profile contains the actual kind.
@@ -54,8 +54,7 @@ static DEVICE_CREATION: Mutex<()> = Mutex::new(());
 
 /// Prevents other threads from creating devices at the same time.
 pub(super) fn device_creation_lock() -> MutexGuard<'static, ()> {
-    // The mutex protects no data here, so a poisoned lock is harmless.
-    DEVICE_CREATION.lock().unwrap_or_else(PoisonError::into_inner)
+    DEVICE_CREATION.lock()
 }
 
 impl Context {

@@ -4,8 +4,12 @@ use super::reader::DatagramReader;
 use super::receiver::ReceivedDatagram;
 use super::scanner::UdpScanner;
 use super::sequence::SequenceTracker;
-use crate::wire::datagram::{PoseDatagram, decode_joints, decode_pose};
-use kinematics::Stamp;
+use crate::RangePoint;
+use crate::wire::datagram::{
+    Clock, DatagramHeader, JointsDatagram, PoseDatagram, ScanPart, decode_joints, decode_pose, encode_joints,
+    encode_pose, encode_scan,
+};
+use kinematics::{Stamp, Transform};
 use std::cell::RefCell;
 use std::time::Duration;
 
@@ -98,38 +102,31 @@ fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
     *newest = Some(stamp);
 }
 
-#[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-    use crate::RangePoint;
-    use crate::wire::datagram::{
-        Clock, DatagramHeader, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
-    };
-    use kinematics::Transform;
-    use kinematics::random::Random;
-
-    /// Datagrams that an arm, a base and a scanner send in 30 ms.
-    pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
-        let names = ["a", "b", "c"].map(str::to_owned);
-        let mut lines = Vec::new();
-        for seq in 0..10_u32 {
-            let stamp_nanos = START_TIME.0 + i64::from(seq) * 3_000_000;
-            let header = DatagramHeader { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
-            let position = [0.0, 1.0, 2.0].map(|zero| zero + 0.01 * f64::from(seq)).to_vec();
-            let joints = JointsDatagram { header, position, velocity: vec![0.5; 3], effort: Vec::new() };
-            lines.push(encode_joints(&joints, &names));
-            let header = DatagramHeader { clock: Clock::Device, ..header };
-            let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
-            lines.push(encode_pose(&PoseDatagram { header, world_from_base, covariance: None }));
-            let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
-            let header =
-                DatagramHeader { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..header };
-            let part =
-                ScanPart { header, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
-            lines.push(encode_scan(&part));
-        }
-        lines
+/// Datagrams that an arm, a base and a scanner send in 30 ms.
+pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
+    let names = ["a", "b", "c"].map(str::to_owned);
+    let mut lines = Vec::new();
+    for seq in 0..10_u32 {
+        let stamp_nanos = START_TIME.0 + i64::from(seq) * 3_000_000;
+        let header = DatagramHeader { seq: seq.into(), clock: Clock::Monotonic, stamp_nanos };
+        let position = [0.0, 1.0, 2.0].map(|zero| zero + 0.01 * f64::from(seq)).to_vec();
+        let joints = JointsDatagram { header, position, velocity: vec![0.5; 3], effort: Vec::new() };
+        lines.push(encode_joints(&joints, &names));
+        let header = DatagramHeader { clock: Clock::Device, ..header };
+        let world_from_base = Transform::translation(0.1 * f64::from(seq), 0.0, 0.5);
+        lines.push(encode_pose(&PoseDatagram { header, world_from_base, covariance: None }));
+        let point = RangePoint { position_m: [1.0, -2.0, 0.5], ring: 3, offset_micros: 7 };
+        let header = DatagramHeader { seq: u64::from(seq / 2), stamp_nanos: i64::from(seq / 2) * 6_000_000, ..header };
+        let part = ScanPart { header, frame: "lidar".to_owned(), part: seq % 2, n_parts: 2, points: vec![point; 2] };
+        lines.push(encode_scan(&part));
     }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::random::Random;
 
     #[test]
     fn corrupted_datagrams_move_no_joint() {

@@ -2,10 +2,11 @@
 
 use crate::{Error, clock};
 use kinematics::Stamp;
+use parking_lot::{Condvar, Mutex};
 use std::collections::VecDeque;
 use std::io::ErrorKind;
 use std::net::{SocketAddr, UdpSocket};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -92,7 +93,7 @@ impl Receiver {
 
     /// Returns the oldest queued datagram, or `None` if none came until `until`.
     pub(super) fn next(&self, until: Instant) -> Result<Option<ReceivedDatagram>, Error> {
-        let mut state = self.shared.lock();
+        let mut state = self.shared.state.lock();
         if !std::mem::replace(&mut state.has_reader, true) {
             state.discard_before(clock::now() - MAX_BUFFERED_AGE);
         }
@@ -108,23 +109,18 @@ impl Receiver {
             if remaining.is_zero() {
                 return Ok(None);
             }
-            state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
+            self.shared.arrived.wait_for(&mut state, remaining);
         }
     }
 }
 
 impl Shared {
-    /// Locks the state. A poisoned lock is accepted because the queue is never left half changed.
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     fn read(&self, socket: &UdpSocket) {
         let mut buffer = vec![0; MAX_DATAGRAM_BYTES];
         loop {
             let received = socket.recv_from(&mut buffer);
             let at = clock::now();
-            let mut state = self.lock();
+            let mut state = self.state.lock();
             if state.stop {
                 return;
             }
@@ -170,7 +166,7 @@ impl State {
 
 impl Drop for Receiver {
     fn drop(&mut self) {
-        self.shared.lock().stop = true;
+        self.shared.state.lock().stop = true;
         if let Some(thread) = self.thread.take() {
             // The panic hook has already reported a panic of the thread.
             let _ = thread.join();

@@ -5,7 +5,7 @@ use std::fmt::Write;
 /// `[red, green, blue]`, sRGB.
 pub type Color = [u8; 3];
 
-/// Text sizes, for which the bitmap font has letters.
+/// Text sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TextSize {
     Normal,
@@ -13,7 +13,7 @@ pub enum TextSize {
 }
 
 impl TextSize {
-    /// Height of a line of text.
+    /// Font size.
     pub fn height(self) -> f64 {
         match self {
             Self::Normal => 12.0,

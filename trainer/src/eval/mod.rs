@@ -1,6 +1,10 @@
 //! Comparison of a rendered picture with the truth: PSNR, SSIM, LPIPS and depth error.
 
 mod depth;
+#[cfg(feature = "lpips")]
+mod lpips;
+#[cfg(not(feature = "lpips"))]
+#[path = "no_lpips.rs"]
 mod lpips;
 mod psnr;
 mod ssim;

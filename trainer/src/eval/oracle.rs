@@ -1,6 +1,8 @@
 //! Compares our metrics with independent libraries on the shared picture pairs.
 
-use super::{Lpips, PixelPair, psnr, ssim};
+#[cfg(feature = "lpips")]
+use super::Lpips;
+use super::{PixelPair, psnr, ssim};
 use serde_json::Value;
 use std::path::Path;
 
@@ -9,6 +11,7 @@ const PSNR_TOLERANCE_DB: f64 = 1e-6;
 /// Ours blurs in f32; the reference in f64 agrees to a few 1e-6.
 const SSIM_TOLERANCE: f64 = 1e-4;
 /// The order of summation through 26 convolutions in f32 differs.
+#[cfg(feature = "lpips")]
 const LPIPS_TOLERANCE: f64 = 1e-4;
 
 struct Picture {
@@ -39,6 +42,7 @@ fn agrees(what: &str, got: f64, expected: f64, tolerance: f64) -> bool {
 #[test]
 fn metrics_agree_with_the_oracle() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
+    #[cfg(feature = "lpips")]
     let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let rows = json(&folder.join("oracle_metrics.json"));
     let mut all_agree = true;
@@ -49,12 +53,16 @@ fn metrics_agree_with_the_oracle() {
         let expected = |column: &str| row[column].as_f64().unwrap();
         all_agree &= agrees(b, psnr(&pair).unwrap(), expected("psnr_skimage_255"), PSNR_TOLERANCE_DB);
         all_agree &= agrees(b, ssim(&pair).unwrap(), expected("ssim_3dgs_valid_crop5"), SSIM_TOLERANCE);
-        all_agree &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
+        #[cfg(feature = "lpips")]
+        {
+            all_agree &= agrees(b, lpips.distance(&pair).unwrap(), expected("lpips_squeeze_v0.1"), LPIPS_TOLERANCE);
+        }
     }
     assert!(all_agree, "see the values above");
     assert_eq!(rows.as_array().unwrap().len(), 3);
 }
 
+#[cfg(feature = "lpips")]
 #[test]
 fn lpips_matches_the_oracle_pair_by_pair() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
@@ -71,7 +79,6 @@ fn lpips_matches_the_oracle_pair_by_pair() {
 #[test]
 fn slightly_brighter_picture_does_not_agree() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };
-    let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
     let (a, b) = (picture(&folder, "fox_a.png"), picture(&folder, "fox_b_noise.png"));
     // One level brighter everywhere: hardly visible, but every metric must detect it.
     let brighter: Vec<u8> = b.rgba.iter().map(|&value| value.saturating_add(1)).collect();
@@ -79,10 +86,15 @@ fn slightly_brighter_picture_does_not_agree() {
     let wrong = PixelPair::new(a.size_px, &a.rgba, &brighter).unwrap();
     assert!(!agrees("psnr", psnr(&wrong).unwrap(), psnr(&right).unwrap(), PSNR_TOLERANCE_DB));
     assert!(!agrees("ssim", ssim(&wrong).unwrap(), ssim(&right).unwrap(), SSIM_TOLERANCE));
-    let (got, expected) = (lpips.distance(&wrong).unwrap(), lpips.distance(&right).unwrap());
-    assert!(!agrees("lpips", got, expected, LPIPS_TOLERANCE));
+    #[cfg(feature = "lpips")]
+    {
+        let lpips = Lpips::load(&folder.join("lpips_squeeze_v0.1.safetensors")).unwrap();
+        let (got, expected) = (lpips.distance(&wrong).unwrap(), lpips.distance(&right).unwrap());
+        assert!(!agrees("lpips", got, expected, LPIPS_TOLERANCE));
+    }
 }
 
+#[cfg(feature = "lpips")]
 #[test]
 fn lpips_ignores_masked_pixels_and_rejects_small_pictures() {
     let Some(folder) = crate::test_data::folder("metrics") else { return };

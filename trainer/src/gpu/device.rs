@@ -2,12 +2,13 @@
 
 use super::{GpuOptions, Optional};
 use crate::Error;
+use parking_lot::{Mutex, RwLock};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Range;
 use std::panic::AssertUnwindSafe;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::RecvTimeoutError;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 /// How often the device is checked while a read-back has not arrived.
@@ -48,14 +49,14 @@ struct LiveBuffers {
 impl LiveBuffers {
     /// Counts a new buffer; returns its label and the total bytes of all buffers.
     fn add(&self, label: &str, bytes: u64) -> (Arc<str>, u64) {
-        let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut by_label = self.by_label.lock();
         let key = by_label.get_key_value(label).map_or_else(|| label.into(), |(key, _)| Arc::clone(key));
         *by_label.entry(Arc::clone(&key)).or_default() += bytes;
         (key, self.bytes.fetch_add(bytes, Ordering::Relaxed) + bytes)
     }
 
     fn remove(&self, label: &str, bytes: u64) {
-        let mut by_label = self.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut by_label = self.by_label.lock();
         if let Some(label_bytes) = by_label.get_mut(label) {
             *label_bytes -= bytes;
         }
@@ -238,7 +239,7 @@ impl Gpu {
 
     /// Bytes of all live buffers by label.
     pub fn live_bytes_by_label(&self) -> BTreeMap<Arc<str>, u64> {
-        let by_label = self.live.by_label.lock().unwrap_or_else(PoisonError::into_inner);
+        let by_label = self.live.by_label.lock();
         by_label.iter().filter(|(_, bytes)| **bytes > 0).map(|(label, bytes)| (Arc::clone(label), *bytes)).collect()
     }
 
@@ -271,7 +272,7 @@ impl Gpu {
     /// Loses the device on purpose, like a driver reset; for tests of recovery.
     pub fn lose(&self) {
         // `destroy` frees memory at once, unlike a device that fails: nobody may read it, and no copy may be under way.
-        let _no_reader = self.mapped.write().unwrap_or_else(PoisonError::into_inner);
+        let _no_reader = self.mapped.write();
         let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
         self.device.destroy();
     }
@@ -388,7 +389,7 @@ impl Gpu {
     /// A read-back buffer, reused if one fits; `None` if no memory is left for it.
     fn staging(&self, bytes: u64) -> Option<wgpu::Buffer> {
         let bytes = bytes.max(4);
-        let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut idle = self.idle_staging.lock();
         let fits = |buffer: &wgpu::Buffer| (bytes..=4 * bytes).contains(&buffer.size());
         let found = idle.iter().enumerate().filter(|(_, buffer)| fits(buffer)).min_by_key(|(_, buffer)| buffer.size());
         if let Some(buffer) = found.map(|(ix, _)| ix).and_then(|ix| idle.remove(ix)) {
@@ -407,13 +408,13 @@ impl Gpu {
 
     #[cfg(test)]
     pub(super) fn n_idle_staging(&self) -> usize {
-        self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner).len()
+        self.idle_staging.lock().len()
     }
 
     /// Keeps a read-back buffer for reuse, within [`MAX_IDLE_STAGING_BYTES`]; the least recently used ones are dropped
     /// first.
     fn keep_staging(&self, buffer: wgpu::Buffer) {
-        let mut idle = self.idle_staging.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut idle = self.idle_staging.lock();
         idle.push_back(buffer);
         while idle.len() > MAX_IDLE_STAGING || idle.iter().map(wgpu::Buffer::size).sum::<u64>() > MAX_IDLE_STAGING_BYTES
         {
@@ -429,7 +430,7 @@ impl Gpu {
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), Error> {
         // wgpu panics if it notices a lost device while it waits.
-        let _mapping = self.mapped.read().unwrap_or_else(PoisonError::into_inner); // Polling maps buffers.
+        let _mapping = self.mapped.read(); // Polling maps buffers.
         let polled = std::panic::catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         match polled {
             Ok(Ok(_)) => Ok(()),
@@ -496,7 +497,7 @@ impl PendingRead {
         if !is_mapped {
             return Err(gpu.failure());
         }
-        let reading = gpu.mapped.read().unwrap_or_else(PoisonError::into_inner);
+        let reading = gpu.mapped.read();
         gpu.check()?; // Before the mapped memory is touched: a destroyed device has unmapped it.
         let view = staging.get_mapped_range(..).map_err(|_| gpu.failure())?;
         let read: Vec<&[u8]> = parts.iter().map(|part| &view[part.clone()]).collect();

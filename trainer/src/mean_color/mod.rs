@@ -26,7 +26,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[COLOR_FILE],
     single_file: None,
     needs_depth: false,
-    learnable: ParamSet::NONE,
+    learnable: ParamSet::empty(),
     exports: &[],
     default_options: default_options::<MeanColorOptions>,
     check_options: |options| options.typed::<MeanColorOptions>().map(drop),

@@ -55,7 +55,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
     let rays = synthetic_rays(nerf_budget);
     let submit = |field_trainer: &mut FieldTrainer, n_steps: usize| {
         for slot_ix in 0..n_steps {
-            field_trainer.record_step(gpu, &options, slot_ix, STEP, &rays, ParamSet::NONE)?;
+            field_trainer.record_step(gpu, &options, slot_ix, STEP, &rays, ParamSet::empty())?;
         }
         Ok::<_, crate::Error>(field_trainer.submit(gpu))
     };
@@ -88,7 +88,7 @@ pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> R
         Ok::<_, crate::Error>(timed.swap_remove(timed.len() / 2))
     };
     let (step_millis, passes) = timed(&mut field_trainer, &|field_trainer| {
-        field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::NONE)
+        field_trainer.record_step(gpu, &options, 0, STEP, &rays, ParamSet::empty())
     })?;
     let (colors_millis, _) = timed(&mut field_trainer, &|field_trainer| {
         field_trainer.record_colors(gpu);

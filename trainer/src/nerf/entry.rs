@@ -22,7 +22,7 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[FIELD_FILE],
     single_file: None,
     needs_depth: false,
-    learnable: ParamSet { image_poses: true, image_gains: true, ..ParamSet::NONE },
+    learnable: ParamSet::IMAGE_POSES.union(ParamSet::IMAGE_GAINS),
     exports: &[], // Other programs cannot read it.
     default_options: default_options::<NerfOptions>,
     check_options: |options| options.typed::<NerfOptions>().map(drop),

@@ -182,14 +182,14 @@ impl FieldTrainer {
         let image_params = images.as_ref().map_or(&field.no_image_params, |images| &images.image_params);
         let slot = &self.slots[slot_ix];
         let passes = FieldPasses { gpu, pipelines: &compiled.pipelines, field, samples, slot, image_params };
-        let images = images.as_ref().filter(|_| learned.any());
+        let images = images.as_ref().filter(|_| !learned.is_empty());
         passes.convert_weights(list);
         let first_update =
             if self.sizes.has_depth { FIRST_OCCUPANCY_UPDATE_WITH_DEPTH } else { OCCUPANCY_UPDATE_PERIOD };
         if step.is_multiple_of(OCCUPANCY_UPDATE_PERIOD) && step >= first_update {
             passes.occupancy_update(list, occupancy, moments);
         }
-        if images.is_some() && learned.image_poses {
+        if images.is_some() && learned.contains(ParamSet::IMAGE_POSES) {
             passes.apply_pose(list);
         }
         passes.count(list, occupancy);
@@ -197,10 +197,10 @@ impl FieldTrainer {
         passes.forward(list, kept);
         passes.backward(list, kept, gradients);
         if let Some(images) = images {
-            if learned.image_poses {
+            if learned.contains(ParamSet::IMAGE_POSES) {
                 passes.pose_gradients(list, kept, images);
             }
-            if learned.image_gains {
+            if learned.contains(ParamSet::IMAGE_GAINS) {
                 passes.embedding_gradients(list, kept, images);
             }
             passes.update_images(list, moments, images);
@@ -534,8 +534,11 @@ fn embedding_dim() -> u32 {
 
 /// Bit mask of the optimized parameters.
 fn learned_bits(learned: ParamSet) -> u32 {
-    let bits = |on: bool, first: usize, n: usize| if on { ((1 << n) - 1) << first } else { 0 };
-    bits(learned.image_poses, 0, EMBEDDING) | bits(learned.image_gains, EMBEDDING, EMBEDDING_DIM)
+    let bits = |params: ParamSet, first: usize, n: usize| match learned.contains(params) {
+        true => ((1 << n) - 1) << first,
+        false => 0,
+    };
+    bits(ParamSet::IMAGE_POSES, 0, EMBEDDING) | bits(ParamSet::IMAGE_GAINS, EMBEDDING, EMBEDDING_DIM)
 }
 
 /// Parameters of an occupancy update.

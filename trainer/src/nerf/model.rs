@@ -223,7 +223,7 @@ impl NerfModel {
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
         let learned_params = self.current_params();
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
-        if learned_params.any() {
+        if !learned_params.is_empty() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
         }
         self.corrections = None;

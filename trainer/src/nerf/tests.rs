@@ -272,7 +272,7 @@ fn drifting_poses_are_corrected() {
         });
         off.sum::<f64>() / given.len() as f64
     };
-    let poses = ParamSet { image_poses: true, ..ParamSet::NONE };
+    let poses = ParamSet::IMAGE_POSES;
     let options = |cameras| with_cameras(cameras, 600);
     let mut model = model_with(options(CameraRefinement::Try(vec![poses])), &drifted_keyframes);
     let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
@@ -324,7 +324,6 @@ fn drifting_poses_are_corrected() {
 /// rendered with the interpolated embedding of their neighbors in time, and others with the mean embedding.
 #[test]
 fn changing_light_is_modeled() {
-    const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
     let options = |cameras| with_cameras(cameras, 480);
     let is_validation = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
     let even: Vec<Arc<Keyframe>> = ball_on_floor(32)
@@ -343,11 +342,11 @@ fn changing_light_is_modeled() {
         Arc::new(Keyframe { rgba_srgb: rgba.into(), ..(**keyframe).clone() })
     };
     let changing: Vec<Arc<Keyframe>> = even.iter().map(lit).collect();
-    let mut unchanged = model_with(options(CameraRefinement::Try(vec![GAINS])), &even);
+    let mut unchanged = model_with(options(CameraRefinement::Try(vec![ParamSet::IMAGE_GAINS])), &even);
     train_until(&mut unchanged, 100);
     assert!(!unchanged.report()[0].kept, "{:?}", unchanged.report());
     assert_eq!(unchanged.n_total_steps().unwrap(), 100, "no steps must be discarded under constant light");
-    let mut model = model_with(options(CameraRefinement::Try(vec![GAINS])), &changing);
+    let mut model = model_with(options(CameraRefinement::Try(vec![ParamSet::IMAGE_GAINS])), &changing);
     train_until(&mut model, 75); // In the middle of the trial.
     let checkpoint = state(&mut model);
     train_until(&mut model, 200);

@@ -265,14 +265,8 @@ fn check_gradients(
     view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
     view_passes.backward(&mut passes, &fixture.train);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
-    let all = ParamSet {
-        extrinsics: true,
-        time_offset: true,
-        lens: true,
-        image_poses: true,
-        image_gains: true,
-        ..ParamSet::default()
-    };
+    let all =
+        ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS | ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS;
     let mut cameras = CameraParams::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
     let refine = TrainPipelines::camera_gradients_only(gpu).unwrap();
@@ -507,7 +501,7 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
     for options in adapter_options() {
         let fixture = KernelFixture::new(&options, &view, &arrays_of(&splats));
         let gpu = &fixture.gpu;
-        let set = ParamSet { lens: true, image_gains: true, ..ParamSet::default() };
+        let set = ParamSet::LENS | ParamSet::IMAGE_GAINS;
         let mut cameras = CameraParams::new(gpu, set).unwrap();
         let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
         cameras.write_rule(gpu, 0.0, 1.0);

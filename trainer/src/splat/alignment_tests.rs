@@ -13,8 +13,8 @@ use std::sync::Arc;
 
 fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
     let common = CommonOptions {
-        align: CameraRefinement::Try(vec![ParamSet { extrinsics: true, ..ParamSet::default() }]),
-        cameras: CameraRefinement::Try(vec![ParamSet { image_poses: true, ..ParamSet::default() }]),
+        align: CameraRefinement::Try(vec![ParamSet::EXTRINSICS]),
+        cameras: CameraRefinement::Try(vec![ParamSet::IMAGE_POSES]),
         n_planned_steps: 120,
         ..CommonOptions::default()
     };

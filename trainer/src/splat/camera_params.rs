@@ -18,14 +18,14 @@ use std::sync::Arc;
 
 /// Bits of the parameters that all images of a camera share.
 fn camera_mask(set: ParamSet) -> u32 {
-    let bits = |on: bool, bits: u32| if on { bits } else { 0 };
-    bits(set.extrinsics, 0b11_1111) | bits(set.time_offset, 1 << 6) | bits(set.lens, 0b1111 << 7)
+    let bits = |params: ParamSet, bits: u32| if set.contains(params) { bits } else { 0 };
+    bits(ParamSet::EXTRINSICS, 0b11_1111) | bits(ParamSet::TIME_OFFSET, 1 << 6) | bits(ParamSet::LENS, 0b1111 << 7)
 }
 
 /// Bits of the parameters of single images.
 fn image_mask(set: ParamSet) -> u32 {
-    let bits = |on: bool, bits: u32| if on { bits } else { 0 };
-    bits(set.image_poses, 0b11_1111) | bits(set.image_gains, 0b111 << 11)
+    let bits = |params: ParamSet, bits: u32| if set.contains(params) { bits } else { 0 };
+    bits(ParamSet::IMAGE_POSES, 0b11_1111) | bits(ParamSet::IMAGE_GAINS, 0b111 << 11)
 }
 
 /// Index of the first gain among the parameters, as in `shared/camera_params.wgsl`.
@@ -75,7 +75,7 @@ impl CameraParams {
 
     /// Adds parameters to the set that is optimized.
     pub(crate) fn enable(&mut self, more: ParamSet) {
-        self.set = self.set.and(more);
+        self.set |= more;
     }
 
     /// Uploads the lens of a keyframe; allocates slots for the parameters of its camera and of the image if they are
@@ -278,7 +278,7 @@ impl CameraParams {
             let drift = |slot: &u32| [0, 1, 2, 3, 4, 5].map(|param| value(*slot, param, image_mask(set)));
             let log_gains =
                 |slot: &u32| [LOG_GAIN, LOG_GAIN + 1, LOG_GAIN + 2].map(|param| value(*slot, param, image_mask(set)));
-            let drift: BTreeMap<i64, [f64; 6]> = if set.image_poses {
+            let drift: BTreeMap<i64, [f64; 6]> = if set.contains(ParamSet::IMAGE_POSES) {
                 slots.images.iter().map(|(stamp, slot)| (stamp.0, drift(slot))).collect()
             } else {
                 BTreeMap::new()
@@ -289,9 +289,13 @@ impl CameraParams {
                 time_offset_secs: camera_value(6),
                 log_focal: [7, 8].map(camera_value),
                 principal_offset_focals: [9, 10].map(camera_value),
-                drift_weight: if set.image_poses { drift_weight(&drift, scene_size_m) } else { 1.0 },
+                drift_weight: if set.contains(ParamSet::IMAGE_POSES) {
+                    drift_weight(&drift, scene_size_m)
+                } else {
+                    1.0
+                },
                 drift,
-                log_gains: if set.image_gains {
+                log_gains: if set.contains(ParamSet::IMAGE_GAINS) {
                     slots.images.iter().map(|(stamp, slot)| (stamp.0, log_gains(slot))).collect()
                 } else {
                     BTreeMap::new()

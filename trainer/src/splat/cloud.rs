@@ -2,9 +2,14 @@
 
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
-use candle_core::npy::NpzTensors;
 use kinematics::random::Random;
+use npyz::npz::file_name_from_array_name;
+use npyz::{NpyFile, Order};
+use std::fs::File;
+use std::io::{self, BufReader};
 use std::path::Path;
+use zip::ZipArchive;
+use zip::result::ZipError;
 
 const SH_DEGREE: u32 = 3;
 const N_COEFFICIENTS: usize = 16;
@@ -32,17 +37,17 @@ pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     splats
 }
 
-/// Reads a cloud written with numpy: `means`, `quats` (w first), `log_scales`, `opacities_logit`, `sh` (n, 16, 3),
-/// all f32.
+/// Reads a cloud written with numpy's `savez`: `means`, `quats` (w first), `log_scales`, `opacities_logit`, `sh` (n, 16,
+/// 3), all f32.
 pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
-    let read = || -> candle_core::Result<SplatArrays> {
-        let file = NpzTensors::new(path)?;
+    let read = || -> io::Result<SplatArrays> {
+        let mut file = ZipArchive::new(BufReader::new(File::open(path)?))?;
         Ok(SplatArrays {
-            means: rows(&file, "means", &[3])?,
-            log_scales: rows(&file, "log_scales", &[3])?,
-            rotations_wxyz: rows(&file, "quats", &[4])?,
-            opacity_logits: rows::<1>(&file, "opacities_logit", &[])?.concat(),
-            sh: rows(&file, "sh", &[N_COEFFICIENTS, 3])?,
+            means: rows(&mut file, "means", &[3])?,
+            log_scales: rows(&mut file, "log_scales", &[3])?,
+            rotations_wxyz: rows(&mut file, "quats", &[4])?,
+            opacity_logits: rows::<1>(&mut file, "opacities_logit", &[])?.concat(),
+            sh: rows(&mut file, "sh", &[N_COEFFICIENTS as u64, 3])?,
             sh_degree: SH_DEGREE,
         })
     };
@@ -50,19 +55,30 @@ pub fn load_cloud_npz(path: &Path) -> Result<SplatArrays, Error> {
 }
 
 /// Reads an f32 array of shape (n, `inner_shape`) as rows of `N`.
-fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) -> candle_core::Result<Vec<[f32; N]>> {
-    let array = file.get(name)?.ok_or_else(|| candle_core::Error::Msg(format!("array {name:?} is missing")))?;
-    if array.dims().split_first().is_none_or(|(_, inner)| inner != inner_shape) {
-        let message = format!("array {name:?} has shape {:?}, expected n followed by {inner_shape:?}", array.dims());
-        return Err(candle_core::Error::Msg(message));
+fn rows<const N: usize>(
+    file: &mut ZipArchive<BufReader<File>>,
+    name: &str,
+    inner_shape: &[u64],
+) -> io::Result<Vec<[f32; N]>> {
+    let member = file.by_name(&file_name_from_array_name(name)).map_err(|error| match error {
+        ZipError::FileNotFound => io::Error::other(format!("array {name:?} is missing")),
+        error => error.into(),
+    })?;
+    let array = NpyFile::new(member)?;
+    if array.shape().split_first().is_none_or(|(_, inner)| inner != inner_shape) {
+        let message = format!("array {name:?} has shape {:?}, expected n followed by {inner_shape:?}", array.shape());
+        return Err(io::Error::other(message));
     }
-    Ok(array.flatten_all()?.to_vec1::<f32>()?.as_chunks::<N>().0.to_vec())
+    if array.order() != Order::C {
+        return Err(io::Error::other(format!("array {name:?} is in Fortran order, expected C order")));
+    }
+    Ok(array.into_vec::<f32>()?.as_chunks::<N>().0.to_vec())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use candle_core::{DType, Device, Tensor};
+    use npyz::WriterBuilder;
 
     /// Mean and standard deviation.
     fn moments(values: &[f32]) -> (f64, f64) {
@@ -105,19 +121,31 @@ mod tests {
         assert_ne!(synthetic_cloud(50, 7), synthetic_cloud(50, 8));
     }
 
-    /// Writes the arrays of a cloud in numpy's format, except for `omitted`.
-    fn write_npz(path: &Path, cloud: &SplatArrays, omitted: &str) {
-        let n = cloud.n_splats();
-        let array = |values: &[f32], shape: &[usize]| Tensor::from_slice(values, shape, &Device::Cpu).unwrap();
-        let mut arrays = vec![
-            ("means", array(cloud.means.as_flattened(), &[n, 3])),
-            ("quats", array(cloud.rotations_wxyz.as_flattened(), &[n, 4])),
-            ("log_scales", array(cloud.log_scales.as_flattened(), &[n, 3])),
-            ("opacities_logit", array(&cloud.opacity_logits, &[n])),
-            ("sh", array(cloud.sh.as_flattened(), &[n, 16, 3])),
-        ];
-        arrays.retain(|(name, _)| *name != omitted);
-        Tensor::write_npz(&arrays, path).unwrap();
+    /// Writes arrays of f32 in numpy's format.
+    fn write_npz(path: &Path, arrays: &[(&str, &[f32], &[u64])]) {
+        let mut file = zip::ZipWriter::new(File::create(path).unwrap());
+        for (name, values, shape) in arrays {
+            file.start_file(file_name_from_array_name(name), zip::write::SimpleFileOptions::default()).unwrap();
+            let options = npyz::WriteOptions::new().default_dtype().shape(shape);
+            let mut array = options.writer(&mut file).begin_nd().unwrap();
+            array.extend(values.iter().copied()).unwrap();
+            array.finish().unwrap();
+        }
+        file.finish().unwrap();
+    }
+
+    /// Writes the arrays of a cloud, except for `omitted`.
+    fn write_cloud(path: &Path, cloud: &SplatArrays, omitted: &str) {
+        let n = cloud.n_splats() as u64;
+        let mut arrays: Vec<(&str, &[f32], &[u64])> = Vec::new();
+        let shapes = [vec![n, 3], vec![n, 4], vec![n], vec![n, 16, 3]];
+        arrays.push(("means", cloud.means.as_flattened(), &shapes[0]));
+        arrays.push(("quats", cloud.rotations_wxyz.as_flattened(), &shapes[1]));
+        arrays.push(("log_scales", cloud.log_scales.as_flattened(), &shapes[0]));
+        arrays.push(("opacities_logit", &cloud.opacity_logits, &shapes[2]));
+        arrays.push(("sh", cloud.sh.as_flattened(), &shapes[3]));
+        arrays.retain(|(name, ..)| *name != omitted);
+        write_npz(path, &arrays);
     }
 
     #[test]
@@ -125,11 +153,11 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("cloud.npz");
         let cloud = synthetic_cloud(9, 3);
-        write_npz(&path, &cloud, "");
+        write_cloud(&path, &cloud, "");
         assert_eq!(load_cloud_npz(&path).unwrap(), cloud);
-        write_npz(&path, &cloud, "quats");
+        write_cloud(&path, &cloud, "quats");
         assert!(load_cloud_npz(&path).unwrap_err().to_string().contains("array \"quats\" is missing"));
-        Tensor::write_npz(&[("means", Tensor::zeros((9, 4), DType::F32, &Device::Cpu).unwrap())], &path).unwrap();
+        write_npz(&path, &[("means", &[0.0; 9 * 4], &[9, 4])]);
         assert!(load_cloud_npz(&path).unwrap_err().to_string().contains("has shape [9, 4]"));
         std::fs::write(&path, b"not a zip").unwrap();
         assert!(matches!(load_cloud_npz(&path), Err(Error::SplatFile { .. })));

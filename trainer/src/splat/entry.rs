@@ -22,14 +22,11 @@ pub(crate) static ENTRY: MethodEntry = MethodEntry {
     files: &[IN_FOLDER],
     single_file: Some(SingleFile { description: "a file of splats", extensions: &["ply", "spz"] }),
     needs_depth: false,
-    learnable: ParamSet {
-        extrinsics: true,
-        time_offset: true,
-        lens: true,
-        image_poses: true,
-        image_gains: true,
-        ..ParamSet::NONE
-    },
+    learnable: ParamSet::EXTRINSICS
+        .union(ParamSet::TIME_OFFSET)
+        .union(ParamSet::LENS)
+        .union(ParamSet::IMAGE_POSES)
+        .union(ParamSet::IMAGE_GAINS),
     exports: &[
         Export { format: "spz", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_spz) },
         Export { format: "ply", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_ply) },

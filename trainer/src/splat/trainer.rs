@@ -225,7 +225,7 @@ impl SplatTrainer {
                 &gpu,
                 match &options.common.cameras {
                     CameraRefinement::Always(params) => *params,
-                    CameraRefinement::Try(_) => ParamSet::default(),
+                    CameraRefinement::Try(_) => ParamSet::empty(),
                 },
             )?,
             saved_corrections: BTreeMap::new(),
@@ -301,7 +301,7 @@ impl SplatTrainer {
         self.finish_in_flight()?;
         let displayed = self.trials.baseline().map(|snapshot| &snapshot.cameras);
         let (set, params) = displayed.map_or((self.cameras.set, &self.cameras.params), |(set, params)| (*set, params));
-        if !set.any() {
+        if set.is_empty() {
             return Ok(self.saved_corrections.clone());
         }
         self.cameras.corrections(&self.gpu, set, params, self.scene_size_m)
@@ -311,7 +311,7 @@ impl SplatTrainer {
     /// corrected.
     fn learned_corrections(&self) -> Result<CameraCorrections, Error> {
         let (set, params) = (self.cameras.set, &self.cameras.params);
-        if set.any() {
+        if !set.is_empty() {
             self.cameras.corrections(&self.gpu, set, params, self.scene_size_m)
         } else {
             Ok(CameraCorrections::new())
@@ -460,7 +460,7 @@ impl SplatTrainer {
                 self.add(&discs)?;
             }
         }
-        if self.cameras.set.any() {
+        if !self.cameras.set.is_empty() {
             for view in &mut self.views {
                 view.assign_lens(&self.gpu, &mut self.cameras)?;
             }
@@ -486,7 +486,7 @@ impl SplatTrainer {
     }
 
     fn write_rule(&self) {
-        if self.cameras.set.any() {
+        if !self.cameras.set.is_empty() {
             // The first step of a submit depends on timing. Values that are set once per submit must not depend on
             // it.
             let step = self.step - self.step % GROWTH_PERIOD;
@@ -641,7 +641,7 @@ impl SplatTrainer {
         (view_ix, level_ix): (usize, usize),
     ) -> Result<PreparedView<'_>, Error> {
         let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
-        let lens = lens.filter(|_| self.cameras.set.any());
+        let lens = lens.filter(|_| !self.cameras.set.is_empty());
         let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
             return Err(Error::DeviceLost);
         };

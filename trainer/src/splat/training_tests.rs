@@ -287,7 +287,7 @@ fn late_keyframe_resumes_growth() {
 
 /// A trainer on many images with a trial of lens parameters.
 fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
-    let cameras = CameraRefinement::Try(vec![ParamSet { lens: true, ..ParamSet::default() }]);
+    let cameras = CameraRefinement::Try(vec![ParamSet::LENS]);
     let options = options().with(|options| {
         options.common.cameras = cameras;
         options.common.n_planned_steps = 1500;
@@ -434,7 +434,7 @@ fn equirectangular_agrees_with_pinhole() {
 fn submit_length_changes_no_bit() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
-    let params = ParamSet { extrinsics: true, time_offset: true, ..ParamSet::default() };
+    let params = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
     let learned = |train: fn(&mut SplatTrainer, u64)| {
         let options = options().with(|options| options.common.cameras = CameraRefinement::Always(params));
         let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();

@@ -40,7 +40,7 @@ fn train_to(trainer: &mut SplatTrainer, n_total_steps: u64) {
 }
 
 fn lens() -> ParamSet {
-    ParamSet { lens: true, ..ParamSet::default() }
+    ParamSet::LENS
 }
 
 const N_EARLY: usize = 30;
@@ -79,7 +79,7 @@ fn assert_all_seeds_kept(trainer: &SplatTrainer, keyframes: &[Arc<Keyframe>]) {
 fn no_op_trial_scores_equal_while_keyframes_arrive() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = around(&gpu);
-    let trainer = trial_with_arrivals(&gpu, ParamSet::NONE, &keyframes);
+    let trainer = trial_with_arrivals(&gpu, ParamSet::empty(), &keyframes);
     let [Trial { gain_db, standard_error_db, n_images, kept, .. }] = trainer.trials() else {
         panic!("{:?}", trainer.trials())
     };
@@ -111,7 +111,7 @@ fn both_halves_score_the_same_images() {
     let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
     let validation: Vec<_> =
         (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Validation)).collect();
-    let mut trainer = trainer_with_candidate(&gpu, ParamSet::NONE);
+    let mut trainer = trainer_with_candidate(&gpu, ParamSet::empty());
     let (early, late) = validation.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
     // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.

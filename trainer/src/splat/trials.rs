@@ -34,7 +34,7 @@ pub(crate) const MAX_SCORED: usize = 24;
 const MIN_SPLATS: u32 = 1000;
 
 /// Per-image gains. Their effect follows from sums over pixels, so they are evaluated without training.
-const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
+const GAINS: ParamSet = ParamSet::IMAGE_GAINS;
 
 /// How the number of splats is chosen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -317,7 +317,7 @@ impl SplatTrials {
 
     pub(crate) fn begin(&mut self, candidate: Candidate, from: Snapshot, n_views: usize) {
         let n_steps = match candidate {
-            Candidate::Cameras(params) if params.image_poses || params.image_gains => {
+            Candidate::Cameras(params) if params.intersects(ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS) => {
                 (STEPS_PER_IMAGE * n_views as u64).clamp(SHARED_STEPS, MAX_STEPS)
             }
             _ => SHARED_STEPS,
@@ -470,7 +470,7 @@ mod tests {
     const HALVED: Candidate = Candidate::Halved { from: 20_000, to: 10_000 };
 
     fn poses() -> ParamSet {
-        ParamSet { image_poses: true, ..ParamSet::default() }
+        ParamSet::IMAGE_POSES
     }
 
     #[test]

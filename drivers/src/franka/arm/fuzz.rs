@@ -10,13 +10,15 @@ use std::time::Duration;
 const START_TIME: Stamp = Stamp(1_000_000_000_000);
 /// Maximum angle of any joint, rad.
 const MAX_RAD: f64 = 10.0;
+/// All versions that are read.
+pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
 /// Decodes concatenated datagrams, a millisecond apart. Each is preceded by its length in two bytes, little-endian.
 /// All are decoded in both FCI versions, as they are and padded to the length of a state.
 ///
 /// Checks that the stamps of the resulting states increase and that their positions are plausible angles.
 pub fn states(bytes: &[u8]) {
-    for version in [FciVersion::V5, FciVersion::V10] {
+    for version in VERSIONS {
         decode_positions(version, bytes);
     }
 }
@@ -52,19 +54,17 @@ pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec
     state_queue.queue.into_iter().map(|state| state.position).collect()
 }
 
+/// Encodes datagrams in the format of [`states`].
+pub(crate) fn with_length_prefixes(datagrams: &[Vec<u8>]) -> Vec<u8> {
+    let length = |datagram: &[u8]| u16::try_from(datagram.len()).expect("shorter than 64 kB").to_le_bytes();
+    datagrams.iter().flat_map(|datagram| [&length(datagram)[..], datagram].concat()).collect()
+}
+
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-    use crate::franka::emulated::fuzz::tests::state_datagrams;
+    use crate::franka::emulated::fuzz::seeds::state_datagrams;
     use kinematics::random::Random;
-
-    pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
-
-    /// Encodes datagrams in the format of [`states`].
-    pub(crate) fn with_length_prefixes(datagrams: &[Vec<u8>]) -> Vec<u8> {
-        let length = |datagram: &[u8]| u16::try_from(datagram.len()).unwrap().to_le_bytes();
-        datagrams.iter().flat_map(|datagram| [&length(datagram)[..], datagram].concat()).collect()
-    }
 
     #[test]
     fn corrupted_states_move_no_joint() {

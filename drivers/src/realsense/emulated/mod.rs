@@ -10,13 +10,13 @@ use super::{Problem, lens};
 use crate::{Image, PixelFormat, YuvLayout};
 use abi::{VideoFrame, VideoStream};
 use kinematics::{Intrinsics, Transform};
+use parking_lot::Mutex;
 use realsense_sys as sys;
 use std::collections::BTreeMap;
 use std::ffi::{CStr, CString, c_void};
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Maximum number of images that the library still has to write. We wait for it because it drops images that it cannot
@@ -348,19 +348,15 @@ static LENT_PIXELS: Mutex<LentPixels> = Mutex::new(BTreeMap::new());
 /// Number of files started so far.
 static N_FILES: AtomicU64 = AtomicU64::new(0);
 
-fn lent_pixels() -> MutexGuard<'static, LentPixels> {
-    LENT_PIXELS.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 fn lend_pixels(file: u64, bytes: &[u8]) -> *mut c_void {
     let mut copy: Box<[u8]> = bytes.into();
     let pixels = copy.as_mut_ptr();
-    lent_pixels().insert(pixels.addr(), (file, copy));
+    LENT_PIXELS.lock().insert(pixels.addr(), (file, copy));
     pixels.cast()
 }
 
 extern "C" fn reclaim_pixels(pixels: *mut c_void) {
-    lent_pixels().remove(&pixels.addr());
+    LENT_PIXELS.lock().remove(&pixels.addr());
 }
 
 /// Waits until the library holds at most this many images of a file.
@@ -373,7 +369,7 @@ fn wait_until_written(
     let started = Instant::now();
     loop {
         poll()?;
-        if lent_pixels().values().filter(|(owner, _)| *owner == file).count() <= max_pending {
+        if LENT_PIXELS.lock().values().filter(|(owner, _)| *owner == file).count() <= max_pending {
             return Ok(());
         }
         if started.elapsed() > MAX_WAIT {

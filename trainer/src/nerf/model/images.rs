@@ -71,14 +71,14 @@ enum TrialPhase {
 
 /// The subset of calibration parameters that a field can optimize.
 fn image_params_of_set(set: ParamSet) -> ParamSet {
-    ParamSet { image_poses: set.image_poses, image_gains: set.image_gains, ..ParamSet::NONE }
+    set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)
 }
 
 /// Parameters that are always optimized, without a trial.
 pub(super) fn given(choice: &CameraRefinement) -> ParamSet {
     match choice {
         CameraRefinement::Always(set) => image_params_of_set(*set),
-        CameraRefinement::Try(_) => ParamSet::NONE,
+        CameraRefinement::Try(_) => ParamSet::empty(),
     }
 }
 
@@ -86,7 +86,7 @@ impl Trials {
     pub(super) fn of(choice: &CameraRefinement) -> Self {
         let remaining = match choice {
             CameraRefinement::Try(candidates) => {
-                candidates.iter().map(|set| image_params_of_set(*set)).filter(|set| set.any()).collect()
+                candidates.iter().map(|set| image_params_of_set(*set)).filter(|set| !set.is_empty()).collect()
             }
             CameraRefinement::Always(_) => VecDeque::new(),
         };
@@ -120,7 +120,7 @@ impl NerfModel {
         if self.step >= self.options.common.n_planned_steps / POSE_START_DIVISOR {
             self.learned_params
         } else {
-            ParamSet::NONE
+            ParamSet::empty()
         }
     }
 
@@ -164,7 +164,7 @@ impl NerfModel {
                 Some(report) => self.end_trial(report),
                 None => {
                     let before = self.snapshot()?;
-                    self.learned_params = self.learned_params.and(candidate);
+                    self.learned_params |= candidate;
                     self.trials.trial_phase = TrialPhase::Variant { before };
                 }
             },
@@ -227,7 +227,7 @@ impl NerfModel {
     /// scales pictures by gains interpolated from training images, and checks whether that brings them closer to the
     /// validation images.
     fn rule_out(&mut self, candidate: ParamSet) -> Result<Option<TrialReport>, Error> {
-        if !candidate.image_gains {
+        if !candidate.contains(ParamSet::IMAGE_GAINS) {
             return Ok(None);
         }
         let (training_images, validation_images) = (self.images.clone(), self.validation_images.clone());
@@ -309,16 +309,16 @@ impl NerfModel {
         // Later images are not part of the field yet and have no parameters.
         for (image, image_params) in self.images.iter().zip(&image_params).take(self.n_hinted) {
             let correction = corrections.entry(image.keyframe.camera.to_string()).or_default();
-            if self.learned_params.image_poses {
+            if self.learned_params.contains(ParamSet::IMAGE_POSES) {
                 correction.drift.insert(image.keyframe.stamp.0, drift_of(&image.keyframe, image_params, extent));
             }
-            if self.learned_params.image_gains {
+            if self.learned_params.contains(ParamSet::IMAGE_GAINS) {
                 correction
                     .appearance_embeddings
                     .insert(image.keyframe.stamp.0, std::array::from_fn(|ix| image_params[EMBEDDING + ix]));
             }
         }
-        for correction in corrections.values_mut().filter(|_| self.learned_params.image_poses) {
+        for correction in corrections.values_mut().filter(|_| self.learned_params.contains(ParamSet::IMAGE_POSES)) {
             correction.drift_weight = drift_weight(&correction.drift, extent.radius_m);
         }
         Ok(corrections)
@@ -326,7 +326,7 @@ impl NerfModel {
 
     /// Initializes the embeddings of new images from those of images before and after them.
     pub(super) fn initialize_embeddings(&mut self) -> Result<(), Error> {
-        if !self.learned_params.image_gains || self.n_hinted == self.images.len() {
+        if !self.learned_params.contains(ParamSet::IMAGE_GAINS) || self.n_hinted == self.images.len() {
             return Ok(());
         }
         self.finish_in_flight()?;
@@ -427,8 +427,6 @@ mod tests {
     use super::*;
     use crate::test_scenes as scenes;
 
-    const POSES: ParamSet = ParamSet { image_poses: true, ..ParamSet::NONE };
-
     #[test]
     fn drift_matches_pose_correction_in_field() {
         let keyframe = scenes::ring(&[scenes::floor()], nalgebra::Point3::origin(), 3)[1].clone();
@@ -446,11 +444,14 @@ mod tests {
     #[test]
     fn only_significant_gains_are_kept() {
         let baseline = [1e-3; 6];
-        assert!(measure_gain(POSES, &baseline.map(|error| 0.8 * error), &baseline).kept);
-        assert!(!measure_gain(POSES, &baseline, &baseline).kept);
-        assert!(!measure_gain(POSES, &baseline.map(|error| 0.999 * error), &baseline).kept, "below the minimum gain");
+        assert!(measure_gain(ParamSet::IMAGE_POSES, &baseline.map(|error| 0.8 * error), &baseline).kept);
+        assert!(!measure_gain(ParamSet::IMAGE_POSES, &baseline, &baseline).kept);
+        assert!(
+            !measure_gain(ParamSet::IMAGE_POSES, &baseline.map(|error| 0.999 * error), &baseline).kept,
+            "below the minimum gain"
+        );
         let mixed = [0.5e-3, 2e-3, 0.5e-3, 2e-3, 0.5e-3, 1.2e-3];
-        assert!(!measure_gain(POSES, &mixed, &baseline).kept, "not significant");
-        assert!(!measure_gain(POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few images");
+        assert!(!measure_gain(ParamSet::IMAGE_POSES, &mixed, &baseline).kept, "not significant");
+        assert!(!measure_gain(ParamSet::IMAGE_POSES, &[0.5e-3; 3], &[1e-3; 3]).kept, "too few images");
     }
 }

@@ -40,7 +40,7 @@ impl SplatTrainer {
     fn restart(&mut self) -> Result<(), Error> {
         self.finish_in_flight()?;
         log::info!("restarting training with corrected cameras");
-        let poses = ParamSet { image_poses: true, ..ParamSet::default() };
+        let poses = ParamSet::IMAGE_POSES;
         if self.alignment_task.result().is_some_and(Alignment::has_image_poses) && self.trials.remove_candidate(poses) {
             self.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
         }

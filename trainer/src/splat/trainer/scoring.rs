@@ -278,7 +278,7 @@ mod tests {
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
 
-    const GAINS: ParamSet = ParamSet { image_gains: true, ..ParamSet::NONE };
+    const GAINS: ParamSet = ParamSet::IMAGE_GAINS;
 
     fn trained(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
         let options = options().with(|options| {
