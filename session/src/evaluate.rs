@@ -28,7 +28,7 @@ pub const MIN_COVERED_FRAC: f64 = 0.05;
 pub const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
 
 /// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS logs a warning.
-pub(crate) fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
+pub fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
     let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
     let Some(weights) = flag.or(named.as_deref()) else { return Ok(None) };
     match Lpips::load(weights) {
