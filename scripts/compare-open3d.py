@@ -2,7 +2,7 @@
 """Compares a fieldrig distance field with Open3D's VoxelBlockGrid on the same images.
 
 usage: compare-open3d.py surfaces DATA MODEL OUT_FOLDER   (MODEL: the folder of `fieldrig train DATA --method tsdf --refine none`)
-       compare-open3d.py frame                            (compare with `cargo test --release -p trainer --lib frame_of_640x480 -- --ignored --nocapture`)
+       compare-open3d.py frame                            (compare with `cargo bench -p trainer --bench tsdf`)
 
 `surfaces` fuses, on the CPU, the images of a nerfstudio folder that MODEL/keyframes.txt lists, with the same poses, lens, depth
 range, voxels and truncation as fieldrig (those of MODEL/model.json), and compares Open3D's mesh with MODEL/mesh.ply:
@@ -15,8 +15,7 @@ range, voxels and truncation as fieldrig (those of MODEL/model.json), and compar
 - distances of uniform samples on each mesh from the other mesh;
 - renders of both meshes next to the photo, from the poses of test images, in OUT_FOLDER.
 
-`frame` fuses the exact images of fieldrig's ignored test `frame_of_640x480` with voxels of 1 cm: 8 images, then the time of 4 more, then
-of all 12 again, for the three block sizes and number formats that Open3D supports.
+`frame` fuses the exact images of fieldrig's benchmark `tsdf` with voxels of 1 cm: 8 images, then the time of 4 more, then of all 12 again, for the three block sizes and number formats that Open3D supports.
 
 Prints one JSON object. Needs open3d 0.20 (pip), numpy, scipy, pillow. To limit both programs to the same cores, run both with
 `taskset -c 0,1` and this one with OMP_NUM_THREADS=2.
@@ -184,7 +183,7 @@ def frames_of(data, keyframes):
     """Frames of a nerfstudio folder by split, as listed: photo n of the folder, in order of names, has the stamp n ms."""
     summary = json.loads((data / "transforms.json").read_text())
     existing = sorted((f for f in summary["frames"] if (data / f["file_path"]).exists()), key=lambda f: f["file_path"])
-    by_split = {"train": [], "selection": [], "test": []}
+    by_split = {"train": [], "validation": [], "test": []}
     for line in keyframes.read_text().splitlines():
         if not line.strip() or line.startswith("#"):
             continue
@@ -196,7 +195,7 @@ def frames_of(data, keyframes):
         pose = np.array(frame["transform_matrix"]) @ OPENGL
         by_split[split].append(
             Frame(frame["file_path"], depth_m, rgb, [frame["fl_x"], frame["fl_y"]], [frame["cx"], frame["cy"]], pose))
-    return by_split["train"] + by_split["selection"], by_split["test"]
+    return by_split["train"] + by_split["validation"], by_split["test"]
 
 
 def timing(millis):
@@ -233,7 +232,7 @@ def surfaces(args):
 
 
 def exact_frame(ix):
-    """Frame `ix` of the test `frame_of_640x480`: exact depth and color of a ball on a floor in front of a wall."""
+    """Frame `ix` of the benchmark `tsdf`: exact depth and color of a ball on a floor in front of a wall."""
     turn = 0.02 * ix - 1.57
     eye, target = np.array([1.6 * np.cos(turn), 1.6 * np.sin(turn), 0.9]), np.array([0.0, 0.3, 0.3])
     ahead = (target - eye) / np.linalg.norm(target - eye)

@@ -184,23 +184,6 @@ pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
-/// Words with commas and a conjunction before the last one: `ply or spz`.
-pub(crate) fn listed(words: &[&str], conjunction: &str) -> String {
-    match words.split_last() {
-        Some((last, others)) if !others.is_empty() => format!("{} {conjunction} {last}", others.join(", ")),
-        _ => words.concat(),
-    }
-}
-
-/// A count and its noun: `1 image`, `2 images`.
-pub(crate) fn counted(n: u64, noun: &str) -> String {
-    match noun.strip_suffix('y') {
-        _ if n == 1 => format!("1 {noun}"),
-        Some(stem) => format!("{n} {stem}ies"),
-        None => format!("{n} {noun}s"),
-    }
-}
-
 /// Prints one JSON object on its own line.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
@@ -208,7 +191,9 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
 
 /// Prints one JSON object on its own line, as [`report`] does.
 ///
-/// # Errors If the value cannot be serialized as JSON.
+/// # Errors
+///
+/// If the value cannot be serialized as JSON.
 pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
     report(json_text(value)?);
     Ok(())

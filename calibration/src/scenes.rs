@@ -2,6 +2,7 @@
 
 use crate::{CameraCorrection, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
+use kinematics::random::Random;
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
@@ -132,17 +133,9 @@ impl Miscalibration {
     }
 }
 
-/// Normally distributed noise from a hash.
+/// Normally distributed noise, the same for the same key.
 pub fn noise(key: u64) -> f64 {
-    let mut state = key.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ 0xd1b5_4a32_d192_ed03;
-    let mut uniform = || {
-        state ^= state >> 29;
-        state = state.wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        state ^= state >> 32;
-        ((state >> 11) as f64 + 0.5) / (1u64 << 53) as f64
-    };
-    let (one, two) = (uniform(), uniform());
-    (-2.0 * one.ln()).sqrt() * (2.0 * std::f64::consts::PI * two).cos()
+    Random::new(key).normal()
 }
 
 /// Keyframes of a scan of the room.

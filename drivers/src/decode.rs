@@ -259,28 +259,4 @@ mod tests {
             Err(Error::WrongKind { expected: "depth", .. })
         ));
     }
-
-    #[test]
-    #[ignore = "benchmark: prints milliseconds"]
-    fn speed_of_jpeg_at_1080p() {
-        let size_px = [1920, 1080];
-        // Edges, gradients and noise, so that the size is that of a webcam image of a room.
-        let pixel = |x: u32, y: u32| {
-            let noise = (x.wrapping_mul(2_654_435_761) ^ y.wrapping_mul(40_503)).to_le_bytes()[1] % 12;
-            let gradient = ((x / 60 + y / 40) * 11 + x / 16).to_le_bytes()[0] / 2;
-            [gradient + noise, gradient / 2 + 40 + noise, 200 - gradient + noise]
-        };
-        let rgb: Vec<u8> = (0..size_px[1]).flat_map(|y| (0..size_px[0]).flat_map(move |x| pixel(x, y))).collect();
-        let mut file = Vec::new();
-        let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, 85);
-        image::ImageEncoder::write_image(encoder, &rgb, size_px[0], size_px[1], image::ExtendedColorType::Rgb8)
-            .expect("an image");
-        let jpeg = image(PixelFormat::Jpeg, size_px, &file);
-        let best = (0..20).map(|_| {
-            let began = std::time::Instant::now();
-            std::hint::black_box(std::hint::black_box(&jpeg).decode_rgb().expect("an image"));
-            began.elapsed()
-        });
-        eprintln!("{} kB: minimum {:.2?}", file.len() / 1000, best.min().expect("20 runs"));
-    }
 }

@@ -3,15 +3,13 @@
 //! Long fuzzing runs use the targets in the folder `fuzz`. The tests here replay its seeds, both unchanged and
 //! corrupted at random. A seed is exactly the input of its function.
 //!
-//! Targets of a device family are beside its code. `input` reads values from the bytes, `scratch` provides folders for
-//! targets that read files, and `random` generates numbers for tests.
+//! Targets of a device family are beside its code. `input` reads values from the bytes, and `scratch` provides folders
+//! for targets that read files.
 
 mod dataset;
 pub(crate) mod input;
 mod messages;
 mod pixels;
-#[cfg(test)]
-pub(crate) mod random;
 mod recording;
 mod scratch;
 #[cfg(test)]

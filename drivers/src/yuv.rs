@@ -327,20 +327,4 @@ mod tests {
         assert_eq!(resolved(2, 1, 0, false), Some((Bt601, Limited)));
         assert_eq!(resolved(8, 6, 0, false), None);
     }
-
-    #[test]
-    #[ignore = "benchmark: prints milliseconds"]
-    fn speed_at_1080p() {
-        let colors = YuvColors { matrix: YuvMatrix::Bt601, range: YuvRange::Limited };
-        for layout in LAYOUTS {
-            let n_bytes = layout.row_bytes(1920) * layout.n_rows(1080);
-            let data: Vec<u8> = (0..n_bytes).map(|ix| (ix * 37).to_le_bytes()[0]).collect();
-            let best = (0..20).map(|_| {
-                let began = std::time::Instant::now();
-                std::hint::black_box(rgb(layout, colors, [1920, 1080], std::hint::black_box(&data)));
-                began.elapsed()
-            });
-            eprintln!("{layout:?} 1920x1080: minimum {:.2?}", best.min().expect("20 runs"));
-        }
-    }
 }

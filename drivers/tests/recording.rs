@@ -3,6 +3,7 @@
 
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata};
 use drivers::{BasePose, Error, Image, PixelFormat, RangePoint, RangeScan, Sample, Source, TruthImage};
+use kinematics::random::Random;
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use nalgebra::{Translation3, UnitQuaternion};
 use std::path::Path;
@@ -63,12 +64,7 @@ fn samples() -> Vec<Sample> {
 }
 
 fn noise(seed: i32, n_bytes: usize) -> Vec<u8> {
-    let mut state = 12345 + u32::try_from(seed).expect("not negative");
-    let mut byte = || {
-        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        state.to_be_bytes()[0]
-    };
-    (0..n_bytes).map(|_| byte()).collect()
+    Random::new(u64::try_from(seed).expect("not negative")).bytes(n_bytes)
 }
 
 fn record(path: &Path, samples: &[Sample]) {

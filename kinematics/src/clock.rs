@@ -245,6 +245,7 @@ mod tests {
     #![expect(clippy::cast_possible_truncation, reason = "test numbers lie well inside the integers' ranges")]
 
     use super::*;
+    use crate::random::Random;
 
     const FIXED_NANOS: i64 = 5_000_000;
     const JITTER_NANOS: f64 = 75e6;
@@ -253,25 +254,20 @@ mod tests {
     /// A device that sends at a fixed rate over a bad connection. All its numbers derive from one seed.
     struct Device {
         rate_hz: f64,
-        random: u64,
+        random: Random,
         clock_starts: i64,
     }
 
     impl Device {
         fn new(rate_hz: f64, seed: u64) -> Self {
-            Self { rate_hz, random: seed, clock_starts: 9_876_543_210 }
-        }
-
-        fn uniform(&mut self) -> f64 {
-            self.random = self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (self.random >> 11) as f64 / (1_u64 << 53) as f64
+            Self { rate_hz, random: Random::new(seed), clock_starts: 9_876_543_210 }
         }
 
         /// True time, device time and arrival of the message at `ix`, in nanoseconds.
         fn message(&mut self, ix: u32) -> (i64, i64, Stamp) {
             let truth = (f64::from(ix) / self.rate_hz * 1e9) as i64;
             let device = self.clock_starts + (truth as f64 / (1.0 + DRIFT)) as i64;
-            let arrival = truth + FIXED_NANOS + (self.uniform() * JITTER_NANOS) as i64;
+            let arrival = truth + FIXED_NANOS + (self.random.unit() * JITTER_NANOS) as i64;
             (truth, device, Stamp(arrival))
         }
     }

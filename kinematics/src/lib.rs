@@ -34,6 +34,8 @@ mod error;
 pub mod history;
 pub mod joints;
 mod lens;
+pub mod quantile;
+pub mod random;
 mod rounding;
 pub mod stamp;
 pub mod transform;

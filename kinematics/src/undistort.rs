@@ -153,6 +153,7 @@ mod tests {
 
     use super::*;
     use crate::Lens;
+    use crate::random::Random;
 
     fn camera(size_px: [u32; 2], lens: Lens) -> Intrinsics {
         let [width, height] = size_px.map(f64::from);
@@ -166,12 +167,7 @@ mod tests {
     }
 
     fn noise(len: usize) -> Vec<u8> {
-        let mut state = 1_u32;
-        let mut next = || {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            state.to_be_bytes()[0]
-        };
-        (0..len).map(|_| next()).collect()
+        Random::new(1).bytes(len)
     }
 
     const BARREL: Lens = Lens::BrownConrady([-0.25, 0.05, 0.001, -0.002, 0.0]);

@@ -1,7 +1,7 @@
 //! Motion of the robot's base: fixed, walking around a pedestal, or walking from one station to the next.
 
 use crate::config::Scene;
-use crate::random::Random;
+use crate::random::RandomStream;
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::TAU;
@@ -34,7 +34,7 @@ const WALK_DURATION_SECS: f64 = 5.0;
 const FAR_STATION: [f64; 3] = [0.0, 0.15, -0.06];
 const NEAR_STATION: [f64; 3] = [1.15, 0.0, 0.02];
 
-/// Pose of the arm's base on the quadruped's back; link `mount` in the URDFs.
+/// Pose of the arm's base on the quadruped's back; link `top_plate` in the URDFs.
 pub(crate) fn base_from_arm() -> Transform {
     Transform::translation(0.12, 0.0, 0.10)
 }
@@ -146,7 +146,7 @@ fn gait(secs: f64, gait_amplitude: f64, [x, y, yaw]: [f64; 3]) -> Transform {
 /// Error of a SLAM system: a random walk that advances while the base walks.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Drift {
-    random: Random,
+    random: RandomStream,
     /// Standard deviations of one step along or about x, y, z.
     step_m: [f64; 3],
     step_rad: [f64; 3],
@@ -167,7 +167,7 @@ impl Drift {
             weights.map(|weight| size * weight / norm / N_STEPS.sqrt())
         };
         Self {
-            random: Random::new(seed, &[DRIFT]),
+            random: RandomStream::new(seed, &[DRIFT]),
             step_m: step_sigmas(size_m, [1.0, 1.0, CONSTRAINED_AXIS_FRAC]),
             step_rad: step_sigmas(size_rad, [CONSTRAINED_AXIS_FRAC, CONSTRAINED_AXIS_FRAC, 1.0]),
         }

@@ -8,7 +8,7 @@ use crate::lidar::{self, RayCaster};
 use crate::noise;
 use crate::optics::{Optics, RowMotion};
 use crate::panda::Joints;
-use crate::random::Random;
+use crate::random::RandomStream;
 use crate::render::{Pending, Renderer};
 use crate::robot::{Robot, RobotPose};
 use crate::{Error, render};
@@ -87,11 +87,11 @@ struct Exposure {
 const FIRST_NANOS: i64 = 50_000_000;
 const STAGGER_NANOS: i64 = 3_700_000;
 
-/// Random number streams of one image.
+/// RandomStream number streams of one image.
 const COLOR_NOISE: u64 = 1;
 const DEPTH_NOISE: u64 = 2;
 const DROP_STREAM: u64 = 3;
-/// Random number stream of one scan.
+/// RandomStream number stream of one scan.
 const SCANS: u64 = 4;
 
 #[expect(clippy::cast_possible_truncation, reason = "times of a run in nanoseconds fit an i64")]
@@ -174,8 +174,8 @@ impl Camera {
         Some(self.depth_optics.as_ref()?.view(world_from_camera * sensor.camera_from_depth, None, 1.0))
     }
 
-    fn random(&self, seed: u64, image_ix: u64, stream: u64) -> Random {
-        Random::new(seed, &[self.ix, image_ix, stream])
+    fn random(&self, seed: u64, image_ix: u64, stream: u64) -> RandomStream {
+        RandomStream::new(seed, &[self.ix, image_ix, stream])
     }
 }
 
@@ -326,7 +326,7 @@ impl Engine {
             return Ok(());
         };
         let motion = self.robot.motion();
-        let random = Random::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
+        let random = RandomStream::new(self.config.seed, &[scanner_ix as u64, scan_ix, SCANS]);
         let world_from_base = |offset_nanos: i64| motion.world_from_base((nanos + offset_nanos) as f64 * 1e-9);
         let points = lidar::scan_revolution(rays, scanner, self.config.ideal, random, world_from_base)?;
         let stamp = Stamp(self.start.0 + nanos);

@@ -3,7 +3,7 @@
 use crate::lab_texture::picture;
 use crate::light::Occluders;
 use crate::mesh::{Mesh, TextureRect};
-use crate::random::Random;
+use crate::random::RandomStream;
 use kinematics::Transform;
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 
@@ -16,7 +16,7 @@ pub(crate) struct Furniture {
     /// Plain frames and legs.
     pub(crate) frames: Mesh,
     solids: Vec<(Transform, [f64; 3])>,
-    random: Random,
+    random: RandomStream,
     n_drawn: u64,
 }
 
@@ -38,7 +38,7 @@ impl Furniture {
             posters: Mesh::default(),
             frames: Mesh::default(),
             solids: Vec::new(),
-            random: Random::new(0xf0_1a, &[name]),
+            random: RandomStream::new(0xf0_1a, &[name]),
             n_drawn: 0,
         }
     }

@@ -3,7 +3,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "places on a sheet are small whole numbers")]
 
 use crate::mesh::TextureRect;
-use crate::random::Random;
+use crate::random::RandomStream;
 use crate::texture::{self, Color, Noise, SIDE_PX, Texture, mix, scale, step};
 
 /// Number of pictures along a side of a sheet.
@@ -35,7 +35,7 @@ fn hue(at: f64, dark: f64, light: f64) -> Color {
 /// Sixteen posters, boards and windows.
 pub(crate) fn posters() -> Texture {
     let noise = Noise::new(101);
-    let each = Random::new(0x7e37, &[102]);
+    let each = RandomStream::new(0x7e37, &[102]);
     sheet(|ix, u, v| {
         let edge = u.min(1.0 - u).min(v.min(1.0 - v));
         let own = each.unit(ix as u64);
@@ -91,7 +91,7 @@ fn rings(own: f64, u: f64, v: f64) -> Color {
     scale(hue(radius.floor() * 0.21 + own, 0.12, 0.92), 0.85 + 0.15 * radius.fract())
 }
 
-fn letters(each: Random, u: f64, v: f64) -> Color {
+fn letters(each: RandomStream, u: f64, v: f64) -> Color {
     let (column, row) = ((u * 12.0).floor(), (v * 9.0).floor());
     let cell = (row * 12.0 + column) as u64;
     let (x, y) = (((u * 12.0).fract() * 5.0) as u64, ((v * 9.0).fract() * 6.0) as u64);
@@ -100,7 +100,7 @@ fn letters(each: Random, u: f64, v: f64) -> Color {
     if on { [0.08, 0.08, 0.12] } else { paper }
 }
 
-fn spots(each: Random, ix: u64, u: f64, v: f64) -> Color {
+fn spots(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let ground = hue(each.unit(50 + ix), 0.25, 0.8);
     let top = (0..14).rev().find(|spot| {
         let at = |counter: u64| each.unit(ix * 100 + spot * 4 + counter);
@@ -112,7 +112,7 @@ fn spots(each: Random, ix: u64, u: f64, v: f64) -> Color {
 /// Sixteen items for shelves and benches: cartons, crates, books, instruments, screens.
 pub(crate) fn items() -> Texture {
     let noise = Noise::new(111);
-    let each = Random::new(0x7e37, &[112]);
+    let each = RandomStream::new(0x7e37, &[112]);
     sheet(|ix, u, v| {
         let grain = 0.86 + 0.2 * noise.rough(u * 30.0 + ix as f64 * 40.0, v * 30.0, 3);
         let worn = 0.75 + 0.4 * noise.rough(u * 3.0 + ix as f64 * 11.0, v * 3.0, 4);
@@ -131,7 +131,7 @@ pub(crate) fn items() -> Texture {
     })
 }
 
-fn carton(each: Random, ix: u64, u: f64, v: f64) -> Color {
+fn carton(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let board = [0.74, 0.57, 0.38];
     let tape = (v - 0.5).abs() < 0.06;
     let label = (0.55..0.9).contains(&u) && (0.12..0.36).contains(&v);
@@ -170,7 +170,7 @@ fn slats(noise: &Noise, ix: usize, u: f64, v: f64) -> Color {
     }
 }
 
-fn books(each: Random, ix: u64, u: f64, v: f64) -> Color {
+fn books(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let mut left = 0.0;
     for book in 0..24 {
         let at = |counter: u64| each.unit(ix * 1000 + book * 8 + counter);
@@ -190,7 +190,7 @@ fn books(each: Random, ix: u64, u: f64, v: f64) -> Color {
     [0.05, 0.04, 0.04]
 }
 
-fn instrument(each: Random, ix: u64, u: f64, v: f64) -> Color {
+fn instrument(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let shell = if ix == 7 { [0.72, 0.74, 0.72] } else { [0.22, 0.25, 0.28] };
     if (0.08..0.5).contains(&u) && (0.14..0.6).contains(&v) {
         let trace = 0.37 + 0.12 * (u * 60.0).sin() * (u * 17.0).cos();
@@ -248,7 +248,7 @@ fn drawers(u: f64, v: f64) -> Color {
     }
 }
 
-fn tin(each: Random, ix: u64, u: f64, v: f64) -> Color {
+fn tin(each: RandomStream, ix: u64, u: f64, v: f64) -> Color {
     let band = (v * 5.0).floor() as u64;
     let emblem = (u - 0.5).hypot((v - 0.5) * 1.2) < 0.24;
     if emblem { hue(each.unit(ix * 9 + 70), 0.5, 0.98) } else { hue(each.unit(ix * 9 + band), 0.08, 0.75) }
@@ -257,7 +257,7 @@ fn tin(each: Random, ix: u64, u: f64, v: f64) -> Color {
 /// Worn floor tiles with a marked lane around the middle. Covers a whole room of `size_m` with tiles of 0.5 m.
 pub(crate) fn floor_tiles(size_m: [f64; 2], lane_m: f64) -> Texture {
     let (rough, blotch) = (Noise::new(121), Noise::new(122));
-    let each = Random::new(0x7e37, &[123]);
+    let each = RandomStream::new(0x7e37, &[123]);
     Texture::paint(2 * SIDE_PX, |u, v| {
         let (x, y) = ((u - 0.5) * size_m[0], (v - 0.5) * size_m[1]);
         let (column, row) = ((x * 2.0).floor(), (y * 2.0).floor());

@@ -3,7 +3,7 @@
 
 use crate::Error;
 use crate::config::ScannerConfig;
-use crate::random::Random;
+use crate::random::RandomStream;
 use crate::scene::ARM_GROUP;
 use drivers::RangePoint;
 use kinematics::Transform;
@@ -53,7 +53,7 @@ pub(crate) fn scan_revolution(
     rays: &mut RayCaster,
     scanner: &ScannerConfig,
     ideal: bool,
-    random: Random,
+    random: RandomStream,
     world_from_base: impl Fn(i64) -> Transform,
 ) -> Result<Vec<RangePoint>, Error> {
     let period_nanos = 1e9 / scanner.rate_hz;

@@ -2,7 +2,7 @@
 #![expect(clippy::cast_possible_truncation, reason = "values are clamped before they become integers")]
 
 use crate::config::{DepthConfig, SensorConfig};
-use crate::random::Random;
+use crate::random::RandomStream;
 use rayon::prelude::{
     IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator, ParallelSlice, ParallelSliceMut,
 };
@@ -17,7 +17,7 @@ fn to_byte(value: f32) -> u8 {
 }
 
 /// Adds shot and read noise to `[height, width, 3]` colors of 0 to 255.
-pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: Random) -> Vec<u8> {
+pub(crate) fn add_color_noise(colors: &[f32], sensor: &SensorConfig, random: RandomStream) -> Vec<u8> {
     const PIXELS_A_CHUNK: usize = 640;
     let sigma: [f32; 256] = std::array::from_fn(|level| noise_sigma(sensor, level as f64) as f32);
     let mut bytes = vec![0; colors.len()];
@@ -58,7 +58,7 @@ pub(crate) fn depth_counts(
     depth_m: &[f32],
     width: usize,
     depth: &DepthConfig,
-    random: Random,
+    random: RandomStream,
     ideal: bool,
 ) -> Vec<u16> {
     let in_range = |meters: f32| f64::from(meters) >= depth.min_m && f64::from(meters) <= depth.max_m;
@@ -83,7 +83,7 @@ pub(crate) fn depth_counts(
 struct Holes {
     is_edge: Vec<bool>,
     width: usize,
-    random: Random,
+    random: RandomStream,
     edge_share: f64,
     cluster_share: f64,
 }
@@ -96,7 +96,7 @@ const CLUSTER_PX: usize = 4;
 const HOLE_COUNTERS: u64 = 1 << 40;
 
 impl Holes {
-    fn new(depth_m: &[f32], width: usize, hole_frac: f64, random: Random) -> Self {
+    fn new(depth_m: &[f32], width: usize, hole_frac: f64, random: RandomStream) -> Self {
         let mut is_edge = vec![false; depth_m.len()];
         is_edge
             .par_chunks_mut(width)
@@ -139,7 +139,7 @@ mod tests {
         let sensor = SensorConfig::default();
         for level in [40.0, 128.0, 200.0] {
             let colors = vec![level as f32; 3 * 100_000];
-            let bytes = add_color_noise(&colors, &sensor, Random::new(1, &[2]));
+            let bytes = add_color_noise(&colors, &sensor, RandomStream::new(1, &[2]));
             let n = bytes.len() as f64;
             let mean = bytes.iter().map(|byte| f64::from(*byte)).sum::<f64>() / n;
             let variance = bytes.iter().map(|byte| (f64::from(*byte) - mean).powi(2)).sum::<f64>() / n;
@@ -155,14 +155,14 @@ mod tests {
     fn depth_noise_holes_and_limits_match_configuration() {
         let depth = DepthConfig::default();
         let plane = vec![1.0_f32; 640 * 480];
-        let counts = depth_counts(&plane, 640, &depth, Random::new(1, &[3]), false);
+        let counts = depth_counts(&plane, 640, &depth, RandomStream::new(1, &[3]), false);
         let meters: Vec<f64> =
             counts.iter().filter(|count| **count > 0).map(|count| f64::from(*count) * 1e-4).collect();
         let holes = 1.0 - meters.len() as f64 / plane.len() as f64;
         let sigma = (meters.iter().map(|z| (z - 1.0).powi(2)).sum::<f64>() / meters.len() as f64).sqrt();
         assert!((holes - 0.02).abs() < 0.003, "{holes}");
         assert!((sigma - 0.0015).abs() < 0.00005, "{sigma}");
-        let near = depth_counts(&[0.05, 7.0, 0.5], 3, &depth, Random::new(1, &[3]), true);
+        let near = depth_counts(&[0.05, 7.0, 0.5], 3, &depth, RandomStream::new(1, &[3]), true);
         assert_eq!(near, [0, 0, 5000]);
     }
 }

@@ -1,28 +1,28 @@
-//! Random numbers that depend only on a key and a counter, so that any image can be reproduced independently.
+//! RandomStream numbers that depend only on a key and a counter, so that any image can be reproduced independently.
 
+use kinematics::random::{hash, nth_bits, unit_from_bits};
 use std::sync::LazyLock;
 
-/// Random number stream of one key.
+/// RandomStream number stream of one key.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Random {
+pub(crate) struct RandomStream {
     key: u64,
 }
 
-impl Random {
+impl RandomStream {
     /// The stream of a seed and the numbers that identify its use, such as camera and image.
     pub(crate) fn new(seed: u64, names: &[u64]) -> Self {
-        Self { key: names.iter().fold(mix(seed), |key, name| mix(key ^ mix(*name))) }
+        Self { key: names.iter().fold(hash(seed), |key, name| hash(key ^ hash(*name))) }
     }
 
     /// 64 random bits at a counter.
     pub(crate) fn bits(self, counter: u64) -> u64 {
-        mix(self.key.wrapping_add(counter.wrapping_mul(GOLDEN)))
+        nth_bits(self.key, counter)
     }
 
     /// Uniform in `0..1` at a counter.
     pub(crate) fn unit(self, counter: u64) -> f64 {
-        // 53 bits fill the mantissa of an f64.
-        (self.bits(counter) >> 11) as f64 / (1u64 << 53) as f64
+        unit_from_bits(self.bits(counter))
     }
 
     /// Uniform in `lower..upper` at a counter.
@@ -36,16 +36,6 @@ impl Random {
         let table = &*QUANTILES;
         [0, 12, 24, 36].map(|shift| table[(bits >> shift & 0xfff) as usize])
     }
-}
-
-const GOLDEN: u64 = 0x9e37_79b9_7f4a_7c15;
-
-/// The finaliser of `SplitMix64` (Steele, Lea and Flood 2014).
-fn mix(value: u64) -> u64 {
-    let value = value.wrapping_add(GOLDEN);
-    let value = (value ^ (value >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    let value = (value ^ (value >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    value ^ (value >> 31)
 }
 
 /// Quantiles of the standard normal distribution at `(i + 1/2) / 4096`, scaled to variance 1.
@@ -90,13 +80,13 @@ mod tests {
 
     #[test]
     fn normals_are_standard_and_depend_on_key() {
-        let random = Random::new(7, &[1, 2]);
+        let random = RandomStream::new(7, &[1, 2]);
         let numbers: Vec<f64> = (0..50_000).flat_map(|ix| random.normals(ix)).map(f64::from).collect();
         let n = numbers.len() as f64;
         let mean = numbers.iter().sum::<f64>() / n;
         let variance = numbers.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n;
         assert!(mean.abs() < 0.01 && (variance - 1.0).abs() < 0.02, "mean {mean}, variance {variance}");
-        assert_ne!(Random::new(7, &[1, 3]).bits(0), random.bits(0));
-        assert_ne!(Random::new(8, &[1, 2]).bits(0), random.bits(0));
+        assert_ne!(RandomStream::new(7, &[1, 3]).bits(0), random.bits(0));
+        assert_ne!(RandomStream::new(8, &[1, 2]).bits(0), random.bits(0));
     }
 }

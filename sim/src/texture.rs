@@ -1,7 +1,7 @@
 //! Procedural textures made of noise and simple shapes: walls, table, wood, fur, tags.
 #![expect(clippy::cast_possible_truncation, reason = "colors are clamped before they become bytes")]
 
-use crate::random::Random;
+use crate::random::RandomStream;
 use crate::tag;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -115,11 +115,11 @@ pub(crate) fn step(lower: f64, upper: f64, value: f64) -> f64 {
 }
 
 /// Smooth noise, 0 to 1, with features of size 1.
-pub(crate) struct Noise(Random);
+pub(crate) struct Noise(RandomStream);
 
 impl Noise {
     pub(crate) fn new(name: u64) -> Self {
-        Self(Random::new(0x7e37, &[name]))
+        Self(RandomStream::new(0x7e37, &[name]))
     }
 
     fn lattice(&self, x: i64, y: i64) -> f64 {
@@ -148,7 +148,7 @@ pub(crate) fn brick_wall() -> Texture {
     const N_COURSES: f64 = 26.0;
     const N_BRICKS: f64 = 10.0;
     let (rough, blotch) = (Noise::new(1), Noise::new(2));
-    let each = Random::new(0x7e37, &[3]);
+    let each = RandomStream::new(0x7e37, &[3]);
     Texture::paint(SIDE_PX, |x, y| {
         let course = (y * N_COURSES).floor();
         let along = x * N_BRICKS + if course as i64 % 2 == 0 { 0.0 } else { 0.5 };
@@ -218,7 +218,7 @@ pub(crate) fn squares(u: f64, v: f64) -> Color {
         [0.10, 0.55, 0.35],
     ];
     let (column, row) = ((u * 8.0).floor(), (v * 6.0).floor());
-    let random = Random::new(0x7e37, &[21]);
+    let random = RandomStream::new(0x7e37, &[21]);
     let pick = |counter: u64| COLORS[(random.bits(counter) % 6) as usize];
     let cell = (row * 8.0 + column) as u64;
     let from_center = ((u * 8.0).fract() - 0.5).hypot((v * 6.0).fract() - 0.5);

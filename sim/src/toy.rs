@@ -1,7 +1,7 @@
 //! A furry toy donkey: a body of ellipsoids, and thousands of hairs in one mesh.
 
 use crate::mesh::{Corner, Mesh, ellipsoid_normal, sphere_direction};
-use crate::random::Random;
+use crate::random::RandomStream;
 use crate::texture::{FUR_DARKEST, FurBand};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
 
@@ -99,7 +99,7 @@ pub(crate) fn body(light: Light<'_>) -> Mesh {
         let texture_y = if part.n_hairs > 0 { 0.3 * tip + 0.7 * root } else { 0.5 * (tip + root) };
         let texture_x = |point: &Point3<f64>, normal: &Vector3<f64>| {
             // Patches as small as tufts, so that skin between hairs does not look bare.
-            let tuft = Random::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
+            let tuft = RandomStream::new(0x70f7, &[point.x.to_bits(), point.z.to_bits()]).between(0, 0.45, 0.9);
             texture_x(tuft * light(point, normal, 0))
         };
         mesh.add_ellipsoid(part.center(), part.half_axes(), 10, texture_x, texture_y);
@@ -116,7 +116,7 @@ fn texture_x(brightness: f64) -> f64 {
 pub(crate) fn fur(light: Light<'_>) -> Mesh {
     let mut mesh = Mesh::default();
     for (ix, part) in PARTS.iter().enumerate() {
-        let random = Random::new(0xf0_44, &[ix as u64]);
+        let random = RandomStream::new(0xf0_44, &[ix as u64]);
         let half_axes = part.half_axes();
         for hair in 0..DENSITY * part.n_hairs / 2 {
             let down = (1.0 - 2.0 * random.unit(8 * hair)).acos() / std::f64::consts::PI;
@@ -154,7 +154,7 @@ struct Hair {
 }
 
 /// Adds a tapered hair of two segments that leans back and droops. Uses five counters.
-fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, hair: &Hair) {
+fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: RandomStream, counter: u64, hair: &Hair) {
     let jitter = Vector3::new(
         random.between(counter, -0.45, 0.45),
         random.between(counter + 1, -0.45, 0.45),
@@ -198,7 +198,7 @@ fn grow_hair(mesh: &mut Mesh, light: Light<'_>, random: Random, counter: u64, ha
 }
 
 fn add_mane(mesh: &mut Mesh, light: Light<'_>) {
-    let random = Random::new(0xf0_44, &[100]);
+    let random = RandomStream::new(0xf0_44, &[100]);
     let line = [
         Point3::new(0.020, 0.0, 0.093),
         Point3::new(0.036, 0.0, 0.110),
@@ -224,7 +224,7 @@ fn add_mane(mesh: &mut Mesh, light: Light<'_>) {
 }
 
 fn add_tail(mesh: &mut Mesh, light: Light<'_>) {
-    let random = Random::new(0xf0_44, &[101]);
+    let random = RandomStream::new(0xf0_44, &[101]);
     for hair in 0..160 {
         let along = random.unit(9 * hair);
         let root =

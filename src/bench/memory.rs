@@ -1,7 +1,8 @@
 //! Memory of this process over time, and its growth rate once all bounded stores are full.
 
-use super::statistics::{median, slope};
+use super::statistics::slope;
 use anyhow::{Context, anyhow};
+use kinematics::quantile::median;
 use serde::Serialize;
 
 /// Time after the keyframe store is full that is ignored, while buffers reach their final size.

@@ -1,10 +1,11 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
-use crate::chart::drawing::escaped;
-use crate::chart::{Chart, raster};
-use crate::{print, run_folder};
+use crate::print;
 use anyhow::Context;
 use serde_json::Value;
+use session::chart::drawing::escaped;
+use session::chart::{Chart, raster};
+use session::{Table, run_folder};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -20,13 +21,6 @@ pub(crate) struct Findings {
     pub(crate) tables: Vec<Table>,
     /// All numbers, for the JSON file.
     pub(crate) numbers: Value,
-}
-
-/// A table of text; the first column contains the row headers.
-pub(crate) struct Table {
-    pub(crate) title: String,
-    pub(crate) head: Vec<String>,
-    pub(crate) rows: Vec<Vec<String>>,
 }
 
 impl Findings {
@@ -90,39 +84,6 @@ fn write_file(path_with: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     std::fs::write(path_with, bytes).with_context(|| format!("cannot write {}", path_with.display()))
 }
 
-impl Table {
-    /// The table with its title as HTML.
-    pub(crate) fn html(&self) -> String {
-        let row = |cells: &[String], tag: &str| {
-            let cells: String = cells.iter().map(|cell| format!("<{tag}>{}</{tag}>", escaped(cell))).collect();
-            format!("<tr>{cells}</tr>\n")
-        };
-        let rows: String = self.rows.iter().map(|cells| row(cells, "td")).collect();
-        let (title, head) = (escaped(&self.title), row(&self.head, "th"));
-        format!(
-            "<h2>{title}</h2>\n<div class=\"wide\"><table>\n<thead>{head}</thead>\n<tbody>{rows}</tbody></table></div>\n"
-        )
-    }
-
-    /// The table with aligned columns, for a terminal.
-    fn text(&self) -> String {
-        let all = || std::iter::once(&self.head).chain(&self.rows);
-        let width = |column: usize| {
-            let widths = all().filter_map(|row| row.get(column)).map(|cell| cell.chars().count());
-            widths.max().unwrap_or(0)
-        };
-        let mut text = format!("\n{}\n", self.title);
-        for row in all() {
-            let cells = row.iter().enumerate().map(|(column, cell)| match column {
-                0 => format!("{cell:<0$}", width(column)),
-                _ => format!("{cell:>0$}", width(column)),
-            });
-            text.push_str(&format!("  {}\n", cells.collect::<Vec<_>>().join("  ")));
-        }
-        text.trim_end().to_owned()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -130,12 +91,6 @@ mod tests {
     fn table() -> Table {
         let words = |words: [&str; 2]| words.map(str::to_owned).to_vec();
         Table { title: "Sizes".into(), head: words(["data", "dB"]), rows: vec![words(["a<b", "1.25"])] }
-    }
-
-    #[test]
-    fn tables_are_escaped_and_aligned() {
-        assert_eq!(table().text(), "\nSizes\n  data    dB\n  a<b   1.25");
-        assert!(table().html().contains("<tr><td>a&lt;b</td><td>1.25</td></tr>"));
     }
 
     #[test]

@@ -1,19 +1,19 @@
 //! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
 //! repeat it.
 
-use crate::data::{Data, DataArgs, Purpose};
-use crate::evaluate::Evaluator;
+use crate::console::{Console, OutputMode, ReadBar};
+use crate::data_args::DataArgs;
 use crate::exit::{BadArgument, InsufficientData};
-use crate::method::{self, MAX_SPLATS};
-use crate::run_folder::CreatedFolders;
-use crate::session::{Evaluation, Evaluators, Limits, OutputMode, TrainingOutcome};
-use crate::stop::Stop;
-use crate::training::{self, TrainingPlan};
+use crate::open_gpu::open_gpu;
 use crate::training_args::TrainingArgs;
-use crate::{print, run_folder};
+use crate::{print, signals};
 use anyhow::{Context, bail};
+use capture::Stop;
 use keyframe::{Keyframe, Split};
 use serde::{Deserialize, Serialize};
+use session::methods::MAX_SPLATS;
+use session::run_folder::{self, CreatedFolders};
+use session::{Data, Evaluation, Evaluator, Evaluators, Limits, Purpose, TrainingOutcome, TrainingPlan};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -180,7 +180,7 @@ impl NamedData {
 
     fn methods(&self) -> String {
         let kinds: Vec<ModelKind> = self.model_specs.iter().map(|model_spec| model_spec.kind).collect();
-        method::describe(&kinds)
+        session::methods::describe(&kinds)
     }
 }
 
@@ -196,7 +196,7 @@ impl Drop for Runs<'_> {
 impl<'a> Runs<'a> {
     /// Creates the folder.
     pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
-        let stop = Stop::on_ctrl_c()?;
+        let stop = signals::stop_on_signals()?;
         let mut created = CreatedFolders::default();
         let out = created.make(args.out.as_deref())?;
         let runs = out.join(RUNS);
@@ -222,14 +222,16 @@ impl<'a> Runs<'a> {
 
     /// Loads data and chooses a name that is not in `used_names`.
     pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> anyhow::Result<NamedData> {
-        training::check_before_data(&self.args.training, path, &self.args.images)?;
-        let overrides = self.args.training.overrides();
-        let data = Data::load(path, &self.args.images, Purpose::Training, &overrides, self.args.json)?;
+        session::check_before_data(&self.args.training.options(), path, &self.args.images.options())?;
+        let overrides = self.args.training.options().overrides();
+        let bar = ReadBar::new(self.args.json);
+        let data =
+            Data::load(path, &self.args.images.options(), Purpose::Training, &overrides, &|read| bar.show(read))?;
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
             return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
         }
-        let model_specs = training::model_specs(&self.args.training, &data, None, self.gpu.is_software())?;
+        let model_specs = session::model_specs(&self.args.training.options(), &data, None, self.gpu.is_software())?;
         Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
@@ -283,22 +285,29 @@ impl<'a> Runs<'a> {
         if let Some(steps) = job.limits.steps {
             model_spec.options.common.n_planned_steps = steps;
         }
+        let output = if self.args.json { OutputMode::Nothing } else { OutputMode::Bar };
         let plan = TrainingPlan {
             model_spec,
             evaluators: Evaluators { during_training, max_images_during_training: usize::MAX, at_end: thorough },
             limits: job.limits,
-            output: if self.args.json { OutputMode::Nothing } else { OutputMode::Bar },
+            observer: Box::new(Console::new(output, job.limits, 1)),
         };
-        let session =
-            training::train(self.gpu.clone(), plan, &(job.keyframes)(), job.data.data.preparation_time, &self.stop)?;
+        let session = session::train(
+            self.gpu.clone(),
+            plan,
+            &(job.keyframes)(),
+            job.data.data.preparation_time,
+            &self.stop,
+            open_gpu,
+        )?;
         if self.stop.requested() && !session.is_over() {
             bail!("stopped early; the same command with --out {} continues the bench", self.out.display());
         }
-        session.score_without_saving()
+        Ok(session.score_without_saving()?)
     }
 
     fn settings(&self, job: &Job<'_>) -> RunSettings {
-        let data = &job.data.data;
+        let (data, images) = (&job.data.data, self.args.images.options());
         let n_test = data.of_split(Split::Test).len();
         RunSettings {
             data: job.data.path.clone(),
@@ -308,9 +317,9 @@ impl<'a> Runs<'a> {
             max_bytes: job.model_spec.options.common.max_bytes,
             seconds: job.limits.seconds,
             steps: job.limits.steps,
-            scale: self.args.images.scale,
-            holdout: self.args.images.holdout.clone(),
-            keyframes: self.args.images.keyframes.clone(),
+            scale: images.scale,
+            holdout: images.holdout,
+            keyframes: images.keyframes,
             n_train: data.keyframes.len() - n_test,
             n_test,
             disturbed: job.disturbed.clone(),

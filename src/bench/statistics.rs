@@ -1,23 +1,6 @@
-//! Statistics over runs: medians, spreads, times to a PSNR level, break points.
+//! Statistics over runs: spreads, times to a PSNR level, break points.
 
-/// Median; the mean of the two middle values for an even count. `None` if empty.
-pub(crate) fn median(values: &[f64]) -> Option<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let middle_ix = sorted.len() / 2;
-    match sorted.len() {
-        0 => None,
-        n if n % 2 == 1 => Some(sorted[middle_ix]),
-        _ => Some(0.5 * (sorted[middle_ix - 1] + sorted[middle_ix])),
-    }
-}
-
-/// The value that a share `frac` of the sorted values does not exceed. `None` if empty.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "an index below the length")]
-pub(crate) fn quantile(sorted: &[f64], frac: f64) -> Option<f64> {
-    let ix = (frac * sorted.len() as f64).ceil() as usize;
-    sorted.get(ix.saturating_sub(1)).copied()
-}
+use kinematics::quantile::median;
 
 /// Smallest and largest value.
 pub(crate) fn extent(values: &[f64]) -> Option<[f64; 2]> {
@@ -102,10 +85,7 @@ mod tests {
     }
 
     #[test]
-    fn medians_of_odd_and_even_numbers() {
-        assert_eq!(median(&[]), None);
-        assert_eq!(median(&[3.0, 1.0, 2.0]), Some(2.0));
-        assert_eq!(median(&[4.0, 1.0, 3.0, 2.0]), Some(2.5));
+    fn extents_of_some_and_no_numbers() {
         assert_eq!(extent(&[4.0, 1.0, 3.0]), Some([1.0, 4.0]));
         assert_eq!(extent(&[]), None);
     }

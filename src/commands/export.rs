@@ -1,18 +1,15 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
-use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList, SampleUse};
-use crate::method;
-use crate::open;
 use crate::open_gpu::open_gpu;
-use crate::partial::{self, Partial};
-use crate::print::{self, counted};
-use crate::run_folder;
-use crate::stations::Stations;
+use crate::{print, signals};
 use anyhow::{Context, ensure};
+use capture::config::Override;
+use capture::{Join, SampleUse, Stations, open};
 use clap::builder::{PossibleValue, PossibleValuesParser};
+use keyframe::{KeyframeList, counted, listed};
+use session::partial::Partial;
+use session::{Written, methods, run_folder, write_nerfstudio};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use trainer::ModelKind;
@@ -49,7 +46,7 @@ fn formats() -> Vec<PossibleValue> {
         contents.entry(export.format).or_default().push(export.contents);
     }
     let format = |(format, contents): (_, Vec<&str>)| {
-        let contents = print::listed(&contents, "or");
+        let contents = listed(&contents, "or");
         PossibleValue::new(format).help(format!("From a model: its {contents}, as .{format}"))
     };
     let nerfstudio = PossibleValue::new(NERFSTUDIO).help(
@@ -83,7 +80,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
     check_file(args)?;
-    partial::remove_on_signals()?;
+    signals::remove_partial_files_on_signals()?;
     match (contents, &*args.to) {
         (Contents::Recording, NERFSTUDIO) => export_recording(args),
         (Contents::Recording, _) => {
@@ -106,12 +103,12 @@ fn describe_exports(kind: ModelKind, format: &str) -> String {
     if formats.is_empty() {
         return format!("{model} cannot be exported");
     }
-    format!("{model} cannot be exported as {format}, only as {}", print::listed(&formats, "or"))
+    format!("{model} cannot be exported as {format}, only as {}", listed(&formats, "or"))
 }
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {
     ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
-    if let Some(kind) = method::kind_of(path)? {
+    if let Some(kind) = methods::kind_of(path)? {
         run_folder::expect_model(path)?;
         return Ok(Contents::Model(kind));
     }
@@ -182,7 +179,7 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+    let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
     data_losses.extend(opened.damage.get().cloned());
     data_losses.extend(missing_from_list);
     Ok(exit::from_losses(&data_losses))

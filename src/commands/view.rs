@@ -2,14 +2,12 @@
 
 use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
-use crate::method;
 use crate::open_gpu::open_gpu;
-use crate::stop::Stop;
-use crate::viewer::{ModelViewer, ServedModel};
-use crate::{camera_list, print, run_folder, scene_hint};
+use crate::{print, signals};
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
+use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use trainer::{Bounds, LoadedModel, ModelKind, Progress};
@@ -60,7 +58,7 @@ impl Up {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
-    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
+    let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.
@@ -68,8 +66,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
-    let models = paths.iter().map(|path| method::load(gpu.clone(), path));
-    let mut models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
+    let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
+    let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
     let bounds = if cameras.is_empty() { bounds(&mut models)? } else { None };
     let mut statuses =
         paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind, &model.method.progress()));

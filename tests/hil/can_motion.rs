@@ -10,6 +10,7 @@ use drivers::wire::can::cia402::Units;
 use drivers::wire::can::{Frame, Id, canopen, odrive, robstride};
 use drivers::{Arm, clock};
 use kinematics::Stamp;
+use kinematics::random::Random;
 use socketcan::{CanErrorFrame, CanSocket, Socket};
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, Command, Stdio};
@@ -505,14 +506,11 @@ fn malformed_frames_at_worst_stop_the_arm() {
         .chain([0x089, 0x085, 0x185, 0x285, 0x585, 0x705].map(Id::standard))
         .map(|id| id.expect("in range"));
     let ids: Vec<Id> = ids.collect();
-    let mut random = 7_u64;
-    let mut next = || {
-        random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        usize::try_from(random >> 33).expect("31 bits")
-    };
+    let mut random = Random::new(7);
     for _ in 0..3000 {
-        let bytes: Vec<u8> = (0..next() % 9).map(|_| next().to_le_bytes()[0]).collect();
-        let frame = Frame::classic(ids[next() % ids.len()], &bytes).expect("at most eight bytes");
+        let n_bytes = random.below(9);
+        let bytes = random.bytes(n_bytes);
+        let frame = Frame::classic(ids[random.below(ids.len())], &bytes).expect("at most eight bytes");
         noise.send(&frame).expect("the bus is up");
         std::thread::sleep(Duration::from_micros(300));
     }

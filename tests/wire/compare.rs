@@ -2,6 +2,7 @@
 
 use drivers::recording::{RIG_FILE, Recording};
 use drivers::{Image, Sample, Source};
+use kinematics::quantile::median;
 use kinematics::{JointHistory, PoseHistory, Stamp};
 use std::path::Path;
 use std::time::Duration;
@@ -87,9 +88,9 @@ pub(super) fn difference(script: &Path, wire: &Path) -> Difference {
             base_m = base_m.max((received.translation.vector - emulated.translation.vector).norm());
         }
     }
-    assert!(!joints_rad.is_empty(), "no image has joint readings before and after it");
-    joints_rad.sort_by(f64::total_cmp);
-    Difference { n_images, joints_rad: [joints_rad[joints_rad.len() / 2], joints_rad[joints_rad.len() - 1]], base_m }
+    let median_rad = median(&joints_rad).expect("some image has joint readings before and after it");
+    let max_rad = joints_rad.iter().copied().fold(0.0, f64::max);
+    Difference { n_images, joints_rad: [median_rad, max_rad], base_m }
 }
 
 /// Distance from the target at which `fieldrig move --json` reports that the arm arrived, rad or m.

@@ -306,7 +306,7 @@ mod tests {
 
     type Resume<M> = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
 
-    fn learn(model: &mut dyn Method, n_steps: u64) {
+    fn train(model: &mut dyn Method, n_steps: u64) {
         for _ in 0..n_steps {
             model.step(1).unwrap();
         }
@@ -330,12 +330,12 @@ mod tests {
         let test = keyframes.iter().find(|keyframe| keyframe.split == Split::Test).unwrap();
         let mut uninterrupted = Aligned::new(model, CameraRefinement::Always(EXTRINSICS), true, 4 * ALIGNMENT_STEP);
         keyframes.iter().for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
-        learn(&mut uninterrupted, ALIGNMENT_STEP - 2);
+        train(&mut uninterrupted, ALIGNMENT_STEP - 2);
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        learn(&mut uninterrupted, 2);
+        train(&mut uninterrupted, 2);
         assert!(uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP);
         let due = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        learn(&mut uninterrupted, 1);
+        train(&mut uninterrupted, 1);
         assert_eq!(
             (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
             (1, ALIGNMENT_STEP + 1),
@@ -345,7 +345,7 @@ mod tests {
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
         assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
         assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
-        learn(&mut uninterrupted, 2);
+        train(&mut uninterrupted, 2);
 
         let resumed = |checkpoint: &Checkpoint| {
             Aligned::resume(checkpoint, &keyframes, |own_checkpoint, keyframes| {
@@ -359,17 +359,17 @@ mod tests {
         };
         assert!(!untrained.is_empty() && untrained.iter().all(is_original));
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 3);
+        train(&mut *interrupted, 3);
         let (mut interrupted, untrained) = resumed(&interrupted.checkpoint().unwrap().finish().unwrap());
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 2);
+        train(&mut *interrupted, 2);
         let [uninterrupted_end, interrupted_end] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
             .map(|model| model.checkpoint().unwrap().finish().unwrap());
         assert_eq!(uninterrupted_end, interrupted_end);
 
         let (mut interrupted, untrained) = resumed(&due);
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 3);
+        train(&mut *interrupted, 3);
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
             uninterrupted_end,

@@ -19,7 +19,7 @@ pub struct Status {
     /// Number of stored keyframes.
     pub keyframes: u64,
     /// Number of images rejected as keyframes, by reason.
-    pub refused: BTreeMap<String, u64>,
+    pub rejected: BTreeMap<String, u64>,
     /// The model rendered for clients that do not choose one.
     #[serde(flatten)]
     pub model: ModelStatus,
@@ -28,7 +28,7 @@ pub struct Status {
     /// Messages that the operator should read, for example that a camera disconnected.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
-    pub ended: Option<RunResult>,
+    pub result: Option<RunResult>,
 }
 
 /// Result of a run that has ended.

@@ -152,7 +152,7 @@ fn publish_updates(hub: &Hub) {
         state: "training".to_owned(),
         seconds: 98.4,
         keyframes: 143,
-        refused: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
+        rejected: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
         model: ModelStatus {
             method: "splat".to_owned(),
             step: 1520,
@@ -170,7 +170,7 @@ fn publish_updates(hub: &Hub) {
             ..ModelStatus::default()
         }],
         notes: Vec::new(),
-        ended: None,
+        result: None,
     });
 }
 
@@ -193,7 +193,7 @@ fn page_renders_scene_and_overlays_correctly() {
     std::fs::write(scratch.join("page.png"), browser.screenshot()).expect("written");
     assert_eq!(browser.text("psnr"), "26.76");
     assert_eq!(browser.text("primitives"), "84,512");
-    assert_eq!(browser.text("refused-total"), "843");
+    assert_eq!(browser.text("rejected-total"), "843");
     let at_rest = render_thread.requests();
     let full = at_rest.last().expect("drawn").clone();
     let widths: Vec<_> = at_rest.iter().map(|request| request.size_px[0]).collect();
@@ -251,11 +251,11 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     let eye = Point3::from(camera.world_from_camera.translation.vector);
     for (u, v) in [(0.0, 0.0), (640.0, 0.0), (640.0, 480.0), (0.0, 480.0)] {
         for share in [0.3, 0.6, 0.9] {
-            let place = pixel_of(request, eye + (corner(u, v) - eye) * share);
+            let center_px = pixel_of(request, eye + (corner(u, v) - eye) * share);
             let is_near = (-REACH_PX..=REACH_PX)
-                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (place.0 + dx, place.1 + dy)))
+                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (center_px.0 + dx, center_px.1 + dy)))
                 .any(|(x, y)| is_accent(pixel(&shot, x, y)));
-            assert!(is_near, "no line of the frustum near {place:?}");
+            assert!(is_near, "no line of the frustum near {center_px:?}");
         }
     }
 }

@@ -10,6 +10,7 @@ use super::solve::INFLATION;
 use super::sums::{self, PairSums, PixelSubset, ResidualOptions};
 use super::view::CorrectedView;
 use crate::{CameraCorrection, drift_weight, rigid_transform};
+use kinematics::quantile::{Rank, quantile};
 use kinematics::{Twist, transform};
 use nalgebra::{DVector, Matrix6, Vector6};
 use std::collections::BTreeMap;
@@ -134,8 +135,7 @@ fn scales([translation_m, rotation_rad]: [f64; 2]) -> Vector6<f64> {
 fn median_depth_m(images: &[PreparedImage]) -> f64 {
     let mut depths: Vec<f64> =
         images.iter().flat_map(|image| &image.uniform_samples).map(|sample| sample.z_m).collect();
-    let middle = depths.len() / 2;
-    if depths.is_empty() { 1.0 } else { *depths.select_nth_unstable_by(middle, f64::total_cmp).1 }
+    quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(1.0)
 }
 
 /// Removes from the steps the significant part of the mean correction of a camera's images, because other parameters

@@ -4,6 +4,7 @@ use super::pairs::Pair;
 use super::prepared_image::{DepthSample, PreparedImage};
 use super::residual::{Correspondence, ParamColumns, Side, Tone};
 use super::view::CorrectedView;
+use kinematics::quantile::{Rank, quantile};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 
@@ -224,8 +225,7 @@ pub(super) fn noise_of(sums: &[PairSums]) -> Option<Noise> {
     const MIN_NOISE: Noise = Noise { photo: 0.3, depth: 5e-5 };
     let scatter = |of: fn(&PairSums) -> &[f64]| {
         let mut all: Vec<f64> = sums.iter().flat_map(|pair| of(pair).iter().copied()).collect();
-        let middle = all.len() / 2;
-        (!all.is_empty()).then(|| 1.4826 * *all.select_nth_unstable_by(middle, f64::total_cmp).1)
+        quantile(&mut all, 0.5, Rank::Upper).map(|median| 1.4826 * median)
     };
     Some(Noise {
         photo: scatter(|pair| &pair.photo)?.max(MIN_NOISE.photo),

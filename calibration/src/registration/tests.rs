@@ -4,6 +4,7 @@
 use super::*;
 use crate::scenes::*;
 use keyframe::Keyframe;
+use kinematics::quantile::{Rank, quantile};
 use kinematics::{Transform, Twist, transform};
 use nalgebra::Vector3;
 
@@ -232,10 +233,9 @@ fn max_jacobian_errors(has_rolling_shutter: bool) -> Vec<(layout::CalibrationPar
             }
         }
         let share = |kind: usize| {
-            let deviation = &mut deviation[kind].clone();
-            deviation.sort_by(f64::total_cmp);
+            let deviation = quantile(&mut deviation[kind].clone(), 0.9, Rank::Upper).expect("residuals");
             // The first joint does not affect pairs, so the only difference is the rounding of brightness to f32.
-            deviation[deviation.len() * 9 / 10] / max_gradients[kind].max([0.1, 1e-3][kind])
+            deviation / max_gradients[kind].max([0.1, 1e-3][kind])
         };
         (param, share(0), share(1))
     };

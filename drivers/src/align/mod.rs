@@ -491,24 +491,4 @@ mod tests {
         let color = Image { format: PixelFormat::Gray8, ..image([64, 48], &[0; 32 * 48]) };
         assert!(matches!(alignment.align(&color), Err(Error::WrongKind { expected: "depth", .. })));
     }
-
-    #[test]
-    #[ignore = "benchmark: prints milliseconds"]
-    fn speed_at_640x480() {
-        let size_px = [640, 480];
-        let d455 = Lens::BrownConrady([-0.0555, 0.0657, -0.0006, 0.0004, -0.0213]);
-        for (lens, color_px, focal_px) in
-            [(Lens::Pinhole, [640, 480], 610.0), (d455, [640, 480], 610.0), (d455, [1280, 720], 910.0)]
-        {
-            let (depth, color) = (camera(size_px, 385.0, Lens::Pinhole), camera(color_px, focal_px, lens));
-            let alignment = DepthAlignment::new(&depth, &color, &color_from_depth_like_d435());
-            let depth = image(size_px, &scene(size_px));
-            let best = (0..50).map(|_| {
-                let began = std::time::Instant::now();
-                std::hint::black_box(alignment.align(std::hint::black_box(&depth)).expect("depth"));
-                began.elapsed()
-            });
-            eprintln!("640x480 to {color_px:?}, {lens:?}: minimum {:.2?}", best.min().expect("50 runs"));
-        }
-    }
 }

@@ -158,7 +158,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::can::emulated::State;
     use crate::can::motor::Reading;
-    use crate::fuzz::random::Random;
+    use kinematics::random::Random;
 
     /// All frames on the buses while an arm is set up and read for some cycles.
     pub(crate) fn example_traffic() -> Vec<Frame> {
@@ -224,7 +224,7 @@ pub(crate) mod tests {
 
     #[test]
     fn corrupted_frames_move_no_joint() {
-        let mut random = Random(1);
+        let mut random = Random::new(1);
         for (config, (sent_frames, expected_readings)) in motors().into_iter().zip(record_traffic()) {
             let motor = Motor::with_limits(config, LIMITS);
             assert!(expected_readings.len() >= 5, "{motor:?} reports");
@@ -292,7 +292,7 @@ pub(crate) mod tests {
 
     #[test]
     fn disabled_motor_never_moves() {
-        let mut random = Random(6);
+        let mut random = Random::new(6);
         for config in motors() {
             let mut frames = set_up(&config);
             frames.extend([command(&config); 20]);

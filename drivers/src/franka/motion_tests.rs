@@ -5,6 +5,7 @@ use super::tests::{FREE_PORT, REST_RAD, TEST_TIMEOUT, VERSIONS, chain, config, i
 use super::{ContactConfig, FciVersion, MovableFrankaArm, N_JOINTS};
 use crate::motion::{JointTarget, Motion, MotionConfig, MotionLimits, MovableArm, OnLoss};
 use kinematics::Transform;
+use kinematics::random::Random;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream, UdpSocket};
 use std::process::{Command, Stdio};
@@ -240,7 +241,7 @@ fn stricter_robot_triggers_reflex_and_recovers() {
         address,
         version: FciVersion::V5,
         chain: chain("link8"),
-        flange_from_ee: Transform::identity(),
+        flange_from_tool: Transform::identity(),
         limits,
     };
     let emulated = EmulatedRobot::start(config_5, joint_simulator).unwrap();
@@ -312,7 +313,7 @@ impl Relay {
                 let _ = to_robot.shutdown(std::net::Shutdown::Both);
             });
             std::thread::spawn(move || drop(std::io::copy(&mut upstream, &mut client)));
-            let mut random = 0x9E37_79B9_7F4A_7C15_u64;
+            let mut random = Random::new(1);
             let (mut buffer, mut robot_states) = ([0; 4096], None);
             while let Ok((n, from)) = udp.recv_from(&mut buffer) {
                 let is_command = from == client_states;
@@ -321,10 +322,7 @@ impl Relay {
                 } else {
                     robot_states = Some(from);
                 }
-                random ^= random << 13;
-                random ^= random >> 7;
-                random ^= random << 17;
-                let is_dropped_randomly = (random >> 11) as f64 / (1_u64 << 53) as f64 <= DROP_FRAC;
+                let is_dropped_randomly = random.unit() < DROP_FRAC;
                 let is_dropped = relay_faults.is_disconnected.load(Ordering::Relaxed)
                     || (is_dropped_randomly && relay_faults.drops_some.load(Ordering::Relaxed));
                 let to = if is_command { robot_states } else { Some(client_states) };

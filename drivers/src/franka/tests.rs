@@ -4,6 +4,7 @@ use super::emulated::{CommandedJoints, EmulatedRobot, JointSimulator, Joints, Li
 use super::{ArmConfig, FciVersion, FrankaArm, N_JOINTS};
 use crate::{Arm, Error};
 use franka::{ControllerMode, FrankaError, JointPositions, MoveStatus, RealtimeConfig, Robot, RobotMode};
+use kinematics::random::Random;
 use kinematics::{Chain, Stamp, Transform};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
@@ -23,10 +24,10 @@ pub(super) fn chain(tip: &str) -> Chain {
 
 pub(super) fn robot(version: FciVersion, joint_simulator: JointSimulator) -> EmulatedRobot {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
-    let flange_from_ee = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
+    let flange_from_tool = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
     let address = FREE_PORT.parse().unwrap();
     EmulatedRobot::start(
-        RobotConfig { address, version, chain: chain("link8"), flange_from_ee, limits },
+        RobotConfig { address, version, chain: chain("link8"), flange_from_tool, limits },
         joint_simulator,
     )
     .unwrap()
@@ -274,13 +275,8 @@ fn contact_above_threshold_ends_motion() {
 
 #[test]
 fn malformed_bytes_stop_neither_robot_nor_client() {
-    let mut random = 0x9E37_79B9_7F4A_7C15_u64;
-    let mut byte = move || {
-        random ^= random << 13;
-        random ^= random >> 7;
-        random ^= random << 17;
-        random.to_le_bytes()[3]
-    };
+    let mut random = Random::new(1);
+    let mut byte = move || random.byte();
     let emulated = robot(FciVersion::V10, ideal_joints());
     // Requests: headers of all kinds, with valid and invalid lengths, truncated anywhere.
     for ix in 0..300_u32 {

@@ -1,12 +1,12 @@
 //! Feeds the seeds of the folder `fuzz`, unchanged and corrupted, to every reader.
 
-use super::random::Random;
 use super::scratch::Scratch;
 use super::*;
 use crate::recording::{Recorder, RecordingMetadata};
 use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample};
 use crate::{can, franka, udp};
+use kinematics::random::Random;
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
 use std::path::{Path, PathBuf};
 
@@ -60,7 +60,7 @@ fn corrupted_seeds_never_panic() {
     /// Each is corrupted a few times. File readers take 50 us per input.
     const N_CORRUPTED: usize = 400;
     for (name, read) in READERS {
-        let mut random = Random(5);
+        let mut random = Random::new(5);
         for seed in load_seeds(name) {
             read(&seed);
             for _ in 0..N_CORRUPTED {
@@ -70,8 +70,8 @@ fn corrupted_seeds_never_panic() {
             }
         }
         for _ in 0..N_CORRUPTED {
-            let bytes: Vec<u8> = (0..random.below(300)).map(|_| random.byte()).collect();
-            read(&bytes);
+            let n_bytes = random.below(300);
+            read(&random.bytes(n_bytes));
         }
     }
 }

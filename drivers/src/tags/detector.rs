@@ -173,6 +173,7 @@ mod tests {
     use super::*;
     use crate::PixelFormat;
     use crate::test_data;
+    use kinematics::random::Random;
 
     fn image(size_px: [u32; 2], format: PixelFormat, data: Vec<u8>) -> Image {
         let (camera, stamp) = ("wrist".into(), Stamp(5));
@@ -216,17 +217,10 @@ mod tests {
     #[test]
     fn noise_yields_no_tags_and_broken_image_is_error() {
         let mut spotter = TagDetector::start(Family::Tag36h11).unwrap();
-        let mut random = 3_u32;
-        let mut noise = |n: usize| -> Vec<u8> {
-            let next = |_| {
-                random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                random.to_be_bytes()[0]
-            };
-            (0..n).map(next).collect()
-        };
+        let mut random = Random::new(3);
         let odd = (1..40_u32).flat_map(|side| [[side, 41 - side], [side, 2000], [999, side]]);
         for size_px in odd.chain([[320, 240], [1201, 901]]) {
-            let pixels = noise((size_px[0] * size_px[1]) as usize);
+            let pixels = random.bytes((size_px[0] * size_px[1]) as usize);
             let detections = spotter.detect_blocking(image(size_px, PixelFormat::Gray8, pixels));
             assert_eq!(detections[0].as_ref().unwrap().tags, [], "{size_px:?}");
         }

@@ -239,6 +239,7 @@ fn rms_error_px(intrinsics: &Intrinsics, corners: &[Corner], camera_from_world: 
 mod tests {
     use super::*;
     use kinematics::Lens;
+    use kinematics::random::Random;
 
     fn camera(lens: Lens) -> Intrinsics {
         Intrinsics {
@@ -327,23 +328,11 @@ mod tests {
     #[test]
     fn errors_match_estimated_covariance() {
         let (camera, truth, tag) = (camera(Lens::Pinhole), camera_in_front_of_tag(0.5), tag(0.0, [0.4, 0.3, 0.1]));
-        let mut random = 88_172_645_463_325_252_u64;
-        let mut standard_normal = || {
-            // Sum of twelve uniform numbers minus six: approximately normal.
-            (0..12)
-                .map(|_| {
-                    random ^= random << 13;
-                    random ^= random >> 7;
-                    random ^= random << 17;
-                    (random >> 11) as f64 / (1_u64 << 53) as f64
-                })
-                .sum::<f64>()
-                - 6.0
-        };
+        let mut random = Random::new(1);
         let (mut chi2, n) = (0.0, 400);
         for _ in 0..n {
             let residual =
-                std::array::from_fn(|_| [CORNER_SIGMA_PX * standard_normal(), CORNER_SIGMA_PX * standard_normal()]);
+                std::array::from_fn(|_| [CORNER_SIGMA_PX * random.normal(), CORNER_SIGMA_PX * random.normal()]);
             let located = locate(&global_shutter(&camera), &[(&tag, project_corners(&camera, &truth, &tag, residual))])
                 .expect("a large tag");
             let residual = transform::log(&(located.world_from_camera.inverse() * truth), 1.0);

@@ -102,11 +102,11 @@ fn assert_monotonic(newest: &mut Option<Stamp>, stamp: Stamp, arrival: Stamp) {
 pub(crate) mod tests {
     use super::*;
     use crate::RangePoint;
-    use crate::fuzz::random::Random;
     use crate::wire::datagram::{
         Clock, DatagramHeader, JointsDatagram, ScanPart, encode_joints, encode_pose, encode_scan,
     };
     use kinematics::Transform;
+    use kinematics::random::Random;
 
     /// Datagrams that an arm, a base and a scanner send in 30 ms.
     pub(crate) fn example_traffic() -> Vec<Vec<u8>> {
@@ -143,7 +143,7 @@ pub(crate) mod tests {
         };
         let doubled: Vec<_> = lines.iter().flat_map(|line| [line.clone(), line.clone()]).collect();
         assert_eq!(read(&doubled), 10, "duplicates are ignored");
-        let mut random = Random(2);
+        let mut random = Random::new(2);
         for _ in 0..50 {
             let mut shuffled = lines.clone();
             random.shuffle(&mut shuffled);

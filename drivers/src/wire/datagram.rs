@@ -400,6 +400,7 @@ fn invalid(reason: String) -> Malformed {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use kinematics::random::Random;
 
     const HEADER: DatagramHeader = DatagramHeader { seq: 7, clock: Clock::Monotonic, stamp_nanos: 1_234_567_890_123 };
 
@@ -545,13 +546,9 @@ mod tests {
                 let _ = (decode_scan(&corrupted), decode_pose(&corrupted), decode_joints(&corrupted, &names()));
             }
         }
-        let mut state = 1_u64;
-        let mut random = || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            state.to_be_bytes()[0]
-        };
+        let mut random = Random::new(1);
         for len in 0..2000 {
-            let bytes: Vec<u8> = (0..len % 300).map(|_| random()).collect();
+            let bytes = random.bytes(len % 300);
             assert!(decode_scan(&bytes).is_err() && decode_pose(&bytes).is_err());
             assert!(decode_joints(&bytes, &names()).is_err());
         }

@@ -73,17 +73,13 @@ pub fn decode(bytes: &[u8]) -> Result<JointState, Malformed> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use kinematics::random::Random;
 
     #[test]
     fn joint_states_round_trip_exactly() {
-        let mut number = 0.1_f64;
+        let mut random = Random::new(1);
         for stamp in [0, -1, 1_700_000_000_123_456_789, i64::MAX] {
-            let position: Vec<f64> = (0..7)
-                .map(|_| {
-                    number = (number * 1103.5 + 0.123).fract() * 3.0 - 1.5;
-                    number
-                })
-                .collect();
+            let position = (0..7).map(|_| random.uniform(-1.5, 1.5)).collect();
             let sent =
                 JointState { stamp: Stamp(stamp), velocity: vec![-0.0, f64::MIN_POSITIVE], position, effort: vec![] };
             let read = decode(&encode(&sent)).expect("own bytes");

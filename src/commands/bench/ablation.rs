@@ -1,13 +1,14 @@
 //! `fieldrig bench ablation`: measures the contribution of each part of the method by training without it.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{median, sample_std};
+use crate::bench::statistics::sample_std;
 use crate::bench::variant::Variant;
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::training;
+use kinematics::quantile::median;
 use serde::Serialize;
+use session::Table;
 use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
@@ -74,7 +75,7 @@ struct VariantResult {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
+    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
@@ -182,7 +183,7 @@ fn findings(
     data: &NamedData,
     rows: &[VariantResult],
 ) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["trained".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
     head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));

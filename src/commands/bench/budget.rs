@@ -1,13 +1,14 @@
 //! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{db_per_doubling, extent, median};
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
+use crate::bench::statistics::{db_per_doubling, extent};
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::training;
+use kinematics::quantile::median;
 use serde::Serialize;
+use session::Table;
+use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use std::collections::HashSet;
 use std::path::PathBuf;
 use trainer::splat::{CountPolicy, SplatOptions};
@@ -70,7 +71,7 @@ struct Gain {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
+    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
         return Err(
             BadArgument("--max-splats, --count: this bench sets them; choose limits with --splats".into()).into()
@@ -150,7 +151,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
     let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
     let chosen = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds; band: minimum to maximum", args.seeds)
     } else {

@@ -1,14 +1,15 @@
 //! `fieldrig bench curve`: accuracy over time, with several seeds, compared with other trainers.
 
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::peer::Peer;
 use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{extent, median, sample_std, secs_to};
-use crate::chart::{Axis, Chart, Line, Point, Scale, compact_number};
+use crate::bench::statistics::{extent, sample_std, secs_to};
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::{evaluation_schedule, training};
+use kinematics::quantile::median;
 use serde::Serialize;
+use session::chart::{Axis, Chart, Line, Point, Scale, compact_number};
+use session::{Table, evaluation_schedule};
 use std::collections::{BTreeMap, HashSet};
 use std::path::PathBuf;
 use trainer::{ModelKind, ModelSpec};
@@ -99,7 +100,7 @@ struct TimeToQuality {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
+    let limits = session::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
     if args.seconds == 0.0 {
         return Err(BadArgument("--seconds: must be above 0".into()).into());
     }

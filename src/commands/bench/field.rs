@@ -35,11 +35,11 @@ pub(crate) struct Args {
 struct Row {
     rays: u32,
     samples: u32,
-    step_ms: f64,
-    step_wall_ms: f64,
+    step_millis: f64,
+    step_wall_millis: f64,
     /// Time to render as many samples of an image.
-    colors_ms: f64,
-    peak_mb: u64,
+    colors_millis: f64,
+    peak_bytes: u64,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     passes: Vec<(&'static str, f64)>,
 }
@@ -62,10 +62,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         let row = Row {
             rays: figures.n_rays,
             samples: figures.n_samples,
-            step_ms: figures.step_millis,
-            step_wall_ms: figures.step_wall_millis,
-            colors_ms: figures.colors_millis,
-            peak_mb: figures.peak_bytes >> 20,
+            step_millis: figures.step_millis,
+            step_wall_millis: figures.step_wall_millis,
+            colors_millis: figures.colors_millis,
+            peak_bytes: figures.peak_bytes,
             passes: super::profile(&figures.passes, args.profile),
         };
         if args.json {
@@ -74,7 +74,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         }
         print::line(format_args!(
             "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
-            row.rays, row.samples, row.step_ms, row.step_wall_ms, row.colors_ms, row.peak_mb
+            row.rays,
+            row.samples,
+            row.step_millis,
+            row.step_wall_millis,
+            row.colors_millis,
+            row.peak_bytes >> 20
         ))?;
         for (name, millis) in &row.passes {
             print::line(format_args!("    {millis:>9.4} ms  {name}"))?;

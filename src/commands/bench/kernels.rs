@@ -1,12 +1,11 @@
 //! `fieldrig bench kernels`: measures the speed of the splat kernels.
 
-use crate::open_gpu::{open_gpu, open_gpu_with};
+use crate::open_gpu::open_gpu;
 use anyhow::Context;
 use serde::Serialize;
 use std::io::Write;
 use std::path::PathBuf;
 use std::time::Duration;
-use trainer::gpu::GpuOptions;
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
@@ -70,22 +69,19 @@ fn parse_size(text: &str) -> Result<Size, String> {
 
 #[derive(Serialize)]
 struct Row {
-    w: u32,
-    h: u32,
-    n: usize,
-    isect: u64,
-    render_ms: f64,
+    size_px: [u32; 2],
+    n_splats: usize,
+    n_intersections: u64,
+    render_millis: f64,
     /// Step that updates every splat.
-    step_ms: f64,
+    step_millis: f64,
     /// Step that updates only the visible splats.
-    step_touched_ms: f64,
-    touched: u64,
-    /// Step with unordered sums; null if the adapter has no atomic float addition.
-    step_unordered_ms: Option<f64>,
-    render_wall_ms: f64,
-    step_wall_ms: f64,
+    step_visible_millis: f64,
+    n_visible: u64,
+    render_wall_millis: f64,
+    step_wall_millis: f64,
     mean_rgb: [f64; 3],
-    peak_mb: u64,
+    peak_bytes: u64,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     passes: Vec<(&'static str, f64)>,
 }
@@ -109,7 +105,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     for (size_ix, Size(size)) in sizes.iter().enumerate() {
         for n_splats in &counts {
             // A new device for each row, so that the memory peak is that of the row.
-            let gpu = open_gpu_with(GpuOptions { float_atomics: true, ..GpuOptions::default() })?;
+            let gpu = open_gpu()?;
             if size_ix == 0 && counts.first() == Some(n_splats) {
                 log::info!("{}", gpu.describe());
             }
@@ -131,43 +127,38 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
             })?;
             let row = Row {
-                w: size[0],
-                h: size[1],
-                n: *n_splats,
-                isect: figures.n_intersections,
-                render_ms: figures.render_millis,
-                step_ms: figures.step_millis,
-                step_touched_ms: figures.step_visible_millis,
-                touched: figures.n_visible,
-                step_unordered_ms: figures.step_unordered_millis,
-                render_wall_ms: figures.render_wall_millis,
-                step_wall_ms: figures.step_wall_millis,
+                size_px: *size,
+                n_splats: *n_splats,
+                n_intersections: figures.n_intersections,
+                render_millis: figures.render_millis,
+                step_millis: figures.step_millis,
+                step_visible_millis: figures.step_visible_millis,
+                n_visible: figures.n_visible,
+                render_wall_millis: figures.render_wall_millis,
+                step_wall_millis: figures.step_wall_millis,
                 mean_rgb: figures.mean_rgb,
-                peak_mb: figures.peak_bytes >> 20,
+                peak_bytes: figures.peak_bytes,
                 passes: super::profile(&figures.passes, args.profile),
             };
             if args.json {
                 writeln!(out, "{}", serde_json::to_string(&row)?)?;
                 continue;
             }
-            let unordered = row
-                .step_unordered_ms
-                .map_or("unordered sums: not supported".into(), |ms| format!("unordered sums {ms:.3} ms"));
             writeln!(
                 out,
-                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms; {unordered}), mean {:.5?}, peak {} MB",
-                row.w,
-                row.h,
-                row.n,
-                row.isect,
-                row.render_ms,
-                row.step_ms,
-                row.render_wall_ms,
-                row.step_wall_ms,
-                row.touched,
-                row.step_touched_ms,
+                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms), mean {:.5?}, peak {} MB",
+                row.size_px[0],
+                row.size_px[1],
+                row.n_splats,
+                row.n_intersections,
+                row.render_millis,
+                row.step_millis,
+                row.render_wall_millis,
+                row.step_wall_millis,
+                row.n_visible,
+                row.step_visible_millis,
                 row.mean_rgb,
-                row.peak_mb
+                row.peak_bytes >> 20
             )?;
             for (name, millis) in &row.passes {
                 writeln!(out, "    {millis:>9.4} ms  {name}")?;

@@ -1,15 +1,19 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
 use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
+use crate::bench::statistics::extent;
 use crate::bench::viewer::Viewer;
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
 use crate::commands::run::{self, Running};
 use crate::exit::{BadArgument, Exit};
 use crate::print;
-use crate::run_folder::CreatedFolders;
 use anyhow::Context;
 use clap::Parser;
+use keyframe::counted;
+use kinematics::quantile::{Rank, quantile};
+use session::Table;
+use session::chart::{Axis, Chart, Line, Marker, Point, Scale};
+use session::run_folder::CreatedFolders;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -23,7 +27,7 @@ const WRITE_PERIOD: Duration = Duration::from_secs(60);
 /// Maximum number of points of a line in the chart.
 const MAX_POINTS: usize = 60;
 /// Labels of GPU buffers that hold images of keyframes.
-const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
+const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.validation"];
 /// Number of GPU buffers in the table, the largest first.
 const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
@@ -229,10 +233,9 @@ fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
     let of_group = |group: &[Sample]| {
         let mut mb: Vec<f64> =
             group.iter().filter_map(component.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
-        mb.sort_by(f64::total_cmp);
-        let (low, high) = (*mb.first()?, *mb.last()?);
+        let [low, high] = extent(&mb)?;
         let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
-        Some(Point { x, y: mb[mb.len() / 2], low, high })
+        Some(Point { x, y: quantile(&mut mb, 0.5, Rank::Upper)?, low, high })
     };
     let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
     Line {
@@ -257,7 +260,7 @@ fn findings(args: &Args, measured: &MemoryRun) -> anyhow::Result<Findings> {
         let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
         format!("{:+.2} % per hour {name} {since}", growth.percent_per_hour)
     });
-    let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
+    let conditions = format!("{}, {}", args.input(), counted(args.viewers, "viewer"));
     let lines: Vec<Line> =
         COMPONENTS.iter().map(|component| line(component, samples)).filter(|line| !line.points.is_empty()).collect();
     let full = samples.iter().find(|sample| sample.evicted > 0);

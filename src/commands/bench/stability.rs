@@ -1,18 +1,18 @@
 //! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
 
 use crate::bench::disturb::Disturbance;
-use crate::bench::page::{Findings, Table};
+use crate::bench::page::Findings;
 use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{Interpolation, break_point, extent, median};
+use crate::bench::statistics::{Interpolation, break_point, extent};
 use crate::bench::variant::Variant;
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
 use crate::exit::{self, BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::session::Limits;
-use crate::training;
 use anyhow::ensure;
 use keyframe::{Keyframe, Split};
+use kinematics::quantile::median;
 use serde::Serialize;
+use session::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
+use session::{Limits, Table};
 use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -116,7 +116,7 @@ struct Break {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
+    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
     args.check()?;
     let mut runs = Runs::open(&args.bench, open_gpu()?)?;
     let data = runs.load(&args.data, &mut HashSet::new())?;
@@ -401,7 +401,7 @@ fn findings(
     data: &NamedData,
     results: &[DisturbanceResult],
 ) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
     let spread = if args.seeds > 1 {
         format!("median of {} seeds; band: minimum to maximum", args.seeds)
     } else {

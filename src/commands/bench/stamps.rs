@@ -1,12 +1,14 @@
 //! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock and a link with
 //! jitter.
 
-use crate::bench::page::{Findings, Table};
-use crate::bench::statistics::{median, quantile};
-use crate::chart::{Axis, Chart, Line, Point, Scale};
+use crate::bench::page::Findings;
 use crate::exit::{BadArgument, Exit};
+use kinematics::quantile::{Rank, median, quantile};
+use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
 use serde::Serialize;
+use session::Table;
+use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -109,7 +111,7 @@ fn check(args: &Args) -> Result<(), BadArgument> {
 /// shutter. The fixed latency is included.
 #[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
 fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
-    let mut random = seed;
+    let mut random = Random::new(seed);
     let mut clock = ClockMap::new();
     let n_readings =
         (args.seconds + args.fixed_millis * 1e-3 + args.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
@@ -124,7 +126,7 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
     for ix in 0..(args.seconds * rate_hz) as i64 {
         let shutter_secs = ix as f64 / rate_hz;
         let device_nanos = (shutter_secs / (1.0 + args.drift_ppm * 1e-6) * 1e9) as i64;
-        let latency_millis = args.fixed_millis + args.jitter_millis * uniform(&mut random);
+        let latency_millis = args.fixed_millis + args.jitter_millis * random.unit();
         let arrival = Stamp(((shutter_secs + latency_millis * 1e-3) * 1e9) as i64);
         let stamp = clock.stamp(device_nanos, arrival);
         if shutter_secs < args.settle_seconds {
@@ -135,15 +137,6 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
         }
     }
     errors
-}
-
-/// The next pseudorandom number in [0, 1). Source: Steele, Lea and Flood 2014, `SplitMix64`.
-fn uniform(state: &mut u64) -> f64 {
-    *state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    let mut mixed = *state;
-    mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    ((mixed ^ (mixed >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
 }
 
 impl StampErrors {
@@ -158,15 +151,14 @@ impl StampErrors {
         }
         let median_millis = median(errors).unwrap_or(f64::NAN);
         let mut sizes: Vec<f64> = errors.iter().map(|error| error.abs()).collect();
-        sizes.sort_by(f64::total_cmp);
         Self {
             rate_hz,
             is_calibrated,
             images: n,
-            within_1_ms_frac: sizes.partition_point(|size| *size <= MAX_ERROR_MILLIS) as f64 / n as f64,
+            within_1_ms_frac: sizes.iter().filter(|size| **size <= MAX_ERROR_MILLIS).count() as f64 / n as f64,
             median_millis,
-            p99_abs_millis: quantile(&sizes, 0.99).unwrap_or(f64::NAN),
-            max_abs_millis: quantile(&sizes, 1.0).unwrap_or(f64::NAN),
+            p99_abs_millis: quantile(&mut sizes, 0.99, Rank::Lower).unwrap_or(f64::NAN),
+            max_abs_millis: quantile(&mut sizes, 1.0, Rank::Lower).unwrap_or(f64::NAN),
             bars,
         }
     }

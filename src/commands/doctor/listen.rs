@@ -1,13 +1,12 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
-use crate::bench::statistics::quantile;
-use crate::config::{BaseDriver, Rig};
-use crate::join::{Join, JoinEvent, Refusal};
-use crate::open::{self, Devices, Opened};
-use crate::stop::Stop;
+use capture::config::{BaseDriver, Rig};
+use capture::open::{self, Devices, Opened};
+use capture::{Join, JoinEvent, Rejection, Stop};
 use drivers::{Sample, clock};
 use kinematics::Stamp;
+use kinematics::quantile::{Rank, quantile};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -64,13 +63,11 @@ impl Track {
 
     fn summarize(mut self, device: String, expected_hz: Option<f64>, is_simulated: bool) -> DeviceStatistics {
         let mut gaps: Vec<f64> = self.stamps.windows(2).map(|pair| pair[1].secs_since(pair[0]) * 1e3).collect();
-        gaps.sort_by(f64::total_cmp);
-        self.latency_millis.sort_by(f64::total_cmp);
         let span_secs = match (self.stamps.first(), self.stamps.last()) {
             (Some(first), Some(last)) => last.secs_since(*first),
             _ => 0.0,
         };
-        let quantile_of = |sorted: &[f64], frac| quantile(sorted, frac).unwrap_or(0.0);
+        let quantile_of = |values: &mut [f64], frac| quantile(values, frac, Rank::Lower).unwrap_or(0.0);
         let n_gaps = self.stamps.len().saturating_sub(1);
         DeviceStatistics {
             device,
@@ -79,11 +76,11 @@ impl Track {
             expected_hz,
             dropped: self.dropped,
             latency: (!is_simulated).then(|| Latency {
-                latency_p50_millis: quantile_of(&self.latency_millis, 0.5),
-                latency_p99_millis: quantile_of(&self.latency_millis, 0.99),
-                latency_max_millis: quantile_of(&self.latency_millis, 1.0),
+                latency_p50_millis: quantile_of(&mut self.latency_millis, 0.5),
+                latency_p99_millis: quantile_of(&mut self.latency_millis, 0.99),
+                latency_max_millis: quantile_of(&mut self.latency_millis, 1.0),
             }),
-            gap_p99_millis: quantile_of(&gaps, 0.99),
+            gap_p99_millis: quantile_of(&mut gaps, 0.99),
         }
     }
 }
@@ -138,10 +135,10 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
         })
         .collect();
     findings.extend(devices.iter().filter_map(problem));
-    let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
-    let n_posed = join.counts().images - join.counts().refused.get(&Refusal::NoPose).copied().unwrap_or(0);
-    if !refused.is_empty() {
-        let message = format!("images that did not become keyframes: {}", refused.join(", "));
+    let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
+    if !rejected.is_empty() {
+        let message = format!("images that did not become keyframes: {}", rejected.join(", "));
         findings.push(if 2 * n_posed < join.counts().images {
             let remedy =
                 "each image needs joint states, and base poses if the base moves, around its time: check their source";
@@ -155,7 +152,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
 
 /// The devices of a rig with their rates, as far as the rig file gives them.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
-    use crate::config::ArmDriver;
+    use capture::config::ArmDriver;
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));

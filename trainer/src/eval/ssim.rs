@@ -167,15 +167,12 @@ fn gaussian() -> [f32; WINDOW] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use kinematics::random::Random;
 
     /// A picture of reproducible noise.
-    fn noise(n_pixels: usize, seed: u32) -> Vec<u8> {
-        let mut state = seed;
-        let mut next = || {
-            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            state.to_le_bytes()[3]
-        };
-        (0..n_pixels).flat_map(|_| [next(), next(), next(), 255]).collect()
+    fn noise(n_pixels: usize, seed: u64) -> Vec<u8> {
+        let mut random = Random::new(seed);
+        (0..n_pixels).flat_map(|_| [random.byte(), random.byte(), random.byte(), 255]).collect()
     }
 
     #[test]

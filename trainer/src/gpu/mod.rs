@@ -5,6 +5,8 @@ mod options;
 mod passes;
 mod pipeline;
 mod requirements;
+#[cfg(test)]
+pub(crate) mod testing;
 mod wgsl;
 
 pub use device::{Buffer, Gpu, PendingRead};

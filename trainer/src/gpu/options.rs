@@ -7,8 +7,6 @@ pub struct GpuOptions {
     pub optional_features: bool,
     /// Whether cooperative matrices may be used.
     pub matrices: bool,
-    /// Whether float atomics may be used. Their order of additions varies between runs, so training does not use them.
-    pub float_atomics: bool,
     /// Lowers the largest binding, bytes; for tests of buffer limits.
     pub max_binding_bytes: Option<u64>,
     /// Total size of all storage buffers above which the GPU counts as full, bytes; for tests of running out of memory.
@@ -22,7 +20,6 @@ impl Default for GpuOptions {
         Self {
             optional_features: true,
             matrices: true,
-            float_atomics: false,
             max_binding_bytes: None,
             memory_limit_bytes: None,
             adapter: None,

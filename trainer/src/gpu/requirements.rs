@@ -11,8 +11,6 @@ pub struct Optional {
     pub subgroup_lanes: Option<u32>,
     /// GPU timestamps for the time of each pass; without them, only wall time is available.
     pub timestamps: bool,
-    /// Atomic additions of floats; used only for benchmarks, which report if they are unavailable.
-    pub float_atomics: bool,
     /// Products of 16x16 f16 matrices, summed in f32, each computed by a subgroup; without them, neural fields use f32.
     pub half_matrices: bool,
 }
@@ -40,7 +38,6 @@ impl Optional {
         Self {
             subgroup_lanes: (allowed && subgroups).then_some(info.subgroup_min_size),
             timestamps: allowed && features.contains(wgpu::Features::TIMESTAMP_QUERY),
-            float_atomics: allowed && options.float_atomics && features.contains(wgpu::Features::SHADER_FLOAT32_ATOMIC),
             half_matrices: allowed
                 && options.matrices
                 && subgroups
@@ -54,7 +51,6 @@ impl Optional {
         let mut features = wgpu::Features::empty();
         features.set(wgpu::Features::SUBGROUP, self.subgroup_lanes.is_some());
         features.set(wgpu::Features::TIMESTAMP_QUERY, self.timestamps);
-        features.set(wgpu::Features::SHADER_FLOAT32_ATOMIC, self.float_atomics);
         features.set(HALF_MATRICES, self.half_matrices);
         features
     }

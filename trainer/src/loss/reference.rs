@@ -180,7 +180,7 @@ fn sign(value: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::mismatches::Mismatches;
-    use crate::random::Random;
+    use crate::random::F32Random;
 
     const SIZE_PX: [usize; 2] = [17, 14];
     const N_PIXELS: usize = SIZE_PX[0] * SIZE_PX[1];
@@ -190,14 +190,14 @@ mod tests {
     /// A render and a target that differ, with masked pixels, pixels without depth, and large depth errors. No
     /// residual is close to zero or to the clip threshold.
     fn image_and_target() -> (RenderedImage, Target) {
-        let mut random = Random::new(11);
+        let mut random = F32Random::new(11);
         let mut image = RenderedImage::default();
         let mut target = Target { size_px: SIZE_PX, ..Target::default() };
         for pixel_ix in 0..N_PIXELS {
             let truth = random.array(0.2, 0.8);
             let transmittance = random.uniform(0.05, 0.6);
             let depth_m = if pixel_ix % 5 == 0 { 0.0 } else { random.uniform(0.5, 3.0) };
-            let offset = |random: &mut Random| {
+            let offset = |random: &mut F32Random| {
                 random.uniform(0.02, 0.2) * if random.uniform(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 }
             };
             let rgb = truth.map(|truth: f64| truth + offset(&mut random));

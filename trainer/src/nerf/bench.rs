@@ -6,13 +6,13 @@
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
 use super::options::NerfBudget;
 use super::params::Ray;
-use super::rays::{mix_hash, unit};
 use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
 use crate::model_options::ModelOptions;
 use calibration::ParamSet;
+use kinematics::random::{hash, unit_from_bits};
 use nalgebra::Vector3;
 use std::sync::Arc;
 use std::time::Instant;
@@ -111,12 +111,12 @@ fn synthetic_rays(nerf_budget: NerfBudget) -> Vec<Ray> {
     // Half a step shorter, so that rounding does not change the count.
     let length = 2.0 / f64::from(n_steps) * (f64::from(n_samples / n_rays) - 0.5);
     let ray = |ix: u32| {
-        let number = |stream: u64| 2.0 * unit(mix_hash(u64::from(ix) << 8 | stream)) - 1.0;
+        let number = |stream: u64| 2.0 * unit_from_bits(hash(u64::from(ix) << 8 | stream)) - 1.0;
         let triple = |stream: u64| Vector3::from_fn(|axis, _| number(stream + axis as u64));
         let direction = triple(0).normalize();
         // Clamped so that the ray's center is in the cube and all of it is where steps have constant length.
         let origin = (triple(3) * 0.5).map(|along| along.clamp(-0.5, 0.5)) - 0.5 * length * direction;
-        let target = mix_hash(u64::from(ix) << 8 | 6).to_le_bytes();
+        let target = hash(u64::from(ix) << 8 | 6).to_le_bytes();
         Ray {
             origin: f32s_of(origin.into()),
             direction: f32s_of(direction.into()),

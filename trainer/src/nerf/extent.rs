@@ -3,6 +3,7 @@
 use crate::Aabb;
 use crate::view::Camera;
 use keyframe::{Keyframe, Shutter};
+use kinematics::quantile::{Rank, quantile, trimmed_range};
 use kinematics::{Transform, Twist};
 use nalgebra::{Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
@@ -37,18 +38,14 @@ impl Extent {
         let cameras: Vec<Vector3<f64>> =
             keyframes.clone().map(|keyframe| keyframe.world_from_camera.translation.vector).collect();
         let mut visible_points: Vec<(f64, Vector3<f64>)> = keyframes.clone().flat_map(depth_samples).collect();
-        if visible_points.is_empty() {
+        let mut depths_m: Vec<f64> = visible_points.iter().map(|(z_m, _)| *z_m).collect();
+        let Some(median_m) = quantile(&mut depths_m, 0.5, Rank::Upper) else {
             return Self::without_depth(keyframes, &cameras);
-        }
-        visible_points.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-        let far_m = FAR_OVER_MEDIAN * visible_points[visible_points.len() / 2].0;
-        visible_points.truncate(visible_points.partition_point(|(z_m, _)| *z_m <= far_m));
+        };
+        visible_points.retain(|(z_m, _)| *z_m <= FAR_OVER_MEDIAN * median_m);
         let range = |axis: usize| {
             let mut along: Vec<f64> = visible_points.iter().map(|(_, point)| point[axis]).collect();
-            along.sort_by(f64::total_cmp);
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
-            let n_outliers = (along.len() as f64 * OUTSIDE_FRAC) as usize;
-            let trimmed_range = [along[n_outliers], along[along.len() - 1 - n_outliers]];
+            let trimmed_range = trimmed_range(&mut along, OUTSIDE_FRAC).expect("readings at the median depth remain");
             let camera_coords = cameras.iter().map(|camera| camera[axis]);
             camera_coords.fold(trimmed_range, |trimmed_range, camera| {
                 [trimmed_range[0].min(camera), trimmed_range[1].max(camera)]
@@ -134,6 +131,5 @@ pub(crate) fn pixel_size_m<'a>(keyframes: impl Iterator<Item = &'a Keyframe>, ex
         typical_depth_m / keyframe.focal_px[0].max(1.0)
     };
     let mut sizes: Vec<f64> = keyframes.map(size).collect();
-    sizes.sort_by(f64::total_cmp);
-    sizes.get(sizes.len() / 2).copied().unwrap_or(extent.radius_m / 512.0)
+    quantile(&mut sizes, 0.5, Rank::Upper).unwrap_or(extent.radius_m / 512.0)
 }

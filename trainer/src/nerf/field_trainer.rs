@@ -10,7 +10,6 @@ use super::params::{
     RayLoss, image_params_of,
 };
 use super::passes::{Canvas, FieldPasses};
-use super::rays::{mix_hash, unit};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
@@ -18,6 +17,7 @@ use crate::model_options::ModelOptions;
 use crate::view::Camera;
 use crate::{Error, Picture};
 use calibration::{EMBEDDING_DIM, ParamSet};
+use kinematics::random::{hash, unit_from_bits};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -139,7 +139,7 @@ impl FieldTrainer {
     /// (Glorot and Bengio 2010).
     fn initialize(&self, gpu: &Gpu, seed: u64, widths: &Widths) {
         let uniform = |stream: u64, ix: usize, bound: f64| {
-            f32_of(bound * (2.0 * unit(mix_hash(seed ^ mix_hash(stream << 40 | ix as u64))) - 1.0))
+            f32_of(bound * (2.0 * unit_from_bits(hash(seed ^ hash(stream << 40 | ix as u64))) - 1.0))
         };
         let n_numbers = 2 * self.field.n_entries as usize;
         let entries: Vec<f32> = (0..n_numbers).into_par_iter().map(|ix| uniform(1, ix, INITIAL_ENTRY_RANGE)).collect();
@@ -205,7 +205,7 @@ impl FieldTrainer {
             }
             passes.update_images(list, moments, images);
         }
-        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
+        passes.update(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
         Ok(())
     }
 
@@ -515,7 +515,7 @@ pub(crate) struct RayColor {
 
 /// A random background: the field must not use the background to explain the images.
 fn background(options: &ModelOptions<NerfOptions>, step: u64) -> [f32; 3] {
-    [0, 1, 2].map(|ix| f32_of(unit(mix_hash(options.common.seed ^ mix_hash(step << 2 | ix)))))
+    [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.common.seed ^ hash(step << 2 | ix)))))
 }
 
 /// Parameters and optimizer state of the first images.
@@ -559,7 +559,8 @@ fn march_of(nerf_budget: NerfBudget) -> March {
         n_cells: nerf_budget.n_cells,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: [0; 3],
+        unused: 0,
+        unused_2: [0; 2],
     }
 }
 

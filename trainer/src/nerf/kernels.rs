@@ -327,3 +327,61 @@ impl FieldPipelines {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::KERNELS;
+    use crate::gpu::testing::{assert_layout, assert_valid};
+    use crate::nerf::params::{
+        AdamRule, Backdrop, Batch, ImageParamRule, Level, March, OccupancyUpdate, Ray, RayLoss, Span, StepScale,
+    };
+
+    #[test]
+    fn structs_have_the_same_layout_in_rust_and_wgsl() {
+        assert_layout!(KERNELS, Batch, [n_rays, n_samples, max_samples, unused]);
+        assert_layout!(
+            KERNELS,
+            Ray,
+            [
+                origin,
+                first_sample,
+                direction,
+                n_samples,
+                begin,
+                end,
+                embedding,
+                target_rgb,
+                target_distance,
+                jitter,
+                is_finished,
+                next_segment,
+            ]
+        );
+        assert_layout!(KERNELS, Span, [begin, end, ray, unused]);
+        assert_layout!(KERNELS, March, [step, max_samples, n_cells, first_ray, max_found, unused, unused_2]);
+        assert_layout!(KERNELS, OccupancyUpdate, [n_cells, n_points, decay, step]);
+        assert_layout!(KERNELS, Backdrop, [srgb, radius_m]);
+        assert_layout!(KERNELS, Level, [n_cells, begin, mask, unused]);
+        assert_layout!(
+            KERNELS,
+            RayLoss,
+            [background_srgb, distance_weight, distance_clip, distortion, near, line_of_sight, band, band_frac, unused,]
+        );
+        assert_layout!(KERNELS, StepScale, [rate_frac, unused, correction]);
+        assert_layout!(
+            KERNELS,
+            ImageParamRule,
+            [learned, n_images, rotation_rate, translation_rate, embedding_rate, weight_decay, unused]
+        );
+        assert_layout!(
+            KERNELS,
+            AdamRule,
+            [rate, final_rate_frac, betas, epsilon, weight_decay, n_planned_steps, unused]
+        );
+    }
+
+    #[test]
+    fn every_kernel_is_valid() {
+        assert_valid(KERNELS);
+    }
+}

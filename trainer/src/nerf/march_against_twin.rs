@@ -9,7 +9,7 @@ use super::reference::march::March;
 use super::reference::space::contract;
 use crate::gpu::{Gpu, GpuOptions, Passes, f32_of, f32s_of};
 use crate::mismatches::Mismatches;
-use crate::random::Random;
+use crate::random::F32Random;
 
 const N_CELLS: u32 = 64;
 /// More than a workgroup scans at once.
@@ -33,7 +33,7 @@ type TestRay = ([f64; 3], [f64; 3], [f64; 2], f64);
 fn rays() -> Vec<TestRay> {
     let rounded = |x: f64| f64::from(f32_of(x));
     let ray = |seed: u64| {
-        let mut random = Random::new(seed);
+        let mut random = F32Random::new(seed);
         let direction = nalgebra::Vector3::from(random.array::<3>(-1.0, 1.0)).normalize().map(rounded);
         // Some begin outside the inner cube, some end inside it.
         let end = if seed.is_multiple_of(5) { 1.5 } else { 1000.0 };
@@ -76,7 +76,8 @@ fn samples_lie_in_occupied_cells_within_limit() {
         n_cells: N_CELLS,
         first_ray: 0,
         max_found: u32::MAX,
-        unused: [0; 3],
+        unused: 0,
+        unused_2: [0; 2],
     };
     gpu.write(&slot.march, 0, bytemuck::bytes_of(&march));
     let image_params = &field.no_image_params;

@@ -221,7 +221,7 @@ impl NerfModel {
 
     /// Records the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
-        let learned_params = self.params_learned_now();
+        let learned_params = self.current_params();
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
         if learned_params.any() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;

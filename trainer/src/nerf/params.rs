@@ -57,7 +57,8 @@ pub(crate) struct March {
     pub(crate) n_cells: u32,
     pub(crate) first_ray: u32,
     pub(crate) max_found: u32,
-    pub(crate) unused: [u32; 3],
+    pub(crate) unused: u32,
+    pub(crate) unused_2: [u32; 2],
 }
 
 /// `OccupancyUpdate` of `shared/occupancy_update.wgsl`.

@@ -5,6 +5,7 @@ use super::params;
 use crate::gpu::{f32_of, f32s_of};
 use crate::view::depth_in_color_view;
 use keyframe::Keyframe;
+use kinematics::random::{hash, unit_from_bits};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
@@ -96,37 +97,24 @@ pub(crate) fn draw(images: &[RayImage], extent: &Extent, draw: &RaySampling) -> 
     if images.is_empty() {
         return Vec::new();
     }
-    let key = mix_hash(draw.seed ^ mix_hash(draw.step));
+    let key = hash(draw.seed ^ hash(draw.step));
     let ray = |ix: u64| {
-        let ray_key = mix_hash(key ^ mix_hash(ix));
-        let share = (ix as f64 + unit(ray_key)) / f64::from(draw.n_rays);
+        let ray_key = hash(key ^ hash(ix));
+        let share = (ix as f64 + unit_from_bits(ray_key)) / f64::from(draw.n_rays);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
         let image_ix = ((share * images.len() as f64) as usize).min(images.len() - 1);
         let image = &images[image_ix];
         let n_pixels = image.keyframe.rgba_srgb.len() as u64 / 4;
         let pick = |attempt: u64| {
-            let word = mix_hash(ray_key.wrapping_add(1 + attempt));
+            let word = hash(ray_key.wrapping_add(1 + attempt));
             // The upper half of a 64-bit product: uniform over all pixels.
             usize::try_from((u128::from(word) * u128::from(n_pixels)) >> 64).expect("less than a length")
         };
         let is_unmasked = |pixel_ix: &usize| image.keyframe.rgba_srgb[4 * pixel_ix + 3] > 0;
         let pixel_ix = (0..MAX_ATTEMPTS).map(pick).find(is_unmasked).unwrap_or_else(|| pick(0));
-        let jitter = f32_of(unit(mix_hash(ray_key ^ 0x5bd1_e995)));
+        let jitter = f32_of(unit_from_bits(hash(ray_key ^ 0x5bd1_e995)));
         let embedding = u32::try_from(image_ix).expect("few images");
         params::Ray { embedding, ..image.ray(extent, pixel_ix, draw.begin, jitter) }
     };
     (0..draw.n_rays).into_par_iter().with_min_len(RAYS_PER_TASK).map(|ix| ray(ix.into())).collect()
-}
-
-/// A hash of a word (Steele et al. 2014, `SplitMix64`).
-pub(crate) fn mix_hash(word: u64) -> u64 {
-    let mut z = word.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
-
-/// Maps a word to 0 <= x < 1.
-pub(crate) fn unit(word: u64) -> f64 {
-    (word >> 11) as f64 / (1u64 << 53) as f64
 }

@@ -6,10 +6,19 @@
 @group(0) @binding(6) var<storage, read> upstream: array<vec4f>;
 @group(0) @binding(7) var<storage, read> pixel_totals: array<vec2f>;
 @group(0) @binding(8) var<storage, read> last: array<u32>;
+// Each intersection of splat and tile has its own slot, written once; `update` adds a splat's slots in order.
+@group(0) @binding(9) var<storage, read_write> gradients: array<f32>; // 12 per slot, see `Gradient`
 
 const N_PARTS_OF_GRADIENT = 12u;
 
-#import gradients
+// Slot for the gradient of a tile's entry.
+fn slot_of(entry: u32, tile: Tile) -> u32 {
+    return entries[entry].z + countOneBits(entries[entry].y & ((1u << tile.in_bin) - 1u));
+}
+
+fn write_gradient(slot: u32, part: u32, value: f32) {
+    gradients[slot * N_PARTS_OF_GRADIENT + part] = value;
+}
 
 // A lane's pixels: upstream gradients and compositing state around the current splat.
 struct Pixels {

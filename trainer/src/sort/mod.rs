@@ -30,7 +30,8 @@ macro_rules! kernel {
 }
 
 /// All kernels of this module, for validation.
-pub const KERNELS: &[Kernel] = &[
+#[cfg(test)]
+const KERNELS: &[Kernel] = &[
     kernel!("radix_count_parallel"),
     kernel!("radix_scan_parallel"),
     kernel!("radix_scatter_parallel"),
@@ -156,6 +157,7 @@ impl RadixSort {
 mod tests {
     use super::*;
     use crate::gpu::GpuOptions;
+    use crate::gpu::testing::{assert_layout, assert_valid};
 
     fn sorted_on_gpu(keys: &[u32], key_range: [u32; 2], parallel: bool) -> Option<(Vec<u32>, Vec<u32>)> {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
@@ -205,5 +207,15 @@ mod tests {
             check(70_000, 0xffff, parallel);
             check(70_000, u32::MAX - 2000, parallel);
         }
+    }
+
+    #[test]
+    fn structs_have_the_same_layout_in_rust_and_wgsl() {
+        assert_layout!(KERNELS, Digit, [shift, counter, largest, max_blocks]);
+    }
+
+    #[test]
+    fn every_kernel_is_valid() {
+        assert_valid(KERNELS);
     }
 }

@@ -64,9 +64,9 @@ fn backward(tile_ix: u32, lane: u32) {
             take_batch(lane, batch, n_queued, tile);
             let n = min(n_queued - batch, BATCH);
             if bitcast<u32>(wg_splats[0].color.w) >= past_last {
-                // All splats of the batch are hidden in this tile.
+                // All splats of the batch are hidden in this tile: they have no gradient, but their slots are read.
                 for (var at = lane; at < n * N_PARTS_OF_GRADIENT; at += LANES) {
-                    write_zero_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT);
+                    write_gradient(wg_slots[at / N_PARTS_OF_GRADIENT], at % N_PARTS_OF_GRADIENT, 0.0);
                 }
                 continue;
             }

@@ -11,7 +11,6 @@
 
 #import backward_bindings
 #import strips
-#import lane_sums
 #import coverage
 
 const BATCH = 32u;
@@ -40,6 +39,13 @@ fn owned_splat(at: u32, n_queued: u32) -> Owned {
         owned.half = halved(owned.splat.conic);
     }
     return owned;
+}
+
+// Sum over the 8 lanes of the subgroup in a fixed order.
+fn sum_of_lanes(mine: vec4f) -> vec4f {
+    var all = mine + subgroupShuffleXor(mine, 1u);
+    all += subgroupShuffleXor(all, 2u);
+    return all + subgroupShuffleXor(all, 4u);
 }
 
 // A lane's pixels of one strip.

@@ -5,12 +5,13 @@
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines, UnorderedPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use kinematics::Transform;
+use kinematics::quantile::{Rank, quantile};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -31,9 +32,6 @@ pub struct KernelFigures {
     pub step_visible_millis: f64,
     /// Number of visible splats.
     pub n_visible: u64,
-    /// Median GPU time of a step that updates every splat and sums gradients in any order, milliseconds; `None` if
-    /// the adapter does not support it.
-    pub step_unordered_millis: Option<f64>,
     /// Mean wall time of consecutive pictures, milliseconds.
     pub render_wall_millis: f64,
     /// Mean wall time of consecutive steps, milliseconds.
@@ -80,7 +78,7 @@ pub struct Repeats {
 struct KernelBench {
     gpu: Arc<Gpu>,
     draw: DrawPipelines,
-    learn: LearnPipelines,
+    train: TrainPipelines,
     splats: SplatBuffers,
     scratch: Scratch,
     image_buffers: ImageBuffers,
@@ -92,15 +90,7 @@ struct KernelBench {
     gains: Buffer,
     rule: Buffer,
     rule_visible: Buffer,
-    unordered: Option<Unordered>,
     size_px: [u32; 2],
-}
-
-/// Resources of a step that sums gradients in any order.
-struct Unordered {
-    pipelines: UnorderedPipelines,
-    /// 12 f32 per splat.
-    sums: Buffer,
 }
 
 /// Times the kernels on `cloud` at one image size.
@@ -123,18 +113,12 @@ pub fn time_kernels(
     let peak_bytes = gpu.peak_bytes();
     let (step_visible_millis, _) = bench.time(&mut passes, repeats, KernelBench::record_step_visible)?;
     let n_visible = bench.n_visible()?;
-    bench.unordered = bench.new_unordered(&[])?;
-    let step_unordered_millis = match &bench.unordered {
-        Some(_) => Some(bench.time(&mut passes, repeats, KernelBench::record_step_unordered)?.0),
-        None => None,
-    };
     Ok(KernelFigures {
         n_intersections,
         render_millis,
         step_millis,
         step_visible_millis,
         n_visible,
-        step_unordered_millis,
         render_wall_millis,
         step_wall_millis,
         mean_rgb,
@@ -146,7 +130,7 @@ pub fn time_kernels(
 impl KernelBench {
     fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
-        let learn = LearnPipelines::new(&gpu)?;
+        let train = TrainPipelines::new(&gpu)?;
         let n_splats =
             u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
@@ -182,9 +166,8 @@ impl KernelBench {
             gains: gpu.storage_with("bench.gains", bytemuck::cast_slice(&[1.0f32; 4]))?,
             rule: gpu.uniform_with("bench.rule", &rule()),
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
-            unordered: None,
             draw,
-            learn,
+            train,
             splats,
             size_px,
             gpu,
@@ -232,23 +215,15 @@ impl KernelBench {
 
     fn record_step(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule, false);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule, false);
         self.record_end(passes);
     }
 
     fn record_step_visible(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule_visible, false);
-        self.record_end(passes);
-    }
-
-    /// Same as [`Self::record_step`] if there are no unordered pipelines.
-    fn record_step_unordered(&self, passes: &mut Passes) {
-        let Some(Unordered { pipelines, sums }) = &self.unordered else { return self.record_step(passes) };
-        let view = self.record_gradients(passes);
-        view.backward_and_update_unordered(passes, pipelines, &self.rule, sums);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule_visible, false);
         self.record_end(passes);
     }
 
@@ -258,7 +233,7 @@ impl KernelBench {
         view.draw(passes, &self.draw);
         view.compare(
             passes,
-            &self.learn,
+            &self.train,
             &Target {
                 image: &self.image,
                 depth: &self.depth,
@@ -271,13 +246,7 @@ impl KernelBench {
     }
 
     fn record_end(&self, passes: &mut Passes) {
-        passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
-    }
-
-    fn new_unordered(&self, overrides_of_update: &[(&str, f64)]) -> Result<Option<Unordered>, Error> {
-        let Some(pipelines) = UnorderedPipelines::new(&self.gpu, overrides_of_update)? else { return Ok(None) };
-        let sums = self.gpu.storage("bench.sums", 48 * u64::from(self.splats.n_splats))?;
-        Ok(Some(Unordered { pipelines, sums }))
+        passes.dispatch(&self.gpu, &self.train.advance, 1, &[("status", &self.status)]);
     }
 
     fn n_visible(&self) -> Result<u64, Error> {
@@ -309,8 +278,8 @@ impl KernelBench {
             let span = passes.submit_timed_total(&self.gpu)?;
             spans.push(span.unwrap_or_else(|| since.elapsed().as_secs_f64() * 1e3));
         }
-        spans.sort_by(f64::total_cmp);
-        Ok((spans[spans.len() / 2], consecutive_millis))
+        let median = quantile(&mut spans, 0.5, Rank::Upper).unwrap_or(f64::NAN);
+        Ok((median, consecutive_millis))
     }
 
     fn counters(&self) -> Result<Vec<u32>, Error> {
@@ -346,62 +315,5 @@ fn rule() -> Rule {
         update_all: 1,
         schedule_start: 0.0,
         unused: 0,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::gpu::GpuOptions;
-    use crate::mismatches::Mismatches;
-    use crate::splat::cloud::synthetic_cloud;
-
-    /// Tolerance for f32 sums of a few hundred terms in another order, relative to the largest sum: a hundred times
-    /// their rounding.
-    const ORDER_TOLERANCE: f64 = 1e-5;
-
-    /// Gradients with respect to all means, scales and constant colors.
-    fn gradients(unordered: bool) -> Vec<f64> {
-        let gpu = Gpu::open(&GpuOptions { float_atomics: true, ..GpuOptions::default() }).unwrap();
-        let cloud = synthetic_cloud(3000, 0);
-        let mut bench = KernelBench::new(gpu.clone(), &cloud, [112, 96], Eye::Outside).unwrap();
-        bench.size_buffers().unwrap();
-        let mut passes = Passes::default();
-        let view = bench.record_gradients(&mut passes);
-        if unordered {
-            let unordered =
-                bench.new_unordered(&[("GRADIENTS_ONLY", 1.0)]).unwrap().expect("lavapipe supports float atomics");
-            view.backward_and_update_unordered(&mut passes, &unordered.pipelines, &bench.rule, &unordered.sums);
-            passes.submit(&gpu);
-            let sums: Vec<f32> = gpu.read(&unordered.sums, 12 * cloud.n_splats()).unwrap();
-            assert!(sums.iter().all(|sum| *sum == 0.0), "the sums are reset to zero for the next step");
-        } else {
-            let update = LearnPipelines::gradients_only(&gpu).unwrap();
-            view.backward(&mut passes, &bench.learn);
-            view.update(&mut passes, &update, &bench.rule, true);
-            passes.submit(&gpu);
-        }
-        assert!(bench.n_visible().unwrap() > 1000);
-        let gradients_read = bench.splats.read(&gpu).unwrap();
-        let constant = gradients_read.sh.chunks_exact(gradients_read.n_coefficients()).map(|coeffs| coeffs[0]);
-        let all = gradients_read.means.iter().chain(&gradients_read.log_scales).copied().chain(constant);
-        all.flatten().map(f64::from).collect()
-    }
-
-    #[test]
-    fn unordered_gradients_match_ordered_ones() {
-        let (ordered, unordered) = (gradients(false), gradients(true));
-        let third = ordered.len() / 3;
-        let mut mismatches = Mismatches::default();
-        for (kind, name) in ["mean", "log scale", "color"].into_iter().enumerate() {
-            let range = kind * third..(kind + 1) * third;
-            let largest = ordered[range.clone()].iter().fold(0.0f64, |max, gradient| max.max(gradient.abs()));
-            assert!(largest > 0.0);
-            for ix in range {
-                let label = format!("{name} {}", ix % third);
-                mismatches.check(label, unordered[ix], ordered[ix], ORDER_TOLERANCE * largest, ORDER_TOLERANCE);
-            }
-        }
-        mismatches.assert_none();
     }
 }

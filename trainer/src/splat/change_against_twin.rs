@@ -115,9 +115,9 @@ fn optimizer_steps_match_the_twin() {
         let mut passes = Passes::default();
         let view_passes = fixture.passes();
         view_passes.draw(&mut passes, &fixture.draw);
-        view_passes.compare(&mut passes, &fixture.learn, &target_buffers.target());
-        view_passes.backward(&mut passes, &fixture.learn);
-        view_passes.update(&mut passes, &fixture.learn.update, &rule, false);
+        view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
+        view_passes.backward(&mut passes, &fixture.train);
+        view_passes.update(&mut passes, &fixture.train.update, &rule, false);
         passes.submit(gpu);
         gpu.write(&fixture.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }
@@ -149,7 +149,7 @@ fn growth_matches_the_twin() {
     for ix in [0, 255, 256, 699] {
         splats[ix].opacity_logit = -9.0; // Dead.
     }
-    let mut random = scene::Random::new(9);
+    let mut random = scene::F32Random::new(9);
     let errors: Vec<f32> = (0..N_BEFORE).map(|_| f32_of(random.uniform(0.0, 1.0).powi(8))).collect();
     let mut fixture = KernelFixture::new(&GpuOptions::default(), &scene::tilted_view(), &arrays_of(&splats));
     let gpu = fixture.gpu.clone();
@@ -175,7 +175,7 @@ fn growth_matches_the_twin() {
     gpu.write(&fixture.splats.moments, 0, bytemuck::cast_slice(&moments));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.train, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
     fixture.splats.set_n_splats(&gpu, N_AFTER);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
@@ -202,7 +202,7 @@ fn growth_matches_the_twin() {
 fn dead_splats_have_no_children() {
     const N_BEFORE: u32 = 60_000;
     const N_AFTER: u32 = 1_200_000; // A few of a million choices are rounded to dead splats.
-    let mut random = scene::Random::new(12);
+    let mut random = scene::F32Random::new(12);
     let n = N_BEFORE as usize;
     let is_dead: Vec<bool> = (0..n).map(|_| random.uniform(0.0, 1.0) < 0.5).collect();
     let arrays = SplatArrays {
@@ -230,7 +230,7 @@ fn dead_splats_have_no_children() {
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.train, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
     let of_dead =

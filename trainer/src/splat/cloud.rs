@@ -3,7 +3,7 @@
 use crate::Error;
 use crate::splat::arrays::SplatArrays;
 use candle_core::npy::NpzTensors;
-use std::f64::consts::TAU;
+use kinematics::random::Random;
 use std::path::Path;
 
 const SH_DEGREE: u32 = 3;
@@ -20,7 +20,7 @@ pub fn synthetic_cloud(n_splats: usize, seed: u64) -> SplatArrays {
     let typical_log_scale = (0.6 / (n_splats as f64).cbrt()).ln();
     let mut splats = SplatArrays { sh_degree: SH_DEGREE, ..SplatArrays::default() };
     for _ in 0..n_splats {
-        splats.means.push(std::array::from_fn(|_| (2.0 * random.uniform() - 1.0) as f32));
+        splats.means.push(std::array::from_fn(|_| (2.0 * random.unit() - 1.0) as f32));
         splats.log_scales.push(std::array::from_fn(|_| (typical_log_scale + 0.3 * random.normal()) as f32));
         splats.rotations_wxyz.push(std::array::from_fn(|_| random.normal() as f32));
         splats.opacity_logits.push((1.5 * random.normal()) as f32);
@@ -57,44 +57,6 @@ fn rows<const N: usize>(file: &NpzTensors, name: &str, inner_shape: &[usize]) ->
         return Err(candle_core::Error::Msg(message));
     }
     Ok(array.flatten_all()?.to_vec1::<f32>()?.as_chunks::<N>().0.to_vec())
-}
-
-/// A fixed pseudo-random sequence. Source: Steele, Lea, Flood 2014 (`SplitMix64`); Box, Muller 1958.
-struct Random {
-    state: u64,
-    /// The Box-Muller method generates two numbers at once.
-    spare: Option<f64>,
-}
-
-impl Random {
-    fn new(seed: u64) -> Self {
-        Self { state: seed, spare: None }
-    }
-
-    fn next(&mut self) -> u64 {
-        self.state = self.state.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut mixed = self.state;
-        mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        mixed ^ (mixed >> 31)
-    }
-
-    /// Uniform in 0 <= x < 1.
-    fn uniform(&mut self) -> f64 {
-        // 53 bits fill an f64 exactly.
-        (self.next() >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    /// Normal with mean 0 and standard deviation 1.
-    fn normal(&mut self) -> f64 {
-        if let Some(spare) = self.spare.take() {
-            return spare;
-        }
-        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
-        let (sine, cosine) = (TAU * self.uniform()).sin_cos();
-        self.spare = Some(radius * sine);
-        radius * cosine
-    }
 }
 
 #[cfg(test)]

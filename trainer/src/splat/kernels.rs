@@ -20,10 +20,7 @@ const PROJECTION: Source = source!("projection");
 const GRADIENT: Source = source!("gradient");
 const TILES: Source = source!("tiles");
 const BINS: Source = source!("bins");
-const GRADIENT_SLOTS: Source = source!("gradients", "gradients_slots");
-const GRADIENT_SUM: Source = source!("gradient_sum", "gradient_sum_slots");
 const SHARED: &[Source] = &[
-    GRADIENT_SUM,
     VIEW,
     STATUS,
     MODEL,
@@ -57,7 +54,7 @@ const LOSS_STRIPS: &[Source] = &[
 ];
 /// Imports of `update`.
 macro_rules! update_sources {
-    ($gradient_sum:expr, $camera_sums:literal) => {
+    ($camera_sums:literal) => {
         &[
             VIEW,
             STATUS,
@@ -66,16 +63,12 @@ macro_rules! update_sources {
             source!("sh"),
             GRADIENT,
             source!("random"),
-            $gradient_sum,
             source!("camera_sums", $camera_sums),
         ]
     };
 }
 /// Imports of `update` if camera parameters are optimized, too.
-const WITH_CAMERA: &[Source] = update_sources!(GRADIENT_SUM, "camera_sums_tree");
-/// Imports of `update` if gradients are summed in any order.
-const UPDATE_UNORDERED: &[Source] =
-    update_sources!(source!("gradient_sum", "gradient_sum_unordered"), "camera_sums_none");
+const WITH_CAMERA: &[Source] = update_sources!("camera_sums_tree");
 
 /// Imports of the kernels over pixels.
 macro_rules! blend_sources {
@@ -86,37 +79,11 @@ macro_rules! blend_sources {
         ]
     };
 }
-const BLEND: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_subgroup")
-);
-const BLEND_BY_MEMORY: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_memory")
-);
-const BLEND_STRIPS: &[Source] = blend_sources!(
-    GRADIENT_SLOTS,
-    source!("pixels", "pixels_4"),
-    source!("strips"),
-    source!("lane_sums", "lane_sums_tree")
-);
-/// Imports of both variants of `backward` if gradients are summed in any order.
-const BACKWARD_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_unordered"),
-    source!("pixels", "pixels_2"),
-    source!("tile_queue"),
-    source!("sums", "sums_unordered")
-);
-const BACKWARD_STRIPS_UNORDERED: &[Source] = blend_sources!(
-    source!("gradients", "gradients_unordered"),
-    source!("pixels", "pixels_4"),
-    source!("strips"),
-    source!("lane_sums", "lane_sums_unordered")
-);
+const BLEND: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_subgroup"));
+const BLEND_BY_MEMORY: &[Source] =
+    blend_sources!(source!("pixels", "pixels_2"), source!("tile_queue"), source!("sums", "sums_memory"));
+const BLEND_STRIPS: &[Source] = blend_sources!(source!("pixels", "pixels_4"), source!("strips"));
 
 macro_rules! kernel {
     ($name:literal) => {
@@ -167,7 +134,8 @@ fn blend(gpu: &Gpu) -> Blend {
 }
 
 /// All kernels of this module, for validation.
-pub const KERNELS: &[Kernel] = &[
+#[cfg(test)]
+pub(crate) const KERNELS: &[Kernel] = &[
     kernel!("project"),
     kernel!("count_bins"),
     kernel!("sum_bins"),
@@ -186,11 +154,8 @@ pub const KERNELS: &[Kernel] = &[
     kernel!("backward", BLEND),
     kernel!("backward", BLEND_BY_MEMORY),
     kernel!("backward_strips", BLEND_STRIPS),
-    kernel!("backward", BACKWARD_UNORDERED),
-    kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED),
     kernel!("update"),
     kernel!("update", WITH_CAMERA),
-    kernel!("update", UPDATE_UNORDERED),
     kernel!("correct_view"),
     kernel!("refine_camera"),
     kernel!("advance"),
@@ -251,7 +216,7 @@ pub(crate) enum Ssim {
 
 /// Additional pipelines for training.
 #[derive(Debug)]
-pub(crate) struct LearnPipelines {
+pub(crate) struct TrainPipelines {
     pub(crate) ssim: Ssim,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
@@ -270,7 +235,7 @@ pub(crate) struct LearnPipelines {
     pub(crate) gather: Pipeline,
 }
 
-impl LearnPipelines {
+impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();
@@ -317,63 +282,16 @@ impl LearnPipelines {
     }
 }
 
-/// Pipelines of a step that sums gradients by atomic additions and `subgroupAdd`, in any order. They are used only in
-/// benchmarks, to measure the cost of a fixed order.
-#[derive(Debug)]
-pub(crate) struct UnorderedPipelines {
-    pub(crate) backward: Pipeline,
-    pub(crate) update: Pipeline,
-}
-
-impl UnorderedPipelines {
-    /// Compiles the pipelines. Returns `None` if the adapter lacks atomic additions of floats or suitable subgroups,
-    /// or if float atomics were not requested.
-    pub(crate) fn new(gpu: &Gpu, overrides_of_update: &[(&str, f64)]) -> Result<Option<Self>, Error> {
-        let backward = match gpu.optional().subgroup_lanes {
-            _ if !gpu.optional().float_atomics => return Ok(None),
-            Some(8) => Pipeline::new(gpu, kernel!("backward_strips", BACKWARD_STRIPS_UNORDERED), &[])?,
-            Some(lanes) if (16..=128).contains(&lanes) => {
-                Pipeline::new(gpu, kernel!("backward", BACKWARD_UNORDERED), &[("SUBGROUP", f64::from(lanes))])?
-            }
-            _ => return Ok(None),
-        };
-        let update = Pipeline::new(gpu, kernel!("update", UPDATE_UNORDERED), overrides_of_update)?;
-        Ok(Some(Self { backward, update }))
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use crate::gpu::{reflect, resolve};
-
-    /// Names and offsets of a struct's fields and its size in WGSL; checks that all kernels that use it agree.
-    fn layout_in_wgsl(name: &str) -> (Vec<(String, usize)>, usize) {
-        let layouts = super::KERNELS.iter().filter_map(|kernel| {
-            let module = reflect(kernel.source.name, &resolve(kernel.source, kernel.shared).unwrap()).unwrap();
-            module.types.iter().find_map(|(_, found)| match &found.inner {
-                wgpu::naga::TypeInner::Struct { members, span } if found.name.as_deref() == Some(name) => {
-                    let fields = members.iter().map(|member| (member.name.clone().unwrap(), member.offset as usize));
-                    Some((fields.collect(), *span as usize))
-                }
-                _ => None,
-            })
-        });
-        let layouts: Vec<(Vec<_>, usize)> = layouts.collect();
-        assert!(layouts.iter().all(|layout| *layout == layouts[0]), "{name} differs between kernels: {layouts:?}");
-        layouts[0].clone()
-    }
-
-    macro_rules! assert_layout {
-        ($type:ident, [$($field:ident),*]) => {
-            let in_rust = vec![$((stringify!($field).to_owned(), std::mem::offset_of!($type, $field))),*];
-            assert_eq!((in_rust, size_of::<$type>()), layout_in_wgsl(stringify!($type)), stringify!($type));
-        };
-    }
+    use super::KERNELS;
+    use crate::gpu::testing::{assert_layout, assert_valid};
 
     #[test]
     fn structs_have_the_same_layout_in_rust_and_wgsl() {
         use crate::splat::params::{CameraRule, Capacity, Gathering, Growth, Lens, Model, Rule, Supervision, View};
         assert_layout!(
+            KERNELS,
             View,
             [
                 camera_row_0,
@@ -393,8 +311,9 @@ mod tests {
                 crop_max
             ]
         );
-        assert_layout!(Model, [n_splats, capacity, sh_degree, n_sh_rest]);
+        assert_layout!(KERNELS, Model, [n_splats, capacity, sh_degree, n_sh_rest]);
         assert_layout!(
+            KERNELS,
             Rule,
             [
                 mean_rate_m,
@@ -417,10 +336,19 @@ mod tests {
                 unused
             ]
         );
-        assert_layout!(Supervision, [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]);
-        assert_layout!(Growth, [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]);
-        assert_layout!(Lens, [linear, angular, camera_params, image_params, unused]);
         assert_layout!(
+            KERNELS,
+            Supervision,
+            [background_srgb, dssim_frac, depth_weight, depth_clip_m, random_background]
+        );
+        assert_layout!(
+            KERNELS,
+            Growth,
+            [n_before, n_after, key, capacity, n_sh_rest, child_spread, min_opacity, unused]
+        );
+        assert_layout!(KERNELS, Lens, [linear, angular, camera_params, image_params, unused]);
+        assert_layout!(
+            KERNELS,
             CameraRule,
             [
                 camera_mask,
@@ -433,21 +361,12 @@ mod tests {
                 image_decay
             ]
         );
-        assert_layout!(Capacity, [n_entries, n_slots, unused]);
-        assert_layout!(Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
+        assert_layout!(KERNELS, Capacity, [n_entries, n_slots, unused]);
+        assert_layout!(KERNELS, Gathering, [n_kept, n_planes, words, from_capacity, to_capacity]);
     }
 
     #[test]
     fn every_kernel_is_valid() {
-        let kernels = super::KERNELS.iter().chain(crate::sort::KERNELS);
-        let invalid: Vec<String> = kernels
-            .filter_map(|kernel| {
-                resolve(kernel.source, kernel.shared)
-                    .and_then(|text| reflect(kernel.source.name, &text).map(|_| ()))
-                    .err()
-            })
-            .map(|error| error.to_string())
-            .collect();
-        assert!(invalid.is_empty(), "{}", invalid.join("\n"));
+        assert_valid(KERNELS);
     }
 }

@@ -1,7 +1,7 @@
 //! The stages of drawing and training, as lists of passes.
 
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines, Ssim, UnorderedPipelines};
+use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
@@ -45,7 +45,7 @@ pub(crate) struct GrowthBuffers {
 pub(crate) fn grow(
     gpu: &Gpu,
     passes: &mut Passes,
-    pipelines: &LearnPipelines,
+    pipelines: &TrainPipelines,
     splats: &SplatBuffers,
     buffers: &GrowthBuffers,
     growth: &Growth,
@@ -216,7 +216,7 @@ impl ViewPasses<'_> {
     }
 
     /// Compares the picture with its target and computes the gradient with respect to every pixel.
-    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
+    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &TrainPipelines, target: &Target<'_>) {
         let Self { gpu, image_buffers, status, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
         let base = [
@@ -258,15 +258,11 @@ impl ViewPasses<'_> {
     }
 
     /// Propagates the gradients from the pixels to the intersections.
-    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines) {
-        self.backward_into(passes, &pipelines.backward, &self.scratch.gradients);
-    }
-
-    fn backward_into(&self, passes: &mut Passes, backward: &Pipeline, gradients: &Buffer) {
+    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
         let Self { gpu, scratch, image_buffers, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
-            backward,
+            &pipelines.backward,
             u64::from(n_tiles(size_px)),
             &[
                 ("view", view),
@@ -278,14 +274,14 @@ impl ViewPasses<'_> {
                 ("upstream", &image_buffers.upstream),
                 ("pixel_totals", &image_buffers.pixel_totals),
                 ("last", &image_buffers.last),
-                ("gradients", gradients),
+                ("gradients", &scratch.gradients),
             ],
         );
     }
 
     /// Adds each splat's contribution to the picture. Requires a previous [`ViewPasses::backward`] with an error of
     /// one at every pixel.
-    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &LearnPipelines, contributions: &Buffer) {
+    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &TrainPipelines, contributions: &Buffer) {
         let buffers = [
             ("model", &self.splats.model),
             ("status", self.status),
@@ -301,34 +297,11 @@ impl ViewPasses<'_> {
     /// Propagates the gradients from the intersections to the parameters and takes one optimizer step. Set `camera`
     /// if `update` is the kernel that also sums the gradients with respect to the camera.
     pub(crate) fn update(&self, passes: &mut Passes, update: &Pipeline, rule: &Buffer, camera: bool) {
-        let mut buffers = vec![("slot_begins", &self.scratch.slot_begins), ("gradients", &self.scratch.gradients)];
-        if camera {
-            buffers.push(("camera_sums", &self.scratch.camera_sums));
-        }
-        self.update_from(passes, update, rule, buffers);
-    }
-
-    /// Runs `backward` and `update` with one sum of 12 f32 per splat, to which gradients are added in any order. The
-    /// sums must be zero before and are reset to zero afterwards.
-    pub(crate) fn backward_and_update_unordered(
-        &self,
-        passes: &mut Passes,
-        pipelines: &UnorderedPipelines,
-        rule: &Buffer,
-        sums: &Buffer,
-    ) {
-        self.backward_into(passes, &pipelines.backward, sums);
-        self.update_from(passes, &pipelines.update, rule, vec![("gradients", sums)]);
-    }
-
-    fn update_from<'b>(
-        &'b self,
-        passes: &mut Passes,
-        update: &Pipeline,
-        rule: &'b Buffer,
-        mut buffers: Vec<(&'b str, &'b Buffer)>,
-    ) {
         let Self { gpu, splats, scratch, status, view, .. } = *self;
+        let mut buffers = vec![("slot_begins", &scratch.slot_begins), ("gradients", &scratch.gradients)];
+        if camera {
+            buffers.push(("camera_sums", &scratch.camera_sums));
+        }
         buffers.extend([
             ("view", view),
             ("model", &splats.model),

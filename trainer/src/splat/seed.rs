@@ -8,6 +8,7 @@ use super::arrays::SplatArrays;
 use super::views::FAR_M;
 use crate::gpu::{f32_of, f32s_of};
 use keyframe::Keyframe;
+use kinematics::random::Random;
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::HashSet;
@@ -25,7 +26,7 @@ const N_RANDOM: usize = 50_000;
 const RANDOM_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
 
-/// Creates discs and remembers the positions that already have splats.
+/// Creates discs and stores the positions that already have splats.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
     /// Octave of the spacing, and the occupied cell at that size.
@@ -282,17 +283,17 @@ impl InverseDepths {
 pub(crate) fn random_cloud(keyframes: &[&Keyframe], seed: u64, n_max: usize) -> SplatArrays {
     let mut seeds = Seeds::new();
     let focus = common_focus(keyframes);
-    let mut random = Random(seed ^ 0x5eed_5eed);
+    let mut random = Random::new(seed ^ 0x5eed_5eed);
     let n = N_RANDOM.min(n_max);
     for _ in 0..n {
-        let keyframe = keyframes[((random.next() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
+        let keyframe = keyframes[((random.unit() * keyframes.len() as f64) as usize).min(keyframes.len() - 1)];
         let [width, height] = keyframe.size_px;
-        let x = ((random.next() * f64::from(width)) as u32).min(width - 1);
-        let y = ((random.next() * f64::from(height)) as u32).min(height - 1);
+        let x = ((random.unit() * f64::from(width)) as u32).min(width - 1);
+        let y = ((random.unit() * f64::from(height)) as u32).min(height - 1);
         let camera = keyframe.world_from_camera.translation.vector;
         let distance_m = (focus - camera).norm().max(1e-3);
         // From a third of the distance to three times the distance, uniform in inverse depth beyond the focus.
-        let share = random.next();
+        let share = random.unit();
         let z = distance_m * if share < 0.5 { 0.35 + 1.3 * share } else { 1.0 / (1.0 - 0.66 * (2.0 * share - 1.0)) };
         let ray = Vector3::new(
             (f64::from(x) + 0.5 - keyframe.principal_px[0]) / keyframe.focal_px[0],
@@ -361,19 +362,6 @@ impl Seeds {
         arrays.rotations_wxyz.push(f32s_of([rotation.w, rotation.i, rotation.j, rotation.k]));
         arrays.opacity_logits.push(f32_of((opacity / (1.0 - opacity)).ln()));
         arrays.sh.push(f32s_of(color.map(|value| (value - 0.5) / SH_0)));
-    }
-}
-
-/// `SplitMix64` (Steele et al. 2014): uniform numbers in 0 <= x < 1.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
     }
 }
 

@@ -11,7 +11,7 @@ use super::bounds::bounds;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_params::CameraParams;
 use super::file::IN_FOLDER;
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
@@ -33,6 +33,7 @@ use calibration::{CalibratedCamera, CameraCorrection, ParamSet};
 use calibration::{CameraRefinement, Candidate, Trial};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
+use kinematics::quantile::{Rank, quantile};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -74,12 +75,12 @@ pub struct SplatTrainer {
     gpu: Arc<Gpu>,
     options: ModelOptions<SplatOptions>,
     draw: DrawPipelines,
-    learn: Learn,
+    train: TrainPipelineState,
     splats: SplatBuffers,
     scratch: Option<(ScratchSize, Scratch)>,
     training_buffers: Option<ImageBuffers>,
     drawing_buffers: Option<ImageBuffers>,
-    learn_status: Buffer,
+    train_status: Buffer,
     draw_status: Buffer,
     draw_view: Buffer,
     rule: Buffer,
@@ -137,26 +138,27 @@ enum RequestedParts<'a> {
     },
 }
 
+/// Whether the training pipelines are compiled.
 #[derive(Debug)]
-enum Learn {
+enum TrainPipelineState {
     OnDemand,
     Compiling(Compiling),
-    Ready(Arc<LearnPipelines>),
+    Ready(Arc<TrainPipelines>),
     Failed,
 }
 
 /// Pipelines being compiled on a thread. Dropping it waits for the thread, because NVIDIA's driver corrupts the heap
 /// if a process exits while the driver compiles.
 #[derive(Debug)]
-struct Compiling(Option<JoinHandle<Result<LearnPipelines, Error>>>);
+struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
 
 impl Compiling {
     fn start(gpu: &Arc<Gpu>) -> Self {
         let gpu = gpu.clone();
-        Self(Some(std::thread::spawn(move || LearnPipelines::new(&gpu))))
+        Self(Some(std::thread::spawn(move || TrainPipelines::new(&gpu))))
     }
 
-    fn finish(&mut self) -> Result<LearnPipelines, Error> {
+    fn finish(&mut self) -> Result<TrainPipelines, Error> {
         self.0.take().and_then(|thread| thread.join().ok()).unwrap_or(Err(Error::DeviceLost))
     }
 }
@@ -168,7 +170,7 @@ impl Drop for Compiling {
 }
 
 /// The resources of one training step.
-struct LearnedView<'a> {
+struct PreparedView<'a> {
     view: ViewPasses<'a>,
     level: &'a Level,
     /// Present if camera parameters are optimized.
@@ -185,22 +187,26 @@ struct InFlight {
 impl SplatTrainer {
     /// Creates an empty model. It can draw at once; the training pipelines are compiled on another thread.
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
-        let learn = Learn::Compiling(Compiling::start(&gpu));
-        Self::with_learn(gpu, options, learn)
+        let train = TrainPipelineState::Compiling(Compiling::start(&gpu));
+        Self::with_pipelines(gpu, options, train)
     }
 
-    fn with_learn(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>, learn: Learn) -> Result<Self, Error> {
+    fn with_pipelines(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        train: TrainPipelineState,
+    ) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let zeros = [0u8; 4 * status::LEN];
         let software = gpu.is_software();
         Ok(Self {
             draw,
-            learn,
+            train,
             splats: SplatBuffers::new(&gpu, 1, options.specific.sh_degree)?,
             scratch: None,
             training_buffers: None,
             drawing_buffers: None,
-            learn_status: gpu.storage_with("splat.learn_status", &zeros)?,
+            train_status: gpu.storage_with("splat.train_status", &zeros)?,
             draw_status: gpu.storage_with("splat.draw_status", &zeros)?,
             draw_view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
@@ -265,7 +271,7 @@ impl SplatTrainer {
         arrays: &SplatArrays,
     ) -> Result<Self, Error> {
         let options = options.with(|options| options.specific.sh_degree = arrays.sh_degree);
-        let mut trainer = Self::with_learn(gpu, options, Learn::OnDemand)?;
+        let mut trainer = Self::with_pipelines(gpu, options, TrainPipelineState::OnDemand)?;
         trainer.add(arrays)?;
         Ok(trainer)
     }
@@ -330,7 +336,7 @@ impl SplatTrainer {
 
     #[cfg(test)]
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
-        self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
+        self.gpu.read::<u32>(&self.train_status, status::LEN).unwrap()[status::STEP].into()
     }
 
     /// Number of positions that are seeded.
@@ -349,16 +355,16 @@ impl SplatTrainer {
         self.n_non_finite
     }
 
-    fn learn(&mut self) -> Result<Arc<LearnPipelines>, Error> {
-        if let Learn::Ready(ready) = &self.learn {
+    fn train_pipelines(&mut self) -> Result<Arc<TrainPipelines>, Error> {
+        if let TrainPipelineState::Ready(ready) = &self.train {
             return Ok(ready.clone());
         }
-        let ready = Arc::new(match std::mem::replace(&mut self.learn, Learn::Failed) {
-            Learn::Compiling(mut thread) => thread.finish()?,
-            Learn::OnDemand => LearnPipelines::new(&self.gpu)?,
-            Learn::Ready(_) | Learn::Failed => return Err(Error::DeviceLost),
+        let ready = Arc::new(match std::mem::replace(&mut self.train, TrainPipelineState::Failed) {
+            TrainPipelineState::Compiling(mut thread) => thread.finish()?,
+            TrainPipelineState::OnDemand => TrainPipelines::new(&self.gpu)?,
+            TrainPipelineState::Ready(_) | TrainPipelineState::Failed => return Err(Error::DeviceLost),
         });
-        self.learn = Learn::Ready(ready.clone());
+        self.train = TrainPipelineState::Ready(ready.clone());
         Ok(ready)
     }
 
@@ -413,7 +419,7 @@ impl SplatTrainer {
     }
 
     fn write_n_splats(&self) {
-        for status in [&self.learn_status, &self.draw_status] {
+        for status in [&self.train_status, &self.draw_status] {
             self.write_n_splats_to(status, self.splats.n_splats);
         }
     }
@@ -475,8 +481,7 @@ impl SplatTrainer {
         let middle = centers.iter().sum::<nalgebra::Vector3<f64>>() / centers.len().max(1) as f64;
         let spread = centers.iter().map(|center| (center - middle).norm()).fold(0.0, f64::max);
         let mut depths: Vec<f64> = self.views.iter().filter_map(|view| view.median_depth_m).collect();
-        depths.sort_by(f64::total_cmp);
-        let median_depth_m = depths.get(depths.len() / 2).copied().unwrap_or(spread);
+        let median_depth_m = quantile(&mut depths, 0.5, Rank::Upper).unwrap_or(spread);
         self.scene_size_m = (1.1 * spread).max(0.5 * median_depth_m).max(1e-3);
     }
 
@@ -574,17 +579,22 @@ impl SplatTrainer {
     }
 
     /// Records the passes of one step.
-    fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
+    fn record_step(&mut self, pipelines: &TrainPipelines, step: u64) -> Result<(), Error> {
         let view_ix = self.order.pick(step, self.views.len());
         let level_ix = self.make_ready(view_ix, level_at(step, self.coarse_steps))?;
         let mut list = std::mem::take(&mut self.passes);
-        let listed = self.list_step(&mut list, learn, (view_ix, level_ix));
+        let listed = self.list_step(&mut list, pipelines, (view_ix, level_ix));
         self.passes = list;
         listed
     }
 
-    fn list_step(&self, list: &mut Passes, learn: &LearnPipelines, place: (usize, usize)) -> Result<(), Error> {
-        let LearnedView { view, level, lens } = self.learned_view(list, learn, place)?;
+    fn list_step(
+        &self,
+        list: &mut Passes,
+        pipelines: &TrainPipelines,
+        view_level: (usize, usize),
+    ) -> Result<(), Error> {
+        let PreparedView { view, level, lens } = self.prepared_view(list, pipelines, view_level)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
@@ -593,15 +603,15 @@ impl SplatTrainer {
             ssim: self.options.specific.dssim_frac > 0.0,
         };
         view.draw(list, &self.draw);
-        view.compare(list, learn, &target);
-        view.backward(list, learn);
+        view.compare(list, pipelines, &target);
+        view.backward(list, pipelines);
         if let Some(lens) = lens {
-            view.update(list, &learn.update_with_camera, &self.rule, true);
-            self.cameras.refine(&view, list, learn, lens);
+            view.update(list, &pipelines.update_with_camera, &self.rule, true);
+            self.cameras.refine(&view, list, pipelines, lens);
         } else {
-            view.update(list, &learn.update, &self.rule, false);
+            view.update(list, &pipelines.update, &self.rule, false);
         }
-        list.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
+        list.dispatch(&self.gpu, &pipelines.advance, 1, &[("status", &self.train_status)]);
         Ok(())
     }
 
@@ -624,37 +634,37 @@ impl SplatTrainer {
     }
 
     /// A prepared view and level with its current camera parameters; records the pass that computes the view.
-    fn learned_view(
+    fn prepared_view(
         &self,
         list: &mut Passes,
-        learn: &LearnPipelines,
+        pipelines: &TrainPipelines,
         (view_ix, level_ix): (usize, usize),
-    ) -> Result<LearnedView<'_>, Error> {
+    ) -> Result<PreparedView<'_>, Error> {
         let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
         let lens = lens.filter(|_| self.cameras.set.any());
         let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
             return Err(Error::DeviceLost);
         };
         if let Some(lens) = lens {
-            self.cameras.correct(&self.gpu, list, learn, &level.view, lens);
+            self.cameras.correct(&self.gpu, list, pipelines, &level.view, lens);
         }
         let view = ViewPasses {
             gpu: &self.gpu,
             splats: &self.splats,
             scratch,
             image_buffers,
-            status: &self.learn_status,
+            status: &self.train_status,
             view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px: level.size_px,
         };
-        Ok(LearnedView { view, level, lens })
+        Ok(PreparedView { view, level, lens })
     }
 
     /// Ensures that a view of this size can be drawn, or trained on.
-    fn make_scratch(&mut self, size_px: [u32; 2], learn: bool) -> Result<(), Error> {
+    fn make_scratch(&mut self, size_px: [u32; 2], for_training: bool) -> Result<(), Error> {
         let n_splats = self.splats.capacity.max(self.displayed().capacity);
         let n_entries = (2 * n_splats).max(1 << 14);
-        let n_slots = if learn { 2 * n_entries } else { 0 };
+        let n_slots = if for_training { 2 * n_entries } else { 0 };
         self.ensure_scratch(ScratchSize { n_splats, n_entries, n_slots, n_bins: n_bins(size_px) })
     }
 
@@ -719,7 +729,7 @@ impl SplatTrainer {
         let failed = self.grow_scratch(&counters)?;
         if failed {
             self.step = u64::from(counters[status::STEP]);
-            self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
+            self.gpu.write(&self.train_status, 4 * status::FAILED as u64, &[0; 12]);
         }
         Ok(failed)
     }
@@ -739,7 +749,7 @@ impl SplatTrainer {
     }
 
     /// Changes the splat count when due: replaces dead splats, and adds splats up to the limit.
-    fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
+    fn grow_when_due(&mut self, pipelines: &TrainPipelines) -> Result<(), Error> {
         let due = self.step >= GROWTH_START
             && self.step < self.growth_end()
             && self.step.is_multiple_of(GROWTH_PERIOD)
@@ -779,7 +789,7 @@ impl SplatTrainer {
             }
             buffers => buffers?,
         };
-        passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
+        passes::grow(&self.gpu, &mut self.passes, pipelines, &self.splats, &buffers, &growth);
         self.passes.submit(&self.gpu);
         self.passes.clear_bindings();
         self.splats.set_n_splats(&self.gpu, n_after);
@@ -824,7 +834,7 @@ impl SplatTrainer {
         self.schedule_start = schedule_start;
         self.write_n_splats();
         let step = u32::try_from(self.step).unwrap_or(u32::MAX);
-        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
+        self.gpu.write(&self.train_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
         Ok(())
     }
 
@@ -1051,10 +1061,10 @@ impl Method for SplatTrainer {
         if self.splats.n_splats == 0 {
             return Ok(0);
         }
-        let learn = self.learn()?;
+        let pipelines = self.train_pipelines()?;
         self.align_when_due()?;
         self.try_when_due()?;
-        self.grow_when_due(&learn)?;
+        self.grow_when_due(&pipelines)?;
         let max_millis = submit_millis(self.is_watched);
         let by_time = if self.step_millis > 0.0 { (max_millis / self.step_millis) as u64 } else { 1 };
         let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at these steps.
@@ -1069,9 +1079,9 @@ impl Method for SplatTrainer {
         let since = Instant::now();
         self.prepare_levels(n)?;
         for step in self.step..self.step + n {
-            self.record_step(&learn, step)?;
+            self.record_step(&pipelines, step)?;
         }
-        let status = self.passes.submit_reading(&self.gpu, &[(&self.learn_status, 4 * status::LEN)]);
+        let status = self.passes.submit_reading(&self.gpu, &[(&self.train_status, 4 * status::LEN)]);
         self.step += n;
         let failed = self.finish_in_flight()?; // The previous submit; this one runs meanwhile.
         if !failed {
@@ -1097,15 +1107,15 @@ impl Method for SplatTrainer {
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
-        self.learn().map(drop)
+        self.train_pipelines().map(drop)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
         self.prepare_training()?;
-        let learn = self.learn()?;
+        let pipelines = self.train_pipelines()?;
         self.write_rule();
-        self.record_step(&learn, self.step)?;
+        self.record_step(&pipelines, self.step)?;
         let timings = self.passes.submit_timed(&self.gpu)?;
         self.step += 1;
         Ok(timings)
@@ -1149,7 +1159,7 @@ impl Method for SplatTrainer {
     }
 
     fn report(&self) -> Vec<TrialReport> {
-        self.trials.finished.iter().map(Trial::part).collect()
+        self.trials.finished.iter().map(Trial::report).collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
@@ -1195,7 +1205,7 @@ fn ensure_image_buffers(
     image_buffers: &mut Option<ImageBuffers>,
     passes: &mut Passes,
     size_px: [u32; 2],
-    learned: bool,
+    for_training: bool,
 ) -> Result<(), Error> {
     let (n_pixels, n_tiles) = (size_px[0] * size_px[1], n_tiles(size_px));
     if image_buffers
@@ -1207,7 +1217,7 @@ fn ensure_image_buffers(
         passes.submit(gpu);
         passes.clear_bindings();
         *image_buffers = None;
-        *image_buffers = Some(ImageBuffers::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
+        *image_buffers = Some(ImageBuffers::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), for_training)?);
     }
     Ok(())
 }

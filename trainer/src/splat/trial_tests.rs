@@ -109,10 +109,10 @@ fn both_halves_score_the_same_images() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 60, true);
     let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
-    let selection: Vec<_> =
+    let validation: Vec<_> =
         (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Validation)).collect();
     let mut trainer = trainer_with_candidate(&gpu, ParamSet::NONE);
-    let (early, late) = selection.split_at(N_FIRST);
+    let (early, late) = validation.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
     // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.
     for (ix, keyframe) in late.iter().enumerate() {
@@ -124,7 +124,7 @@ fn both_halves_score_the_same_images() {
             _ => {}
         }
     }
-    assert!(selection.len() > MAX_SCORED + 4);
+    assert!(validation.len() > MAX_SCORED + 4);
     train_to(&mut trainer, END + 3);
     let [Trial { gain_db, standard_error_db, n_images, .. }] = trainer.trials() else {
         panic!("{:?}", trainer.trials())

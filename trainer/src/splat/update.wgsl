@@ -19,7 +19,6 @@
 #import sh
 #import status
 #import gradient
-#import gradient_sum
 #import random
 
 struct Rule {
@@ -47,6 +46,8 @@ struct Rule {
 @group(0) @binding(1) var<uniform> model: Model;
 @group(0) @binding(2) var<uniform> rule: Rule;
 @group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(4) var<storage, read> slot_begins: array<u32>;
+@group(0) @binding(5) var<storage, read> gradients: array<Gradient>;
 @group(0) @binding(6) var<storage, read_write> means: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> rotations: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> shapes: array<vec4f>;
@@ -114,11 +115,24 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let block = folded(wg, n_wgs);
     let splat_ix = block * 256u + lane;
     var camera: CameraGradient;
-    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = learn(splat_ix); }
+    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = update_splat(splat_ix); }
     add_up_camera(lane, block, camera);
 }
 
-fn learn(splat_ix: u32) -> CameraGradient {
+// Adds the gradients of a splat's intersections in their order.
+fn gradient_of(splat_ix: u32, n_touched: u32) -> Gradient {
+    var sum: Gradient;
+    let begin = slot_begins[splat_ix];
+    for (var slot = begin; slot < begin + n_touched; slot++) {
+        let part = gradients[slot];
+        sum.position += part.position;
+        sum.conic += part.conic;
+        sum.color += part.color;
+    }
+    return sum;
+}
+
+fn update_splat(splat_ix: u32) -> CameraGradient {
     var camera: CameraGradient;
     let n_touched = tile_counts[splat_ix];
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return camera; }

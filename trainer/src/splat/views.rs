@@ -53,6 +53,7 @@ impl Order {
     }
 }
 
+/// A random order. Source: Durstenfeld 1964, with the linear congruential generator of Knuth (MMIX).
 fn shuffled(round: u64, n_views: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..n_views).collect();
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ round.wrapping_mul(0xd134_2543_de82_ef95);

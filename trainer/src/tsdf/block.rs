@@ -32,11 +32,6 @@ impl Block {
         Self { geometry: vec![0; N_VOXELS], colors: vec![[0; 2]; N_VOXELS] }
     }
 
-    /// Whether any voxel was observed.
-    pub fn is_observed(&self) -> bool {
-        self.geometry.iter().any(|word| word >> 16 != 0)
-    }
-
     /// Distance as a fraction of the field's scale; `None` if the voxel was not observed.
     pub fn distance(&self, voxel_ix: usize) -> Option<f64> {
         let word = self.geometry[voxel_ix];

@@ -5,6 +5,7 @@ use super::capacity::BYTES_PER_BLOCK;
 use super::options::TsdfOptions;
 use keyframe::DepthMap;
 use kinematics::Transform;
+use kinematics::quantile::{Rank, quantile};
 use nalgebra::{Translation3, UnitQuaternion};
 use serde::{Deserialize, Serialize};
 
@@ -50,7 +51,7 @@ impl VoxelGrid {
     pub fn choose(options: &TsdfOptions, max_bytes: Option<u64>, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();
         let n_valid = depths.len();
-        let median_m = quantile(&mut depths, 5)?;
+        let median_m = quantile(&mut depths, 0.5, Rank::Upper)?;
         let noise_per_m2 = positive(options.noise_per_m2).unwrap_or_else(|| noise_per_m2(options, depth));
         let px_m = median_m / (0.5 * (depth.focal_px[0] + depth.focal_px[1]));
         let by_noise_m = noise_per_m2 * median_m * median_m;
@@ -108,14 +109,5 @@ fn noise_per_m2(options: &TsdfOptions, depth: &DepthMap) -> f64 {
         .filter(|(ix, _)| ix % width > 0 && ix % width + 1 < width)
         .filter_map(|(ix, z)| Some((at(ix - 1)? - 2.0 * z + at(ix + 1)?).abs() / (z * z)))
         .collect();
-    quantile(&mut second_differences, 9).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
-}
-
-/// The value below which `tenths` tenths of the values lie.
-fn quantile(values: &mut [f64], tenths: usize) -> Option<f64> {
-    let at = values.len() * tenths / 10;
-    if values.is_empty() {
-        return None;
-    }
-    Some(*values.select_nth_unstable_by(at, f64::total_cmp).1)
+    quantile(&mut second_differences, 0.9, Rank::Upper).unwrap_or(0.0) / (1.6449 * 6.0f64.sqrt())
 }

@@ -7,6 +7,7 @@
 
 use keyframe::Keyframe;
 use kinematics::f32_of;
+use kinematics::quantile::{Rank, quantile};
 use nalgebra::Point3;
 use std::sync::Arc;
 
@@ -15,9 +16,8 @@ pub(crate) fn median_depth_m(keyframe: &Keyframe) -> Option<f64> {
     let depth = keyframe.depth.as_ref()?;
     // Samples all columns and rows, with a sufficient number of pixels from small images.
     let step = 997.min(depth.depth_m.len() / 64).max(1);
-    let mut sample: Vec<f32> = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0).collect();
-    sample.sort_by(f32::total_cmp);
-    sample.get(sample.len() / 2).map(|z| f64::from(*z))
+    let sample = depth.depth_m.iter().copied().step_by(step).filter(|z| *z > 0.0);
+    quantile(&mut sample.map(f64::from).collect::<Vec<_>>(), 0.5, Rank::Upper)
 }
 
 /// Depth along the color camera's z axis for each of its pixels; empty if the keyframe has no depth.

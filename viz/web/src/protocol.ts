@@ -37,10 +37,10 @@ export interface Status extends ModelStatus {
   state: string;
   seconds: number;
   keyframes: number;
-  refused: Record<string, number>;
+  rejected: Record<string, number>;
   others: ModelStatus[];
   notes: string[];
-  ended: RunResult | null;
+  result: RunResult | null;
 }
 
 /** Result of a run that has ended. */

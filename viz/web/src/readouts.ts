@@ -18,9 +18,9 @@ export class Readouts {
     text("primitives", count(model.primitives));
     text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
-    const reasons = Object.entries(status.refused).sort((a, b) => b[1] - a[1]);
-    text("refused-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
-    element("refused").replaceChildren(
+    const reasons = Object.entries(status.rejected).sort((a, b) => b[1] - a[1]);
+    text("rejected-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
+    element("rejected").replaceChildren(
       ...reasons.flatMap(([reason, n]) => [child("dt", reason), child("dd", count(n))]),
     );
     element("notes-card").hidden = status.notes.length === 0;

@@ -56,7 +56,7 @@ pub(crate) fn decode_positions(version: FciVersion, mut bytes: &[u8]) -> Vec<Vec
 pub(crate) mod tests {
     use super::*;
     use crate::franka::emulated::fuzz::tests::state_datagrams;
-    use crate::fuzz::random::Random;
+    use kinematics::random::Random;
 
     pub(crate) const VERSIONS: [FciVersion; 2] = [FciVersion::V5, FciVersion::V10];
 
@@ -78,7 +78,7 @@ pub(crate) mod tests {
                 expected,
                 "a duplicate is not a new state"
             );
-            let mut random = Random(3);
+            let mut random = Random::new(3);
             for _ in 0..20 {
                 let mut shuffled = datagrams.clone();
                 random.shuffle(&mut shuffled);

@@ -251,8 +251,8 @@ fn checked_count(field: &'static str, count: f64, range: (f64, f64), value: f64,
 #[cfg(test)]
 mod tests {
     use super::super::canopen::{Node, encode_write};
-    use super::super::testing::Random;
     use super::*;
+    use kinematics::random::Random;
 
     const ALL: [State; 8] = [
         State::NotReadyToSwitchOn,
@@ -331,12 +331,11 @@ mod tests {
         let units = Units { counts_per_turn: 524_288.0, rated_torque_nm: 2.5 };
         assert_eq!(units.raw_from_rad("the position", TAU), Ok(524_288));
         assert!((units.nm_from_raw(-1000) + 2.5).abs() < 1e-12);
-        let mut random = Random(31);
+        let mut random = Random::new(31);
         for _ in 0..10_000 {
-            let raw = random.next().cast_signed();
+            let raw = random.bits_32().cast_signed();
             assert_eq!(units.raw_from_rad("the position", units.rad_from_raw(raw)), Ok(raw));
-            let [low, high, ..] = random.next().to_le_bytes();
-            let torque = i16::from_le_bytes([low, high]);
+            let torque = i16::from_le_bytes([random.byte(), random.byte()]);
             assert_eq!(units.raw_from_nm(units.nm_from_raw(torque)), Ok(torque));
         }
         for bad in [1e6, -1e6, f64::NAN, f64::INFINITY] {

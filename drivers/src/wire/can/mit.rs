@@ -157,8 +157,8 @@ fn low_twelve(first: u8, second: u8) -> u16 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::Random;
     use super::*;
+    use kinematics::random::Random;
 
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
@@ -187,9 +187,9 @@ mod tests {
 
     #[test]
     fn any_bytes_decode_and_round_trip() {
-        let mut random = Random(3);
+        let mut random = Random::new(3);
         for _ in 0..20_000 {
-            let bytes = (u64::from(random.next()) << 32 | u64::from(random.next())).to_be_bytes();
+            let bytes = random.bits().to_be_bytes();
             assert_eq!(encode(&decode(&bytes, &LIMITS), &LIMITS), Ok(bytes));
             let motion = bytes[..5].try_into().expect("five");
             assert_eq!(encode_motion(&decode_motion(motion, &LIMITS), &LIMITS), Ok(motion));
@@ -198,8 +198,8 @@ mod tests {
 
     #[test]
     fn commands_round_trip_within_resolution() {
-        let mut random = Random(5);
-        let mut random_within = |max: f64| (2.0 * random.unit_interval() - 1.0) * max;
+        let mut random = Random::new(5);
+        let mut random_within = |max: f64| random.uniform(-max, max);
         for _ in 0..20_000 {
             let command = Command {
                 position_rad: random_within(12.5),

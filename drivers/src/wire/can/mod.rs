@@ -126,34 +126,20 @@ fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[
 #[cfg(test)]
 mod testing {
     use super::{Frame, Id};
-
-    /// Random numbers from a seed: the upper half of Knuth's linear congruential generator.
-    pub(super) struct Random(pub(super) u64);
-
-    impl Random {
-        pub(super) fn next(&mut self) -> u32 {
-            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (self.0 >> 32) as u32
-        }
-
-        /// A number from 0 to 1.
-        pub(super) fn unit_interval(&mut self) -> f64 {
-            f64::from(self.next()) / f64::from(u32::MAX)
-        }
-    }
+    use kinematics::random::Random;
 
     /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
     pub(super) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         (0..20_000).map(move |round| {
-            let identifier = match random.next() % 2 {
-                0 => Id::standard(random.next() & 0x7FF),
-                _ => Id::extended(random.next() & 0x1FFF_FFFF),
+            let identifier = match random.below(2) {
+                0 => Id::standard(random.bits_32() & 0x7FF),
+                _ => Id::extended(random.bits_32() & 0x1FFF_FFFF),
             };
             let id = if round % 4 == 0 { id } else { identifier.expect("the identifier is masked to 11 or 29 bits") };
-            let bytes: Vec<u8> = (0..64).map(|_| random.next().to_le_bytes()[0]).collect();
-            let len = usize::try_from(random.next() % 9).expect("small");
-            match random.next() % 8 {
+            let bytes = random.bytes(64);
+            let len = random.below(9);
+            match random.below(8) {
                 0 => Frame::remote(id, len),
                 1 => Frame::fd(id, &bytes[..[8, 12, 16, 64][len % 4]], true),
                 2..5 => Frame::classic(id, &bytes[..8]),

@@ -335,8 +335,9 @@ fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanErr
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{Random, random_frames, truncated_and_doubled};
+    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
+    use kinematics::random::Random;
 
     const NODE: Node = Node(1);
 
@@ -392,12 +393,11 @@ mod tests {
 
     #[test]
     fn motion_round_trips_in_single_precision() {
-        let mut random = Random(19);
+        let mut random = Random::new(19);
         for _ in 0..10_000 {
-            let (position_rad, velocity_rad_s) =
-                ((random.unit_interval() - 0.5) * 1e4, (random.unit_interval() - 0.5) * 1e3);
+            let (position_rad, velocity_rad_s) = (random.uniform(-5e3, 5e3), random.uniform(-5e2, 5e2));
             let answer = Answer::Motion { position_rad, velocity_rad_s };
-            let node = Node::new(random.next().to_le_bytes()[0] & 63).expect("masked");
+            let node = Node::new(random.byte() & 63).expect("masked");
             let (from, back) = decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
             let Answer::Motion { position_rad: position, velocity_rad_s: velocity } = back else { panic!("{back:?}") };
             // Half a unit in the last of 24 bits.

@@ -55,8 +55,8 @@ impl Scale {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::Random;
     use super::*;
+    use kinematics::random::Random;
 
     #[test]
     fn counts_round_trip_and_values_within_half_a_step() {
@@ -65,9 +65,9 @@ mod tests {
                 for raw in 0..=u16::try_from((1_u32 << n_bits) - 1).expect("16 bits") {
                     assert_eq!(scale.raw_from_value("x", scale.value_from_raw(raw)), Ok(raw));
                 }
-                let mut random = Random(7);
+                let mut random = Random::new(7);
                 for _ in 0..10_000 {
-                    let value = scale.lower + random.unit_interval() * (scale.upper - scale.lower);
+                    let value = random.uniform(scale.lower, scale.upper);
                     let back = scale.value_from_raw(scale.raw_from_value("x", value).expect("a number"));
                     // Half a step, plus the rounding of doubles.
                     assert!((back - value).abs() <= scale.step() * (0.5 + 1e-9), "{value} {back}");

@@ -40,7 +40,7 @@ struct NerfState {
     /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     are_trials_finished: bool,
-    parts: Vec<TrialReport>,
+    trials: Vec<TrialReport>,
     n_discarded_steps: u64,
     /// Number of images that the parameter array can hold.
     image_capacity: Option<u32>,
@@ -71,7 +71,7 @@ impl FieldTrainer {
     }
 
     /// Buffers needed to continue training, by name.
-    fn learned_params(&self) -> Vec<(String, &Buffer)> {
+    fn training_buffers(&self) -> Vec<(String, &Buffer)> {
         let mut all = self.render_buffers();
         all.extend(
             [
@@ -113,7 +113,7 @@ impl NerfModel {
             field: self.field.as_ref().map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
             learned_params: self.learned_params,
             are_trials_finished: self.trials.are_finished(),
-            parts: self.trials.finished.clone(),
+            trials: self.trials.finished.clone(),
             n_discarded_steps: self.n_discarded_steps,
             image_capacity: self
                 .field
@@ -127,7 +127,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.training_buffers()));
         let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
         Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
     }
@@ -145,7 +145,7 @@ impl NerfModel {
             }
             None => field_trainer.drop_images(),
         }
-        for (name, buffer) in field_trainer.learned_params() {
+        for (name, buffer) in field_trainer.training_buffers() {
             if let Some(array) = snapshot.arrays.iter().find(|array| array.name == name) {
                 self.gpu.write(buffer, 0, &array.bytes);
             }
@@ -169,7 +169,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.training_buffers()));
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
@@ -200,7 +200,7 @@ impl NerfModel {
         model.step = state.step;
         model.n_discarded_steps = state.n_discarded_steps;
         model.learned_params = state.learned_params;
-        model.trials = Trials::of(&state.options.common.cameras).after(state.parts.clone(), state.are_trials_finished);
+        model.trials = Trials::of(&state.options.common.cameras).after(state.trials.clone(), state.are_trials_finished);
         Ok((model, state))
     }
 
@@ -211,7 +211,7 @@ impl NerfModel {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
-        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::learned_params)?;
+        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
         let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes, Arc::clone)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;

@@ -5,7 +5,7 @@ use super::field::{Field, FieldGrad};
 use super::grid::GridShape;
 use super::network::Network;
 use super::ray::{self, Sample, Target, Weights};
-use crate::random::Random;
+use crate::random::F32Random;
 
 fn rounded(value: f64) -> f64 {
     f64::from(crate::gpu::f32_of(value))
@@ -17,13 +17,13 @@ fn shape() -> GridShape {
     GridShape::between(2, 13, 4, 6) // The first level has one entry per corner, the others share 64.
 }
 
-fn network(random: &mut Random, sizes: Vec<usize>) -> Network {
+fn network(random: &mut F32Random, sizes: Vec<usize>) -> Network {
     let weights = (0..Network::n_weights(&sizes)).map(|_| random.uniform(-0.6, 0.6)).collect();
     Network { sizes, weights }
 }
 
 pub(crate) fn field(seed: u64) -> Field {
-    let mut random = Random::new(seed);
+    let mut random = F32Random::new(seed);
     let shape = shape();
     let [density, color] = Field::sizes(&shape, 7, EMBEDDING_DIM);
     Field {
@@ -44,7 +44,7 @@ pub(crate) struct Ray {
 }
 
 pub(crate) fn ray(seed: u64) -> Ray {
-    let mut random = Random::new(seed);
+    let mut random = F32Random::new(seed);
     let direction = nalgebra::Vector3::from(random.array(-1.0, 1.0)).normalize().map(rounded);
     let mut cursor = 0.2;
     let span = |_| {

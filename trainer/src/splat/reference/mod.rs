@@ -160,10 +160,10 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
-    let place = |(splat, row_share): (&Splat, &Option<f64>)| {
+    let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share.map(|row_share| project::project_at(view, splat, row_share)).unwrap_or_default()
     };
-    splats.iter().zip(&decisions.row_shares).map(place).collect()
+    splats.iter().zip(&decisions.row_shares).map(project_one).collect()
 }
 
 impl ViewGrad {

@@ -1,7 +1,7 @@
 //! Small scenes and cameras for tests of the reference and of the kernels.
 
 use super::{RenderedImage, Splat, Upstream, View};
-pub(crate) use crate::random::Random;
+pub(crate) use crate::random::F32Random;
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 
@@ -36,7 +36,7 @@ pub(crate) fn rolling_view() -> View {
 ///
 /// Colors stay above 0, opacities are between 0.15 and 0.95, and rotations do not have unit length.
 pub(crate) fn small_scene(seed: u64, n: usize) -> Vec<Splat> {
-    let mut random = Random::new(seed);
+    let mut random = F32Random::new(seed);
     let splat = |splat_ix: usize| Splat {
         mean: random.array(-0.45, 0.45),
         log_scale: random.array(-3.2, -1.4),
@@ -47,7 +47,7 @@ pub(crate) fn small_scene(seed: u64, n: usize) -> Vec<Splat> {
     (0..n).map(splat).collect()
 }
 
-fn colorful(random: &mut Random, n_coeffs: usize) -> Vec<[f64; 3]> {
+fn colorful(random: &mut F32Random, n_coeffs: usize) -> Vec<[f64; 3]> {
     let mut sh = vec![random.array(-0.6, 1.4)];
     sh.resize_with(n_coeffs, || random.array(-0.08, 0.08));
     sh
@@ -55,7 +55,7 @@ fn colorful(random: &mut Random, n_coeffs: usize) -> Vec<[f64; 3]> {
 
 /// A random gradient with respect to every number of an image, between -1 and 1.
 pub(crate) fn some_upstream(seed: u64, view: &View) -> Upstream {
-    let mut random = Random::new(seed);
+    let mut random = F32Random::new(seed);
     let n_pixels = view.n_pixels();
     Upstream {
         rgb: (0..n_pixels).map(|_| random.array(-1.0, 1.0)).collect(),

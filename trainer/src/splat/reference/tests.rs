@@ -2,7 +2,7 @@
 
 use super::project::{MIN_ALPHA, project_at, row_share};
 use super::rasterize::{MAX_ALPHA, MIN_TRANSMITTANCE, threshold_margins};
-use super::scene::{Random, rolling_view, small_scene, some_upstream, tilted_view};
+use super::scene::{F32Random, rolling_view, small_scene, some_upstream, tilted_view};
 use super::*;
 use crate::mismatches::Mismatches;
 
@@ -284,7 +284,7 @@ fn faint_and_near_splats_are_not_drawn() {
 #[test]
 fn saturated_pixels_stop_compositing() {
     let view = tilted_view();
-    let mut random = Random::new(3);
+    let mut random = F32Random::new(3);
     // Ten wide, almost opaque splats one behind another, listed back to front.
     let splats: Vec<_> = (0..10)
         .map(|ix| {

@@ -48,7 +48,7 @@ impl SplatTrainer {
         self.passes.clear_bindings();
         self.splats = SplatBuffers::new(&self.gpu, 1, self.options.specific.sh_degree)?;
         self.write_n_splats();
-        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, &[0; 4]);
+        self.gpu.write(&self.train_status, 4 * status::STEP as u64, &[0; 4]);
         self.cameras = CameraParams::new(&self.gpu, self.cameras.set)?;
         self.seeder = Seeder::default();
         self.unseeded.clear();

@@ -360,7 +360,7 @@ impl SplatTrainer {
         trainer.splats = read_splats(&trainer.gpu, checkpoint, "", size)?;
         trainer.write_n_splats();
         for (ix, value) in [(status::STEP, step), (status::N_NON_FINITE, state.n_non_finite)] {
-            trainer.gpu.write(&trainer.learn_status, 4 * ix as u64, &value.to_le_bytes());
+            trainer.gpu.write(&trainer.train_status, 4 * ix as u64, &value.to_le_bytes());
         }
         trainer.seeder = read_seeds(checkpoint, "", state.n_seeds)?;
         trainer.cameras.restore(&trainer.gpu, &state.slots, state.params, checkpoint)?;

@@ -49,7 +49,7 @@ impl TsdfModel {
             "method": METHOD,
             "steps": self.step,
             "blocks": self.progress().primitives,
-            "refused_keyframes": self.n_skipped,
+            "skipped_keyframes": self.n_skipped,
             "vertices": mesh.positions_m.len(),
             "triangles": mesh.triangles.len(),
             "voxel_grid": self.voxel_grid,

@@ -70,7 +70,8 @@ fn server(version: FciVersion, limits: Limits) -> Server {
     let states = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
     listener.set_nonblocking(true).and_then(|()| states.set_nonblocking(true)).expect("an open socket");
     let address = listener.local_addr().expect("an open socket");
-    let config = RobotConfig { address, version, chain: CHAIN.clone(), flange_from_ee: Transform::identity(), limits };
+    let config =
+        RobotConfig { address, version, chain: CHAIN.clone(), flange_from_tool: Transform::identity(), limits };
     let joint_simulator: JointSimulator = Box::new(|_, commanded: &CommandedJoints| Joints {
         position_rad: commanded.position_rad,
         velocity_rad_s: commanded.velocity_rad_s,
@@ -119,9 +120,9 @@ fn check(limits: &Limits, before: &CommandedJoints, now: &CommandedJoints) {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::fuzz::random::Random;
     use franka::wire::HeaderLayout;
     use franka::wire::robot::{v5, v10};
+    use kinematics::random::Random;
     use zerocopy::IntoBytes;
     use zerocopy::little_endian::{F64, U64};
 
@@ -198,7 +199,7 @@ pub(crate) mod tests {
 
     #[test]
     fn only_a_started_motion_moves_joints() {
-        let mut random = Random(4);
+        let mut random = Random::new(4);
         for version in crate::franka::fuzz::tests::VERSIONS {
             let records = example_traffic(version);
             let (first, last) = commanded(version, &records.concat());
