@@ -11,7 +11,7 @@ use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
-use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
+use crate::{Aabb, Error, Method, ModelKind, Picture, Projection, RenderRequest};
 use calibration::{CameraRefinement, ParamSet, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
@@ -155,7 +155,7 @@ fn resume_and_load_are_bit_exact() {
 
     let folder = tempfile::tempdir().unwrap();
     half.save(folder.path()).unwrap();
-    assert!(NerfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap().map(ModelKind::name), Some("nerf"));
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     let request = request(&keyframes[1]);
     let (drawn, again) = (half.render(&request).unwrap(), loaded.render(&request).unwrap());
@@ -516,7 +516,7 @@ fn outgrown_field_restarts_and_budget_is_enforced() {
     let keyframes = || near.iter().map(|keyframe| &**keyframe);
     let sizes = |max_bytes| {
         let options = options().with(|options| options.common.max_bytes = Some(max_bytes));
-        Sizes::choose(&options, options.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
+        Sizes::choose(&options, options.specific.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
     };
     let n_entries = |sizes: &Sizes| sizes.shape().n_entries_total();
     assert!(n_entries(&sizes(900_000).unwrap()) < n_entries(&sizes(1 << 30).unwrap()));

@@ -5,7 +5,7 @@ use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
-use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
+use crate::{Aabb, Error, Method, ModelKind, Picture, Projection, RenderRequest};
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
@@ -335,9 +335,9 @@ fn saved_model_renders_identically() {
     let keyframes = ball_on_floor(4);
     let mut model = fused_model(scenes::options(), &keyframes);
     let folder = tempfile::tempdir().unwrap();
-    assert!(!TsdfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), None);
     model.save(folder.path()).unwrap();
-    assert!(TsdfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap().map(ModelKind::name), Some("tsdf"));
     for name in ["mesh.ply", "mesh.glb", "model.json"] {
         assert!(std::fs::metadata(folder.path().join(name)).unwrap().len() > 100, "{name}");
     }
