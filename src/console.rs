@@ -3,10 +3,10 @@
 use crate::print;
 use indicatif::ProgressBar;
 use keyframe::counted;
+use parking_lot::Mutex;
 use serde::Serialize;
 use session::next_commands::{self, SavedModel};
 use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
-use parking_lot::Mutex;
 
 /// What is printed about a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -395,8 +395,8 @@ impl Decisions {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use trainer::splat::SplatOptions;
     use kinematics::Transform;
+    use trainer::splat::SplatOptions;
 
     fn settings(from_step: Option<u64>) -> Settings {
         Settings::new(RunDescription {

@@ -5,7 +5,7 @@ use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
-use crate::{Aabb, Error, Method, ModelKind, Picture, Projection, RenderRequest};
+use crate::{Aabb, Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
