@@ -1,11 +1,10 @@
 //! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
 //! come out of a bounded queue.
 
-use crate::join::Change;
-use crate::join::{Join, JoinEvent, PosedImage};
+use crate::error::{Context, Error, chain};
+use crate::join::{Change, Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
 use crate::stop::Stop;
-use crate::error::{Context, Error, chain};
 use drivers::recording::Recorder;
 use drivers::{PixelFormat, Sample, Source, clock};
 use kinematics::{Stamp, Transform};
@@ -72,10 +71,13 @@ struct Shared {
 
 /// The parts of the input.
 pub struct Input {
+    /// The open devices or recording.
     pub source: Box<dyn Source>,
+    /// Makes keyframes of the samples.
     pub join: Join,
     /// Corrects base poses at stations, if the base moves.
     pub stations: Option<Stations>,
+    /// Records all samples, if they are recorded.
     pub recorder: Option<Recorder>,
     /// Whether devices are read in real time. The stamps of a recording are from another time.
     pub is_live: bool,
@@ -85,7 +87,9 @@ pub struct Input {
 
 /// The input after it ended.
 pub struct InputResult {
+    /// The join with its keyframes and counts.
     pub join: Join,
+    /// The stations with their reports, if the base moves.
     pub stations: Option<Stations>,
     /// Error that ended the input early.
     pub input_error: Option<drivers::Error>,
@@ -116,12 +120,14 @@ impl Feed {
         Ok(Self { changes, shared, thread, ended: false })
     }
 
-    /// Time at which the first image arrived.
+    /// Time at which the first image arrived; `None` before.
+    #[must_use]
     pub fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
     }
 
-    /// Number of rejected images so far, by reason.
+    /// Number of rejected images so far, by [`Rejection::name`](crate::Rejection::name).
+    #[must_use]
     pub fn rejected(&self) -> BTreeMap<String, u64> {
         lock(&self.shared.rejected).clone()
     }
@@ -139,11 +145,13 @@ impl Feed {
     }
 
     /// Whether the input ended and all its changes were taken.
+    #[must_use]
     pub fn ended(&self) -> bool {
         self.ended
     }
 
     /// Whether the source failed.
+    #[must_use]
     pub fn source_failed(&self) -> bool {
         self.shared.source_failed.load(Ordering::Relaxed)
     }

@@ -1,8 +1,8 @@
 //! Locates the base from tags that its cameras see: estimates base poses from images and adds them to the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
-use crate::join::{CameraPose, Motion};
 use crate::error::bail;
+use crate::join::{CameraPose, Motion};
 use drivers::tags::{
     LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector, TagPlacement, locate,
 };
