@@ -3,9 +3,7 @@
 use crate::downscale;
 use crate::error::{Context, ensure};
 use drivers::dataset::{Dataset, DatasetImage, DepthImage};
-use keyframe::Holdout;
-use keyframe::counted;
-use keyframe::{DepthMap, Keyframe, Split};
+use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
 use kinematics::{Intrinsics, Undistortion};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -14,7 +12,7 @@ use std::sync::{Arc, OnceLock};
 /// Name of the only camera of a dataset.
 const CAMERA: &str = "camera";
 
-/// The photos of a dataset as keyframes.
+/// The photos of a dataset as keyframes, undistorted and scaled, with poses as in the dataset.
 #[derive(Debug)]
 pub struct LoadedDataset {
     /// In the order of the dataset.
@@ -29,12 +27,13 @@ pub struct LoadedDataset {
 
 /// Decodes all photos in parallel.
 ///
-/// `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1 keeps their size. `on_progress`
-/// receives the number of finished photos. A photo that does not decode is skipped and reported in `data_losses`.
+/// `holdout` assigns the splits. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
+/// keeps their size. `on_progress` receives the number of finished photos, from any thread. A photo that does not decode
+/// is skipped and reported in `data_losses`.
 ///
 /// # Errors
 ///
-/// If no photo decodes.
+/// If no photo decodes, the scaled photos would be too small, or `holdout` does not match the names.
 pub fn load(
     dataset: &Dataset,
     holdout: &Holdout,
@@ -77,7 +76,7 @@ pub fn load(
                 loaded.names.push(name);
                 depth_errors.extend(depth_error);
             }
-            Err(error) => image_errors.push(format!("{error:#}")),
+            Err(error) => image_errors.push(chain(&error)),
         }
     }
     ensure!(

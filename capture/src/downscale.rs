@@ -8,7 +8,11 @@ const MIN_SIDE_PX: u32 = 16;
 /// Allowed fractions of the width and height.
 const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
 
-/// Parses the value of `--scale`.
+/// Parses a scale factor for the width and height of training images, such as `0.5`.
+///
+/// # Errors
+///
+/// If the text is not a number from 0.05 to 1; the message gives the range.
 pub fn parse_scale(text: &str) -> Result<f64, String> {
     let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
     share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
@@ -16,7 +20,7 @@ pub fn parse_scale(text: &str) -> Result<f64, String> {
 
 /// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error if they become too
 /// small.
-pub fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
+pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
     let scaled = full.scaled(share);
     if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
         let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
@@ -28,9 +32,11 @@ pub fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
     Ok(scaled)
 }
 
-/// Scales an image to its new size, `[height, width, 4]`; returns it unchanged if the size is the same.
+/// Scales an image `[height, width, 4]` with alpha from the size `from_px`, width and height, to the smaller `to_px`.
 ///
-/// A new pixel is masked if any pixel it covers is masked, so that no masked content leaks into the result.
+/// The color is unchanged if the sizes are equal. A new pixel is masked (alpha 0) if any pixel it covers is masked, so
+/// that no masked content leaks into the result.
+#[must_use]
 pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
     let mut rgba = if from_px == to_px { rgba } else { area_mean(&rgba, from_px, to_px) };
     for alpha in rgba.iter_mut().skip(3).step_by(4) {

@@ -10,8 +10,8 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Why a rig cannot be opened, read or joined.
 ///
-/// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its outermost
-/// context; `{:#}` gives the message with all causes.
+/// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its
+/// outermost context; `{:#}` gives the message with all causes.
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Error {

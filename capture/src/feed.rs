@@ -2,8 +2,7 @@
 //! come out of a bounded queue.
 
 use crate::error::{Context, Error};
-use crate::join::Change;
-use crate::join::{Join, JoinEvent, PosedImage};
+use crate::join::{Change, Join, JoinEvent, PosedImage};
 use crate::stations::Stations;
 use crate::stop::Stop;
 use drivers::recording::Recorder;
@@ -73,10 +72,13 @@ struct Shared {
 
 /// The parts of the input.
 pub struct Input {
+    /// The open devices or recording.
     pub source: Box<dyn Source>,
+    /// Makes keyframes of the samples.
     pub join: Join,
     /// Corrects base poses at stations, if the base moves.
     pub stations: Option<Stations>,
+    /// Records all samples, if they are recorded.
     pub recorder: Option<Recorder>,
     /// Whether devices are read in real time. The stamps of a recording are from another time.
     pub is_live: bool,
@@ -86,7 +88,9 @@ pub struct Input {
 
 /// The input after it ended.
 pub struct InputResult {
+    /// The join with its keyframes and counts.
     pub join: Join,
+    /// The stations with their reports, if the base moves.
     pub stations: Option<Stations>,
     /// Error that ended the input early.
     pub input_error: Option<drivers::Error>,
@@ -117,12 +121,14 @@ impl Feed {
         Ok(Self { changes, shared, thread, ended: false })
     }
 
-    /// Time at which the first image arrived.
+    /// Time at which the first image arrived; `None` before.
+    #[must_use]
     pub fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
     }
 
-    /// Number of rejected images so far, by reason.
+    /// Number of rejected images so far, by [`Rejection::name`](crate::Rejection::name).
+    #[must_use]
     pub fn rejected(&self) -> BTreeMap<String, u64> {
         self.shared.rejected.lock().clone()
     }
@@ -140,11 +146,13 @@ impl Feed {
     }
 
     /// Whether the input ended and all its changes were taken.
+    #[must_use]
     pub fn ended(&self) -> bool {
         self.ended
     }
 
     /// Whether the source failed.
+    #[must_use]
     pub fn source_failed(&self) -> bool {
         self.shared.source_failed.load(Ordering::Relaxed)
     }

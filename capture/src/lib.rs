@@ -1,10 +1,10 @@
 //! From a rig file to keyframes: opens the devices, joins images with poses, and corrects base poses.
 //!
 //! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and [`open::recording`] a
-//! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose of
-//! its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
+//! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
+//! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
 //! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a thread of its own.
-//! [`dataset`] reads datasets with known poses instead.
+//! [`dataset`] loads datasets with known poses instead.
 //!
 //! ```
 //! use capture::{Join, Rig};
@@ -23,7 +23,7 @@
 //! let rig = Rig::parse("rig.toml", rig_file, urdf, &[])?;
 //! assert_eq!(&*rig.cameras[0].name, "front");
 //! let join = Join::new(&rig)?;
-//! assert_eq!(join.counts().to_string(), "no image");
+//! assert_eq!(join.counts().to_string(), "0 keyframes of 0 images");
 //! # Ok::<(), capture::Error>(())
 //! ```
 
@@ -43,6 +43,6 @@ mod test_data;
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
 pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
-pub use join::{CameraPose, Change, Counts, Join, JoinEvent, Motion, PosedImage, Rejection, SampleUse};
+pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

@@ -29,7 +29,10 @@ const MAX_HELD: usize = 128;
 /// Maximum number of reference keyframes from earlier stations. When it is reached, every other one is removed.
 const MAX_REFERENCE_KEYFRAMES: usize = 160;
 
-/// Corrects keyframes for errors of the reported base poses.
+/// Corrects keyframes for errors of the reported base poses, at each station.
+///
+/// A station is an interval in which the base is stationary. Its keyframes are registered with those of earlier
+/// stations; keyframes taken on the way get a share of the correction.
 pub struct Stations {
     /// Cameras on the base or the arm.
     carried: BTreeSet<Arc<str>>,
@@ -58,7 +61,7 @@ struct SearchResult {
     took: Duration,
 }
 
-/// Report on a station after the first.
+/// Report on a station after the first; serialized for run reports, printed as one line.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StationReport {
     /// Index of the station, counted from 0.
@@ -80,7 +83,9 @@ struct PoseDistance {
 }
 
 impl Stations {
-    /// Returns `None` unless the base of the rig moves and realignment is enabled.
+    /// Corrections for the base of a rig; `None` unless it moves and [`Base::realign`](crate::config::Base::realign) is
+    /// set.
+    #[must_use]
     pub fn new(rig: &Rig) -> Option<Self> {
         let carried = || {
             let on_base = rig.cameras.iter().filter(|camera| camera.parent != Parent::World);
@@ -102,6 +107,7 @@ impl Stations {
     }
 
     /// Continues after the keyframes of an earlier run; the first station is registered with them.
+    #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> Self {
         /// Station index of the earlier run, different from all stations of this run.
         const PREVIOUS_RUN: usize = usize::MAX;
@@ -113,17 +119,17 @@ impl Stations {
         self
     }
 
-    /// Processes a change; returns the changes that can be passed on.
-    pub fn push(&mut self, change: Change) -> Vec<Change> {
+    /// Processes a change; returns the changes that can be passed on, in order.
+    pub(crate) fn push(&mut self, change: Change) -> Vec<Change> {
         self.queue.push_back(change);
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
         released
     }
 
-    /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of all samples. Returns
-    /// the changes that can be passed on.
-    pub fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
+    /// Updates the time, because the wait for a station is limited. `newest`: the newest stamp of all samples, on the
+    /// clock of the keyframes. Returns the changes that can be passed on, in order.
+    pub(crate) fn advance_to(&mut self, newest: Stamp) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(false, &mut released);
         // Images with earlier stamps have already been decided by the join.
@@ -134,8 +140,8 @@ impl Stations {
         released
     }
 
-    /// Processes all queued changes at the end of the input; returns them.
-    pub fn finish(&mut self) -> Vec<Change> {
+    /// Processes all queued changes at the end of the input; returns them in order.
+    pub(crate) fn finish(&mut self) -> Vec<Change> {
         let mut released = Vec::new();
         self.process_queue(true, &mut released);
         while !self.held.is_empty() {
@@ -145,7 +151,8 @@ impl Stations {
         released
     }
 
-    /// Corrects all keyframes of a recording.
+    /// Corrects all keyframes of a recording and returns them in the same order.
+    #[must_use]
     pub fn corrected(&mut self, keyframes: Vec<Arc<Keyframe>>) -> Vec<Arc<Keyframe>> {
         let mut released: Vec<Change> = Vec::new();
         for keyframe in keyframes {
@@ -160,16 +167,18 @@ impl Stations {
     }
 
     /// Corrects the current pose of a camera, given its pose according to the reported base pose.
-    pub fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
+    pub(crate) fn corrected_pose(&self, camera: &str, world_from_camera: &Transform) -> Transform {
         if self.carried.contains(camera) { self.map_from_odom * world_from_camera } else { *world_from_camera }
     }
 
     /// Reports on all stations after the first.
+    #[must_use]
     pub fn reports(&self) -> &[StationReport] {
         &self.reported
     }
 
     /// Total time spent on registration.
+    #[must_use]
     pub fn spent(&self) -> Duration {
         self.spent
     }
@@ -529,7 +538,7 @@ mod tests {
     }
 
     fn stations() -> Stations {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/mobile-arm.toml");
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/mobile-arm.toml");
         Stations::new(&Rig::load(&path, &[]).unwrap()).expect("its base moves")
     }
 
@@ -651,7 +660,7 @@ mod tests {
     #[test]
     fn only_moving_bases_are_realigned_on_request() {
         let rig = |name: &str, realign: bool| {
-            let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
+            let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
             Rig::load(&path, &[crate::config::Override::new("base.realign", realign)]).unwrap()
         };
         assert!(Stations::new(&rig("mobile-arm.toml", false)).is_none());

@@ -65,7 +65,7 @@ impl Hash {
 #[cfg(test)]
 mod tests {
     use super::{fingerprint as of, *};
-    use keyframe::Split;
+    use crate::Split;
     use kinematics::{Stamp, Transform};
 
     fn keyframe() -> Keyframe {

@@ -10,24 +10,24 @@ use toml::{Table, Value};
 pub struct ArmMotion {
     /// Fail-safe behavior of the motors when communication with this computer is lost.
     pub on_loss: OnLoss,
-    /// Time without communication until then.
+    /// Time without communication until then, milliseconds, 5 to 2000.
     pub timeout_millis: f64,
-    /// Time from rest to `arm.max_speed_rad_s` at full acceleration.
+    /// Time from rest to [`max_speed_rad_s`](super::Arm::max_speed_rad_s) at full acceleration, seconds, 0.01 to 10.
     pub acceleration_secs: f64,
-    /// Time from rest to full acceleration.
+    /// Time from rest to full acceleration, seconds, 0.001 to 10.
     pub jerk_secs: f64,
     /// Whether motors without a watchdog may be moved.
     pub accept_no_watchdog: bool,
-    /// External torques at which a Franka arm stops, Nm, in the order of its joints; `None` here and below: the
-    /// driver's default.
+    /// External torques at which a Franka arm stops, Nm, in the order of its joints, 1 to 100; `None` here and below:
+    /// the driver's default.
     pub contact_torque_nm: Option<[f64; 7]>,
-    /// External forces at the end effector at which it stops, N.
+    /// External forces at the end effector at which it stops, along x, y and z of the robot base, N, 1 to 100.
     pub contact_force_n: Option<[f64; 3]>,
-    /// External moments at the end effector at which it stops, Nm.
+    /// External moments about the same axes at which it stops, Nm, 1 to 100.
     pub contact_moment_nm: Option<[f64; 3]>,
-    /// Joint stiffness, Nm/rad.
+    /// Joint stiffness of a Franka arm, Nm/rad, in the order of its joints, 10 to 14,250.
     pub stiffness_nm_rad: Option<[f64; 7]>,
-    /// Path of `ODrive`'s `flat_endpoints.json`; empty if not given.
+    /// Path of ODrive's `flat_endpoints.json`; empty if not given.
     pub odrive_endpoints: String,
 }
 

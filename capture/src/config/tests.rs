@@ -282,7 +282,7 @@ fn resolved_file_gives_the_same_rig() {
 
 #[test]
 fn documentation_lists_exactly_the_existing_keys() {
-    let page = include_str!("../../docs/reference/rig.md");
+    let page = include_str!("../../../docs/reference/rig.md");
     let documented: BTreeMap<String, &str> =
         page.lines().filter_map(|line| Some((line.strip_prefix("| `")?.split_once('`')?.0.to_owned(), line))).collect();
     let (_, _, context) = read::keys("rig.toml", &full(), &[]).expect("TOML");
@@ -316,7 +316,7 @@ fn full() -> String {
 
 #[test]
 fn documented_defaults_match_the_code() {
-    let page = include_str!("../../docs/reference/rig.md");
+    let page = include_str!("../../../docs/reference/rig.md");
     let rig = parse(RIG, &[]).expect("a good rig file");
     let resolved: toml::Table = toml::from_str(&rig.to_toml()).expect("TOML");
     let mut n_checked = 0;
@@ -386,7 +386,7 @@ fn invalid_value_error_names_line_or_flag() {
 
 #[test]
 fn bundled_rig_files_are_valid_and_round_trip() {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs");
     let mut n_rigs = 0;
     for entry in std::fs::read_dir(&folder).expect("the folder rigs") {
         let path = entry.expect("a file").path();

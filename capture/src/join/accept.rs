@@ -107,7 +107,7 @@ mod tests {
 
     #[test]
     fn stationary_camera_of_a_resumed_run_ignores_earlier_stamps() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
         let fixed = || {
             let spacing = Spacing { translation_m: 1.0, rotation_rad: 1.0 };
@@ -123,7 +123,7 @@ mod tests {
     #[test]
     fn unknown_velocity_is_rejected_only_for_rolling_shutters() {
         for (readout_micros, expected) in [(0, Ok(())), (15_000, Err(Rejection::ShearUnknown))] {
-            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
             let rig = Rig::load(&path, &[Override::new("camera.wrist.readout_micros", readout_micros)]).expect("a rig");
             let camera = &rig.cameras[0];
             let acceptance =

@@ -1,10 +1,8 @@
 //! Converts device images to the arrays of a keyframe: decoded, undistorted, depth in meters.
 
 use super::motion::CameraPose;
-use crate::Error;
-use crate::config;
-use crate::downscale;
 use crate::error::Context;
+use crate::{config, downscale};
 use drivers::{Image, TruthImage};
 use keyframe::{DepthMap, Truth};
 use kinematics::quantile::{Rank, quantile};
@@ -20,7 +18,7 @@ pub(super) struct Undistorter {
 
 impl Undistorter {
     /// `scale`: factor for the width and height of the undistorted images.
-    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> Result<Self, Error> {
+    pub(super) fn new(intrinsics: &Intrinsics, scale: f64) -> crate::Result<Self> {
         let undistortion = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
         let full = intrinsics.undistorted();
         Ok(Self { pinhole: downscale::intrinsics(&full, scale)?, full, undistortion })

@@ -18,10 +18,9 @@ mod tests;
 mod waiting;
 
 pub use change::Change;
-pub use motion::{CameraPose, Motion};
+pub(crate) use motion::{CameraPose, Motion};
 pub use rejection::{Counts, Rejection, SampleUse};
 
-use crate::Error;
 use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
 use crate::error::Context;
 use accept::Acceptance;
@@ -36,6 +35,9 @@ use store::KeyframeStore;
 use waiting::{Partner, Waiting};
 
 /// Converts samples to keyframes.
+///
+/// Samples go in one by one with [`Join::push`]; [`Join::finish`] ends the stream. The store of keyframes is bounded:
+/// beyond its limits, the most redundant keyframe is evicted.
 pub struct Join {
     motion: Motion,
     cameras: Vec<CameraState>,
@@ -64,11 +66,19 @@ pub enum JoinEvent {
     /// A new keyframe was added to the store.
     Accepted(Arc<Keyframe>),
     /// A keyframe was evicted from the full store.
-    Evicted { camera: Arc<str>, stamp: Stamp },
+    Evicted {
+        /// Name of its camera.
+        camera: Arc<str>,
+        /// Its stamp.
+        stamp: Stamp,
+    },
     /// A color image with a known pose, whether or not it becomes a keyframe.
     PosedImage(PosedImage),
     /// A color image did not become a keyframe.
-    Rejected { why: Rejection },
+    Rejected {
+        /// The reason.
+        why: Rejection,
+    },
 }
 
 /// A color image and its camera pose.
@@ -76,6 +86,7 @@ pub enum JoinEvent {
 pub struct PosedImage {
     /// As delivered by the device; not undistorted.
     pub image: Image,
+    /// Pose of the camera at mid-exposure, without the correction of a station.
     pub world_from_camera: Transform,
 }
 
@@ -101,6 +112,10 @@ struct ReadyImage {
 
 impl Join {
     /// A join for the cameras and the arm of a rig.
+    ///
+    /// # Errors
+    ///
+    /// If the robot description does not match the rig, or the scaled training images would be too small.
     pub fn new(rig: &Rig) -> crate::Result<Self> {
         let join = &rig.join;
         let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
@@ -126,6 +141,7 @@ impl Join {
     }
 
     /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store limits.
+    #[must_use]
     pub fn taking_only(mut self, list: KeyframeList) -> Self {
         self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
         self.list = Some(list);
@@ -136,6 +152,7 @@ impl Join {
     ///
     /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, all
     /// new keyframes get a stamp offset.
+    #[must_use]
     pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
         let mut evicted = Vec::new();
         for keyframe in keyframes {
@@ -150,7 +167,7 @@ impl Join {
     }
 
     /// Converts the stamp of a sample to the clock of the keyframes.
-    pub fn shifted(&self, stamp: Stamp) -> Stamp {
+    pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
         Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
     }
 
@@ -196,7 +213,8 @@ impl Join {
         events
     }
 
-    /// Counts of all images so far.
+    /// Counts of all samples so far.
+    #[must_use]
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
@@ -211,8 +229,13 @@ impl Join {
         self.ranges.iter()
     }
 
-    /// Compares the result with the list, as [`KeyframeList::check_found`] does.
-    pub fn check_list(&self) -> Result<Option<String>, Error> {
+    /// Compares the result with the list of [`Join::taking_only`], as [`KeyframeList::check_found`] does; `None`
+    /// without a list or a difference.
+    ///
+    /// # Errors
+    ///
+    /// If no keyframe of the list was found.
+    pub fn check_list(&self) -> crate::Result<Option<String>> {
         let Some(list) = &self.list else { return Ok(None) };
         let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
         Ok(list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))?)
@@ -429,7 +452,7 @@ impl CameraState {
     /// Logs the first decoding error of a camera; all of them are counted.
     fn undecodable(&mut self, error: &crate::Error) -> Rejection {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
-            log::warn!("{error:#}");
+            log::warn!("{}", chain(error));
         }
         Rejection::Undecodable
     }

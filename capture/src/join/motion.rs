@@ -18,7 +18,7 @@ const MAX_LIMIT_EXCESS: f64 = 0.2;
 const MAX_IMAGE_INTERVALS: f64 = 2.5;
 
 /// The recent motion of the robot.
-pub struct Motion {
+pub(crate) struct Motion {
     chain: Chain,
     /// Index of each chain joint in the readings.
     order: Vec<usize>,
@@ -44,9 +44,10 @@ struct ReportedPoses {
 
 /// A camera's pose and velocity at a stamp.
 #[derive(Clone, Debug, PartialEq)]
-pub struct CameraPose {
-    pub world_from_camera: Transform,
-    pub twist: Option<Twist>,
+pub(crate) struct CameraPose {
+    pub(crate) world_from_camera: Transform,
+    /// Twist in camera axes; `None` if the joint velocities are unknown.
+    pub(crate) twist: Option<Twist>,
     /// Camera twist per unit velocity of each chain joint (1 rad/s or 1 m/s); empty if no joint moves the camera.
     pub(super) joint_twists: Arc<[Twist]>,
     /// State of a moving base that carries the camera.
@@ -54,7 +55,8 @@ pub struct CameraPose {
 }
 
 impl Motion {
-    pub fn new(rig: &Rig) -> crate::Result<Self> {
+    /// The motion of the robot of a rig, without readings.
+    pub(crate) fn new(rig: &Rig) -> crate::Result<Self> {
         let chain =
             Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link).context("the arm's URDF")?;
         let order = chain.order_in(&rig.arm.joints).context("arm.joints")?;
@@ -96,7 +98,7 @@ impl Motion {
     }
 
     /// Adds joint readings in the order of the device; returns whether they were valid.
-    pub fn push_joints(&mut self, state: JointState) -> bool {
+    pub(crate) fn push_joints(&mut self, state: JointState) -> bool {
         let ordered = |numbers: &[f64]| -> Option<Vec<f64>> {
             if numbers.is_empty() {
                 return Some(Vec::new());
@@ -144,7 +146,7 @@ impl Motion {
     }
 
     /// The pose and velocity of a camera at a stamp; `NotYet` if the readings do not reach that far.
-    pub fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
+    pub(crate) fn at(&self, camera: &config::Camera, stamp: Stamp) -> Result<CameraPose, HistoryError> {
         let (world_from_base, base_twist, base) = match &self.base {
             BaseMotion::Fixed(pose) => (*pose, Twist::zero(), None),
             BaseMotion::ReportedPoses(reported) if camera.parent != Parent::World => {

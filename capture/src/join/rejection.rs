@@ -32,7 +32,8 @@ pub enum Rejection {
 }
 
 impl Rejection {
-    /// The key in reports and protocols.
+    /// The key in reports and protocols, such as `not_moved`.
+    #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::UnknownCamera => "unknown_camera",
@@ -68,7 +69,7 @@ impl std::fmt::Display for Rejection {
     }
 }
 
-/// Counts of all samples.
+/// Counts of all samples; printed as one line that lists the counts above 0.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Color images received.
@@ -107,6 +108,7 @@ pub enum SampleUse {
 
 impl Counts {
     /// Lost data that should have been kept, one sentence each.
+    #[must_use]
     pub fn data_losses(&self, sample_use: SampleUse) -> Vec<String> {
         let mut data_losses = Vec::new();
         if sample_use == SampleUse::Recorded && self.device_skipped > 0 {

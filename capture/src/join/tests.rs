@@ -1,10 +1,11 @@
 //! Generated samples in, keyframes out: poses at the shutter time, every rejection, the bounds, and bit-exact replay.
 
-use super::{Join, JoinEvent, KeyframeList, Rejection, keyframe_list};
+use super::{Join, JoinEvent, Rejection};
 use crate::config::{Override, Rig};
+use crate::error::chain;
 use crate::open;
 use drivers::{BasePose, Image, PixelFormat, Sample, TruthImage};
-use keyframe::{Keyframe, Split};
+use keyframe::{Keyframe, KeyframeList, Split, list_text};
 use kinematics::{Chain, JointState, Stamp, Transform};
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -26,7 +27,7 @@ fn rig(overrides: &[Override]) -> Rig {
         Override::new("sim.truth", false),
     ];
     all.extend(overrides.iter().cloned());
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
     Rig::load(&path, &all).expect("a bundled rig file")
 }
 
@@ -395,7 +396,7 @@ fn list_selects_exactly_its_keyframes() {
     let path = folder.path().join("keyframes.txt");
     let mut first = join(&rig(&[]));
     let chosen = run_join(&mut first, samples(6));
-    std::fs::write(&path, keyframe_list(first.keyframes())).expect("disk space");
+    std::fs::write(&path, list_text(first.keyframes())).expect("disk space");
     // A rig whose checks would reject all of them.
     let strict = rig(&[
         Override::new("join.max_shear_px", 0),
@@ -407,7 +408,7 @@ fn list_selects_exactly_its_keyframes() {
     assert_eq!(differences(&chosen.keyframes, &listed.keyframes), Vec::<String>::new());
     assert_eq!((listed.rejected, listed.evicted), (vec![], vec![]));
     let again = folder.path().join("again.txt");
-    std::fs::write(&again, keyframe_list(second.keyframes())).expect("disk space");
+    std::fs::write(&again, list_text(second.keyframes())).expect("disk space");
     assert_eq!(std::fs::read_to_string(&path).expect("a list"), std::fs::read_to_string(&again).expect("a list"));
 }
 
@@ -465,8 +466,5 @@ fn downscaled_keyframes_are_area_means_with_scaled_intrinsics() {
     assert_eq!(depth_px(small), depth_px(full), "depth keeps its size");
     let truth = small.truth.as_ref().expect("a simulation");
     assert_eq!((truth.rgba_srgb.len(), truth.psnr_ceiling), (4 * 32 * 24, None));
-    assert!(
-        Join::new(&rig(&[Override::new("train.scale", 0.2)]))
-            .is_err_and(|error| format!("{error:#}").contains("13x10"))
-    );
+    assert!(Join::new(&rig(&[Override::new("train.scale", 0.2)])).is_err_and(|error| chain(&error).contains("13x10")));
 }

@@ -8,7 +8,7 @@ mod simulated;
 mod simulated_tests;
 mod tags;
 
-#[cfg(all(feature = "sim", feature = "realsense", target_os = "linux"))]
+#[cfg(target_os = "linux")]
 pub use real::franka_chain;
 pub use real::{check_motion, movable_arm, udp_arm_address};
 
@@ -40,12 +40,18 @@ pub enum Devices {
 pub struct Opened {
     /// The rig with all settings resolved.
     pub rig: Rig,
+    /// The samples of all devices, or of the recording.
     pub source: Box<dyn Source>,
     /// Set when the samples end early because the recording is damaged.
     pub damage: Arc<OnceLock<String>>,
 }
 
-/// Opens the devices of a rig.
+/// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that store it.
+///
+/// # Errors
+///
+/// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a setting that a driver
+/// needs.
 pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
     if devices == Devices::Sim {
         rig.arm.driver = ArmDriver::Sim;
@@ -79,6 +85,10 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
 
 /// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
 /// recording.
+///
+/// # Errors
+///
+/// If the file is not a recording, contains no valid rig, or does not match the given rig.
 pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate::Result<Opened> {
     let recording = Recording::open(path)?;
     let mut rig = match rig {
@@ -103,6 +113,10 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
 }
 
 /// Creates a recording of a rig, with the rig file and the URDF attached.
+///
+/// # Errors
+///
+/// If the file cannot be written.
 pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
     let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
     let resolved = rig.to_toml();
@@ -115,6 +129,10 @@ pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
 }
 
 /// The kinematic chain from the robot's base to its flange.
+///
+/// # Errors
+///
+/// If the URDF of the rig has no such chain.
 pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
     let arm = &rig.arm;
     Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
@@ -152,6 +170,7 @@ fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
 }
 
 /// Whether any device of a rig is simulated.
+#[must_use]
 pub fn is_any_simulated(rig: &Rig) -> bool {
     rig.arm.driver == ArmDriver::Sim
         || rig.base.driver == BaseDriver::Sim
@@ -209,14 +228,14 @@ mod tests {
     use super::*;
 
     fn load(name: &str, overrides: &[Override]) -> Rig {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
         Rig::load(&path, overrides).expect("a bundled rig file")
     }
 
     #[test]
     fn unsupported_driver_error_suggests_sim() {
         let rig = load("static-arm.toml", &[Override::new("base.driver", "rgbd")]);
-        let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
+        let message = chain(&super::rig(rig, Devices::Real).err().expect("no such driver"));
         assert!(message.contains("rgbd") && message.contains("--sim"), "{message}");
     }
 
@@ -231,7 +250,7 @@ mod tests {
         ];
         let error_of = |overrides: &[Override]| {
             let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
-            format!("{:#}", opened.err().expect("nothing is connected"))
+            chain(&opened.err().expect("nothing is connected"))
         };
         let message = error_of(&absent);
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
@@ -251,7 +270,7 @@ mod tests {
             let overrides =
                 driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
             let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
-            format!("{:#}", opened.err().expect("nothing is connected"))
+            chain(&opened.err().expect("nothing is connected"))
         };
         assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
         let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
@@ -267,7 +286,7 @@ mod tests {
             Override::new("camera.wrist.device", "no such serial"),
         ];
         let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
-        let message = format!("{:#}", opened.err().expect("nothing is connected"));
+        let message = chain(&opened.err().expect("nothing is connected"));
         let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
         assert!(message.contains(expected) && message.contains("--sim"), "{message}");
     }
@@ -277,7 +296,7 @@ mod tests {
         let error_of = |driver: &str, address: &str| {
             let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
             let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
-            format!("{:#}", opened.err().expect("no such arm"))
+            chain(&opened.err().expect("no such arm"))
         };
         for (driver, address, expected) in
             [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
@@ -311,7 +330,8 @@ mod tests {
             let emulated = EmulatedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
             let address = emulated.address().to_string();
             let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
-            let mut opened = super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{e:#}"));
+            let mut opened =
+                super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{}", crate::chain(&e)));
             let joints = loop {
                 match opened.source.next_sample().expect("the rig works").expect("it does not end") {
                     Sample::Joints(joints) => break joints,
@@ -325,7 +345,7 @@ mod tests {
     #[test]
     fn missing_recording_is_an_error() {
         let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
-        assert!(format!("{missing:#}").contains("no/such.mcap"));
+        assert!(chain(&missing).contains("no/such.mcap"));
     }
 
     #[test]
@@ -353,7 +373,7 @@ mod tests {
         assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
         let mut renamed = rig;
         renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
-        let error_of = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
+        let error_of = chain(&recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
         assert!(error_of.contains("run.mcap") && error_of.contains("\"elbow\""), "{error_of}");
         let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
         assert_eq!(overridden.rig.train.seed, 9);

@@ -55,6 +55,11 @@ pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
 
 /// Opens the arm for motion: enables it and holds its position. Joint positions are those of the device, without
 /// `arm.joint_offsets`.
+///
+/// # Errors
+///
+/// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the settings, or the
+/// arm cannot be reached.
 pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
     let Some(motion) = &rig.arm.motion else {
         bail!("the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md");
@@ -67,6 +72,10 @@ pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
 }
 
 /// Checks the motion settings as far as possible without the arm.
+///
+/// # Errors
+///
+/// If the driver cannot move arms or does not support the settings.
 pub fn check_motion(rig: &Rig) -> crate::Result<()> {
     let Some(motion) = &rig.arm.motion else { return Ok(()) };
     match rig.arm.driver {
@@ -172,6 +181,10 @@ fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
 }
 
 /// The chain from the link in which a Franka arm reports poses to its flange.
+///
+/// # Errors
+///
+/// If the URDF of the rig has no such chain.
 #[cfg(target_os = "linux")]
 pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
     let Rig { arm, .. } = rig;
@@ -195,7 +208,11 @@ fn udp_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
     Ok(Box::new(open))
 }
 
-/// The address on which joint states are received.
+/// The address on which [`ArmDriver::Udp`] receives joint states.
+///
+/// # Errors
+///
+/// If `arm.address` is not an IP address with a port.
 pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
     match &*rig.arm.address {
         "" => Ok(DEFAULT_ARM_ADDRESS),

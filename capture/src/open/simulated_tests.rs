@@ -27,7 +27,7 @@ fn small(name: &str, overrides: &[Override]) -> Rig {
         Override::new("sim.lockstep", true),
     ];
     all.extend(overrides.iter().cloned());
-    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all).expect("a bundled rig file")
+    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name), &all).expect("a bundled rig file")
 }
 
 /// Reads a source to its end; `on_sample` is called for every sample.
@@ -148,7 +148,7 @@ fn range_bits(join: &Join) -> Vec<String> {
 fn mobile(name: &str, overrides: &[Override]) -> Rig {
     let mut all = vec![Override::new("sim.lockstep", true), Override::new("train.scale", 0.25)];
     all.extend(overrides.iter().cloned());
-    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name), &all).expect("a bundled rig file")
+    Rig::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name), &all).expect("a bundled rig file")
 }
 
 #[test]
@@ -337,7 +337,7 @@ fn drifting_base_is_corrected_live_and_in_replay() {
 
 #[test]
 fn tags_localize_an_unmeasured_base() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/tags.toml");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/tags.toml");
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 40)];
     let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
     for (id, tag) in &rig.base.tags {
@@ -375,7 +375,7 @@ fn tags_localize_an_unmeasured_base() {
 
 #[test]
 fn tag_corners_match_the_simulator() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
     let at_once = Override::new("camera.wrist.readout_micros", 0);
     let overrides = [Override::new("sim.lockstep", true), Override::new("sim.n_images", 30), at_once];
     let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
