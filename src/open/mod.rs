@@ -304,7 +304,7 @@ mod tests {
                 address: "127.0.0.1:0".parse().expect("an address"),
                 version: FciVersion::V5,
                 chain,
-                flange_from_ee: kinematics::Transform::identity(),
+                flange_from_tool: kinematics::Transform::identity(),
                 limits: Limits::panda(),
             };
             let rest = Joints { position_rad: REST_RAD, ..Joints::default() };

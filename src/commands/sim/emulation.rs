@@ -259,7 +259,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     };
     let address = fci_address(&rig.arm.address)?;
     let chain = open::franka_chain(rig)?;
-    Ok(RobotConfig { address, version, chain, flange_from_ee: Transform::identity(), limits })
+    Ok(RobotConfig { address, version, chain, flange_from_tool: Transform::identity(), limits })
 }
 
 /// Address at which a controller listens; it must be one of this computer.

@@ -165,7 +165,7 @@ impl Drop for Compiling {
 }
 
 /// The resources of one training step.
-struct TrainView<'a> {
+struct PreparedView<'a> {
     view: ViewPasses<'a>,
     level: &'a Level,
     /// Present if camera parameters are optimized.
@@ -581,7 +581,7 @@ impl SplatTrainer {
         pipelines: &TrainPipelines,
         view_level: (usize, usize),
     ) -> Result<(), Error> {
-        let TrainView { view, level, lens } = self.train_view(list, pipelines, view_level)?;
+        let PreparedView { view, level, lens } = self.prepared_view(list, pipelines, view_level)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
@@ -621,12 +621,12 @@ impl SplatTrainer {
     }
 
     /// A prepared view and level with its current camera parameters; records the pass that computes the view.
-    fn train_view(
+    fn prepared_view(
         &self,
         list: &mut Passes,
         pipelines: &TrainPipelines,
         (view_ix, level_ix): (usize, usize),
-    ) -> Result<TrainView<'_>, Error> {
+    ) -> Result<PreparedView<'_>, Error> {
         let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
         let lens = lens.filter(|_| self.cameras.set.any());
         let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
@@ -644,7 +644,7 @@ impl SplatTrainer {
             view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px: level.size_px,
         };
-        Ok(TrainView { view, level, lens })
+        Ok(PreparedView { view, level, lens })
     }
 
     /// Ensures that a view of this size can be drawn, or trained on.

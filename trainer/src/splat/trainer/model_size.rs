@@ -1,7 +1,7 @@
 //! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
 //! degrees.
 
-use super::{SplatTrainer, TrainView, VIEWS_AT_ONCE};
+use super::{PreparedView, SplatTrainer, VIEWS_AT_ONCE};
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
 use crate::splat::kernels::TrainPipelines;
@@ -35,7 +35,7 @@ impl SplatTrainer {
             }
             loop {
                 let mut list = std::mem::take(&mut self.passes);
-                let TrainView { view, .. } = self.train_view(&mut list, pipelines, (view_ix, 0))?;
+                let PreparedView { view, .. } = self.prepared_view(&mut list, pipelines, (view_ix, 0))?;
                 view.draw(&mut list, &self.draw);
                 view.backward(&mut list, pipelines);
                 view.contribute(&mut list, pipelines, &contributions); // Adds nothing if a buffer was too small.
