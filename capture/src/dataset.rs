@@ -76,7 +76,7 @@ pub fn load(
                 loaded.names.push(name);
                 depth_errors.extend(depth_error);
             }
-            Err(error) => image_errors.push(chain(&error)),
+            Err(error) => image_errors.push(format!("{error:#}")),
         }
     }
     ensure!(

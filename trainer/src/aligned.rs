@@ -278,6 +278,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
 mod tests {
     use super::*;
     use crate::gpu::GpuOptions;
+    use crate::mean_color::MeanColor;
     use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
     use crate::test_scenes as scenes;
@@ -316,6 +317,12 @@ mod tests {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_restart(&gpu, tsdf(&gpu), TsdfModel::resume, TsdfModel::load);
         check_restart(&gpu, nerf(&gpu), NerfModel::resume, NerfModel::load);
+        check_restart(
+            &gpu,
+            MeanColor::new(ModelOptions::default()),
+            |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes),
+            |_, folder| MeanColor::load(folder),
+        );
     }
 
     fn check_restart<M: Restartable + 'static>(
@@ -393,6 +400,7 @@ mod tests {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));
+        check_training_continues(MeanColor::new(ModelOptions::default()));
     }
 
     fn check_training_continues<M: Restartable + 'static>(model: M) {

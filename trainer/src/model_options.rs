@@ -98,27 +98,28 @@ fn json(options: &impl MethodOptions) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::splat::{CountPolicy, SplatOptions};
+    use crate::mean_color::MeanColorOptions;
 
     #[test]
     fn options_survive_json_bit_by_bit() {
-        let options = ModelOptions::<SplatOptions>::default().with(|options| {
+        let options = ModelOptions::<MeanColorOptions>::default().with(|options| {
             options.common.seed = u64::MAX;
-            options.specific.noise = 0.1 + 0.2;
-            options.specific.count = CountPolicy::Tested;
+            options.specific.rate = 0.1 + 0.2;
         });
         let text = serde_json::to_string(&options.to_json()).unwrap();
         let read: ModelOptions = serde_json::from_str(&text).unwrap();
-        assert_eq!(read.typed::<SplatOptions>().unwrap(), options);
+        assert_eq!(read.typed::<MeanColorOptions>().unwrap(), options);
     }
 
     #[test]
     fn invalid_options_are_rejected_with_the_method() {
-        let mut options = ModelOptions::<SplatOptions>::default().to_json();
-        options.specific["noise"] = "loud".into();
-        let message = options.typed::<SplatOptions>().unwrap_err().to_string();
-        assert!(message.contains("splat") && message.contains("loud"), "{message}");
-        options.specific = serde_json::json!({ "seed": 1 });
-        assert!(options.typed::<SplatOptions>().is_err(), "a common option among those of the method");
+        let mut options = ModelOptions::<MeanColorOptions>::default().to_json();
+        options.specific["rate"] = "fast".into();
+        let message = options.typed::<MeanColorOptions>().unwrap_err().to_string();
+        assert!(message.contains("mean-color") && message.contains("fast"), "{message}");
+        options.specific = serde_json::json!({ "rate": 0.5, "seed": 1 });
+        assert!(options.typed::<MeanColorOptions>().is_err(), "a common option among those of the method");
+        options.specific = serde_json::json!({});
+        assert!(options.typed::<MeanColorOptions>().is_err(), "no option may be missing");
     }
 }

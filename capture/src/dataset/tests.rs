@@ -1,7 +1,7 @@
 //! Loading dataset folders as keyframes.
 
 use super::*;
-use crate::{error::chain, test_data};
+use crate::test_data;
 use image::{GrayImage, Luma, RgbImage};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -84,7 +84,7 @@ fn scaling_averages_areas_and_propagates_masks() {
     // Columns 0 and 1 hold 0 and 4; column 1 of the scaled image covers the masked column.
     assert_eq!((row[0], row[1][3], row[2]), ([2, 100, 7, 255], 0, [18, 100, 7, 255]));
     assert_eq!((keyframe.size_px, keyframe.principal_px), ([32, 24], [16.0, 12.0]));
-    assert!(chain(&load_at(folder.path(), 0.2).unwrap_err()).contains("64x48 pixels would have 13x10"));
+    assert!(format!("{:#}", load_at(folder.path(), 0.2).unwrap_err()).contains("64x48 pixels would have 13x10"));
 }
 
 #[test]

@@ -235,7 +235,7 @@ mod tests {
     #[test]
     fn unsupported_driver_error_suggests_sim() {
         let rig = load("static-arm.toml", &[Override::new("base.driver", "rgbd")]);
-        let message = chain(&super::rig(rig, Devices::Real).err().expect("no such driver"));
+        let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
         assert!(message.contains("rgbd") && message.contains("--sim"), "{message}");
     }
 
@@ -250,7 +250,7 @@ mod tests {
         ];
         let error_of = |overrides: &[Override]| {
             let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
-            chain(&opened.err().expect("nothing is connected"))
+            format!("{:#}", opened.err().expect("nothing is connected"))
         };
         let message = error_of(&absent);
         assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
@@ -270,7 +270,7 @@ mod tests {
             let overrides =
                 driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
             let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
-            chain(&opened.err().expect("nothing is connected"))
+            format!("{:#}", opened.err().expect("nothing is connected"))
         };
         assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
         let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
@@ -286,7 +286,7 @@ mod tests {
             Override::new("camera.wrist.device", "no such serial"),
         ];
         let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
-        let message = chain(&opened.err().expect("nothing is connected"));
+        let message = format!("{:#}", opened.err().expect("nothing is connected"));
         let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
         assert!(message.contains(expected) && message.contains("--sim"), "{message}");
     }
@@ -296,7 +296,7 @@ mod tests {
         let error_of = |driver: &str, address: &str| {
             let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
             let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
-            chain(&opened.err().expect("no such arm"))
+            format!("{:#}", opened.err().expect("no such arm"))
         };
         for (driver, address, expected) in
             [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
@@ -331,7 +331,7 @@ mod tests {
             let address = emulated.address().to_string();
             let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
             let mut opened =
-                super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{}", crate::chain(&e)));
+                super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{}", format!("{e:#}")));
             let joints = loop {
                 match opened.source.next_sample().expect("the rig works").expect("it does not end") {
                     Sample::Joints(joints) => break joints,
@@ -345,7 +345,7 @@ mod tests {
     #[test]
     fn missing_recording_is_an_error() {
         let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
-        assert!(chain(&missing).contains("no/such.mcap"));
+        assert!(format!("{missing:#}").contains("no/such.mcap"));
     }
 
     #[test]
@@ -373,7 +373,7 @@ mod tests {
         assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
         let mut renamed = rig;
         renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
-        let error_of = chain(&recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
+        let error_of = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
         assert!(error_of.contains("run.mcap") && error_of.contains("\"elbow\""), "{error_of}");
         let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
         assert_eq!(overridden.rig.train.seed, 9);

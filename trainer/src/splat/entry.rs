@@ -5,7 +5,7 @@ use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
-use crate::model_options::{MethodOptions, ModelOptions, default_options};
+use crate::model_options::{MethodOptions, default_options};
 use crate::{Error, Method, ResumedModel};
 use calibration::ParamSet;
 use keyframe::Keyframe;
@@ -45,7 +45,10 @@ fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -
 
 fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
     let splats = file::read(model)?;
-    let trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &splats)?;
+    // The limit is for training; a saved model is shown completely.
+    let max_splats = u32::try_from(splats.n_splats()).unwrap_or(u32::MAX);
+    let options = SplatOptions { max_splats, ..SplatOptions::default() };
+    let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
     Ok(Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer }))
 }
 
@@ -63,4 +66,30 @@ fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error>
     file::write(request.out, format, &splats)?;
     let detail = format!("of color degree {}", splats.sh_degree);
     Ok(Exported { n_items: splats.n_splats() as u64, item: "splat", detail })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::splat::arrays::SplatArrays;
+    use crate::splat::ply;
+
+    #[test]
+    fn saved_model_above_the_training_limit_is_loaded_completely() {
+        let n_splats = SplatOptions::default().max_splats as usize + 1;
+        let splats = SplatArrays {
+            means: vec![[0.0, 0.0, 1.0]; n_splats],
+            log_scales: vec![[-5.0; 3]; n_splats],
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n_splats],
+            opacity_logits: vec![1.0; n_splats],
+            sh: vec![[0.1; 3]; n_splats],
+            sh_degree: 0,
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("large.ply");
+        ply::write(&path, &splats).unwrap();
+        let model = load(Gpu::open(&GpuOptions::default()).unwrap(), &path).unwrap();
+        assert_eq!(model.progress().primitives, n_splats as u64);
+    }
 }
