@@ -1,11 +1,10 @@
-//! `fieldrig bench ablation`: measures the contribution of each part of the method by training without it.
+//! Measures the contribution of each part of the method by training without it.
 
-use crate::bench::page::Findings;
-use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::sample_std;
-use crate::bench::variant::Variant;
-use crate::exit::{self, BadArgument, Exit};
-use crate::open_gpu::open_gpu;
+use crate::findings::{BenchResult, Findings};
+use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
+use crate::statistics::sample_std;
+use crate::variant::Variant;
+use crate::{Error, Result};
 use kinematics::quantile::median;
 use serde::Serialize;
 use session::Table;
@@ -23,38 +22,34 @@ const TABLE_SECS: [f64; 2] = [1.0, 4.0];
 const BASELINE: Variant<SplatOptions> = Variant { name: "baseline", change: |_| () };
 
 const VARIANTS: &[Variant<SplatOptions>] = &[
-    Variant { name: "no seeds from depth", change: |options| options.specific.seeds_per_image = Some(0.0) },
-    Variant { name: "no depth loss", change: |options| options.specific.depth_per_m = 0.0 },
-    Variant { name: "no structure loss", change: |options| options.specific.dssim_frac = 0.0 },
-    Variant { name: "full resolution from the start", change: |options| options.specific.coarse_steps = Some([0; 2]) },
-    Variant { name: "black background", change: |options| options.specific.random_background = 0.0 },
-    Variant { name: "no opacity and size regularization", change: |options| options.specific.cost_images = 0.0 },
-    Variant { name: "no growth", change: |options| options.specific.growth_frac = 0.0 },
-    Variant { name: "no position noise", change: |options| options.specific.noise = 0.0 },
-    Variant { name: "constant color per splat", change: |options| options.specific.sh_degree = 0 },
-    Variant { name: "grown to the cap", change: |options| options.specific.count = CountPolicy::ToCap },
+    Variant { name: "no seeds from depth", change: |model| model.specific.seeds_per_image = Some(0.0) },
+    Variant { name: "no depth loss", change: |model| model.specific.depth_per_m = 0.0 },
+    Variant { name: "no structure loss", change: |model| model.specific.dssim_frac = 0.0 },
+    Variant { name: "full resolution from the start", change: |model| model.specific.coarse_steps = Some([0; 2]) },
+    Variant { name: "black background", change: |model| model.specific.random_background = 0.0 },
+    Variant { name: "no opacity and size regularization", change: |model| model.specific.cost_images = 0.0 },
+    Variant { name: "no growth", change: |model| model.specific.growth_frac = 0.0 },
+    Variant { name: "no position noise", change: |model| model.specific.noise = 0.0 },
+    Variant { name: "constant color per splat", change: |model| model.specific.sh_degree = 0 },
+    Variant { name: "grown to the cap", change: |model| model.specific.count = CountPolicy::ToCap },
     Variant::CAMERAS_AS_GIVEN,
 ];
 
-/// Flags of `bench ablation`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
-    data: PathBuf,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 16, unless --steps is given]
-    #[arg(long, value_name = "S")]
-    seconds: Option<f64>,
-    /// Optimizer steps of each run
-    #[arg(long, value_name = "N")]
-    steps: Option<u64>,
-    /// Runs of each variant, 1 to 1000, with consecutive seeds from --seed
-    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    seeds: u64,
-    /// Only the rows whose names contain one of these words, separated by commas
-    #[arg(long, value_name = "WORD,...", value_delimiter = ',')]
-    only: Vec<String>,
-    #[command(flatten)]
-    bench: BenchArgs,
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct AblationOptions {
+    /// Folder or recording.
+    pub data: PathBuf,
+    /// Training time of each run, seconds; 16 if there is no other limit.
+    pub seconds: Option<f64>,
+    /// Optimizer steps of each run.
+    pub steps: Option<u64>,
+    /// Runs of each variant, with consecutive seeds.
+    pub seeds: u64,
+    /// Only the variants whose names contain one of these words; empty: all.
+    pub only: Vec<String>,
+    /// Models, images and folder.
+    pub runs: RunsOptions,
 }
 
 /// The runs of one variant.
@@ -74,36 +69,41 @@ struct VariantResult {
     runs: Vec<Run>,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    let data = runs.load(&args.data, &mut HashSet::new())?;
+/// Trains splats with and without each part of the method.
+///
+/// # Errors
+///
+/// If an option is invalid, the data cannot be read or scored, or training fails.
+pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
+    let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
+    let mut runs = Runs::open(&options.runs, host)?;
+    let data = runs.load(&options.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
     let is_selected = |change: &&Variant<SplatOptions>| {
-        args.only.is_empty() || args.only.iter().any(|word| change.name.contains(word))
+        options.only.is_empty() || options.only.iter().any(|word| change.name.contains(word))
     };
     let changes: Vec<&Variant<SplatOptions>> =
         VARIANTS.iter().filter(|change| is_change(change, &base_options)).filter(is_selected).collect();
     if changes.is_empty() {
         let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
-        return Err(BadArgument(format!("--only: no row has such a name; rows: {}", names.join(", "))).into());
+        return Err(Error::BadInput(format!("--only: no row has such a name; rows: {}", names.join(", "))));
     }
-    if args.bench.training.count.is_some() {
-        return Err(BadArgument("--count: this bench sets it; remove the flag".into()).into());
+    if options.runs.training.count.is_some() {
+        return Err(Error::BadInput("--count: this bench sets it; remove the flag".into()));
     }
-    runs.expect((changes.len() + 1) * usize::try_from(args.seeds)?);
+    runs.expect((changes.len() as u64 + 1) * options.seeds);
     let mut baseline: Vec<Run> = Vec::new();
     let mut rows: Vec<VariantResult> = Vec::new();
     let mut page = None;
     for change in std::iter::once(&BASELINE).chain(changes) {
         let mut finished = Vec::new();
         let first_seed = base_options.common.seed;
-        for seed in first_seed..first_seed.saturating_add(args.seeds) {
-            let options = base_options.clone().with(|options| options.common.seed = seed);
+        for seed in first_seed..first_seed.saturating_add(options.seeds) {
+            let seeded = base_options.clone().with(|model| model.common.seed = seed);
             finished.push(runs.run(Job {
                 name: format!("ablation {} {} seed {seed}", data.name, change.name),
                 data: &data,
-                model_spec: ModelSpec::of(&change.options(&options))?,
+                model_spec: ModelSpec::of(&change.options(&seeded))?,
                 limits,
                 disturbed: None,
                 variant: Some(change.name.to_owned()),
@@ -115,12 +115,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             baseline = finished.clone();
         }
         rows.extend(VariantResult::of(change.name, &baseline, finished));
-        page = Some(findings(args, &runs, &data, &rows)?);
+        page = Some(findings(options, &runs, &data, &rows)?);
     }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data.data.data_losses))
+    BenchResult::of(page, data.data.data_losses)
 }
 
 /// Whether the variant changes any of these options.
@@ -178,12 +175,12 @@ impl VariantResult {
 
 /// Writes the findings so far.
 fn findings(
-    args: &Args,
+    options: &AblationOptions,
     runs: &Runs<'_>,
     data: &NamedData,
     rows: &[VariantResult],
-) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
+) -> Result<(Findings, PathBuf)> {
+    let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
     let mut head = vec!["trained".to_owned()];
     head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
     head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
@@ -194,7 +191,7 @@ fn findings(
             format!(
                 "Each row is trained for {length} with one part removed or changed, and scored on test images; medians of {} seeds. \
  Gain: PSNR of the baseline minus that of the row, for the same seed.",
-                args.seeds
+                options.seeds
             ),
             format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
         ],
@@ -219,7 +216,7 @@ fn findings(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::runs::tests::run;
+    use crate::runs::tests::run;
 
     #[test]
     fn gains_are_computed_per_seed() {

@@ -1,10 +1,9 @@
-//! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
+//! Accuracy over the number of splats, and the number that the trainer chooses.
 
-use crate::bench::page::Findings;
-use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{db_per_doubling, extent};
-use crate::exit::{self, BadArgument, Exit};
-use crate::open_gpu::open_gpu;
+use crate::findings::{BenchResult, Findings};
+use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
+use crate::statistics::{db_per_doubling, extent};
+use crate::{Error, Result};
 use kinematics::quantile::median;
 use serde::Serialize;
 use session::Table;
@@ -16,36 +15,24 @@ use trainer::{MethodOptions, ModelSpec};
 
 /// Training time of a run if no flag limits it.
 const DEFAULT_SECONDS: f64 = 60.0;
-/// Maximum number of splats in a rig file.
-const MAX_CAP: i64 = 100_000_000;
 /// Gain below which doubling the splats is not worthwhile, dB.
 const MIN_GAIN_DB: f64 = 0.1;
 
-/// Flags of `bench budget`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
-    data: PathBuf,
-    /// Limits on the number of splats, 1 to 100000000, separated by commas
-    #[arg(
-        long,
-        value_name = "N,...",
-        value_delimiter = ',',
-        default_value = "2000,4000,8000,16000,32000,64000,128000,256000,512000,1000000",
-        value_parser = clap::value_parser!(u32).range(1..=MAX_CAP)
-    )]
-    splats: Vec<u32>,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 60, unless --steps is given]
-    #[arg(long, value_name = "S")]
-    seconds: Option<f64>,
-    /// Optimizer steps of each run
-    #[arg(long, value_name = "N")]
-    steps: Option<u64>,
-    /// Runs per limit, 1 to 1000, with consecutive seeds from --seed
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    seeds: u64,
-    #[command(flatten)]
-    bench: BenchArgs,
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct BudgetOptions {
+    /// Folder or recording.
+    pub data: PathBuf,
+    /// Limits on the number of splats.
+    pub splats: Vec<u32>,
+    /// Training time of each run, seconds; 60 if there is no other limit.
+    pub seconds: Option<f64>,
+    /// Optimizer steps of each run.
+    pub steps: Option<u64>,
+    /// Runs per limit, with consecutive seeds.
+    pub seeds: u64,
+    /// Models, images and folder.
+    pub runs: RunsOptions,
 }
 
 /// The runs with one limit.
@@ -70,21 +57,24 @@ struct Gain {
     db_per_doubling: f64,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
-        return Err(
-            BadArgument("--max-splats, --count: this bench sets them; choose limits with --splats".into()).into()
-        );
+/// Trains splats with each limit on their number, and without one.
+///
+/// # Errors
+///
+/// If an option is invalid, the data cannot be read or scored, or training fails.
+pub fn run(options: &BudgetOptions, host: &Host<'_>) -> Result<BenchResult> {
+    let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
+    if options.runs.training.max_splats.is_some() || options.runs.training.count.is_some() {
+        return Err(Error::BadInput("--max-splats, --count: this bench sets them; choose limits with --splats".into()));
     }
-    let mut caps: Vec<Option<u32>> = args.splats.iter().copied().map(Some).collect();
+    let mut caps: Vec<Option<u32>> = options.splats.iter().copied().map(Some).collect();
     caps.sort_unstable();
     caps.dedup();
     // The number chosen by the trainer comes first, because most readers want it.
     caps.insert(0, None);
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    runs.expect(caps.len() * usize::try_from(args.seeds)?);
-    let data = runs.load(&args.data, &mut HashSet::new())?;
+    let mut runs = Runs::open(&options.runs, host)?;
+    runs.expect(caps.len() as u64 * options.seeds);
+    let data = runs.load(&options.data, &mut HashSet::new())?;
     let base_options = data.splats()?;
     let mut capped = Vec::new();
     let mut page = None;
@@ -92,16 +82,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         let mut finished = Vec::new();
         let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
         let first_seed = base_options.common.seed;
-        for seed in first_seed..first_seed.saturating_add(args.seeds) {
-            let options = base_options.clone().with(|options| {
-                options.common.seed = seed;
-                options.specific.count = if cap.is_some() { CountPolicy::ToCap } else { CountPolicy::Tested };
-                options.specific.max_splats = cap.unwrap_or(options.specific.max_splats);
+        for seed in first_seed..first_seed.saturating_add(options.seeds) {
+            let capped_options = base_options.clone().with(|model| {
+                model.common.seed = seed;
+                model.specific.count = if cap.is_some() { CountPolicy::ToCap } else { CountPolicy::Tested };
+                model.specific.max_splats = cap.unwrap_or(model.specific.max_splats);
             });
             finished.push(runs.run(Job {
                 name: format!("budget {} {cap_name} seed {seed}", data.name),
                 data: &data,
-                model_spec: ModelSpec::of(&options)?,
+                model_spec: ModelSpec::of(&capped_options)?,
                 limits,
                 disturbed: None,
                 variant: None,
@@ -110,12 +100,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             })?);
         }
         capped.extend(Capped::of(cap, finished));
-        page = Some(findings(args, &runs, &data, &capped)?);
+        page = Some(findings(options, &runs, &data, &capped)?);
     }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data.data.data_losses))
+    BenchResult::of(page, data.data.data_losses)
 }
 
 impl Capped {
@@ -147,13 +134,18 @@ fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
 }
 
 /// Writes the findings so far.
-fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -> anyhow::Result<(Findings, PathBuf)> {
+fn findings(
+    options: &BudgetOptions,
+    runs: &Runs<'_>,
+    data: &NamedData,
+    capped: &[Capped],
+) -> Result<(Findings, PathBuf)> {
     let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
     let chosen = capped.iter().find(|capped| capped.cap.is_none());
     let gains = gains(&by_cap);
-    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
-    let spread = if args.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", args.seeds)
+    let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
+    let spread = if options.seeds > 1 {
+        format!("median of {} seeds; band: minimum to maximum", options.seeds)
     } else {
         "one run per cap".to_owned()
     };
@@ -232,7 +224,7 @@ fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::runs::tests::run;
+    use crate::runs::tests::run;
 
     #[test]
     fn gains_are_between_caps_that_were_reached() {

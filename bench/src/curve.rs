@@ -1,11 +1,10 @@
-//! `fieldrig bench curve`: accuracy over time, with several seeds, compared with other trainers.
+//! Accuracy over time, with several seeds, compared with other trainers.
 
-use crate::bench::page::Findings;
-use crate::bench::peer::Peer;
-use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{extent, sample_std, secs_to};
-use crate::exit::{self, BadArgument, Exit};
-use crate::open_gpu::open_gpu;
+use crate::findings::{BenchResult, Findings};
+use crate::peer::Peer;
+use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
+use crate::statistics::{extent, sample_std, secs_to};
+use crate::{Error, Result};
 use kinematics::quantile::median;
 use serde::Serialize;
 use session::chart::{Axis, Chart, Line, Point, Scale, compact_number};
@@ -16,26 +15,22 @@ use trainer::{ModelKind, ModelSpec};
 
 /// PSNR levels for which the time to reach them is reported, dB.
 const TARGET_DB: [f64; 3] = [25.0, 28.0, 30.0];
-/// Training time of a run if no flag limits it.
-const DEFAULT_SECONDS: f64 = 60.0;
+/// Default training time of a run, seconds.
+pub const DEFAULT_SECONDS: f64 = 60.0;
 
-/// Flags of `bench curve`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// Nerfstudio or TUM RGB-D folders, or recordings (.mcap); each gives one line per method
-    #[arg(required = true)]
-    data: Vec<PathBuf>,
-    /// Training time of each run in seconds; loading and scoring do not count
-    #[arg(long, value_name = "S", default_value_t = DEFAULT_SECONDS)]
-    seconds: f64,
-    /// Runs per line, 1 to 1000, with consecutive seeds from --seed
-    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    seeds: u64,
-    /// Curve of another trainer: JSON with rows of seconds and psnr; can be repeated
-    #[arg(long, value_name = "FILE.json")]
-    peer: Vec<PathBuf>,
-    #[command(flatten)]
-    bench: BenchArgs,
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct CurveOptions {
+    /// Folders or recordings; each gives one line per method.
+    pub data: Vec<PathBuf>,
+    /// Training time of each run, seconds.
+    pub seconds: f64,
+    /// Runs per line, with consecutive seeds.
+    pub seeds: u64,
+    /// Files with the curves of other trainers.
+    pub peers: Vec<PathBuf>,
+    /// Models, images and folder.
+    pub runs: RunsOptions,
 }
 
 /// Result of one method on one data set, or of one peer.
@@ -99,32 +94,37 @@ struct TimeToQuality {
     n_runs: usize,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = session::limits(Some(args.seconds), None, DEFAULT_SECONDS)?;
-    if args.seconds == 0.0 {
-        return Err(BadArgument("--seconds: must be above 0".into()).into());
+/// Trains every method on every data set with several seeds.
+///
+/// # Errors
+///
+/// If an option or a file of a peer is invalid, data cannot be read or scored, or training fails.
+pub fn run(options: &CurveOptions, host: &Host<'_>) -> Result<BenchResult> {
+    let limits = session::limits(Some(options.seconds), None, DEFAULT_SECONDS)?;
+    if options.seconds == 0.0 {
+        return Err(Error::BadInput("--seconds: must be above 0".into()));
     }
-    let peers = args.peer.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>, _>>()?;
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    let mut bench = Bench { args, peers, results: Vec::new(), notes: Vec::new() };
+    let peers = options.peers.iter().map(|path| Peer::load(path)).collect::<Result<Vec<_>>>()?;
+    let mut runs = Runs::open(&options.runs, host)?;
+    let mut bench = Bench { options, peers, results: Vec::new(), notes: Vec::new() };
     let (mut data_losses, mut names) = (Vec::new(), HashSet::new());
     let mut page = None;
-    for (path, n_left) in args.data.iter().zip((1..=args.data.len()).rev()) {
+    for (path, n_left) in options.data.iter().zip((1..=options.data.len()).rev()) {
         let data = runs.load(path, &mut names)?;
         data_losses.extend(data.data.data_losses.iter().cloned());
         let model_specs = bench.applicable(&data);
-        runs.expect(n_left * model_specs.len() * usize::try_from(args.seeds)?);
+        runs.expect((n_left * model_specs.len()) as u64 * options.seeds);
         for model_spec in model_specs {
             let mut finished = Vec::new();
             bench.results.push(CurveResult::of_runs(&data, model_spec.kind, Vec::new()));
             let first_seed = model_spec.options.common.seed;
-            for seed in first_seed..first_seed.saturating_add(args.seeds) {
+            for seed in first_seed..first_seed.saturating_add(options.seeds) {
                 finished.push(runs.run(Job {
                     name: format!("curve {} {} seed {seed}", data.name, model_spec.kind.name()),
                     data: &data,
                     model_spec: ModelSpec {
                         kind: model_spec.kind,
-                        options: model_spec.options.clone().with(|options| options.common.seed = seed),
+                        options: model_spec.options.clone().with(|model| model.common.seed = seed),
                     },
                     limits,
                     disturbed: None,
@@ -139,10 +139,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
             }
         }
     }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data_losses))
+    BenchResult::of(page, data_losses)
 }
 
 impl CurveResult {
@@ -269,7 +266,7 @@ impl Summary {
 
 /// The results so far.
 struct Bench<'a> {
-    args: &'a Args,
+    options: &'a CurveOptions,
     peers: Vec<Peer>,
     results: Vec<CurveResult>,
     /// Notes for the page.
@@ -297,11 +294,11 @@ impl Bench<'_> {
     }
 
     /// Writes the findings so far.
-    fn findings(&self, runs: &Runs<'_>) -> anyhow::Result<(Findings, PathBuf)> {
+    fn findings(&self, runs: &Runs<'_>) -> Result<(Findings, PathBuf)> {
         let peers: Vec<CurveResult> = self.peers.iter().map(CurveResult::of_peer).collect();
         let all = || self.results.iter().chain(&peers);
         let last_secs = all().flat_map(|results| &results.points).map(|point| point.seconds).fold(1.0, f64::max);
-        let (n_seeds, seconds) = (self.args.seeds, compact_number(self.args.seconds));
+        let (n_seeds, seconds) = (self.options.seeds, compact_number(self.options.seconds));
         let subtitle = if n_seeds > 1 {
             format!("median of {n_seeds} seeds; band: minimum to maximum; dashed: peers")
         } else {
@@ -360,7 +357,7 @@ impl Bench<'_> {
             numbers: serde_json::json!({
                 "bench": "curve",
                 "adapter": runs.adapter(),
-                "seconds": self.args.seconds,
+                "seconds": self.options.seconds,
                 "n_seeds": n_seeds,
                 "notes": self.notes,
                 "lines": all().collect::<Vec<_>>(),

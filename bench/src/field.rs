@@ -1,89 +1,87 @@
-//! `fieldrig bench field`: measures the training speed of a neural field.
+//! Measures the training speed of a neural field.
 
-use crate::open_gpu::open_gpu;
-use crate::print;
-use anyhow::Context;
+use crate::error::Context;
+use crate::kernels::profile;
+use crate::{Error, Result};
 use serde::Serialize;
+use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 
-/// Samples of a step if the flag is not given, on a GPU and on the CPU.
+/// Samples of a step if they are not given, on a GPU and on the CPU.
 const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
 const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
+/// Timed steps if they are not given, on a GPU and on the CPU.
+const DEFAULT_REPEATS: u32 = 100;
+const DEFAULT_REPEATS_ON_CPU: u32 = 3;
 
-/// Flags of `bench field`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// Rays per step, 1 to 65536
-    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..=65_536))]
-    rays: u32,
-    /// Samples per step, separated by commas; rounded down to a multiple of the rays, with at least one per ray
-    /// [default: 131072,262144; without a GPU 16384]
-    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
-    samples: Vec<u32>,
-    /// Number of timed steps, 1 to 10000; the median is reported [default: 100; without a GPU 3]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    repeats: Option<u32>,
-    /// Print the GPU time of each pass of a step
-    #[arg(long)]
-    profile: bool,
-    /// Print JSON, one object per line
-    #[arg(long)]
-    json: bool,
+/// Options of [`measure`].
+#[derive(Clone, Debug)]
+pub struct FieldOptions {
+    /// Rays per step.
+    pub n_rays: u32,
+    /// Samples per step, one row each; rounded down to a multiple of the rays, with at least one per ray. Empty: the
+    /// default ones.
+    pub n_samples: Vec<u32>,
+    /// Number of timed steps, whose median is reported; 100, or 3 on the CPU, if `None`.
+    pub n_repeats: Option<u32>,
+    /// Whether to report the GPU time of each pass.
+    pub profile: bool,
 }
 
-#[derive(Serialize)]
-struct Row {
-    rays: u32,
-    samples: u32,
-    step_millis: f64,
-    step_wall_millis: f64,
-    /// Time to render as many samples of an image.
-    colors_millis: f64,
-    peak_bytes: u64,
+/// Times of a training step.
+#[derive(Clone, Debug, Serialize)]
+pub struct FieldRow {
+    /// Rays per step.
+    pub rays: u32,
+    /// Samples per step.
+    pub samples: u32,
+    /// GPU time of a step, milliseconds.
+    pub step_millis: f64,
+    /// Wall time of a step, milliseconds.
+    pub step_wall_millis: f64,
+    /// Time to render as many samples of an image, milliseconds.
+    pub colors_millis: f64,
+    /// Peak size of live GPU buffers, bytes.
+    pub peak_bytes: u64,
+    /// Names and milliseconds of the passes of a step, if requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    passes: Vec<(&'static str, f64)>,
+    pub passes: Vec<(&'static str, f64)>,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+/// Measures one number of samples after the other.
+///
+/// * `on_row`: takes each row; its error ends the bench.
+///
+/// # Errors
+///
+/// If the GPU cannot be opened or its memory is insufficient.
+pub fn measure<E: From<Error>>(
+    options: &FieldOptions,
+    open_gpu: OpenGpu,
+    mut on_row: impl FnMut(&FieldRow) -> Result<(), E>,
+) -> Result<(), E> {
     let is_software = open_gpu()?.is_software();
     let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
-    let n_repeats = args.repeats.unwrap_or(if is_software { 3 } else { 100 }) as usize;
-    for (row_ix, n_samples) in
-        (if args.samples.is_empty() { default_samples } else { &args.samples }).iter().enumerate()
-    {
+    let n_samples = if options.n_samples.is_empty() { default_samples } else { &options.n_samples };
+    let n_repeats = options.n_repeats.unwrap_or(if is_software { DEFAULT_REPEATS_ON_CPU } else { DEFAULT_REPEATS });
+    for (row_ix, n_samples) in n_samples.iter().enumerate() {
         // A new device for each row, so that the memory peak is that of the row.
         let gpu = open_gpu()?;
         if row_ix == 0 {
             log::info!("{}", gpu.describe());
         }
-        let n_samples = (n_samples / args.rays).max(1) * args.rays;
-        let figures = time_steps(&gpu, args.rays, n_samples, n_repeats)
+        let n_samples = (n_samples / options.n_rays).max(1) * options.n_rays;
+        let figures = time_steps(&gpu, options.n_rays, n_samples, n_repeats as usize)
             .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
-        let row = Row {
+        on_row(&FieldRow {
             rays: figures.n_rays,
             samples: figures.n_samples,
             step_millis: figures.step_millis,
             step_wall_millis: figures.step_wall_millis,
             colors_millis: figures.colors_millis,
             peak_bytes: figures.peak_bytes,
-            passes: super::profile(&figures.passes, args.profile),
-        };
-        if args.json {
-            print::json(&row)?;
-            continue;
-        }
-        print::line(format_args!(
-            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
-            row.rays,
-            row.samples,
-            row.step_millis,
-            row.step_wall_millis,
-            row.colors_millis,
-            row.peak_bytes >> 20
-        ))?;
-        for (name, millis) in &row.passes {
-            print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
-        }
+            passes: profile(&figures.passes, options.profile),
+        })?;
     }
     Ok(())
 }

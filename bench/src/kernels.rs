@@ -1,108 +1,106 @@
-//! `fieldrig bench kernels`: measures the speed of the splat kernels.
+//! Measures the speed of the splat kernels.
 
-use crate::open_gpu::open_gpu;
-use anyhow::Context;
+use crate::error::Context;
+use crate::{Error, Result};
 use serde::Serialize;
-use std::io::Write;
+use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;
+use trainer::gpu::PassTiming;
 use trainer::splat::arrays::SplatArrays;
 use trainer::splat::bench::{Eye, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
-/// Maximum number of splats in a rig file.
-const MAX_CLOUD_SPLATS: i64 = 100_000_000;
-
-/// Settings if no flag is given.
+/// Settings if an option is not given.
 struct Defaults {
-    size: &'static [Size],
-    splats: &'static [u32],
-    repeats: u32,
+    sizes_px: &'static [[u32; 2]],
+    n_splats: &'static [u32],
+    n_repeats: u32,
 }
 
 /// Defaults on a GPU.
 const DEFAULTS: Defaults = Defaults {
-    size: &[Size([1024, 1024]), Size([1280, 720]), Size([1920, 1080])],
-    splats: &[100_000, 300_000, 1_000_000, 3_000_000],
-    repeats: 30,
+    sizes_px: &[[1024, 1024], [1280, 720], [1920, 1080]],
+    n_splats: &[100_000, 300_000, 1_000_000, 3_000_000],
+    n_repeats: 30,
 };
 /// Defaults on the CPU, which needs seconds for what a GPU does in a millisecond, and supports only smaller buffers.
-const DEFAULTS_ON_CPU: Defaults = Defaults { size: &[Size([320, 240])], splats: &[10_000, 30_000], repeats: 3 };
+const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
 
-/// Flags of `bench kernels`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// Use the splats of an .npz file with `means`, `quats`, `log_scales`, `opacities_logit` and `sh` instead of a
-    /// synthetic cloud
-    #[arg(long, value_name = "FILE.npz")]
-    cloud: Option<PathBuf>,
-    /// Image sizes, `WIDTHxHEIGHT`, separated by commas [default: 1024x1024,1280x720,1920x1080; without a GPU 320x240]
-    #[arg(long, value_delimiter = ',', value_parser = parse_size)]
-    size: Vec<Size>,
-    /// Numbers of splats, 1 to 100000000, separated by commas; with --cloud, that of the file
-    /// [default: 100000,300000,1000000,3000000; without a GPU 10000,30000]
-    #[arg(long, value_delimiter = ',', conflicts_with = "cloud", value_parser = clap::value_parser!(u32).range(1..=MAX_CLOUD_SPLATS))]
-    splats: Vec<u32>,
-    /// Number of timed images and steps, 1 to 10000; the median is reported [default: 30; without a GPU 3]
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    repeats: Option<u32>,
-    /// Put the camera into the middle of the cloud, where it sees only some of the splats
-    #[arg(long)]
-    inside: bool,
-    /// Print the GPU time of each pass of a step
-    #[arg(long)]
-    profile: bool,
-    /// Print JSON, one object per line
-    #[arg(long)]
-    json: bool,
+/// Options of [`measure`].
+#[derive(Clone, Debug)]
+pub struct KernelsOptions {
+    /// An `.npz` file with splats; a synthetic cloud if `None`.
+    pub cloud: Option<PathBuf>,
+    /// Image sizes, pixels; empty: the default ones.
+    pub sizes_px: Vec<[u32; 2]>,
+    /// Numbers of splats of the synthetic cloud; empty: the default ones.
+    pub n_splats: Vec<u32>,
+    /// Number of timed images and steps, whose median is reported; 30, or 3 on the CPU, if `None`.
+    pub n_repeats: Option<u32>,
+    /// Whether the camera is inside the cloud, where it sees only some of the splats.
+    pub inside: bool,
+    /// Whether to report the GPU time of each pass.
+    pub profile: bool,
 }
 
-#[derive(Clone, Copy, Debug)]
-struct Size([u32; 2]);
-
-fn parse_size(text: &str) -> Result<Size, String> {
-    let parse = |part: &str| part.parse::<u32>().ok().filter(|size| (1..=16_384).contains(size));
-    text.split_once('x')
-        .and_then(|(width, height)| Some(Size([parse(width)?, parse(height)?])))
-        .ok_or_else(|| "expected WIDTHxHEIGHT in pixels, each from 1 to 16384".to_owned())
-}
-
-#[derive(Serialize)]
-struct Row {
-    size_px: [u32; 2],
-    n_splats: usize,
-    n_intersections: u64,
-    render_millis: f64,
-    /// Step that updates every splat.
-    step_millis: f64,
-    /// Step that updates only the visible splats.
-    step_visible_millis: f64,
-    n_visible: u64,
-    render_wall_millis: f64,
-    step_wall_millis: f64,
-    mean_rgb: [f64; 3],
-    peak_bytes: u64,
+/// Times of an image and of a training step.
+#[derive(Clone, Debug, Serialize)]
+pub struct KernelsRow {
+    /// Size of the image, pixels.
+    pub size_px: [u32; 2],
+    /// Number of splats.
+    pub n_splats: usize,
+    /// Number of intersections of splats with tiles.
+    pub n_intersections: u64,
+    /// GPU time of an image, milliseconds.
+    pub render_millis: f64,
+    /// GPU time of a step that updates every splat, milliseconds.
+    pub step_millis: f64,
+    /// GPU time of a step that updates only the visible splats, milliseconds.
+    pub step_visible_millis: f64,
+    /// Number of visible splats.
+    pub n_visible: u64,
+    /// Wall time of an image, milliseconds.
+    pub render_wall_millis: f64,
+    /// Wall time of a step, milliseconds.
+    pub step_wall_millis: f64,
+    /// Mean color of the image.
+    pub mean_rgb: [f64; 3],
+    /// Peak size of live GPU buffers, bytes.
+    pub peak_bytes: u64,
+    /// Names and milliseconds of the passes of a step, if requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    passes: Vec<(&'static str, f64)>,
+    pub passes: Vec<(&'static str, f64)>,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    let given = args
+/// Measures every number of splats at one image size after the other.
+///
+/// * `on_row`: takes each row; its error ends the bench.
+///
+/// # Errors
+///
+/// If the file of the cloud is invalid, the GPU cannot be opened, or its memory is insufficient.
+pub fn measure<E: From<Error>>(
+    options: &KernelsOptions,
+    open_gpu: OpenGpu,
+    mut on_row: impl FnMut(&KernelsRow) -> Result<(), E>,
+) -> Result<(), E> {
+    let given = options
         .cloud
         .as_deref()
         .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
         .transpose()?;
     let defaults = if open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
-    let sizes = if args.size.is_empty() { defaults.size } else { &args.size };
-    let splat_counts = if args.splats.is_empty() { defaults.splats } else { &args.splats };
+    let sizes_px = if options.sizes_px.is_empty() { defaults.sizes_px } else { &options.sizes_px };
+    let splat_counts = if options.n_splats.is_empty() { defaults.n_splats } else { &options.n_splats };
     let counts = given.as_ref().map_or_else(
         || splat_counts.iter().map(|n_splats| *n_splats as usize).collect(),
         |cloud| vec![cloud.n_splats()],
     );
-    let n_repeats = args.repeats.unwrap_or(defaults.repeats) as usize;
-    let eye = if args.inside { Eye::Inside } else { Eye::Outside };
-    let mut out = std::io::stdout().lock();
-    for (size_ix, Size(size)) in sizes.iter().enumerate() {
+    let n_repeats = options.n_repeats.unwrap_or(defaults.n_repeats) as usize;
+    let eye = if options.inside { Eye::Inside } else { Eye::Outside };
+    for (size_ix, size_px) in sizes_px.iter().enumerate() {
         for n_splats in &counts {
             // A new device for each row, so that the memory peak is that of the row.
             let gpu = open_gpu()?;
@@ -123,11 +121,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 n_timed: n_repeats,
                 n_consecutive: 3 * n_repeats,
             };
-            let figures = time_kernels(&gpu, cloud, *size, eye, repeats).with_context(|| {
-                format!("{}x{} pixels and {n_splats} splats: try fewer --splats or a smaller --size", size[0], size[1])
+            let figures = time_kernels(&gpu, cloud, *size_px, eye, repeats).with_context(|| {
+                let [width, height] = size_px;
+                format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
             })?;
-            let row = Row {
-                size_px: *size,
+            on_row(&KernelsRow {
+                size_px: *size_px,
                 n_splats: *n_splats,
                 n_intersections: figures.n_intersections,
                 render_millis: figures.render_millis,
@@ -138,32 +137,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
                 step_wall_millis: figures.step_wall_millis,
                 mean_rgb: figures.mean_rgb,
                 peak_bytes: figures.peak_bytes,
-                passes: super::profile(&figures.passes, args.profile),
-            };
-            if args.json {
-                writeln!(out, "{}", serde_json::to_string(&row)?)?;
-                continue;
-            }
-            writeln!(
-                out,
-                "{}x{} {:>8} splats {:>9} intersections: image {:.3} ms, step {:.3} ms (wall {:.3}, {:.3}; only the {} visible splats {:.3} ms), mean {:.5?}, peak {} MB",
-                row.size_px[0],
-                row.size_px[1],
-                row.n_splats,
-                row.n_intersections,
-                row.render_millis,
-                row.step_millis,
-                row.render_wall_millis,
-                row.step_wall_millis,
-                row.n_visible,
-                row.step_visible_millis,
-                row.mean_rgb,
-                row.peak_bytes >> 20
-            )?;
-            for (name, millis) in &row.passes {
-                writeln!(out, "    {millis:>9.4} ms  {name}")?;
-            }
+                passes: profile(&figures.passes, options.profile),
+            })?;
         }
     }
     Ok(())
+}
+
+/// Names and milliseconds of the passes, if requested.
+pub(crate) fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
+    if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
 }

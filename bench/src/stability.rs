@@ -1,13 +1,12 @@
-//! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
+//! Accuracy over the size of a disturbance, and its break points.
 
-use crate::bench::disturb::Disturbance;
-use crate::bench::page::Findings;
-use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{Interpolation, break_point, extent};
-use crate::bench::variant::Variant;
-use crate::exit::{self, BadArgument, Exit};
-use crate::open_gpu::open_gpu;
-use anyhow::ensure;
+use crate::disturb::Disturbance;
+use crate::error::ensure;
+use crate::findings::{BenchResult, Findings};
+use crate::runs::{Disturbed, Host, Job, NamedData, Run, Runs, RunsOptions};
+use crate::statistics::{Interpolation, break_point, extent};
+use crate::variant::Variant;
+use crate::{Error, Result};
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
 use serde::Serialize;
@@ -29,46 +28,27 @@ const NANOS_PER_COUNT: f64 = 1e6;
 /// All variants are trained on the same disturbed data; each gives one line per chart.
 const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |_| () }, Variant::CAMERAS_AS_GIVEN];
 
-/// Flags of `bench stability`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// A nerfstudio or TUM RGB-D folder, or a recording (.mcap)
-    data: PathBuf,
-    /// What to disturb, separated by commas
-    #[arg(long, value_name = "WHAT,...", value_delimiter = ',', default_value = "all")]
-    disturb: Vec<DisturbanceArg>,
-    /// Sizes of the disturbance instead of the default ones (mm, ms, EV or keyframes), separated by commas; needs a
-    /// single disturbance
-    #[arg(long, value_name = "N,...", value_delimiter = ',')]
-    levels: Vec<f64>,
-    /// Images per second of a folder without times; clock-offset needs it then
-    #[arg(long, value_name = "HZ")]
-    rate_hz: Option<f64>,
-    /// Training time of each run in seconds; loading and scoring do not count [default: 30, unless --steps is given]
-    #[arg(long, value_name = "S")]
-    seconds: Option<f64>,
-    /// Optimizer steps of each run
-    #[arg(long, value_name = "N")]
-    steps: Option<u64>,
-    /// Runs per size, 1 to 1000, with consecutive seeds from --seed
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    seeds: u64,
-    #[command(flatten)]
-    bench: BenchArgs,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum DisturbanceArg {
-    /// Errors of training poses: 0 to 50 mm and 0 to 5 degrees
-    PoseNoise,
-    /// Poses of a time that is 0 to 200 ms later
-    ClockOffset,
-    /// Exposure step of 0 to 1 EV in the middle of the capture
-    Exposure,
-    /// 3 to 300 training keyframes
-    Keyframes,
-    /// All disturbances
-    All,
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct StabilityOptions {
+    /// Folder or recording.
+    pub data: PathBuf,
+    /// What to disturb, without duplicates.
+    pub disturbances: Vec<Disturbance>,
+    /// Whether a clock offset is skipped, rather than an error, if the images have no times.
+    pub can_skip_clock_offset: bool,
+    /// Sizes of a single disturbance, in its unit; empty: the default ones.
+    pub levels: Vec<f64>,
+    /// Images per second, for images without times.
+    pub rate_hz: Option<f64>,
+    /// Training time of each run, seconds; 30 if there is no other limit.
+    pub seconds: Option<f64>,
+    /// Optimizer steps of each run.
+    pub steps: Option<u64>,
+    /// Runs per size, with consecutive seeds.
+    pub seeds: u64,
+    /// Models, images and folder.
+    pub runs: RunsOptions,
 }
 
 /// Measurements to make of one disturbance.
@@ -115,15 +95,20 @@ struct Break {
     level: Option<f64>,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    args.check()?;
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    let data = runs.load(&args.data, &mut HashSet::new())?;
-    let plans = args.plans(&data)?;
+/// Trains on disturbed images, for every size of every disturbance.
+///
+/// # Errors
+///
+/// If an option is invalid, the data cannot be read or scored, or training fails.
+pub fn run(options: &StabilityOptions, host: &Host<'_>) -> Result<BenchResult> {
+    let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
+    options.check()?;
+    let mut runs = Runs::open(&options.runs, host)?;
+    let data = runs.load(&options.data, &mut HashSet::new())?;
+    let plans = options.plans(&data)?;
     let n_levels: usize = plans.iter().map(|plan| plan.levels.len()).sum();
     let variants = distinguished(&data.single_model_spec()?.options);
-    runs.expect(n_levels * variants.len() * usize::try_from(args.seeds)?);
+    runs.expect((n_levels * variants.len()) as u64 * options.seeds);
     let mut results: Vec<DisturbanceResult> = Vec::new();
     let mut page = None;
     for plan in &plans {
@@ -136,20 +121,17 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         for &variant in &variants {
             let mut curve = Curve { name: variant.name, points: Vec::new(), breaks: Vec::new() };
             for level in &plan.levels {
-                let finished = measure(args, &mut runs, &data, limits, plan, variant, *level)?;
+                let finished = measure(options, &mut runs, &data, limits, plan, variant, *level)?;
                 curve.add(plan.disturbance, *level, finished);
                 // Written after every size, so that an interrupted bench leaves results.
                 let variants = &mut results.last_mut().expect("pushed above").variants;
                 variants.retain(|curve| curve.name != variant.name);
                 variants.push(curve.clone());
-                page = Some(findings(args, &runs, &data, &results)?);
+                page = Some(findings(options, &runs, &data, &results)?);
             }
         }
     }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data.data.data_losses))
+    BenchResult::of(page, data.data.data_losses)
 }
 
 /// The variants that differ for these options. If no camera parameters are refined, there is only one.
@@ -169,14 +151,14 @@ fn distinguished(options: &ModelOptions) -> Vec<&'static Variant> {
 
 /// Trains with one size of the disturbance, once per seed.
 fn measure(
-    args: &Args,
+    options: &StabilityOptions,
     runs: &mut Runs<'_>,
     data: &NamedData,
     limits: Limits,
     plan: &DisturbancePlan,
     variant: &Variant,
     level: f64,
-) -> anyhow::Result<Vec<Run>> {
+) -> Result<Vec<Run>> {
     let disturbance = plan.disturbance;
     let is_undisturbed = is_undisturbed(disturbance, level, n_train(data));
     // All disturbances share the undisturbed run, so that it is trained only once.
@@ -194,12 +176,12 @@ fn measure(
     let mut finished = Vec::new();
     let ModelSpec { kind, options: base_options } = data.single_model_spec()?;
     let first_seed = base_options.common.seed;
-    for seed in first_seed..first_seed.saturating_add(args.seeds) {
-        let options = base_options.clone().with(|options| options.common.seed = seed);
+    for seed in first_seed..first_seed.saturating_add(options.seeds) {
+        let seeded = base_options.clone().with(|model| model.common.seed = seed);
         finished.push(runs.run(Job {
             name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
             data,
-            model_spec: ModelSpec { kind: *kind, options: variant.options(&options) },
+            model_spec: ModelSpec { kind: *kind, options: variant.options(&seeded) },
             limits,
             disturbed: disturbed.clone(),
             variant: Some(variant.name.to_owned()),
@@ -230,48 +212,37 @@ fn is_undisturbed(disturbance: Disturbance, level: f64, n_train: usize) -> bool 
     if disturbance == Disturbance::Keyframes { level >= n_train as f64 } else { level == 0.0 }
 }
 
-impl Args {
-    fn disturbances(&self) -> Vec<Disturbance> {
-        let is_selected = |disturbance: Disturbance| {
-            self.disturb.iter().any(|selected| match selected {
-                DisturbanceArg::All => true,
-                DisturbanceArg::PoseNoise => disturbance == Disturbance::PoseNoise,
-                DisturbanceArg::ClockOffset => disturbance == Disturbance::ClockOffset,
-                DisturbanceArg::Exposure => disturbance == Disturbance::Exposure,
-                DisturbanceArg::Keyframes => disturbance == Disturbance::Keyframes,
-            })
-        };
-        Disturbance::ALL.into_iter().filter(|disturbance| is_selected(*disturbance)).collect()
-    }
-
-    fn check(&self) -> Result<(), BadArgument> {
-        let selected = self.disturbances();
+impl StabilityOptions {
+    fn check(&self) -> Result<()> {
+        let selected = &self.disturbances;
         if !self.levels.is_empty() && selected.len() != 1 {
-            return Err(BadArgument("--levels: needs a single disturbance in --disturb, because units differ".into()));
+            return Err(Error::BadInput(
+                "--levels: needs a single disturbance in --disturb, because units differ".into(),
+            ));
         }
-        let min_level = if selected == [Disturbance::Keyframes] { 1.0 } else { 0.0 };
+        let min_level = if *selected == [Disturbance::Keyframes] { 1.0 } else { 0.0 };
         if let Some(level) = self.levels.iter().find(|level| !level.is_finite() || **level < min_level) {
-            return Err(BadArgument(format!("--levels {level}: must be a number of at least {min_level}")));
+            return Err(Error::BadInput(format!("--levels {level}: must be a number of at least {min_level}")));
         }
         if self.rate_hz.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
-            return Err(BadArgument("--rate-hz: must be a number above 0".into()));
+            return Err(Error::BadInput("--rate-hz: must be a number above 0".into()));
         }
         Ok(())
     }
 
     /// The measurements to make. A clock offset without image times is an error, or is skipped for `all`.
-    fn plans(&self, data: &NamedData) -> anyhow::Result<Vec<DisturbancePlan>> {
-        let mut selected = self.disturbances();
+    fn plans(&self, data: &NamedData) -> Result<Vec<DisturbancePlan>> {
+        let mut selected = self.disturbances.clone();
         let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
             (true, _) => (NANOS_PER_SEC, None),
             (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),
             (false, None) => {
                 let reason = "the images have no times; give their rate with --rate-hz";
                 let message = format!("clock-offset: {}: {reason}", data.path.display());
-                if self.disturb.contains(&DisturbanceArg::ClockOffset) {
-                    return Err(BadArgument(message).into());
-                }
                 if selected.contains(&Disturbance::ClockOffset) {
+                    if !self.can_skip_clock_offset {
+                        return Err(Error::BadInput(message));
+                    }
                     log::warn!("skipped: {message}");
                 }
                 selected.retain(|disturbance| *disturbance != Disturbance::ClockOffset);
@@ -396,14 +367,14 @@ fn significant_digits(level: f64) -> String {
 
 /// Writes the findings so far.
 fn findings(
-    args: &Args,
+    options: &StabilityOptions,
     runs: &Runs<'_>,
     data: &NamedData,
     results: &[DisturbanceResult],
-) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
-    let spread = if args.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", args.seeds)
+) -> Result<(Findings, PathBuf)> {
+    let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
+    let spread = if options.seeds > 1 {
+        format!("median of {} seeds; band: minimum to maximum", options.seeds)
     } else {
         "one run per size".to_owned()
     };
@@ -461,7 +432,7 @@ fn findings(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::runs::tests::run;
+    use crate::runs::tests::run;
 
     #[test]
     fn levels_start_undisturbed_and_clip_to_available_keyframes() {

@@ -1,8 +1,8 @@
-//! `fieldrig bench stamps`: measures the stamp errors of images from a camera with its own clock and a link with
-//! jitter.
+//! Measures the stamp errors of images from a camera with its own clock and a link with jitter.
 
-use crate::bench::page::Findings;
-use crate::exit::{BadArgument, Exit};
+use crate::error::Context;
+use crate::findings::{BenchResult, Findings};
+use crate::{Error, Result};
 use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
@@ -23,85 +23,94 @@ const SPEED_RAD_S: f64 = 1.0;
 /// Error up to which a stamp counts as correct.
 const MAX_ERROR_MILLIS: f64 = 1.0;
 
-/// Flags of `bench stamps`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {
-    /// Camera rates, images per second, separated by commas
-    #[arg(long, value_name = "HZ,...", value_delimiter = ',', default_value = "30,60,200")]
-    rates: Vec<f64>,
-    /// Minimum latency from the shutter to the arrival of an image
-    #[arg(long, value_name = "MS", default_value_t = 5.0)]
-    fixed_millis: f64,
-    /// Maximum random latency added to each image
-    #[arg(long, value_name = "MS", default_value_t = 75.0)]
-    jitter_millis: f64,
-    /// How much faster this computer's clock runs than the camera's, parts per million
-    #[arg(long, value_name = "PPM", default_value_t = 50.0, allow_hyphen_values = true)]
-    drift_ppm: f64,
-    /// Length of a run
-    #[arg(long, value_name = "S", default_value_t = 120.0)]
-    seconds: f64,
-    /// Time at the start of a run that is not counted
-    #[arg(long, value_name = "S", default_value_t = 10.0)]
-    settle_seconds: f64,
-    /// Runs per rate
-    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
-    seeds: u64,
-    /// Folder for charts and numbers [default: bench-stamps]
-    #[arg(long, value_name = "DIR", default_value = "bench-stamps")]
-    out: PathBuf,
-    /// Print one JSON object
-    #[arg(long)]
-    json: bool,
+/// Options of [`run`] and [`measure`].
+#[derive(Clone, Debug)]
+pub struct StampsOptions {
+    /// Camera rates, images per second, 1 to 10000.
+    pub rates_hz: Vec<f64>,
+    /// Minimum latency from the shutter to the arrival of an image, 0 to 1000 ms.
+    pub fixed_millis: f64,
+    /// Maximum random latency added to each image, 0 to 1000 ms.
+    pub jitter_millis: f64,
+    /// How much faster this computer's clock runs than the camera's, -200 to 200 parts per million.
+    pub drift_ppm: f64,
+    /// Length of a run, 1 to 3600 s.
+    pub seconds: f64,
+    /// Time at the start of a run that is not counted; at least half a second less than `seconds`.
+    pub settle_seconds: f64,
+    /// Runs per rate.
+    pub seeds: u64,
+    /// Folder for charts and numbers.
+    pub out: PathBuf,
 }
 
 /// Stamp errors for one camera rate, milliseconds.
-#[derive(Debug, Serialize)]
-struct StampErrors {
-    rate_hz: f64,
+#[derive(Clone, Debug, Serialize)]
+pub struct StampErrors {
+    /// Images per second.
+    pub rate_hz: f64,
     /// Whether the rig file corrects the fixed latency.
-    is_calibrated: bool,
-    images: usize,
-    within_1_ms_frac: f64,
-    median_millis: f64,
-    p99_abs_millis: f64,
-    max_abs_millis: f64,
+    pub is_calibrated: bool,
+    /// Number of images.
+    pub images: usize,
+    /// Share of the images with an error of at most 1 ms.
+    pub within_1_ms_frac: f64,
+    /// Median of the errors.
+    pub median_millis: f64,
+    /// 99th percentile of the absolute errors.
+    pub p99_abs_millis: f64,
+    /// Largest absolute error.
+    pub max_abs_millis: f64,
     /// Share of the images in each bin, from -8 ms in steps of 0.1 ms.
-    bars: Vec<f64>,
+    pub bars: Vec<f64>,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    check(args)?;
+/// Measures the stamp errors and draws them as a histogram.
+///
+/// # Errors
+///
+/// If an option is out of range or the folder cannot be written.
+pub fn run(options: &StampsOptions) -> Result<BenchResult> {
+    let results = measure(options)?;
+    std::fs::create_dir_all(&options.out).with_context(|| format!("cannot create {}", options.out.display()))?;
+    let findings = findings(options, &results)?;
+    let page = findings.write(&options.out)?;
+    Ok(BenchResult { findings, page, data_losses: Vec::new() })
+}
+
+/// Measures the stamp errors at each rate, first with a calibrated fixed latency, then without calibration.
+///
+/// # Errors
+///
+/// If an option is out of range.
+pub fn measure(options: &StampsOptions) -> Result<Vec<StampErrors>> {
+    check(options)?;
     let mut results = Vec::new();
-    for rate_hz in &args.rates {
-        let errors: Vec<f64> = (1..=args.seeds).flat_map(|seed| errors_millis(args, *rate_hz, seed)).collect();
+    for rate_hz in &options.rates_hz {
+        let errors: Vec<f64> = (1..=options.seeds).flat_map(|seed| errors_millis(options, *rate_hz, seed)).collect();
         for is_calibrated in [true, false] {
             // The rig file's offset is subtracted from every stamp.
-            let fixed_latency = if is_calibrated { args.fixed_millis } else { 0.0 };
+            let fixed_latency = if is_calibrated { options.fixed_millis } else { 0.0 };
             let errors: Vec<f64> = errors.iter().map(|error| error - fixed_latency).collect();
             results.push(StampErrors::of(*rate_hz, is_calibrated, &errors));
         }
     }
-    std::fs::create_dir_all(&args.out)
-        .map_err(|error| anyhow::Error::new(error).context(format!("cannot create {}", args.out.display())))?;
-    let findings = findings(args, &results)?;
-    findings.print_summary(&findings.write(&args.out)?, args.json)?;
-    Ok(Exit::Done)
+    Ok(results)
 }
 
-fn check(args: &Args) -> Result<(), BadArgument> {
+fn check(options: &StampsOptions) -> Result<()> {
     let numbers = [
-        ("--rates", args.rates.iter().copied().fold(f64::INFINITY, f64::min), 1.0..=10_000.0),
-        ("--rates", args.rates.iter().copied().fold(0.0, f64::max), 1.0..=10_000.0),
-        ("--fixed-millis", args.fixed_millis, 0.0..=1000.0),
-        ("--jitter-millis", args.jitter_millis, 0.0..=1000.0),
-        ("--drift-ppm", args.drift_ppm, -200.0..=200.0),
-        ("--seconds", args.seconds, 1.0..=3600.0),
-        ("--settle-seconds", args.settle_seconds, 0.0..=args.seconds - 0.5),
+        ("--rates", options.rates_hz.iter().copied().fold(f64::INFINITY, f64::min), 1.0..=10_000.0),
+        ("--rates", options.rates_hz.iter().copied().fold(0.0, f64::max), 1.0..=10_000.0),
+        ("--fixed-millis", options.fixed_millis, 0.0..=1000.0),
+        ("--jitter-millis", options.jitter_millis, 0.0..=1000.0),
+        ("--drift-ppm", options.drift_ppm, -200.0..=200.0),
+        ("--seconds", options.seconds, 1.0..=3600.0),
+        ("--settle-seconds", options.settle_seconds, 0.0..=options.seconds - 0.5),
     ];
     match numbers.into_iter().find(|(_, number, allowed)| !allowed.contains(number)) {
         Some((flag, number, allowed)) => {
-            Err(BadArgument(format!("{flag}: {number} is outside {} to {}", allowed.start(), allowed.end())))
+            Err(Error::BadInput(format!("{flag}: {number} is outside {} to {}", allowed.start(), allowed.end())))
         }
         None => Ok(()),
     }
@@ -110,11 +119,11 @@ fn check(args: &Args) -> Result<(), BadArgument> {
 /// For each image after the settling time, the time of the pose that the join assigns to it minus the time of its
 /// shutter. The fixed latency is included.
 #[expect(clippy::cast_possible_truncation, reason = "times of an hour at most, in nanoseconds")]
-fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
+fn errors_millis(options: &StampsOptions, rate_hz: f64, seed: u64) -> Vec<f64> {
     let mut random = Random::new(seed);
     let mut clock = ClockMap::new();
     let n_readings =
-        (args.seconds + args.fixed_millis * 1e-3 + args.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
+        (options.seconds + options.fixed_millis * 1e-3 + options.jitter_millis * 1e-3 + 1.0) * f64::from(JOINT_RATE_HZ);
     let mut joints = JointHistory::new(Duration::from_millis(100), n_readings.ceil() as usize + 1);
     for ix in 0..n_readings.ceil() as i64 {
         let stamp = Stamp(ix * 1_000_000_000 / i64::from(JOINT_RATE_HZ));
@@ -123,13 +132,13 @@ fn errors_millis(args: &Args, rate_hz: f64, seed: u64) -> Vec<f64> {
         joints.push(state).expect("the states are ordered and finite");
     }
     let mut errors = Vec::new();
-    for ix in 0..(args.seconds * rate_hz) as i64 {
+    for ix in 0..(options.seconds * rate_hz) as i64 {
         let shutter_secs = ix as f64 / rate_hz;
-        let device_nanos = (shutter_secs / (1.0 + args.drift_ppm * 1e-6) * 1e9) as i64;
-        let latency_millis = args.fixed_millis + args.jitter_millis * random.unit();
+        let device_nanos = (shutter_secs / (1.0 + options.drift_ppm * 1e-6) * 1e9) as i64;
+        let latency_millis = options.fixed_millis + options.jitter_millis * random.unit();
         let arrival = Stamp(((shutter_secs + latency_millis * 1e-3) * 1e9) as i64);
         let stamp = clock.stamp(device_nanos, arrival);
-        if shutter_secs < args.settle_seconds {
+        if shutter_secs < options.settle_seconds {
             continue;
         }
         if let Ok(state) = joints.at(stamp) {
@@ -169,7 +178,7 @@ impl StampErrors {
     }
 }
 
-fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
+fn findings(options: &StampsOptions, results: &[StampErrors]) -> Result<Findings> {
     let point = |(ix, fraction): (usize, &f64)| {
         let y = 100.0 * fraction;
         Point { x: (ix as f64 + 0.5) * BIN_MILLIS - HISTOGRAM_RANGE_MILLIS, y, low: y, high: y }
@@ -188,7 +197,12 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
     };
     let conditions = format!(
         "{} ms fixed latency, 0 to {} ms of jitter, {} ppm of drift; {} runs of {} s, without the first {} s",
-        args.fixed_millis, args.jitter_millis, args.drift_ppm, args.seeds, args.seconds, args.settle_seconds
+        options.fixed_millis,
+        options.jitter_millis,
+        options.drift_ppm,
+        options.seeds,
+        options.seconds,
+        options.settle_seconds
     );
     let row = |results: &StampErrors| {
         vec![
@@ -234,30 +248,38 @@ fn findings(args: &Args, results: &[StampErrors]) -> anyhow::Result<Findings> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::Parser;
 
-    #[derive(Parser)]
-    struct Flags {
-        #[command(flatten)]
-        args: Args,
+    fn options() -> StampsOptions {
+        StampsOptions {
+            rates_hz: vec![30.0],
+            fixed_millis: 5.0,
+            jitter_millis: 75.0,
+            drift_ppm: 50.0,
+            seconds: 120.0,
+            settle_seconds: 10.0,
+            seeds: 3,
+            out: "bench-stamps".into(),
+        }
     }
 
     #[test]
     fn calibrated_stamps_are_within_one_millisecond() {
-        let args = Flags::parse_from(["stamps", "--rates", "30", "--seeds", "3"]).args;
-        let errors: Vec<f64> = (1..=3).flat_map(|seed| errors_millis(&args, 30.0, seed)).collect();
-        let fixed_latency = StampErrors::of(30.0, true, &errors.iter().map(|error| error - 5.0).collect::<Vec<_>>());
+        let errors = measure(&options()).expect("in range");
+        let [fixed_latency, unknown] = &errors[..] else { panic!("one rate") };
         assert_eq!(fixed_latency.within_1_ms_frac, 1.0, "{fixed_latency:?}");
         assert!((fixed_latency.bars.iter().sum::<f64>() - 1.0).abs() < 1e-9);
-        let unknown = StampErrors::of(30.0, false, &errors);
         assert!((unknown.median_millis - 5.0).abs() < 0.5 && unknown.within_1_ms_frac == 0.0, "{unknown:?}");
     }
 
     #[test]
-    fn out_of_range_arguments_are_rejected() {
-        for flags in [["--seconds", "0"], ["--rates", "0,30"], ["--drift-ppm", "-900"], ["--settle-seconds", "500"]] {
-            let args = Flags::parse_from(["stamps"].into_iter().chain(flags)).args;
-            assert!(check(&args).is_err_and(|error| error.to_string().contains(flags[0])), "{flags:?}");
+    fn out_of_range_options_are_rejected() {
+        for (flag, options) in [
+            ("--seconds", StampsOptions { seconds: 0.0, ..options() }),
+            ("--rates", StampsOptions { rates_hz: vec![0.0, 30.0], ..options() }),
+            ("--drift-ppm", StampsOptions { drift_ppm: -900.0, ..options() }),
+            ("--settle-seconds", StampsOptions { settle_seconds: 500.0, ..options() }),
+        ] {
+            assert!(check(&options).is_err_and(|error| error.to_string().contains(flag)), "{flag}");
         }
     }
 }

@@ -1,0 +1,60 @@
+//! `fieldrig bench field`: measures the training speed of a neural field.
+
+use crate::open_gpu::open_gpu;
+use crate::print;
+use bench::field::{FieldOptions, FieldRow};
+
+/// Flags of `bench field`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Rays per step, 1 to 65536
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    rays: u32,
+    /// Samples per step, separated by commas; rounded down to a multiple of the rays, with at least one per ray
+    /// [default: 131072,262144; without a GPU 16384]
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=1 << 24))]
+    samples: Vec<u32>,
+    /// Number of timed steps, 1 to 10000; the median is reported [default: 100; without a GPU 3]
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    repeats: Option<u32>,
+    /// Print the GPU time of each pass of a step
+    #[arg(long)]
+    profile: bool,
+    /// Print JSON, one object per line
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    bench::field::measure(&args.options(), open_gpu, |row| args.print(row))
+}
+
+impl Args {
+    fn options(&self) -> FieldOptions {
+        FieldOptions {
+            n_rays: self.rays,
+            n_samples: self.samples.clone(),
+            n_repeats: self.repeats,
+            profile: self.profile,
+        }
+    }
+
+    fn print(&self, row: &FieldRow) -> anyhow::Result<()> {
+        if self.json {
+            return print::json(row);
+        }
+        print::line(format_args!(
+            "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
+            row.rays,
+            row.samples,
+            row.step_millis,
+            row.step_wall_millis,
+            row.colors_millis,
+            row.peak_bytes >> 20
+        ))?;
+        for (name, millis) in &row.passes {
+            print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
+        }
+        Ok(())
+    }
+}
