@@ -17,7 +17,7 @@ const TRIM_THRESHOLD_BYTES: i32 = 2 * MMAP_THRESHOLD_BYTES;
 
 /// Keeps large blocks out of the heaps, unless the environment sets the allocator's thresholds.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
-pub fn keep_images_out_of_heaps() {
+pub(crate) fn keep_images_out_of_heaps() {
     let is_set = |name: &str| std::env::var_os(name).is_some();
     if is_set("MALLOC_MMAP_THRESHOLD_") || is_set("GLIBC_TUNABLES") {
         return;
@@ -38,7 +38,7 @@ pub fn keep_images_out_of_heaps() {
 
 /// Does nothing: other allocators have no such setting.
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
-pub fn keep_images_out_of_heaps() {}
+pub(crate) fn keep_images_out_of_heaps() {}
 
 #[cfg(all(test, target_os = "linux", target_env = "gnu"))]
 mod tests {

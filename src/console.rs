@@ -92,7 +92,8 @@ impl Observer for Console {
     }
 }
 
-fn print_json(value: &impl Serialize) {
+/// Prints a JSON object as [`print::report_json`] does; an error is logged.
+pub(crate) fn print_json(value: &impl Serialize) {
     if let Err(error) = print::report_json(value) {
         log::error!("{error:#}");
     }

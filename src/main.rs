@@ -1,7 +1,6 @@
 //! The `fieldrig` command: parse, run, exit code.
 
 mod allocator;
-mod bench;
 mod checkpoint_args;
 mod cli;
 mod commands;

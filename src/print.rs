@@ -217,14 +217,19 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
     BARS.add(bar)
 }
 
+/// The crates that log progress.
+const WORKSPACE_CRATES: [&str; 9] =
+    ["fieldrig", "bench", "calibration", "capture", "drivers", "session", "sim", "trainer", "viz"];
+
 /// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
-    let level = match verbose {
-        0 => "warn,fieldrig=info,drivers=info,sim=info,trainer=info,viz=info",
-        1 => "info,fieldrig=debug,drivers=debug,sim=debug,trainer=debug,viz=debug",
-        _ => "trace",
+    let of_workspace = |level| WORKSPACE_CRATES.map(|name| format!(",{name}={level}")).concat();
+    let filter = match verbose {
+        0 => format!("warn{}", of_workspace("info")),
+        1 => format!("info{}", of_workspace("debug")),
+        _ => "trace".to_owned(),
     };
-    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or(level))
+    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or(filter))
         .target(env_logger::Target::Pipe(Box::new(LogTarget)))
         .format_target(false)
         .init();

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 10] = [
+const ALLOWED: [(&str, &[&str]); 11] = [
     ("kinematics", &[]),
     ("keyframe", &["kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
@@ -15,7 +15,11 @@ const ALLOWED: [(&str, &[&str]); 10] = [
     ("trainer", &["calibration", "keyframe", "kinematics"]),
     ("viz", &["keyframe", "kinematics", "trainer"]),
     ("session", &["calibration", "capture", "drivers", "keyframe", "kinematics", "trainer", "viz"]),
-    ("fieldrig", &["calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"]),
+    ("bench", &["calibration", "capture", "keyframe", "kinematics", "session", "trainer"]),
+    (
+        "fieldrig",
+        &["bench", "calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"],
+    ),
 ];
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.

@@ -7,7 +7,7 @@
 //! depend on the order of the others. All sizes with one seed share their random directions, which keeps curves over
 //! the size free of extra noise.
 
-use crate::bench::statistics::Interpolation;
+use crate::statistics::Interpolation;
 use keyframe::{Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist, transform};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -17,7 +17,7 @@ use std::sync::Arc;
 
 /// Kinds of disturbances.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Disturbance {
+pub enum Disturbance {
     /// Errors of the camera poses.
     PoseNoise,
     /// The clock of the poses is offset from that of the images.
@@ -33,10 +33,11 @@ const DEGREES_PER_MM: f64 = 0.1;
 
 impl Disturbance {
     /// All disturbances.
-    pub(crate) const ALL: [Self; 4] = [Self::PoseNoise, Self::ClockOffset, Self::Exposure, Self::Keyframes];
+    pub const ALL: [Self; 4] = [Self::PoseNoise, Self::ClockOffset, Self::Exposure, Self::Keyframes];
 
     /// Name in files and on the command line.
-    pub(crate) fn name(self) -> &'static str {
+    #[must_use]
+    pub fn name(self) -> &'static str {
         match self {
             Self::PoseNoise => "pose-noise",
             Self::ClockOffset => "clock-offset",

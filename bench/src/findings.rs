@@ -1,31 +1,54 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
-use crate::print;
-use anyhow::Context;
+use crate::Result;
+use crate::error::{Context, failed};
 use serde_json::Value;
 use session::chart::drawing::escaped;
 use session::chart::{Chart, raster};
 use session::{Table, run_folder};
-use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 /// Results of a bench so far.
-pub(crate) struct Findings {
+pub struct Findings {
     /// Base name of the files: `curve`, `budget`, `stability`.
-    pub(crate) name: &'static str,
-    pub(crate) title: String,
+    pub name: &'static str,
+    /// Title of the page.
+    pub title: String,
     /// Description of the measurement, for the page.
-    pub(crate) sentences: Vec<String>,
+    pub sentences: Vec<String>,
     /// Charts, each with the suffix of its file names.
-    pub(crate) charts: Vec<(&'static str, Chart)>,
-    pub(crate) tables: Vec<Table>,
+    pub charts: Vec<(&'static str, Chart)>,
+    /// Tables, for the page and the terminal.
+    pub tables: Vec<Table>,
     /// All numbers, for the JSON file.
-    pub(crate) numbers: Value,
+    pub numbers: Value,
+}
+
+/// The results of a finished bench.
+pub struct BenchResult {
+    /// The results.
+    pub findings: Findings,
+    /// Path of the page.
+    pub page: PathBuf,
+    /// Input data that could not be read.
+    pub data_losses: Vec<String>,
+}
+
+impl BenchResult {
+    /// The result of a bench that trains, with the findings after its last run.
+    pub(crate) fn of(latest: Option<(Findings, PathBuf)>, data_losses: Vec<String>) -> Result<Self> {
+        let (findings, page) = latest.ok_or_else(|| failed!("there is nothing to train"))?;
+        Ok(Self { findings, page, data_losses })
+    }
 }
 
 impl Findings {
     /// Writes all files; returns the path of the page.
-    pub(crate) fn write(&self, folder: &Path) -> anyhow::Result<PathBuf> {
+    ///
+    /// # Errors
+    ///
+    /// If a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<PathBuf> {
         let path_with = |suffix: &str| folder.join(format!("{}{suffix}", self.name));
         run_folder::write_json(&path_with(".json"), &self.numbers)?;
         let mut page = self.page_head();
@@ -35,7 +58,7 @@ impl Findings {
             write_file(&path_with(&format!("{part}.svg")), svg.as_bytes())?;
             write_file(&path_with(&format!("{part}.png")), &raster::png(&drawing)?)?;
             let title = escaped(&chart.title);
-            write!(page, "<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n")?;
+            page.push_str(&format!("<figure role=\"img\" aria-label=\"{title}\">\n{svg}</figure>\n"));
         }
         for table in &self.tables {
             page.push_str(&table.html());
@@ -44,18 +67,6 @@ impl Findings {
         let page_path = path_with(".html");
         write_file(&page_path, page.as_bytes())?;
         Ok(page_path)
-    }
-
-    /// Prints the tables, or one JSON object.
-    pub(crate) fn print_summary(&self, page: &Path, json: bool) -> anyhow::Result<()> {
-        if json {
-            return print::report_json(&serde_json::json!({ "event": "done", "page": page, "findings": self.numbers }));
-        }
-        for table in &self.tables {
-            print::report(table.text());
-        }
-        print::report(format_args!("see {}", page.display()));
-        Ok(())
     }
 
     fn page_head(&self) -> String {
@@ -80,7 +91,7 @@ th,td{padding:.3rem .8rem;border-bottom:1px solid #ddd;text-align:right;white-sp
 th:first-child,td:first-child{text-align:left}h1{font-size:1.5rem}h2{font-size:1.1rem;margin-bottom:0}\
 .wide{overflow-x:auto}</style>\n";
 
-fn write_file(path_with: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+fn write_file(path_with: &Path, bytes: &[u8]) -> Result<()> {
     std::fs::write(path_with, bytes).with_context(|| format!("cannot write {}", path_with.display()))
 }
 

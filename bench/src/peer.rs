@@ -1,6 +1,6 @@
 //! Curves measured with other trainers: JSON with `rows` of `seconds` and `psnr`.
 
-use crate::exit::BadArgument;
+use crate::{Error, Result};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -31,9 +31,11 @@ struct File {
 impl Peer {
     /// Reads a file.
     ///
-    /// # Errors If the file is unreadable or has another format.
-    pub(crate) fn load(path: &Path) -> Result<Self, BadArgument> {
-        let invalid = |reason: &str| BadArgument(format!("--peer {}: {reason}", path.display()));
+    /// # Errors
+    ///
+    /// If the file is unreadable or has another format.
+    pub(crate) fn load(path: &Path) -> Result<Self> {
+        let invalid = |reason: &str| Error::BadInput(format!("--peer {}: {reason}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|error| invalid(&format!("cannot be read ({error})")))?;
         let file: File = serde_json::from_str(&text)
             .map_err(|error| invalid(&format!("expected an object with rows of seconds and psnr ({error})")))?;
@@ -69,9 +71,9 @@ mod tests {
         assert_eq!(peer.curve(), [(0.5, 11.0), (1.0, 12.4)]);
         for other in ["[]", r#"{"rows": []}"#, r#"{"rows": [{"seconds": 0.0, "psnr": 1.0}]}"#] {
             write(other);
-            let message = Peer::load(&path).expect_err("no curve").0;
+            let message = Peer::load(&path).expect_err("no curve").to_string();
             assert!(message.contains("gsplat_fox.json"), "{message}");
         }
-        assert!(Peer::load(Path::new("absent.json")).expect_err("absent").0.contains("cannot be read"));
+        assert!(Peer::load(Path::new("absent.json")).expect_err("absent").to_string().contains("cannot be read"));
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! It runs in the measured process, so it reads through one small buffer.
 
-use anyhow::{Context, bail, ensure};
+use crate::Result;
+use crate::error::{Context, ensure, failed};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use serde_json::{Value, json};
@@ -32,15 +33,19 @@ const PONG: u8 = 10;
 
 /// A connected viewer; it disconnects when dropped.
 #[derive(Debug)]
-pub(crate) struct Viewer {
+pub struct Viewer {
     stream: TcpStream,
     n_pictures: Arc<AtomicU64>,
-    thread: Option<JoinHandle<anyhow::Result<()>>>,
+    thread: Option<JoinHandle<Result<()>>>,
 }
 
 impl Viewer {
     /// Connects to a server on this machine and starts to request images.
-    pub(crate) fn connect(address: SocketAddr) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    ///
+    /// If the server does not accept the connection.
+    pub fn connect(address: SocketAddr) -> Result<Self> {
         let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
         stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
         let n_pictures = Arc::new(AtomicU64::new(0));
@@ -58,12 +63,14 @@ impl Viewer {
     }
 
     /// Number of complete images received so far.
-    pub(crate) fn n_pictures(&self) -> u64 {
+    #[must_use]
+    pub fn n_pictures(&self) -> u64 {
         self.n_pictures.load(Ordering::Relaxed)
     }
 
     /// Whether it still receives.
-    pub(crate) fn is_connected(&self) -> bool {
+    #[must_use]
+    pub fn is_connected(&self) -> bool {
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
     }
 }
@@ -89,7 +96,7 @@ struct Client {
 }
 
 impl Client {
-    fn handshake(&mut self, address: SocketAddr) -> anyhow::Result<()> {
+    fn handshake(&mut self, address: SocketAddr) -> Result<()> {
         write!(
             self.stream,
             "GET /ws HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
@@ -105,7 +112,7 @@ impl Client {
         Ok(())
     }
 
-    fn run(mut self) -> anyhow::Result<()> {
+    fn run(mut self) -> Result<()> {
         self.request_picture()?;
         loop {
             let (opcode, n_bytes) = self.next_frame()?;
@@ -113,8 +120,8 @@ impl Client {
                 TEXT => self.handle_text(n_bytes)?,
                 BINARY => self.handle_binary(n_bytes)?,
                 PING => {
-                    let mut contents = vec![0; usize::try_from(n_bytes.min(125))?];
-                    self.reader.read_exact(&mut contents)?;
+                    let mut contents = Vec::new();
+                    (&mut self.reader).take(n_bytes.min(125)).read_to_end(&mut contents)?;
                     self.send(PONG, &contents)?;
                 }
                 CLOSE => return Ok(()),
@@ -123,12 +130,12 @@ impl Client {
         }
     }
 
-    fn handle_text(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+    fn handle_text(&mut self, n_bytes: u64) -> Result<()> {
         ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
         let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
         match message["type"].as_str() {
             Some("scene") => {
-                let number = |value: &Value| value.as_f64().context("a scene message lacks a number");
+                let number = |value: &Value| value.as_f64().ok_or_else(|| failed!("a scene message lacks a number"));
                 let center = &message["center_m"];
                 self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
                 self.radius_m = number(&message["radius_m"])?;
@@ -143,7 +150,7 @@ impl Client {
         Ok(())
     }
 
-    fn handle_binary(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+    fn handle_binary(&mut self, n_bytes: u64) -> Result<()> {
         let mut length = [0; 4];
         self.reader.read_exact(&mut length)?;
         let n_header = u64::from(u32::from_le_bytes(length));
@@ -158,7 +165,7 @@ impl Client {
     }
 
     /// Requests the next image on a circle around the scene.
-    fn request_picture(&mut self) -> anyhow::Result<()> {
+    fn request_picture(&mut self) -> Result<()> {
         let angle = self.n_requested as f64 * STEP_RAD;
         let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
         // `face_towards` has z forward and y up, but a camera's y axis points down.
@@ -176,7 +183,7 @@ impl Client {
     }
 
     /// Opcode and length of the next frame; the server sends each message as one frame.
-    fn next_frame(&mut self) -> anyhow::Result<(u8, u64)> {
+    fn next_frame(&mut self) -> Result<(u8, u64)> {
         let mut head = [0; 2];
         self.reader.read_exact(&mut head)?;
         let is_final = head[0] & 0x80 != 0;
@@ -193,25 +200,26 @@ impl Client {
                 u64::from_be_bytes(bytes)
             }
             short @ 0..126 => u64::from(short),
-            masked => bail!("the server sent a masked frame (length byte {masked})"),
+            masked => return Err(failed!("the server sent a masked frame (length byte {masked})")),
         };
         Ok((head[0] & 0x0f, n_bytes))
     }
 
-    fn skip(&mut self, n_bytes: u64) -> anyhow::Result<()> {
+    fn skip(&mut self, n_bytes: u64) -> Result<()> {
         let n_skipped = std::io::copy(&mut (&mut self.reader).take(n_bytes), &mut std::io::sink())?;
         ensure!(n_skipped == n_bytes, "the server closed the connection within a message");
         Ok(())
     }
 
     /// Sends a frame. Its mask is zero: the protocol requires one, but on loopback there is no proxy to protect.
-    fn send(&mut self, opcode: u8, contents: &[u8]) -> anyhow::Result<()> {
+    fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
         let mut frame = vec![0x80 | opcode];
         match u8::try_from(contents.len()) {
             Ok(n @ 0..126) => frame.push(0x80 | n),
             _ => {
                 frame.push(0x80 | 126);
-                frame.extend(u16::try_from(contents.len())?.to_be_bytes());
+                let too_long = |_| failed!("a message of {} bytes, expected at most 65535", contents.len());
+                frame.extend(u16::try_from(contents.len()).map_err(too_long)?.to_be_bytes());
             }
         }
         frame.extend([0; 4]);

@@ -1,19 +1,17 @@
 //! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
 //! repeat it.
 
-use crate::console::{Console, OutputMode, ReadBar};
-use crate::data_args::DataArgs;
-use crate::exit::{BadArgument, InsufficientData};
-use crate::open_gpu::open_gpu;
-use crate::training_args::TrainingArgs;
-use crate::{print, signals};
-use anyhow::{Context, bail};
+use crate::error::{Context, ensure, failed};
+use crate::{Error, Result};
 use capture::Stop;
 use keyframe::{Keyframe, Split};
 use serde::{Deserialize, Serialize};
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
-use session::{Data, Evaluation, Evaluator, Evaluators, Limits, Purpose, TrainingOutcome, TrainingPlan};
+use session::{
+    Data, DataOptions, Evaluation, Evaluator, Evaluators, Limits, Observer, OpenGpu, Purpose, ReadProgress,
+    TrainingOptions, TrainingOutcome, TrainingPlan, ignore_progress,
+};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -24,87 +22,164 @@ use trainer::{MethodOptions, ModelKind, ModelOptions, ModelSpec};
 /// Folder of the runs inside the folder of the bench.
 const RUNS: &str = "bench-runs";
 
-/// Flags shared by all benches that train.
-#[derive(Debug, clap::Args)]
-pub(crate) struct BenchArgs {
-    #[command(flatten)]
-    pub(crate) training: TrainingArgs,
-    #[command(flatten)]
-    pub(crate) images: DataArgs,
-    /// Folder for runs, charts and the page; finished runs of an earlier bench in this folder are not repeated
-    /// [default: a new folder in runs]
-    #[arg(long, value_name = "FOLDER")]
-    pub(crate) out: Option<PathBuf>,
-    /// Print JSON, one object per line: each run when it ends, then the findings
-    #[arg(long)]
-    pub(crate) json: bool,
+/// Options shared by all benches that train.
+#[derive(Clone, Debug, Default)]
+pub struct RunsOptions {
+    /// Which models to train, and their limits.
+    pub training: TrainingOptions,
+    /// Which images are used.
+    pub images: DataOptions,
+    /// Folder for runs, charts and the page; a new folder in `runs` if `None`.
+    pub out: Option<PathBuf>,
+}
+
+/// What the program that runs a bench provides.
+#[derive(Clone)]
+pub struct Host<'a> {
+    /// Opens the GPU, and opens it again after it was lost.
+    pub open_gpu: OpenGpu,
+    /// Requests that the bench stops.
+    pub stop: Stop,
+    /// Receives the reports.
+    pub observer: &'a dyn BenchObserver,
+}
+
+/// Receives the reports of a bench that trains, for example to print them.
+pub trait BenchObserver {
+    /// Returns a function that takes the progress of reading one data set. It is dropped after the last image.
+    fn reading(&self) -> Box<dyn Fn(ReadProgress) + Sync>;
+    /// Returns the observer of the training session of one run with these limits.
+    fn training(&self, limits: Limits) -> Box<dyn Observer>;
+    /// Takes a finished run.
+    fn on_run(&self, report: &RunReport<'_>);
+}
+
+/// Ignores all reports.
+impl BenchObserver for () {
+    fn reading(&self) -> Box<dyn Fn(ReadProgress) + Sync> {
+        Box::new(ignore_progress)
+    }
+
+    fn training(&self, _limits: Limits) -> Box<dyn Observer> {
+        Box::new(())
+    }
+
+    fn on_run(&self, _report: &RunReport<'_>) {}
+}
+
+/// Report of a finished run. Serialized, it is the event `run`.
+#[derive(Clone, Debug, Serialize)]
+pub struct RunReport<'a> {
+    event: &'static str,
+    /// Whether it was trained by an earlier bench.
+    #[serde(rename = "cached")]
+    pub is_cached: bool,
+    /// The run.
+    #[serde(flatten)]
+    pub run: &'a Run,
+    /// Number of runs of this bench that are finished, including this one.
+    #[serde(skip)]
+    pub n_done: u64,
+    /// Number of all runs of this bench.
+    #[serde(skip)]
+    pub n_all: u64,
 }
 
 /// Settings that identify a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct RunSettings {
-    pub(crate) data: PathBuf,
-    pub(crate) method: String,
-    pub(crate) seed: u64,
+pub struct RunSettings {
+    /// Folder or recording.
+    pub data: PathBuf,
+    /// Name of the scene model.
+    pub method: String,
+    /// Random seed.
+    pub seed: u64,
     /// `None` if the method has no such limit.
-    pub(crate) max_splats: Option<u64>,
-    pub(crate) max_bytes: Option<u64>,
-    pub(crate) seconds: Option<f64>,
-    pub(crate) steps: Option<u64>,
-    pub(crate) scale: Option<f64>,
-    pub(crate) holdout: Option<String>,
-    pub(crate) keyframes: Option<PathBuf>,
+    pub max_splats: Option<u64>,
+    /// Maximum GPU memory of the model, bytes; `None`: no limit.
+    pub max_bytes: Option<u64>,
+    /// Limit of the training time, seconds.
+    pub seconds: Option<f64>,
+    /// Limit of the optimizer steps.
+    pub steps: Option<u64>,
+    /// Fraction to which images are scaled.
+    pub scale: Option<f64>,
+    /// Selection of test images.
+    pub holdout: Option<String>,
+    /// List of the keyframes to use.
+    pub keyframes: Option<PathBuf>,
     /// Number of training images if nothing is disturbed.
-    pub(crate) n_train: usize,
-    pub(crate) n_test: usize,
-    pub(crate) disturbed: Option<Disturbed>,
+    pub n_train: usize,
+    /// Number of test images.
+    pub n_test: usize,
+    /// Disturbance of the training images, if any.
+    pub disturbed: Option<Disturbed>,
     /// Name of the variant of the trainer.
-    pub(crate) variant: Option<String>,
-    pub(crate) adapter: String,
-    pub(crate) version: String,
+    pub variant: Option<String>,
+    /// Description of the GPU.
+    pub adapter: String,
+    /// Version of this program.
+    pub version: String,
 }
 
 /// Disturbance of the training keyframes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Disturbed {
-    pub(crate) disturbance: String,
-    pub(crate) level: f64,
-    pub(crate) unit: String,
+pub struct Disturbed {
+    /// Name of the disturbance.
+    pub disturbance: String,
+    /// Size of the disturbance, in `unit`.
+    pub level: f64,
+    /// Unit of the size.
+    pub unit: String,
     /// Images per second, if stamps only count images.
-    pub(crate) rate_hz: Option<f64>,
+    pub rate_hz: Option<f64>,
 }
 
 /// Scores and size at one time; `None` if unknown.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct RunScores {
-    pub(crate) seconds: f64,
-    pub(crate) step: u64,
-    pub(crate) psnr: Option<f64>,
-    pub(crate) ssim: Option<f64>,
-    pub(crate) lpips: Option<f64>,
-    pub(crate) depth_rmse_m: Option<f64>,
-    pub(crate) primitives: u64,
-    pub(crate) bytes: u64,
+pub struct RunScores {
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Number of optimizer steps.
+    pub step: u64,
+    /// Mean PSNR of the test images, dB; also unknown if it is infinite.
+    pub psnr: Option<f64>,
+    /// Mean SSIM of the test images.
+    pub ssim: Option<f64>,
+    /// Mean LPIPS of the test images.
+    pub lpips: Option<f64>,
+    /// Root mean square error of the depth, meters.
+    pub depth_rmse_m: Option<f64>,
+    /// Number of splats, voxel blocks or table entries, depending on the method.
+    pub primitives: u64,
+    /// Size of the model, bytes.
+    pub bytes: u64,
 }
 
 /// A finished training run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Run {
-    pub(crate) name: String,
-    pub(crate) settings: RunSettings,
-    pub(crate) evaluations: Vec<RunScores>,
-    pub(crate) end: RunScores,
+pub struct Run {
+    /// Name of the run within its bench.
+    pub name: String,
+    /// Settings that identify the run.
+    pub settings: RunSettings,
+    /// Scores at the scheduled evaluations.
+    pub evaluations: Vec<RunScores>,
+    /// Scores at the end.
+    pub end: RunScores,
 }
 
 impl Run {
     /// Final test PSNR, dB; 99 for an image without errors, whose PSNR is infinite.
-    pub(crate) fn psnr(&self) -> f64 {
+    #[must_use]
+    pub fn psnr(&self) -> f64 {
         const WITHOUT_ERROR_DB: f64 = 99.0;
         self.end.psnr.unwrap_or(WITHOUT_ERROR_DB)
     }
 
     /// Points `(seconds, dB)` at the evaluations and at the end.
-    pub(crate) fn curve(&self) -> Vec<(f64, f64)> {
+    #[must_use]
+    pub fn curve(&self) -> Vec<(f64, f64)> {
         /// An end this close after the last evaluation is not a separate point.
         const MIN_SECONDS_RATIO: f64 = 1.02;
         let is_new = self.evaluations.last().is_none_or(|last| self.end.seconds > MIN_SECONDS_RATIO * last.seconds);
@@ -138,23 +213,25 @@ pub(crate) struct Job<'a> {
 
 /// Trains and saves runs.
 pub(crate) struct Runs<'a> {
-    args: &'a BenchArgs,
+    options: &'a RunsOptions,
+    host: &'a Host<'a>,
     out: PathBuf,
     created: CreatedFolders,
     gpu: Arc<Gpu>,
-    stop: Stop,
-    n_all: usize,
-    n_done: usize,
+    n_all: u64,
+    n_done: u64,
 }
 
 impl NamedData {
     /// The scene model, for a bench of a single method.
     ///
-    /// # Errors If there are several.
-    pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec, BadArgument> {
+    /// # Errors
+    ///
+    /// If there are several.
+    pub(crate) fn single_model_spec(&self) -> Result<&ModelSpec> {
         match &self.model_specs[..] {
             [one] => Ok(one),
-            _ => Err(BadArgument(format!(
+            _ => Err(Error::BadInput(format!(
                 "{}: this bench needs a single method, but the methods are {}",
                 self.name,
                 self.methods()
@@ -164,8 +241,10 @@ impl NamedData {
 
     /// The training options of splats, for a bench of splats.
     ///
-    /// # Errors If the method is another one.
-    pub(crate) fn splats(&self) -> anyhow::Result<ModelOptions<SplatOptions>> {
+    /// # Errors
+    ///
+    /// If the method is another one.
+    pub(crate) fn splats(&self) -> Result<ModelOptions<SplatOptions>> {
         let options = match &self.model_specs[..] {
             [one] => one.options_of()?,
             _ => None,
@@ -173,9 +252,9 @@ impl NamedData {
         let wrong_method = || {
             let (data, methods) = (&self.name, self.methods());
             let needed = SplatOptions::METHOD;
-            BadArgument(format!("{data}: this bench needs the method {needed}, but the method is {methods}"))
+            Error::BadInput(format!("{data}: this bench needs the method {needed}, but the method is {methods}"))
         };
-        Ok(options.ok_or_else(wrong_method)?)
+        options.ok_or_else(wrong_method)
     }
 
     fn methods(&self) -> String {
@@ -194,15 +273,15 @@ impl Drop for Runs<'_> {
 }
 
 impl<'a> Runs<'a> {
-    /// Creates the folder.
-    pub(crate) fn open(args: &'a BenchArgs, gpu: Arc<Gpu>) -> anyhow::Result<Self> {
-        let stop = signals::stop_on_signals()?;
+    /// Opens the GPU and creates the folder.
+    pub(crate) fn open(options: &'a RunsOptions, host: &'a Host<'a>) -> Result<Self> {
+        let gpu = (host.open_gpu)()?;
         let mut created = CreatedFolders::default();
-        let out = created.make(args.out.as_deref())?;
+        let out = created.make(options.out.as_deref())?;
         let runs = out.join(RUNS);
         std::fs::create_dir_all(&runs).with_context(|| format!("cannot create the folder {}", runs.display()))?;
         log::info!("{}", gpu.describe());
-        Ok(Self { args, out, created, gpu, stop, n_all: 0, n_done: 0 })
+        Ok(Self { options, host, out, created, gpu, n_all: 0, n_done: 0 })
     }
 
     /// The folder of the bench.
@@ -216,41 +295,40 @@ impl<'a> Runs<'a> {
     }
 
     /// Sets the number of remaining runs.
-    pub(crate) fn expect(&mut self, n_more: usize) {
+    pub(crate) fn expect(&mut self, n_more: u64) {
         self.n_all = self.n_done + n_more;
     }
 
     /// Loads data and chooses a name that is not in `used_names`.
-    pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> anyhow::Result<NamedData> {
-        session::check_before_data(&self.args.training.options(), path, &self.args.images.options())?;
-        let overrides = self.args.training.options().overrides();
-        let bar = ReadBar::new(self.args.json);
-        let data =
-            Data::load(path, &self.args.images.options(), Purpose::Training, &overrides, &|read| bar.show(read))?;
+    pub(crate) fn load(&self, path: &Path, used_names: &mut HashSet<String>) -> Result<NamedData> {
+        let RunsOptions { training, images, .. } = self.options;
+        session::check_before_data(training, path, images)?;
+        let on_progress = self.host.observer.reading();
+        let data = Data::load(path, images, Purpose::Training, &training.overrides(), &on_progress)?;
+        drop(on_progress);
         if data.of_split(Split::Test).is_empty() {
             let reason = "there are no test images, so nothing can be scored; see --holdout";
-            return Err(InsufficientData(format!("{}: {reason}", path.display())).into());
+            return Err(Error::InsufficientData(format!("{}: {reason}", path.display())));
         }
-        let model_specs = session::model_specs(&self.args.training.options(), &data, None, self.gpu.is_software())?;
+        let model_specs = session::model_specs(training, &data, None, self.gpu.is_software())?;
         Ok(NamedData { name: unique_name(path, used_names), path: path.to_owned(), data, model_specs })
     }
 
     /// Returns the run of a job, from its file or trained now and saved.
-    pub(crate) fn run(&mut self, job: Job<'_>) -> anyhow::Result<Run> {
+    pub(crate) fn run(&mut self, job: Job<'_>) -> Result<Run> {
         self.n_done += 1;
         let settings = self.settings(&job);
         let path = self.out.join(RUNS).join(format!("{}.json", file_name(&job.name)));
         if path.exists() {
             let cached = read(&path)?;
             if let Some(difference) = difference(&cached.settings, &settings)? {
-                return Err(BadArgument(format!(
+                return Err(Error::BadInput(format!(
                     "--out {}: the saved run {} differs in {difference}; choose another folder",
                     self.out.display(),
                     job.name
-                ))
-                .into());
+                )));
             }
-            self.report(&cached, true)?;
+            self.report(&cached, true);
             return Ok(cached);
         }
         log::info!("run {} of {}: {}", self.n_done, self.n_all, job.name);
@@ -274,40 +352,41 @@ impl<'a> Runs<'a> {
         let unfinished = path.with_extension("part");
         run_folder::write_json(&unfinished, &run)?;
         std::fs::rename(&unfinished, &path).with_context(|| format!("cannot write {}", path.display()))?;
-        self.report(&run, false)?;
+        self.report(&run, false);
         Ok(run)
     }
 
-    fn train(&self, job: &Job<'_>) -> anyhow::Result<TrainingOutcome> {
+    fn train(&self, job: &Job<'_>) -> Result<TrainingOutcome> {
         let thorough = Evaluator::thorough(None)?;
         let during_training = if job.is_thorough { thorough.clone() } else { Evaluator::psnr_only() };
         let mut model_spec = job.model_spec.clone();
         if let Some(steps) = job.limits.steps {
             model_spec.options.common.n_planned_steps = steps;
         }
-        let output = if self.args.json { OutputMode::Nothing } else { OutputMode::Bar };
         let plan = TrainingPlan {
             model_spec,
             evaluators: Evaluators { during_training, max_images_during_training: usize::MAX, at_end: thorough },
             limits: job.limits,
-            observer: Box::new(Console::new(output, job.limits, 1)),
+            observer: self.host.observer.training(job.limits),
         };
         let session = session::train(
             self.gpu.clone(),
             plan,
             &(job.keyframes)(),
             job.data.data.preparation_time,
-            &self.stop,
-            open_gpu,
+            &self.host.stop,
+            self.host.open_gpu,
         )?;
-        if self.stop.requested() && !session.is_over() {
-            bail!("stopped early; the same command with --out {} continues the bench", self.out.display());
-        }
-        Ok(session.score_without_saving()?)
+        ensure!(
+            session.is_over() || !self.host.stop.requested(),
+            "stopped early; the same command with --out {} continues the bench",
+            self.out.display()
+        );
+        session.score_without_saving()
     }
 
     fn settings(&self, job: &Job<'_>) -> RunSettings {
-        let (data, images) = (&job.data.data, self.args.images.options());
+        let (data, images) = (&job.data.data, self.options.images.clone());
         let n_test = data.of_split(Split::Test).len();
         RunSettings {
             data: job.data.path.clone(),
@@ -329,30 +408,9 @@ impl<'a> Runs<'a> {
         }
     }
 
-    fn report(&self, run: &Run, is_cached: bool) -> anyhow::Result<()> {
-        #[derive(Serialize)]
-        struct Event<'a> {
-            event: &'static str,
-            cached: bool,
-            #[serde(flatten)]
-            run: &'a Run,
-        }
-        if self.args.json {
-            return print::report_json(&Event { event: "run", cached: is_cached, run });
-        }
-        let (end, cached) = (&run.end, if is_cached { ", done earlier" } else { "" });
-        print::report(format_args!(
-            "run {} of {}  {:40} {:7.1} s  step {:6}  {:8} primitives  {:7.2} MB  {:.2} dB{cached}",
-            self.n_done,
-            self.n_all,
-            run.name,
-            end.seconds,
-            end.step,
-            end.primitives,
-            end.bytes as f64 / 1e6,
-            run.psnr()
-        ));
-        Ok(())
+    fn report(&self, run: &Run, is_cached: bool) {
+        let report = RunReport { event: "run", is_cached, run, n_done: self.n_done, n_all: self.n_all };
+        self.host.observer.on_run(&report);
     }
 }
 
@@ -369,17 +427,17 @@ fn from_evaluation(evaluation: &Evaluation) -> RunScores {
     }
 }
 
-fn read(path: &Path) -> anyhow::Result<Run> {
+fn read(path: &Path) -> Result<Run> {
     let message = || format!("{} is not a finished run; remove it to repeat the run", path.display());
     let text = std::fs::read_to_string(path).with_context(message)?;
     serde_json::from_str(&text).with_context(message)
 }
 
 /// Description of the first setting that differs.
-fn difference(cached: &RunSettings, requested: &RunSettings) -> anyhow::Result<Option<String>> {
+fn difference(cached: &RunSettings, requested: &RunSettings) -> Result<Option<String>> {
     let fields = |settings: &RunSettings| serde_json::to_value(settings).context("settings are plain data");
     let (cached, requested) = (fields(cached)?, fields(requested)?);
-    let Some(requested) = requested.as_object() else { bail!("settings are an object") };
+    let requested = requested.as_object().ok_or_else(|| failed!("settings are an object"))?;
     Ok(requested
         .iter()
         .find(|(key, value)| cached[key.as_str()] != **value)

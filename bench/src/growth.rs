@@ -1,7 +1,8 @@
 //! Memory of this process over time, and its growth rate once all bounded stores are full.
 
-use super::statistics::slope;
-use anyhow::{Context, anyhow};
+use crate::Result;
+use crate::error::{Context, failed};
+use crate::statistics::slope;
 use kinematics::quantile::median;
 use serde::Serialize;
 
@@ -15,33 +16,36 @@ const SECS_PER_HOUR: f64 = 3600.0;
 
 /// Memory use at one time, bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub(crate) struct Sample {
+pub struct Sample {
     /// Time since the first image.
-    pub(crate) seconds: f64,
+    pub seconds: f64,
     /// Resident memory of the process; on a software adapter this includes GPU memory.
-    pub(crate) resident_bytes: u64,
+    pub resident_bytes: u64,
     /// GPU buffers in use.
-    pub(crate) gpu_bytes: u64,
+    pub gpu_bytes: u64,
     /// Memory that the GPU allocator reserves for them, if the backend reports it.
-    pub(crate) gpu_reserved_bytes: Option<u64>,
+    pub gpu_reserved_bytes: Option<u64>,
     /// Models, a part of `gpu_bytes`.
-    pub(crate) model_bytes: u64,
+    pub model_bytes: u64,
     /// Images of keyframes on the GPU, a part of `gpu_bytes`.
-    pub(crate) gpu_image_bytes: u64,
+    pub gpu_image_bytes: u64,
     /// Host memory of the keyframes.
-    pub(crate) keyframe_bytes: u64,
-    pub(crate) keyframes: usize,
+    pub keyframe_bytes: u64,
+    /// Number of keyframes.
+    pub keyframes: usize,
     /// Keyframes evicted so far.
-    pub(crate) evicted: u64,
-    pub(crate) step: u64,
-    /// Number of connected viewers, and of the images they received.
-    pub(crate) viewers: usize,
-    pub(crate) pictures: u64,
+    pub evicted: u64,
+    /// Number of optimizer steps.
+    pub step: u64,
+    /// Number of connected viewers.
+    pub viewers: usize,
+    /// Number of images that the viewers received.
+    pub pictures: u64,
 }
 
 /// Which part of the resident memory is not counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Excluded {
+pub enum Excluded {
     /// Nothing; GPU buffers are in separate memory.
     Nothing,
     /// The models.
@@ -63,23 +67,25 @@ impl Excluded {
 
 /// How fast memory grows once the keyframe store is full.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub(crate) struct Growth {
+pub struct Growth {
     /// Whether the store was full; otherwise the second half of the run is measured.
-    pub(crate) store_was_full: bool,
-    /// Start and end of the measurement, seconds since the first image.
-    pub(crate) from_seconds: f64,
-    pub(crate) to_seconds: f64,
+    pub store_was_full: bool,
+    /// Start of the measurement, seconds since the first image.
+    pub from_seconds: f64,
+    /// End of the measurement, seconds since the first image.
+    pub to_seconds: f64,
     /// Median resident memory in that time.
-    pub(crate) resident_bytes: f64,
+    pub resident_bytes: f64,
     /// Theil-Sen slope: the median of the slopes between all pairs of samples.
-    pub(crate) bytes_per_hour: f64,
+    pub bytes_per_hour: f64,
     /// The slope as a percentage of `resident_bytes`.
-    pub(crate) percent_per_hour: f64,
+    pub percent_per_hour: f64,
 }
 
 impl Growth {
     /// Returns `None` if less than a minute of samples can be used.
-    pub(crate) fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
+    #[must_use]
+    pub fn of(samples: &[Sample], excluded: Excluded) -> Option<Self> {
         let full_at = samples.iter().find(|sample| sample.evicted > 0).map(|sample| sample.seconds + SETTLE_SECS);
         let last = samples.last()?;
         let from_seconds = full_at.unwrap_or(0.5 * last.seconds);
@@ -107,12 +113,16 @@ impl Growth {
 }
 
 /// Current and peak resident memory of this process, bytes.
-pub(crate) fn resident_bytes() -> anyhow::Result<(u64, u64)> {
+///
+/// # Errors
+///
+/// If the system does not report it; only Linux does.
+pub fn resident_bytes() -> Result<(u64, u64)> {
     const STATUS: &str = "/proc/self/status";
     let status = std::fs::read_to_string(STATUS)
         .with_context(|| format!("cannot read {STATUS}: resident memory is measured on Linux only"))?;
-    let now = kilobytes(&status, "VmRSS:").ok_or_else(|| anyhow!("{STATUS} has no line VmRSS"))?;
-    let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| anyhow!("{STATUS} has no line VmHWM"))?;
+    let now = kilobytes(&status, "VmRSS:").ok_or_else(|| failed!("{STATUS} has no line VmRSS"))?;
+    let peak = kilobytes(&status, "VmHWM:").ok_or_else(|| failed!("{STATUS} has no line VmHWM"))?;
     Ok((now << 10, peak << 10))
 }
 
