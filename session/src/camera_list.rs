@@ -14,11 +14,17 @@ pub const FILE: &str = "cameras.json";
 /// Pose and intrinsics of one keyframe.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PosedCamera {
+    /// Name of the camera.
     pub camera: String,
+    /// Stamp of the image, nanoseconds.
     pub stamp_nanos: i64,
+    /// Name of the split: train, validation or test.
     pub split: String,
+    /// Width and height, pixels.
     pub size_px: [u32; 2],
+    /// Focal length, pixels.
     pub focal_px: [f64; 2],
+    /// Principal point, pixels.
     pub principal_px: [f64; 2],
     /// 4x4 matrix, row major.
     pub world_from_camera: [f64; 16],

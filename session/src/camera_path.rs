@@ -10,6 +10,7 @@ use std::path::Path;
 /// One viewpoint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathCamera {
+    /// Pose of the camera: x right, y down, z forward.
     pub world_from_camera: Transform,
     /// Vertical field of view in radians, if the path specifies it.
     pub fov_y_rad: Option<f64>,
@@ -18,6 +19,7 @@ pub struct PathCamera {
 /// A camera path.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraPath {
+    /// The cameras, in the order of the path.
     pub cameras: Vec<PathCamera>,
     /// Width and height of the pictures in pixels, if the path specifies them.
     pub size_px: Option<[u32; 2]>,

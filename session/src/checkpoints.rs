@@ -102,6 +102,7 @@ struct WriterThread {
 
 /// A model in training, and the other contents of its checkpoint.
 pub struct Snapshot<'a> {
+    /// The model.
     pub method: &'a mut dyn Method,
     /// All keyframes in the store, including test keyframes.
     pub keyframes: &'a [Arc<Keyframe>],

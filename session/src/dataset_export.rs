@@ -30,7 +30,9 @@ const DEPTH: &str = "depth";
 /// Counts of what was written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Written {
+    /// Number of images.
     pub n_images: usize,
+    /// Number of depth images.
     pub n_depth: usize,
     /// Depth images that were left out because their intrinsics differ from those of the photo, which the format cannot
     /// express.

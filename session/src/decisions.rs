@@ -28,6 +28,7 @@ const MAX_WAITING: usize = 4096;
 #[serde(deny_unknown_fields)]
 pub struct Settings {
     version: u64,
+    /// Name of the method.
     pub method: String,
     /// Name of the dataset folder or recording; `None` if a live run was not recorded.
     pub data: Option<String>,
@@ -40,21 +41,30 @@ pub struct Settings {
     pub depth_from: Option<String>,
     /// Number of earlier updates if the run continued from a checkpoint.
     pub from_step: Option<u64>,
+    /// Options of the model.
     pub options: ModelOptions,
 }
 
 /// Everything that determines a training result besides its data.
 pub struct RunDescription<'a> {
+    /// Name of the method.
     pub method: &'a str,
+    /// Dataset folder or recording; `None` if a live run was not recorded.
     pub data: Option<&'a Path>,
+    /// Description of the GPU.
     pub adapter: String,
+    /// Size of the images relative to those of the data.
     pub scale: f64,
+    /// SHA-256 of the model from which depth was rendered.
     pub depth_from: Option<String>,
+    /// Step of the checkpoint that training continues from.
     pub from_step: Option<u64>,
+    /// Options of the model.
     pub options: ModelOptions,
 }
 
 impl Settings {
+    /// The settings of a run.
     pub fn new(description: RunDescription<'_>) -> Self {
         let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
         Self {
@@ -240,15 +250,18 @@ impl DecisionLog {
         Ok(log)
     }
 
+    /// Logs a keyframe that a checkpoint already contains.
     pub fn restored(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
         self.write(Line::Restored(step, keyframe.clone()));
     }
 
+    /// Logs that a keyframe was pushed after this many steps.
     pub fn pushed(&mut self, step: u64, keyframe: &Arc<Keyframe>) {
         self.log_activity(step);
         self.write(Line::Push(step, keyframe.clone()));
     }
 
+    /// Logs that a keyframe was removed after this many steps.
     pub fn removed(&mut self, step: u64, camera: &str, stamp: Stamp) {
         self.log_activity(step);
         let removed_keyframe = Removed { camera: camera.to_owned(), stamp_nanos: stamp.0 };
@@ -267,6 +280,7 @@ impl DecisionLog {
         self.activity = Activity::Training;
     }
 
+    /// Logs that a checkpoint was taken after this many steps.
     pub fn checkpoint(&mut self, step: u64) {
         self.log_activity(step);
         self.write(Line::Entry(Entry { step, decision: Decision::Checkpoint(True) }));

@@ -52,11 +52,15 @@ pub struct Evaluator {
 /// Scores of one test image. `None` means unknown, never zero.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ImageScores {
+    /// Name of the camera.
     pub camera: String,
+    /// Stamp of the image, nanoseconds.
     pub stamp_nanos: i64,
     /// PSNR against the image as the camera delivered it, dB.
     pub psnr: f64,
+    /// Structural similarity, up to 1.
     pub ssim: Option<f64>,
+    /// Perceptual distance; `None` without weights.
     pub lpips: Option<f64>,
     /// Root mean square error along z over pixels where both have depth, meters.
     pub depth_rmse_m: Option<f64>,
@@ -80,16 +84,24 @@ pub struct ImageScores {
 /// Mean scores over the test images. `None` means unknown, never zero.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Scores {
+    /// Mean PSNR, dB.
     pub psnr: Option<f64>,
+    /// Mean SSIM.
     pub ssim: Option<f64>,
+    /// Mean LPIPS.
     pub lpips: Option<f64>,
+    /// Root mean square error of depth, meters.
     pub depth_rmse_m: Option<f64>,
+    /// Mean distance of the rendered surface from the true one, meters; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_error_m: Option<f64>,
+    /// Fraction of the surface within 5 mm of the true one; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_within_5_mm: Option<f64>,
+    /// PSNR against images without sensor noise, dB; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_truth: Option<f64>,
+    /// PSNR of the noisy images against those without noise, dB; only in simulation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_ceiling: Option<f64>,
     /// PSNR per camera; empty if there is only one.

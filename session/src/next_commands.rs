@@ -27,16 +27,22 @@ impl DataSource {
 /// What the commands need to know about a saved model.
 #[derive(Clone, Copy, Debug)]
 pub struct SavedModel<'a> {
+    /// The method.
     pub kind: ModelKind,
+    /// Folder of the model.
     pub folder: &'a Path,
+    /// The images that it was trained on.
     pub data: &'a DataSource,
+    /// Number of test images.
     pub n_tests: usize,
 }
 
 /// A command and its purpose.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NextCommand {
+    /// What the command is for.
     pub purpose: String,
+    /// The command line.
     pub command: String,
 }
 

@@ -11,7 +11,7 @@ use std::time::Duration;
 const MAX_SCORING: Duration = Duration::from_secs(60);
 
 /// An evaluation in progress.
-pub struct PendingEvaluation {
+pub(crate) struct PendingEvaluation {
     /// Training time when the evaluation was due, seconds.
     pub seconds: f64,
     /// Ordered so that the first images scored are already spread evenly over all.
@@ -22,7 +22,11 @@ pub struct PendingEvaluation {
 
 impl PendingEvaluation {
     /// An evaluation due at `seconds` that scores at most `max_images` of these test keyframes.
-    pub fn new<'a>(seconds: f64, tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>, max_images: usize) -> Self {
+    pub(crate) fn new<'a>(
+        seconds: f64,
+        tests: impl ExactSizeIterator<Item = &'a Arc<Keyframe>>,
+        max_images: usize,
+    ) -> Self {
         let stride = tests.len().div_ceil(max_images).max(1);
         let mut selected: Vec<(usize, &Arc<Keyframe>)> = tests.step_by(stride).enumerate().collect();
         selected.sort_by_key(|(ix, _)| ix.reverse_bits());
@@ -31,23 +35,23 @@ impl PendingEvaluation {
     }
 
     /// The next test keyframe to score; `None` if all are scored or the time limit is reached.
-    pub fn take_next(&mut self) -> Option<Arc<Keyframe>> {
+    pub(crate) fn take_next(&mut self) -> Option<Arc<Keyframe>> {
         if self.spent < MAX_SCORING { self.remaining.pop_front() } else { None }
     }
 
     /// Adds the scores of the last keyframe and the time that scoring took.
-    pub fn add(&mut self, scores: ImageScores, spent: Duration) {
+    pub(crate) fn add(&mut self, scores: ImageScores, spent: Duration) {
         self.images.push(scores);
         self.spent += spent;
     }
 
     /// Whether no image is left to score.
-    pub fn is_complete(&self) -> bool {
+    pub(crate) fn is_complete(&self) -> bool {
         self.remaining.is_empty() || self.spent >= MAX_SCORING
     }
 
     /// The scores so far.
-    pub fn into_images(self) -> Vec<ImageScores> {
+    pub(crate) fn into_images(self) -> Vec<ImageScores> {
         self.images
     }
 }

@@ -9,6 +9,7 @@ use trainer::ModelSpec;
 
 /// What a session needs to continue on another device.
 pub struct Recovery {
+    /// Method and options of the model.
     pub model_spec: ModelSpec,
     /// Folder of the run.
     pub folder: PathBuf,

@@ -13,7 +13,7 @@ const MAX_DEBT_SECS: f64 = 1.0;
 
 /// The time available for pictures.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RenderBudget {
+pub(crate) struct RenderBudget {
     /// Credit if positive, debt if negative.
     balance_secs: f64,
 }
@@ -26,18 +26,18 @@ impl Default for RenderBudget {
 
 impl RenderBudget {
     /// Whether a picture may be drawn now.
-    pub fn may_render(self) -> bool {
+    pub(crate) fn may_render(self) -> bool {
         self.balance_secs >= 0.0
     }
 
     /// Adds time spent on training.
-    pub fn add_training(&mut self, spent: Duration) {
+    pub(crate) fn add_training(&mut self, spent: Duration) {
         let spent_secs = spent.as_secs_f64();
         self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
     }
 
     /// Subtracts time spent on a picture.
-    pub fn add_render(&mut self, spent: Duration) {
+    pub(crate) fn add_render(&mut self, spent: Duration) {
         self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_DEBT_SECS);
     }
 }

@@ -19,6 +19,7 @@ use trainer::{ModelKind, ModelSpec};
 /// A decision log to replay.
 pub struct Replay {
     path: PathBuf,
+    /// The decisions of the log.
     pub decisions: Decisions,
     model_spec: ModelSpec,
 }

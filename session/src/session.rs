@@ -25,7 +25,7 @@ use trainer::gpu::{Gpu, PassTiming};
 use trainer::{FailedModel, Method, ModelKind, Picture, Progress, RenderRequest};
 
 /// Approximate duration of a slice. The device is idle for a moment at the end of each slice.
-pub const TIME_SLICE: Duration = Duration::from_millis(40);
+pub(crate) const TIME_SLICE: Duration = Duration::from_millis(40);
 /// Number of steps in a profile, which reports medians.
 const N_PROFILED: usize = 21;
 /// Drivers are slow for a while after large buffers have been freed.
@@ -106,10 +106,15 @@ pub struct Session {
 
 /// Result of training.
 pub struct TrainingOutcome {
+    /// Training time, seconds.
     pub seconds: f64,
+    /// Number of optimizer steps.
     pub steps: u64,
+    /// Mean scores of the test images.
     pub scores: Scores,
+    /// Number of primitives of the model, such as splats.
     pub primitives: u64,
+    /// Size of the model, bytes.
     pub bytes: u64,
     /// The scheduled evaluations.
     pub evaluations: Vec<Evaluation>,
@@ -141,8 +146,11 @@ struct NamedScores<'a> {
 
 /// A trained model that has been saved and scored and is still in GPU memory.
 pub struct FinishedModel {
+    /// The method.
     pub kind: ModelKind,
+    /// The model.
     pub method: Box<dyn Method>,
+    /// Folder of the saved model.
     pub folder: PathBuf,
     /// Training time, seconds.
     pub seconds: f64,
@@ -162,8 +170,11 @@ impl FinishedModel {
 
 /// One of several sessions that end together, with its output folder and the report details specific to the command.
 pub struct EndingSession<P> {
+    /// The session.
     pub session: Session,
+    /// Folder for the model and its report.
     pub out: PathBuf,
+    /// Entries of the report besides scores.
     pub details: P,
 }
 

@@ -16,7 +16,7 @@ use std::sync::Arc;
 use trainer::checkpoint::{Array, Checkpoint};
 
 /// Name of the folder in the folder of a run.
-pub const FOLDER: &str = "keyframes";
+pub(crate) const FOLDER: &str = "keyframes";
 const EXTENSION: &str = "keyframe";
 const METHOD: &str = "keyframe";
 const COLOR: &str = "rgba_srgb.png";

@@ -4,8 +4,11 @@ use crate::chart::drawing::escaped;
 
 /// A table of text; the first column contains the row headers.
 pub struct Table {
+    /// Title above the table.
     pub title: String,
+    /// Names of the columns.
     pub head: Vec<String>,
+    /// Cells of each row.
     pub rows: Vec<Vec<String>>,
 }
 

@@ -11,7 +11,7 @@ use std::time::Duration;
 ///
 /// `max_steps`: maximum number of steps of a session in this slice, given its index. `is_render_pending`: whether a
 /// picture waits; the slice then ends after the current submit.
-pub fn train_next(
+pub(crate) fn train_next(
     sessions: &mut [Session],
     max_steps: impl Fn(usize, &Session) -> u64,
     is_render_pending: impl Fn() -> bool,

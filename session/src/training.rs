@@ -19,8 +19,11 @@ use trainer::{self, CommonOptions, ModelKind, ModelSpec};
 
 /// Everything that determines a training besides its keyframes.
 pub struct TrainingPlan {
+    /// Method and options of the model.
     pub model_spec: ModelSpec,
+    /// How the model is scored.
     pub evaluators: Evaluators,
+    /// When to stop.
     pub limits: Limits,
     /// Receives the reports.
     pub observer: Box<dyn Observer>,

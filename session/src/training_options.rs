@@ -31,18 +31,29 @@ pub struct TrainingOptions {
 /// Calibration parameters that can be requested, and how to choose them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refine {
+    /// Those that improve validation images.
     Auto,
+    /// No parameters.
     None,
     /// The rig file's `base.realign`; not a camera parameter.
     Base,
+    /// Pose of each camera relative to its parent.
     Extrinsics,
+    /// Time offset of each camera.
     TimeOffset,
+    /// Offset of each joint that carries a camera.
     Joints,
+    /// Pose of each depth camera relative to its color camera.
     DepthPose,
+    /// Focal length and principal point of each camera.
     Lens,
+    /// Factor on the readings of each depth camera.
     DepthScale,
+    /// Time from the first to the last row of each rolling shutter.
     Readout,
+    /// A small pose correction of each image.
     ImagePoses,
+    /// Gains of red, green and blue of each image.
     ImageGains,
 }
 

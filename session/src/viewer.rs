@@ -11,7 +11,9 @@ const POLL_PERIOD: Duration = Duration::from_millis(100);
 
 /// A model that clients can view.
 pub struct ServedModel {
+    /// The method.
     pub kind: ModelKind,
+    /// The model.
     pub method: Box<dyn Method>,
 }
 

@@ -452,7 +452,7 @@ impl CameraState {
     /// Logs the first decoding error of a camera; all of them are counted.
     fn undecodable(&mut self, error: &crate::Error) -> Rejection {
         if !std::mem::replace(&mut self.warned_undecodable, true) {
-            log::warn!("{}", chain(error));
+            log::warn!("{error:#}");
         }
         Rejection::Undecodable
     }

@@ -465,5 +465,8 @@ fn downscaled_keyframes_are_area_means_with_scaled_intrinsics() {
     assert_eq!(depth_px(small), depth_px(full), "depth keeps its size");
     let truth = small.truth.as_ref().expect("a simulation");
     assert_eq!((truth.rgba_srgb.len(), truth.psnr_ceiling), (4 * 32 * 24, None));
-    assert!(Join::new(&rig(&[Override::new("train.scale", 0.2)])).is_err_and(|error| format!("{error:#}").contains("13x10")));
+    assert!(
+        Join::new(&rig(&[Override::new("train.scale", 0.2)]))
+            .is_err_and(|error| format!("{error:#}").contains("13x10"))
+    );
 }

@@ -3,6 +3,7 @@
 /// How values map to positions.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Scale {
+    /// Equal distances are equal differences.
     Linear,
     /// Values are above 0.
     Log,
@@ -15,6 +16,7 @@ pub enum Scale {
 pub struct Axis {
     /// Quantity and unit.
     pub label: String,
+    /// How values are mapped to positions.
     pub scale: Scale,
     /// Tick values; chosen automatically if empty. Ticks outside the data are omitted.
     pub ticks: Vec<f64>,

@@ -8,7 +8,9 @@ pub type Color = [u8; 3];
 /// Text sizes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TextSize {
+    /// Labels and numbers.
     Normal,
+    /// The title of a chart.
     Title,
 }
 
@@ -25,8 +27,11 @@ impl TextSize {
 /// Which point of a text is at its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Anchor {
+    /// The text begins at the position.
     Start,
+    /// The text is centered on the position.
     Middle,
+    /// The text ends at the position.
     End,
 }
 
@@ -34,17 +39,48 @@ pub enum Anchor {
 #[derive(Clone, Debug, PartialEq)]
 pub enum VectorShape {
     /// A line through points; `dash` is the length of dashes and gaps.
-    Line { points: Vec<[f64; 2]>, color: Color, width: f64, dash: Option<[f64; 2]> },
+    Line {
+        /// Corners, units.
+        points: Vec<[f64; 2]>,
+        /// Color of the line.
+        color: Color,
+        /// Width of the line, units.
+        width: f64,
+        /// Lengths of dashes and gaps, units; `None` for a solid line.
+        dash: Option<[f64; 2]>,
+    },
     /// A filled polygon.
-    Area { points: Vec<[f64; 2]>, color: Color, opacity_frac: f64 },
+    Area {
+        /// Corners, units.
+        points: Vec<[f64; 2]>,
+        /// Color of the area.
+        color: Color,
+        /// Opacity, 0 to 1.
+        opacity_frac: f64,
+    },
     /// One line of text, centered vertically on `at`; `vertical` text runs from bottom to top.
-    Text { at: [f64; 2], text: String, color: Color, size: TextSize, anchor: Anchor, vertical: bool },
+    Text {
+        /// Position of the anchor on the baseline, units.
+        at: [f64; 2],
+        /// The text.
+        text: String,
+        /// Color of the letters.
+        color: Color,
+        /// Size of the letters.
+        size: TextSize,
+        /// The part of the text that is at the position.
+        anchor: Anchor,
+        /// Whether the text runs upwards.
+        vertical: bool,
+    },
 }
 
 /// Shapes in drawing order, on a white background.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Drawing {
+    /// Width and height, units.
     pub size: [f64; 2],
+    /// The shapes, from back to front.
     pub shapes: Vec<VectorShape>,
 }
 

@@ -14,11 +14,15 @@ use raster::text_width;
 /// Contents of a chart.
 #[derive(Clone, Debug)]
 pub struct Chart {
+    /// Title above the chart.
     pub title: String,
     /// Explanation of the points and bands.
     pub subtitle: String,
+    /// The horizontal axis.
     pub x: Axis,
+    /// The vertical axis.
     pub y: Axis,
+    /// The lines, in the order of the legend.
     pub lines: Vec<Line>,
     /// Values on the y axis to mark with a dashed line, with their labels.
     pub thresholds: Vec<(f64, String)>,
@@ -29,6 +33,7 @@ pub struct Chart {
 /// One line of a chart.
 #[derive(Clone, Debug)]
 pub struct Line {
+    /// Name in the legend.
     pub label: String,
     /// Points, ordered by x.
     pub points: Vec<Point>,
@@ -39,16 +44,22 @@ pub struct Line {
 /// A point and the range of the values it summarizes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
+    /// Position on the horizontal axis.
     pub x: f64,
+    /// Position on the vertical axis.
     pub y: f64,
+    /// Lower end of the band around the line.
     pub low: f64,
+    /// Upper end of the band around the line.
     pub high: f64,
 }
 
 /// A marked value on the x axis, with a label above the plot.
 #[derive(Clone, Debug)]
 pub struct Marker {
+    /// Position on the horizontal axis.
     pub x: f64,
+    /// Text at the marker.
     pub label: String,
     /// The line to which it belongs.
     pub line_ix: usize,

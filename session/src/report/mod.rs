@@ -4,7 +4,7 @@
 
 mod pictures;
 
-pub use pictures::{Comparison, Scored, compare};
+pub(crate) use pictures::{Comparison, Scored, compare};
 
 use crate::chart::drawing::escaped;
 use crate::chart::{Axis, Chart, Line, Point, Scale};
@@ -16,12 +16,12 @@ use std::fmt::Write;
 use std::path::Path;
 
 /// Name of the page in the folder of a run.
-pub const FILE: &str = "report.html";
+pub(crate) const FILE: &str = "report.html";
 /// Tables with more rows than this are collapsed.
 const MAX_OPEN_ROWS: usize = 16;
 
 /// The content of the page.
-pub struct Page<'a> {
+pub(crate) struct Page<'a> {
     pub folder: &'a Path,
     /// The content of `report.json`.
     pub report: &'a Value,
@@ -37,7 +37,7 @@ pub struct Page<'a> {
 
 impl Page<'_> {
     /// Writes the page into the folder.
-    pub fn write(&self) -> crate::Result<()> {
+    pub(crate) fn write(&self) -> crate::Result<()> {
         run_folder::write_atomic(&self.folder.join(FILE), &self.html())
     }
 
@@ -397,7 +397,7 @@ fn array(value: &Value) -> &[Value] {
 }
 
 /// The settings in the decision log of a folder, which are its first line; `Null` if there is no log.
-pub fn settings_in(folder: &Path) -> Value {
+pub(crate) fn settings_in(folder: &Path) -> Value {
     let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
     let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let newest = names.filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path()))).max();

@@ -30,7 +30,7 @@ const MAX_RENDER_TIME: Duration = Duration::from_secs(10);
 const MAX_ERROR: u8 = 64;
 
 /// One test image and the model's render of it.
-pub struct Comparison {
+pub(crate) struct Comparison {
     pub name: String,
     pub psnr: f64,
     pub ssim: Option<f64>,
@@ -50,7 +50,7 @@ pub(super) struct DepthPicture {
 }
 
 /// A test image with its name and scores.
-pub struct Scored<'a> {
+pub(crate) struct Scored<'a> {
     pub keyframe: &'a Arc<Keyframe>,
     pub name: String,
     pub psnr: f64,
@@ -58,7 +58,7 @@ pub struct Scored<'a> {
 }
 
 /// Draws test images spread over all of them, including the best and the worst, in the order of `scored`.
-pub fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::Result<Vec<Comparison>> {
+pub(crate) fn compare(method: &mut dyn Method, scored: &[Scored<'_>]) -> crate::Result<Vec<Comparison>> {
     let started = Instant::now();
     let mut comparisons: Vec<(usize, Comparison)> = Vec::new();
     let mut n_bytes = 0;
