@@ -141,7 +141,7 @@ def measure(args, address, begin, end):
                 view = message["world_from_camera"]
     request = ask(args, view)
     time.sleep(max(0.0, begin - time.monotonic()))
-    first_ms, full_ms, n_stages, errors = [], [], 0, []
+    first_millis, full_millis, n_stages, errors = [], [], 0, []
     request_id = 0
     while time.monotonic() < end and len(errors) < 10:
         request_id += 1
@@ -160,16 +160,16 @@ def measure(args, address, begin, end):
             header = json.loads(payload[4 : 4 + length])
             if header["type"] != "picture" or header["id"] != request_id:
                 continue
-            took_ms = 1e3 * (time.monotonic() - sent)
+            took_millis = 1e3 * (time.monotonic() - sent)
             n_stages += 1
             if is_first:
-                first_ms.append(took_ms)
+                first_millis.append(took_millis)
                 is_first = False
             if header["last"]:
-                full_ms.append(took_ms)
+                full_millis.append(took_millis)
                 break
     link.send(TEXT, b'{"type": "goodbye"}')
-    return {"first_ms": first_ms, "full_ms": full_ms, "n_stages": n_stages, "errors": errors}
+    return {"first_millis": first_millis, "full_millis": full_millis, "n_stages": n_stages, "errors": errors}
 
 
 def quantile(values, share):
@@ -215,8 +215,8 @@ def phase(args, address, n_clients):
     errors = [part["error"] for part in parts if "error" in part]
     parts = [part for part in parts if "error" not in part]
     errors += [error for part in parts for error in part["errors"]]
-    full = [ms for part in parts for ms in part["full_ms"]]
-    first = [ms for part in parts for ms in part["first_ms"]]
+    full = [ms for part in parts for ms in part["full_millis"]]
+    first = [ms for part in parts for ms in part["first_millis"]]
     (from_s, before), (to_s, after) = samples[0], samples[-1]
     step_before, _, _ = steps_of(before, args.method)
     step_after, step_millis, primitives = steps_of(after, args.method)
@@ -226,12 +226,12 @@ def phase(args, address, n_clients):
         "pictures": len(full),
         "pictures_per_s": round(len(full) / args.seconds, 2),
         "stages_per_picture": round(sum(part["n_stages"] for part in parts) / len(full), 2) if full else None,
-        "full_p50_ms": quantile(full, 0.5),
-        "full_p90_ms": quantile(full, 0.9),
-        "full_p99_ms": quantile(full, 0.99),
-        "full_max_ms": quantile(full, 1.0),
-        "first_stage_p50_ms": quantile(first, 0.5),
-        "first_stage_p99_ms": quantile(first, 0.99),
+        "full_p50_millis": quantile(full, 0.5),
+        "full_p90_millis": quantile(full, 0.9),
+        "full_p99_millis": quantile(full, 0.99),
+        "full_max_millis": quantile(full, 1.0),
+        "first_stage_p50_millis": quantile(first, 0.5),
+        "first_stage_p99_millis": quantile(first, 0.99),
         "steps_per_s": round((step_after - step_before) / spent_s, 2) if spent_s > 0 else None,
         "step_millis": step_millis,
         "primitives": primitives,

@@ -183,7 +183,7 @@ def frames_of(data, keyframes):
     """Frames of a nerfstudio folder by split, as listed: photo n of the folder, in order of names, has the stamp n ms."""
     summary = json.loads((data / "transforms.json").read_text())
     existing = sorted((f for f in summary["frames"] if (data / f["file_path"]).exists()), key=lambda f: f["file_path"])
-    by_split = {"train": [], "selection": [], "test": []}
+    by_split = {"train": [], "validation": [], "test": []}
     for line in keyframes.read_text().splitlines():
         if not line.strip() or line.startswith("#"):
             continue
@@ -195,7 +195,7 @@ def frames_of(data, keyframes):
         pose = np.array(frame["transform_matrix"]) @ OPENGL
         by_split[split].append(
             Frame(frame["file_path"], depth_m, rgb, [frame["fl_x"], frame["fl_y"]], [frame["cx"], frame["cy"]], pose))
-    return by_split["train"] + by_split["selection"], by_split["test"]
+    return by_split["train"] + by_split["validation"], by_split["test"]
 
 
 def timing(millis):

@@ -1,7 +1,8 @@
 //! Exit codes and the errors that lead to them.
 
-use crate::config::ConfigError;
 use crate::print;
+use capture::ConfigError;
+use keyframe::ErrorClass;
 use std::io::ErrorKind;
 use std::process::ExitCode;
 
@@ -18,7 +19,7 @@ pub(crate) enum Exit {
     /// Done, but some data is missing from the result.
     Loss = 3,
     /// Not done: the input is not sufficient for a result.
-    Refused = 4,
+    InsufficientData = 4,
 }
 
 impl Exit {
@@ -46,16 +47,36 @@ pub(crate) struct InsufficientData(pub(crate) String);
 
 /// The exit code of an error.
 pub(crate) fn of(error: &anyhow::Error) -> Exit {
-    let is_small_budget = |cause: &(dyn std::error::Error + 'static)| {
-        matches!(cause.downcast_ref(), Some(trainer::Error::BudgetTooSmall { .. }))
-    };
-    if error.chain().any(|cause| cause.is::<BadArgument>() || cause.is::<ConfigError>() || is_small_budget(cause)) {
+    let has = |class| error.chain().any(|cause| class_of(cause) == Some(class));
+    if has(ErrorClass::BadInput) {
         Exit::BadArguments
-    } else if error.chain().any(|cause| cause.is::<InsufficientData>()) {
-        Exit::Refused
+    } else if has(ErrorClass::InsufficientData) {
+        Exit::InsufficientData
     } else {
         Exit::Failed
     }
+}
+
+/// The class of an error of this program or its libraries.
+fn class_of(error: &(dyn std::error::Error + 'static)) -> Option<ErrorClass> {
+    if error.is::<BadArgument>() || error.is::<ConfigError>() {
+        return Some(ErrorClass::BadInput);
+    }
+    if error.is::<InsufficientData>() {
+        return Some(ErrorClass::InsufficientData);
+    }
+    if let Some(trainer::Error::BudgetTooSmall { .. }) = error.downcast_ref() {
+        return Some(ErrorClass::BadInput);
+    }
+    let of_session = || Some(error.downcast_ref::<session::Error>()?.class());
+    let of_capture = || Some(error.downcast_ref::<capture::Error>()?.class());
+    let of_keyframe = || Some(error.downcast_ref::<keyframe::Error>()?.class());
+    of_session().or_else(of_capture).or_else(of_keyframe)
+}
+
+/// Whether a command was rejected: because of bad arguments, or because the data is insufficient.
+pub(crate) fn is_rejection(error: &anyhow::Error) -> bool {
+    matches!(of(error), Exit::BadArguments | Exit::InsufficientData)
 }
 
 /// Logs each loss of data as a warning and returns the exit code.
@@ -64,11 +85,6 @@ pub(crate) fn from_losses(data_losses: &[String]) -> Exit {
         log::warn!("data loss: {loss}");
     }
     if data_losses.is_empty() { Exit::Done } else { Exit::Loss }
-}
-
-/// Whether reading or writing a file failed, for example on a full disk.
-pub(crate) fn is_io(error: &anyhow::Error) -> bool {
-    error.chain().any(|cause| cause.is::<std::io::Error>())
 }
 
 /// Whether the reader of our output closed the pipe, as `head` does. This ends a command whose result is its output.

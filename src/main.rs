@@ -1,57 +1,16 @@
 //! The `fieldrig` command: parse, run, exit code.
 
 mod allocator;
-mod bench;
-mod camera_list;
-mod camera_path;
-mod chart;
-mod checkpoints;
+mod checkpoint_args;
 mod cli;
-mod clock;
 mod commands;
-mod config;
-mod corrected_rig;
-mod data;
-mod dataset;
-mod decisions;
-mod depth_from;
-mod downscale;
-mod evaluate;
-mod evaluation_schedule;
+mod console;
+mod data_args;
 mod exit;
-mod export;
-mod feed;
-mod fingerprint;
-mod holdout;
-mod join;
-mod live;
-mod method;
-mod model_bounds;
-mod next_commands;
-mod open;
 mod open_gpu;
-mod partial;
-mod pending_evaluation;
 mod print;
-mod recoveries;
-mod recovery;
-mod render_budget;
-mod replay;
-mod report;
-mod run_folder;
-mod scene_hint;
-mod session;
-mod splat_file;
-mod stations;
-mod stop;
-mod stored_keyframes;
-#[cfg(test)]
-#[path = "../tests/common/test_data.rs"]
-mod test_data;
-mod time_slices;
-mod training;
+mod signals;
 mod training_args;
-mod viewer;
 
 use clap::Parser;
 use std::process::ExitCode;
@@ -60,14 +19,14 @@ fn main() -> ExitCode {
     keep_wayland_quiet();
     let cli = cli::Cli::parse();
     print::start_log(cli.verbose);
-    let ended = cli.command.run();
-    if let Err(error) = &ended
+    let result = cli.command.run();
+    if let Err(error) = &result
         && !exit::is_broken_pipe(error)
     {
         print::error(error);
     }
     print::flush();
-    match ended {
+    match result {
         Ok(exit) => exit.or_output_loss().into(),
         Err(error) if exit::is_broken_pipe(&error) => exit::Exit::Done.into(),
         Err(error) => exit::of(&error).into(),

@@ -1,26 +1,29 @@
-//! Opens the GPU as the environment says.
+//! Opens the GPU with the settings from environment variables.
 
 use crate::allocator;
-use crate::exit::BadArgument;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Once, OnceLock};
+use std::sync::{Arc, Once};
 use trainer::gpu::{Gpu, GpuOptions};
 
 /// Opens the GPU. `FIELDRIG_GPU` selects one of several; `FIELDRIG_GPU_FEATURES=none` disables all optional features,
 /// and `no-matrices` only cooperative matrices.
-pub(crate) fn open_gpu() -> anyhow::Result<Arc<Gpu>> {
+pub(crate) fn open_gpu() -> session::Result<Arc<Gpu>> {
     let features = std::env::var_os("FIELDRIG_GPU_FEATURES");
     let [optional_features, matrices] =
         ["none", "no-matrices"].map(|word| features.as_ref().is_none_or(|value| value != word));
     let adapter = match std::env::var("FIELDRIG_GPU") {
         Ok(text) => {
-            let invalid = |_| BadArgument(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
+            let invalid = |_| session::Error::BadInput(format!("FIELDRIG_GPU: {text:?} is not the number of a GPU"));
             Some(text.parse().map_err(invalid)?)
         }
         Err(_) => None,
     };
     hide_caught_panics();
     check_open_for_tests()?;
+    // Lets tests lose the GPU once, when a model reaches this step.
+    if let Some(step) = std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP").ok().and_then(|text| text.parse().ok()) {
+        session::lose_gpu_at_step(step);
+    }
     // Lets tests exhaust GPU memory.
     let memory_limit_bytes = std::env::var("FIELDRIG_TEST_GPU_BYTES").ok().and_then(|text| text.parse().ok());
     let gpu =
@@ -42,16 +45,6 @@ fn hide_caught_panics() {
             }
         }));
     });
-}
-
-/// For tests: `FIELDRIG_TEST_LOSE_GPU_AT_STEP=N` loses the device once, when a model reaches step N.
-pub(crate) fn lose_for_tests(gpu: &Gpu, step: u64) {
-    static AT_STEP: OnceLock<Option<u64>> = OnceLock::new();
-    static IS_LOST: AtomicBool = AtomicBool::new(false);
-    let at_step = AT_STEP.get_or_init(|| std::env::var("FIELDRIG_TEST_LOSE_GPU_AT_STEP").ok()?.parse().ok());
-    if at_step.is_some_and(|at_step| step >= at_step) && !IS_LOST.swap(true, Ordering::Relaxed) {
-        gpu.lose();
-    }
 }
 
 /// For tests: with `FIELDRIG_TEST_OPEN_GPU_ONCE` set, the GPU can be opened only once.

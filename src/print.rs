@@ -185,15 +185,6 @@ pub(crate) fn has_lost_output() -> bool {
     LOST_OUTPUT.load(Ordering::Relaxed)
 }
 
-/// A count and its noun: `1 image`, `2 images`.
-pub(crate) fn counted(n: u64, noun: &str) -> String {
-    match noun.strip_suffix('y') {
-        _ if n == 1 => format!("1 {noun}"),
-        Some(stem) => format!("{n} {stem}ies"),
-        None => format!("{n} {noun}s"),
-    }
-}
-
 /// Prints one JSON object on its own line.
 pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
     Ok(line(json_text(value)?)?)
@@ -201,7 +192,9 @@ pub(crate) fn json(value: &impl Serialize) -> anyhow::Result<()> {
 
 /// Prints one JSON object on its own line, as [`report`] does.
 ///
-/// # Errors If the value cannot be serialized as JSON.
+/// # Errors
+///
+/// If the value cannot be serialized as JSON.
 pub(crate) fn report_json(value: &impl Serialize) -> anyhow::Result<()> {
     report(json_text(value)?);
     Ok(())
@@ -224,14 +217,19 @@ pub(crate) fn bar(length: Option<u64>, template: &'static str, hidden: bool) -> 
     BARS.add(bar)
 }
 
+/// The crates that log progress.
+const WORKSPACE_CRATES: [&str; 9] =
+    ["fieldrig", "bench", "calibration", "capture", "drivers", "session", "sim", "trainer", "viz"];
+
 /// Sends log records to stderr. `RUST_LOG` takes precedence; `verbose` counts the `-v` flags.
 pub(crate) fn start_log(verbose: u8) {
-    let level = match verbose {
-        0 => "warn,fieldrig=info,drivers=info,sim=info,trainer=info,viz=info",
-        1 => "info,fieldrig=debug,drivers=debug,sim=debug,trainer=debug,viz=debug",
-        _ => "trace",
+    let of_workspace = |level| WORKSPACE_CRATES.map(|name| format!(",{name}={level}")).concat();
+    let filter = match verbose {
+        0 => format!("warn{}", of_workspace("info")),
+        1 => format!("info{}", of_workspace("debug")),
+        _ => "trace".to_owned(),
     };
-    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or(level))
+    env_logger::Builder::from_env(env_logger::Env::default().default_filter_or(filter))
         .target(env_logger::Target::Pipe(Box::new(LogTarget)))
         .format_target(false)
         .init();

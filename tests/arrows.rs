@@ -5,15 +5,21 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::process::Command;
 
 /// Every crate, and the workspace crates that it may depend on.
-const ALLOWED: [(&str, &[&str]); 8] = [
+const ALLOWED: [(&str, &[&str]); 11] = [
     ("kinematics", &[]),
     ("keyframe", &["kinematics"]),
     ("calibration", &["keyframe", "kinematics"]),
     ("drivers", &["kinematics"]),
     ("sim", &["drivers", "kinematics"]),
+    ("capture", &["calibration", "drivers", "keyframe", "kinematics", "sim"]),
     ("trainer", &["calibration", "keyframe", "kinematics"]),
     ("viz", &["keyframe", "kinematics", "trainer"]),
-    ("fieldrig", &["calibration", "drivers", "keyframe", "kinematics", "sim", "trainer", "viz"]),
+    ("session", &["calibration", "capture", "drivers", "keyframe", "kinematics", "trainer", "viz"]),
+    ("bench", &["calibration", "capture", "keyframe", "kinematics", "session", "trainer"]),
+    (
+        "fieldrig",
+        &["bench", "calibration", "capture", "drivers", "keyframe", "kinematics", "session", "sim", "trainer", "viz"],
+    ),
 ];
 
 /// Crates that only `fieldrig` may use, because only it prints and parses command lines.

@@ -11,8 +11,19 @@ use syn::visit::Visit;
 use syn::{Attribute, Item, UseTree};
 
 /// Source folders of the crates, relative to the workspace.
-const ROOTS: [&str; 8] =
-    ["kinematics/src", "keyframe/src", "calibration/src", "drivers/src", "sim/src", "trainer/src", "viz/src", "src"];
+const ROOTS: [&str; 11] = [
+    "kinematics/src",
+    "keyframe/src",
+    "calibration/src",
+    "drivers/src",
+    "sim/src",
+    "capture/src",
+    "trainer/src",
+    "viz/src",
+    "session/src",
+    "bench/src",
+    "src",
+];
 
 /// Path of a module within its crate; empty for the crate root.
 type Module = Vec<String>;

@@ -93,11 +93,19 @@ fn check_mesh_export(folder: &Path) {
         let coarse = export(to, &["--cell-m", "0.1"], &format!("coarse.{to}"));
         assert!(coarse.len() < saved.len() / 4, "{to}: {} of {} bytes", coarse.len(), saved.len());
     }
-    assert_fails_with(folder, &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"], &["has no splats"]);
+    assert_fails_with(
+        folder,
+        &["export", "all/tsdf", "--to", "spz", "--out", "a.spz"],
+        &["a distance field cannot be exported as spz, only as glb or ply"],
+    );
     assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "whole.glb"], &["the file exists"]);
     assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.ply"], &["must end in .glb"]);
     assert_fails_with(folder, &["export", "all/tsdf", "--to", "glb", "--out", "a.glb", "--cell-m", "0"], &["--cell-m"]);
-    assert_fails_with(folder, &["export", "all/nerf", "--to", "glb", "--out", "a.glb"], &["neither splats nor a mesh"]);
+    assert_fails_with(
+        folder,
+        &["export", "all/nerf", "--to", "glb", "--out", "a.glb"],
+        &["a neural field cannot be exported"],
+    );
     assert_fails_with(
         folder,
         &["export", "all", "--to", "glb", "--out", "a.glb"],

@@ -1,4 +1,4 @@
-//! Finds and compresses the bundled web page. Without the bundle, the server shows a page that says to run `make web`.
+//! Finds and compresses the bundled web page. Without the bundle, the server shows a page with the command `make web`.
 
 use flate2::Compression;
 use flate2::write::GzEncoder;

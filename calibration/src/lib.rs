@@ -15,7 +15,7 @@
 //! #     rgba_srgb: [0; 4].into(), depth: None, world_from_camera: Transform::identity(), twist: None,
 //! #     readout_secs: 0.0, joint_twists: [].into(), base: None, split: Split::Train, truth: None,
 //! # };
-//! // The camera is 5 mm further along its x axis than its extrinsics say.
+//! // The camera is 5 mm further along its x axis than in its extrinsics.
 //! let correction = CameraCorrection { translation_m: [-0.005, 0.0, 0.0], ..CameraCorrection::default() };
 //! let corrected = correction.corrected(&keyframe);
 //! assert!((corrected.world_from_camera.translation.x - 0.005).abs() < 1e-12);

@@ -101,14 +101,14 @@ impl Trial {
     }
 
     /// Report on the part of the model that was tested: the addition, or what the reduction would remove.
-    pub fn part(&self) -> TrialReport {
-        let (part, is_reduction) = match self.candidate {
+    pub fn report(&self) -> TrialReport {
+        let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
             Candidate::Halved { from, to } => (format!("{from} instead of {to} splats"), true),
             Candidate::ShDegree { from, to } => (format!("colors of degree {from} instead of {to}"), true),
         };
         TrialReport {
-            part,
+            candidate,
             gain_db: if is_reduction { -self.gain_db } else { self.gain_db },
             standard_error_db: self.standard_error_db,
             n_images: self.n_images,
@@ -134,17 +134,17 @@ impl Trial {
     }
 }
 
-/// Result of a trial of one part of a model, on validation images.
+/// Result of a trial on validation images, for reports.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrialReport {
-    /// Description of the part.
-    pub part: String,
-    /// Mean PSNR with the part minus that without it, dB.
+    /// Description of the tested part of the model: the addition, or what the reduction would remove.
+    pub candidate: String,
+    /// Mean PSNR with that part minus that without it, dB.
     pub gain_db: f64,
     /// Standard error of the mean, dB.
     pub standard_error_db: f64,
     /// Number of validation images.
     pub n_images: usize,
-    /// Whether the part was kept.
+    /// Whether that part was kept.
     pub kept: bool,
 }

@@ -325,14 +325,14 @@ pub enum Error {
         /// Error of the decoder.
         source: image::ImageError,
     },
-    /// The size of an image or mask differs from that of its frame.
+    /// The size of an image or mask differs from that in the dataset.
     #[error("{path:?} has {got_px:?} pixels, expected {expected_px:?}")]
     DatasetImageSize {
         /// The file.
         path: PathBuf,
         /// Size in the file.
         got_px: [u32; 2],
-        /// Size of the frame.
+        /// Size according to the dataset.
         expected_px: [u32; 2],
     },
     /// A depth image is not 16-bit grayscale.

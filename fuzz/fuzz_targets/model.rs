@@ -10,9 +10,9 @@
 mod atomic_file;
 #[path = "../../trainer/src/checkpoint.rs"]
 mod checkpoint;
-#[path = "../../trainer/src/ply/mod.rs"]
+#[path = "../../trainer/src/splat/ply/mod.rs"]
 mod ply;
-#[path = "../../trainer/src/spz/mod.rs"]
+#[path = "../../trainer/src/splat/spz/mod.rs"]
 mod spz;
 mod splat {
     pub use crate::arrays;

@@ -1,23 +1,16 @@
 //! Fuzz target for rig files, with a fixed robot description. The complete form of an accepted rig file must be
 //! accepted, too.
 #![no_main]
-#![allow(dead_code, unused_imports, reason = "only reading is tested here")]
 
-#[path = "../../src/config/mod.rs"]
-mod config;
-#[path = "../../src/method/kind.rs"]
-mod kind;
-mod method {
-    pub(crate) use crate::kind::ModelKind;
-}
+use capture::Rig;
 
 const URDF: &str = include_str!("../../kinematics/tests/data/panda.urdf");
 
 libfuzzer_sys::fuzz_target!(|text: &str| {
-    match config::Rig::parse("rig.toml", text, URDF, &[]) {
+    match Rig::parse("rig.toml", text, URDF, &[]) {
         Ok(rig) => {
             let settled = rig.to_toml();
-            let reread = config::Rig::parse("rig.toml", &settled, &rig.arm.urdf_text, &[]);
+            let reread = Rig::parse("rig.toml", &settled, &rig.arm.urdf_text, &[]);
             if let Err(error) = reread {
                 panic!("{error}\n{settled}");
             }

@@ -1,6 +1,9 @@
 //! Errors of keyframes.
 
-/// An error of a keyframe.
+use crate::ErrorClass;
+use std::path::PathBuf;
+
+/// An error of a keyframe or of a selection of keyframes.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -28,4 +31,50 @@ pub enum Error {
         /// Expected number of values.
         expected: usize,
     },
+    /// A file that selects keyframes cannot be read.
+    #[error("cannot read {path:?}: {reason}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Message of the operating system.
+        reason: String,
+    },
+    /// A list of keyframes is invalid.
+    #[error("the keyframe list {path:?}: {reason}")]
+    List {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with the line.
+        reason: String,
+    },
+    /// A list of keyframes has none in common with the data.
+    #[error("the keyframe list matches nothing in the data: it lists {listed}, the data has {found}")]
+    NoListedKeyframe {
+        /// Camera and stamp of a listed keyframe.
+        listed: String,
+        /// Camera and stamp of an image in the data.
+        found: String,
+    },
+    /// Test images cannot be selected as requested.
+    #[error("--holdout {request}: {reason}")]
+    Holdout {
+        /// The number, file or name.
+        request: String,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+impl Error {
+    /// What the error means for the caller.
+    #[must_use]
+    pub fn class(&self) -> ErrorClass {
+        match self {
+            Self::Holdout { .. } => ErrorClass::BadInput,
+            Self::NoListedKeyframe { .. } => ErrorClass::InsufficientData,
+            Self::ImageBytes { .. } | Self::DepthPixels { .. } | Self::Read { .. } | Self::List { .. } => {
+                ErrorClass::Failed
+            }
+        }
+    }
 }

@@ -2,7 +2,8 @@
 //!
 //! A [`Keyframe`] is an undistorted image with the pose of its camera at mid-exposure, optionally with a [`DepthMap`],
 //! the motion of a rolling shutter and, from a simulator, the [`Truth`]. [`RangePoints`] is one revolution of a range
-//! scanner. All are plain arrays without driver or GPU types. Cameras are x right, y down, z forward; the world is z up.
+//! scanner. All are plain arrays without driver or GPU types. A [`KeyframeList`] or [`Holdout`] selects keyframes and
+//! assigns their splits. Cameras are x right, y down, z forward; the world is z up.
 //!
 //! ```
 //! use keyframe::{Keyframe, Split};
@@ -29,14 +30,24 @@
 //! # Ok::<(), keyframe::Error>(())
 //! ```
 
+mod counted;
 mod error;
+mod error_class;
+mod fingerprint;
+mod holdout;
 mod keyframe;
+mod list;
 mod range_points;
 #[cfg(any(test, feature = "scenes"))]
 pub mod scenes;
 mod shutter;
 
+pub use counted::{counted, listed};
 pub use error::Error;
+pub use error_class::ErrorClass;
+pub use fingerprint::fingerprint;
+pub use holdout::Holdout;
 pub use keyframe::{BaseState, DepthMap, Keyframe, Split, Truth};
+pub use list::{KeyframeList, list_text, split_from_name, split_name};
 pub use range_points::RangePoints;
 pub use shutter::Shutter;

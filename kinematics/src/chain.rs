@@ -226,14 +226,14 @@ fn follow_mimics<'a>(robot: &'a Robot, joint: &'a Joint) -> Result<MimicRule<'a>
     let mut rule = MimicRule { source: joint, multiplier: 1.0, offset: 0.0 };
     let mut n_mimics = 0;
     while let Some(mimic) = &rule.source.mimic {
-        let refused = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
-        let source = robot.joint(&mimic.source).ok_or_else(|| refused("is not in the URDF"))?;
+        let rejected = |why| Error::Mimic { joint: joint.name.clone(), source_joint: mimic.source.clone(), why };
+        let source = robot.joint(&mimic.source).ok_or_else(|| rejected("is not in the URDF"))?;
         if !matches!(source.kind, JointKind::Revolute | JointKind::Prismatic) {
-            return Err(refused("is not a moving joint of one number"));
+            return Err(rejected("is not a moving joint of one number"));
         }
         n_mimics += 1;
         if n_mimics > robot.joints().len() {
-            return Err(refused("follows it in turn"));
+            return Err(rejected("follows it in turn"));
         }
         rule.offset += rule.multiplier * mimic.offset;
         rule.multiplier *= mimic.multiplier;

@@ -9,20 +9,20 @@ use std::time::Duration;
 #[non_exhaustive]
 pub enum HistoryError {
     /// The newest reading is older than the stamp. Retry after more readings have arrived.
-    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.asked)).unwrap_or_default())]
+    #[error("no reading at or after the requested stamp yet{}", .newest.map(|newest| behind(newest, *.requested)).unwrap_or_default())]
     NotYet {
         /// Stamp of the newest reading; `None` if the history is empty.
         newest: Option<Stamp>,
         /// Requested stamp.
-        asked: Stamp,
+        requested: Stamp,
     },
     /// The stamp is before the oldest reading kept. Retrying does not help.
-    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.asked))]
+    #[error("the requested stamp is {:.3} s before the oldest reading kept", .oldest.secs_since(*.requested))]
     TooOld {
         /// The oldest reading kept.
         oldest: Stamp,
         /// Requested stamp.
-        asked: Stamp,
+        requested: Stamp,
     },
     /// The readings around the stamp are too far apart to interpolate. Retrying does not help.
     #[error("readings are missing for {:.1} ms around the requested stamp (at most {:.1} ms)", .after.secs_since(*.before) * 1e3, .max_gap.as_secs_f64() * 1e3)]
@@ -55,8 +55,8 @@ pub enum HistoryError {
     },
 }
 
-fn behind(newest: Stamp, asked: Stamp) -> String {
-    format!(" (the newest is {:.1} ms older)", asked.secs_since(newest) * 1e3)
+fn behind(newest: Stamp, requested: Stamp) -> String {
+    format!(" (the newest is {:.1} ms older)", requested.secs_since(newest) * 1e3)
 }
 
 /// Stamped readings in order. The oldest are dropped at capacity.
@@ -65,7 +65,7 @@ struct Readings<T> {
     max_gap: Duration,
     capacity: usize,
     buffer: VecDeque<(Stamp, T)>,
-    n_refused: u64,
+    n_rejected: u64,
 }
 
 /// Two neighboring readings and the position of the stamp between them, 0 to 1. At 0 or 1 the stamp coincides with a
@@ -78,7 +78,7 @@ struct Bracket<'a, T> {
 
 impl<T> Readings<T> {
     fn new(max_gap: Duration, capacity: usize) -> Self {
-        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_refused: 0 }
+        Self { max_gap, capacity: capacity.max(2), buffer: VecDeque::new(), n_rejected: 0 }
     }
 
     fn push(&mut self, stamp: Stamp, reading: T) -> Result<(), HistoryError> {
@@ -95,29 +95,29 @@ impl<T> Readings<T> {
     }
 
     fn reject(&mut self, why: HistoryError) -> Result<(), HistoryError> {
-        self.n_refused += 1;
+        self.n_rejected += 1;
         Err(why)
     }
 
-    fn around(&self, asked: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
+    fn around(&self, requested: Stamp) -> Result<Bracket<'_, T>, HistoryError> {
         let (Some((oldest, _)), Some((newest, _))) = (self.buffer.front(), self.buffer.back()) else {
-            return Err(HistoryError::NotYet { newest: None, asked });
+            return Err(HistoryError::NotYet { newest: None, requested });
         };
-        if asked > *newest {
-            return Err(HistoryError::NotYet { newest: Some(*newest), asked });
+        if requested > *newest {
+            return Err(HistoryError::NotYet { newest: Some(*newest), requested });
         }
-        if asked < *oldest {
-            return Err(HistoryError::TooOld { oldest: *oldest, asked });
+        if requested < *oldest {
+            return Err(HistoryError::TooOld { oldest: *oldest, requested });
         }
-        let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < asked);
+        let after_ix = self.buffer.partition_point(|(stamp, _)| *stamp < requested);
         let reading = |ix: usize| self.buffer.get(ix).map(|(stamp, reading)| (*stamp, reading));
         let near = |a: Stamp, b: Stamp| b.duration_since(a) <= self.max_gap;
         let after = reading(after_ix).expect("the newest reading is not before the stamp");
         let before = after_ix.checked_sub(1).and_then(reading);
-        if after.0 == asked {
+        if after.0 == requested {
             return Ok(match (before, reading(after_ix + 1)) {
-                (Some(before), _) if near(before.0, asked) => Bracket { before, after, frac: 1.0 },
-                (_, Some(next)) if near(asked, next.0) => Bracket { before: after, after: next, frac: 0.0 },
+                (Some(before), _) if near(before.0, requested) => Bracket { before, after, frac: 1.0 },
+                (_, Some(next)) if near(requested, next.0) => Bracket { before: after, after: next, frac: 0.0 },
                 _ => Bracket { before: after, after, frac: 0.0 },
             });
         }
@@ -125,7 +125,7 @@ impl<T> Readings<T> {
         if !near(before.0, after.0) {
             return Err(HistoryError::Gap { before: before.0, after: after.0, max_gap: self.max_gap });
         }
-        let frac = asked.secs_since(before.0) / after.0.secs_since(before.0);
+        let frac = requested.secs_since(before.0) / after.0.secs_since(before.0);
         Ok(Bracket { before, after, frac })
     }
 
@@ -224,8 +224,8 @@ impl JointHistory {
     }
 
     /// Number of readings dropped because they were out of order or invalid.
-    pub fn n_refused(&self) -> u64 {
-        self.readings.n_refused
+    pub fn n_rejected(&self) -> u64 {
+        self.readings.n_rejected
     }
 
     /// Removes all readings, for a device whose clock restarted.
@@ -300,8 +300,8 @@ impl PoseHistory {
     }
 
     /// Number of poses dropped because they were out of order or not finite.
-    pub fn n_refused(&self) -> u64 {
-        self.readings.n_refused
+    pub fn n_rejected(&self) -> u64 {
+        self.readings.n_rejected
     }
 
     /// Removes all poses, for a source whose clock restarted.
@@ -400,7 +400,7 @@ mod tests {
         assert_eq!(history.push(state(1.02, f64::NAN, None)), Err(HistoryError::NotFinite));
         let short = JointState { position: vec![0.0], ..state(1.02, 0.0, None) };
         assert_eq!(history.push(short), Err(HistoryError::JointCount { got: 1, expected: 2 }));
-        assert_eq!(history.n_refused(), 4);
+        assert_eq!(history.n_rejected(), 4);
         assert_eq!(history.newest(), Some(Stamp::from_secs(1.01)));
         assert!((history.at(Stamp::from_secs(1.005)).unwrap().position[0] - 0.55).abs() < 1e-12);
         history.clear();
@@ -423,6 +423,6 @@ mod tests {
         let broken = pose(f64::NAN);
         assert_eq!(history.push(Stamp::from_secs(2.0), broken), Err(HistoryError::NotFinite));
         assert!(history.push(Stamp::from_secs(1.05), pose(0.0)).is_err());
-        assert_eq!(history.n_refused(), 2);
+        assert_eq!(history.n_rejected(), 2);
     }
 }

@@ -82,11 +82,11 @@ impl Robot {
         }
         let links: Vec<String> = parsed.links.into_iter().map(|link| link.name).collect();
         let joints = parsed.joints.iter().map(joint).collect::<Result<Vec<_>, _>>()?;
-        refuse_duplicates("link", links.iter())?;
-        refuse_duplicates("joint", joints.iter().map(|joint| &joint.name))?;
+        reject_duplicates("link", links.iter())?;
+        reject_duplicates("joint", joints.iter().map(|joint| &joint.name))?;
         let joint_above = joints_above(&links, &joints)?;
         let robot = Self { name: parsed.name, links, joints, joint_above };
-        robot.refuse_cycles()?;
+        robot.reject_cycles()?;
         Ok(robot)
     }
 
@@ -144,7 +144,7 @@ impl Robot {
         Err(Error::UnknownLink { link: link.into(), robot: self.name.clone(), links: self.links.clone() })
     }
 
-    fn refuse_cycles(&self) -> Result<(), Error> {
+    fn reject_cycles(&self) -> Result<(), Error> {
         for start in &self.links {
             let mut link = start;
             // Going up more steps than there are links visits some link twice; the last one is on the cycle.
@@ -168,22 +168,22 @@ fn one_line(error: &urdf_rs::UrdfError) -> String {
 
 fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
     let kind = kind(&parsed.joint_type);
-    let refused = |what, value: [f64; 3]| Error::JointNumber { joint: parsed.name.clone(), what, value };
+    let rejected = |what, value: [f64; 3]| Error::JointNumber { joint: parsed.name.clone(), what, value };
     let (xyz, rpy) = (parsed.origin.xyz.0, parsed.origin.rpy.0);
     for (what, value) in [("origin xyz", xyz), ("origin rpy", rpy), ("axis", parsed.axis.xyz.0)] {
         if value.iter().any(|number| !number.is_finite()) {
-            return Err(refused(what, value));
+            return Err(rejected(what, value));
         }
     }
     let is_movable = matches!(kind, JointKind::Revolute | JointKind::Prismatic);
     let axis = match Unit::try_new(Vector3::from(parsed.axis.xyz.0), f64::MIN_POSITIVE) {
         Some(axis) => axis,
         None if !is_movable => Vector3::x_axis(),
-        None => return Err(refused("axis", parsed.axis.xyz.0)),
+        None => return Err(rejected("axis", parsed.axis.xyz.0)),
     };
     let limits = limits(parsed);
     if limits.lower.is_nan() || limits.upper.is_nan() || limits.lower > limits.upper {
-        return Err(refused("range (lower, upper)", [limits.lower, limits.upper, 0.0]));
+        return Err(rejected("range (lower, upper)", [limits.lower, limits.upper, 0.0]));
     }
     let mimic = match &parsed.mimic {
         Some(mimic) if is_movable => Some(Mimic {
@@ -196,7 +196,7 @@ fn joint(parsed: &urdf_rs::Joint) -> Result<Joint, Error> {
     if let Some(Mimic { multiplier, offset, .. }) = mimic
         && !(multiplier.is_finite() && offset.is_finite())
     {
-        return Err(refused("mimic (multiplier, offset)", [multiplier, offset, 0.0]));
+        return Err(rejected("mimic (multiplier, offset)", [multiplier, offset, 0.0]));
     }
     Ok(Joint {
         name: parsed.name.clone(),
@@ -239,7 +239,7 @@ fn limits(parsed: &urdf_rs::Joint) -> JointLimits {
     }
 }
 
-fn refuse_duplicates<'a>(kind: &'static str, names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
+fn reject_duplicates<'a>(kind: &'static str, names: impl Iterator<Item = &'a String>) -> Result<(), Error> {
     let mut unique = std::collections::HashSet::new();
     for name in names {
         if !unique.insert(name) {
@@ -320,8 +320,8 @@ mod tests {
             r#"<limit lower="nan" upper="1" velocity="1"/>"#,
             r#"<mimic joint="k" multiplier="inf"/>"#,
         ] {
-            let refused = robot(&joint_xml("j", "revolute", "a", "b", rest));
-            assert!(matches!(refused, Err(Error::JointNumber { .. })), "{rest}: {refused:?}");
+            let rejected = robot(&joint_xml("j", "revolute", "a", "b", rest));
+            assert!(matches!(rejected, Err(Error::JointNumber { .. })), "{rest}: {rejected:?}");
         }
     }
 

@@ -125,13 +125,13 @@ fn lever_and_cables() -> (Mesh, Mesh) {
     let mut cables = Mesh::default();
     for (ix, (from_y, to_y)) in [(-0.30, -0.22), (-0.18, 0.05), (0.0, 0.10), (0.14, 0.33)].into_iter().enumerate() {
         let depth = 2.325 - 0.02 * ix as f64;
-        let place = |step: i32| {
+        let point_at = |step: i32| {
             let share = f64::from(step) / 8.0;
             let sag = 0.05 * (share * std::f64::consts::PI).sin();
             [depth - 0.5 * sag, from_y + (to_y - from_y) * share + sag, 1.17 - share * 0.36 - sag]
         };
         for step in 0..8 {
-            cables.append(bar(place(step), place(step + 1), 0.0075), Vector3::zeros());
+            cables.append(bar(point_at(step), point_at(step + 1), 0.0075), Vector3::zeros());
         }
     }
     (lever, cables)
@@ -196,7 +196,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let mut tiles = lab_texture::floor_tiles([far - near, 2.0 * ROOM_HALF_Y_M], 1.1);
     tiles.shade(WHOLE, 100, |u, v, name| {
         let point = Point3::new(near + (far - near) * u, (1.0 - 2.0 * v) * ROOM_HALF_Y_M, 0.0);
-        occluders.light_share(&point, &Vector3::z(), name)
+        occluders.light_frac(&point, &Vector3::z(), name)
     });
     let mut plate = lab_texture::mounting_plate();
     plate.shade(WHOLE, 80, |u, v, name| {
@@ -205,7 +205,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
             (0.5 - u) * 2.0 * HALF_M,
             CENTER_Z_M + (1.0 - 2.0 * v) * HALF_M,
         );
-        occluders.light_share(&point, &-Vector3::x(), name)
+        occluders.light_frac(&point, &-Vector3::x(), name)
     });
     vec![
         ("items", lab_texture::items()),

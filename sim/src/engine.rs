@@ -87,11 +87,11 @@ struct Exposure {
 const FIRST_NANOS: i64 = 50_000_000;
 const STAGGER_NANOS: i64 = 3_700_000;
 
-/// RandomStream number streams of one image.
+/// Random number streams of one image.
 const COLOR_NOISE: u64 = 1;
 const DEPTH_NOISE: u64 = 2;
 const DROP_STREAM: u64 = 3;
-/// RandomStream number stream of one scan.
+/// Random number stream of one scan.
 const SCANS: u64 = 4;
 
 #[expect(clippy::cast_possible_truncation, reason = "times of a run in nanoseconds fit an i64")]

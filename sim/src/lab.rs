@@ -138,9 +138,9 @@ fn bowl() -> Mesh {
 
 /// Fruit in the bowl, one mesh per color.
 fn fruit() -> [Mesh; 3] {
-    let ball = |places: &[[f64; 4]]| {
+    let ball = |spheres: &[[f64; 4]]| {
         let mut mesh = Mesh::default();
-        for [x, y, z, radius] in places {
+        for [x, y, z, radius] in spheres {
             let axes = [Vector3::x() * *radius, Vector3::y() * *radius, Vector3::z() * (0.93 * radius)];
             mesh.add_ellipsoid(Point3::new(*x, *y, TOP_M + z), axes, 12, |_, _| 0.5, 0.5);
         }
@@ -204,7 +204,7 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
     let mut tiles = lab_texture::floor_tiles(size_m, 3.2);
     tiles.shade(WHOLE, 150, |u, v, name| {
         let point = Point3::new((2.0 * u - 1.0) * ROOM_HALF_M[0], (1.0 - 2.0 * v) * ROOM_HALF_M[1], 0.0);
-        occluders.light_share(&point, &Vector3::z(), name)
+        occluders.light_frac(&point, &Vector3::z(), name)
     });
     let mut wood = texture::wood();
     shade_box(&mut wood, &occluders, PEDESTAL_HALF_M, &world_from_pedestal());

@@ -118,18 +118,18 @@ impl Occluders {
     /// Fraction of the unoccluded light that reaches a surface, 0 to 1.
     ///
     /// `name` identifies the point and selects its random rays.
-    pub(crate) fn light_share(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
+    pub(crate) fn light_frac(&self, point: &Point3<f64>, normal: &Vector3<f64>, name: u64) -> f64 {
         const LIFT_M: f64 = 5e-4;
         let random = RandomStream::new(0x11_6874, &[name]);
         let from = point + normal * LIFT_M;
         let key = KEY.brightness(normal);
         let others = AMBIENT[1] + FILLS.iter().map(|lamp| lamp.brightness(normal)).sum::<f64>();
-        let key_share = if key > 0.0 { self.key_share(&from, random) } else { 0.0 };
-        let other_share = self.ambient_share(&from, normal, random);
-        (key * key_share + others * other_share) / (key + others)
+        let key_frac = if key > 0.0 { self.key_frac(&from, random) } else { 0.0 };
+        let other_frac = self.ambient_frac(&from, normal, random);
+        (key * key_frac + others * other_frac) / (key + others)
     }
 
-    fn key_share(&self, from: &Point3<f64>, random: RandomStream) -> f64 {
+    fn key_frac(&self, from: &Point3<f64>, random: RandomStream) -> f64 {
         let to_lamp = KEY.to_lamp();
         let side = to_lamp.cross(&Vector3::x()).normalize();
         let across = to_lamp.cross(&side);
@@ -143,7 +143,7 @@ impl Occluders {
         n_free.count() as f64 / N_KEY_RAYS as f64
     }
 
-    fn ambient_share(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: RandomStream) -> f64 {
+    fn ambient_frac(&self, from: &Point3<f64>, normal: &Vector3<f64>, random: RandomStream) -> f64 {
         let side =
             if normal.x.abs() < 0.7 { normal.cross(&Vector3::x()) } else { normal.cross(&Vector3::y()) }.normalize();
         let across = normal.cross(&side);
@@ -191,7 +191,7 @@ mod tests {
         let mut occluders = Occluders::new(0.25);
         occluders.add_box(Transform::translation(0.0, 0.0, 0.05), [0.05; 3]);
         let up = Vector3::z();
-        let share = |x: f64, y: f64| occluders.light_share(&Point3::new(x, y, 0.0), &up, 1);
+        let share = |x: f64, y: f64| occluders.light_frac(&Point3::new(x, y, 0.0), &up, 1);
         assert!(share(0.5, 0.5) > 0.99, "far away: {}", share(0.5, 0.5));
         assert!(share(0.055, 0.0) < 0.5, "in the shadow: {}", share(0.055, 0.0));
         let before = share(-0.055, 0.0);

@@ -81,7 +81,7 @@ pub(crate) fn objects() -> Vec<Object> {
     let object = |name, material, mesh, world_from_mesh| Object { name, material, mesh, world_from_mesh };
     let occluders = occluders();
     let toy_light = |point: &Point3<f64>, normal: &Vector3<f64>, name: u64| {
-        occluders.light_share(&(world_from_toy() * point), &(world_from_toy() * normal), name)
+        occluders.light_frac(&(world_from_toy() * point), &(world_from_toy() * normal), name)
     };
     let sides: [_; 6] = std::array::from_fn(texture::side_rectangle);
     let here = Transform::identity();
@@ -106,13 +106,13 @@ pub(crate) fn textures() -> Vec<(&'static str, Texture)> {
         let world_from_wall = world_from_wall(side);
         wall.shade(WHOLE, 160, |u, v, name| {
             let point = Point3::new(0.0, (2.0 * u - 1.0) * WALL_HALF_M[0], (1.0 - 2.0 * v) * WALL_HALF_M[1]);
-            occluders.light_share(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
+            occluders.light_frac(&(world_from_wall * point), &(world_from_wall * Vector3::x()), name)
         });
     }
     let mut metal = texture::metal_table([2.0 * TABLE_HALF_XY_M[1], 2.0 * TABLE_HALF_XY_M[0]]);
     metal.shade(WHOLE, 400, |u, v, name| {
         let right_up = Vector3::new((1.0 - 2.0 * v) * TABLE_HALF_XY_M[0], (1.0 - 2.0 * u) * TABLE_HALF_XY_M[1], 0.0);
-        occluders.light_share(&(table_center() + right_up), &Vector3::z(), name)
+        occluders.light_frac(&(table_center() + right_up), &Vector3::z(), name)
     });
     let [mut wood, mut tags] = [texture::wood(), texture::tags()];
     shade_box(&mut wood, &occluders, BLOCK_HALF_M, &world_from_block());
@@ -132,7 +132,7 @@ pub(crate) fn shade_box(texture: &mut Texture, occluders: &Occluders, half_m: [f
     for side in 0..6 {
         texture.shade(texture::side_rectangle(side), 40, |u, v, name| {
             let (point, normal) = Mesh::on_cuboid(half_m, side, u, v);
-            occluders.light_share(&(world_from_box * point), &(world_from_box * normal), name)
+            occluders.light_frac(&(world_from_box * point), &(world_from_box * normal), name)
         });
     }
 }

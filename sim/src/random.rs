@@ -1,9 +1,9 @@
-//! RandomStream numbers that depend only on a key and a counter, so that any image can be reproduced independently.
+//! Random numbers that depend only on a key and a counter, so that any image can be reproduced independently.
 
 use kinematics::random::{hash, nth_bits, unit_from_bits};
 use std::sync::LazyLock;
 
-/// RandomStream number stream of one key.
+/// Random number stream of one key.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RandomStream {
     key: u64,

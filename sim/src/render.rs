@@ -162,7 +162,7 @@ impl Canvas {
             if let Some(joints_rad) = &robot.joints_rad {
                 self.data.qpos_mut().copy_from_slice(joints_rad.as_slice());
             }
-            place_base(&mut self.data, &robot.world_from_base);
+            set_base_pose(&mut self.data, &robot.world_from_base);
         }
         self.data.forward_kinematics();
         self.scene.update(&mut self.data, &options, &MjvPerturb::default(), &mut MjvCamera::default());
@@ -238,12 +238,12 @@ fn meters_from_depth(depth: f32, near_far_m: [f64; 2]) -> f32 {
 }
 
 /// Sets the pose of a moving base; does nothing for a fixed one.
-pub(crate) fn place_base<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
-    if let Some(place) = data.mocap_pos_mut().first_mut() {
-        *place = world_from_base.translation.vector.into();
+pub(crate) fn set_base_pose<M: ModelType>(data: &mut MjData<M>, world_from_base: &Transform) {
+    if let Some(position) = data.mocap_pos_mut().first_mut() {
+        *position = world_from_base.translation.vector.into();
     }
-    if let Some(turn) = data.mocap_quat_mut().first_mut() {
+    if let Some(rotation_wxyz) = data.mocap_quat_mut().first_mut() {
         let q = world_from_base.rotation.coords;
-        *turn = [q.w, q.x, q.y, q.z];
+        *rotation_wxyz = [q.w, q.x, q.y, q.z];
     }
 }

@@ -21,7 +21,7 @@ pub const PANDA_URDF: &str = include_str!("../../rigs/robots/panda.urdf");
 
 /// The mobile arm as a URDF: root `base`, arm as above.
 const MOBILE_ARM_URDF: &str = include_str!("../../rigs/robots/mobile-arm.urdf");
-/// The quadruped as a URDF: root `base`, `mount` on its back.
+/// The quadruped as a URDF: root `base`, `top_plate` on its back.
 const QUADRUPED_URDF: &str = include_str!("../../rigs/robots/quadruped.urdf");
 
 /// The robot of a scene.

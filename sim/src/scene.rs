@@ -90,9 +90,9 @@ fn robot(config: &Config) -> String {
     if !config.scene.has_moving_base() {
         return arm;
     }
-    let arm_mount_pose = panda::pose_attributes(&base::base_from_arm());
+    let top_plate_pose = panda::pose_attributes(&base::base_from_arm());
     format!(
-        "<body name=\"base\" mocap=\"true\" childclass=\"arm\">\n{QUADRUPED}<body name=\"mount\" {arm_mount_pose}>\n{arm}</body>\n</body>\n"
+        "<body name=\"base\" mocap=\"true\" childclass=\"arm\">\n{QUADRUPED}<body name=\"top_plate\" {top_plate_pose}>\n{arm}</body>\n</body>\n"
     )
 }
 
@@ -187,12 +187,12 @@ mod tests {
             data.qpos_mut().copy_from_slice(&position_rad);
             data.forward_kinematics();
             let [w, x, y, z] = data.xquat()[flange_ix];
-            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
             let ours = panda::base_from_flange(&Joints::from(position_rad));
             let urdf = chain.forward(&position_rad).expect("seven joints");
             for pose in [ours, urdf] {
                 assert!((pose.translation.vector - Vector3::from(data.xpos()[flange_ix])).norm() < TOLERANCE);
-                assert!(pose.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
+                assert!(pose.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
             }
         }
     }
@@ -208,20 +208,20 @@ mod tests {
                 config.cameras[0].parent = Parent::Base;
             }
             let model = build(&config, [64, 64]).expect("the scene is valid");
-            let tip = if scene.has_arm() { "panda_link8" } else { "mount" };
+            let tip = if scene.has_arm() { "panda_link8" } else { "top_plate" };
             let chain = kinematics::Chain::from_urdf(crate::rig::urdf_of(scene), "base", tip).expect("valid");
             let tip_ix = model.name_to_id(MjtObjBase::mjOBJ_BODY, tip).expect("a body");
             let mut data = MjData::new(&model);
             let position_rad: &[f64] = if scene.has_arm() { &[0.4, -0.9, 1.3, -2.2, -0.7, 1.8, 0.6] } else { &[] };
             let world_from_base = crate::base::BaseMotion::of(scene, 1.0).world_from_base(16.3);
             data.qpos_mut().copy_from_slice(position_rad);
-            crate::render::place_base(&mut data, &world_from_base);
+            crate::render::set_base_pose(&mut data, &world_from_base);
             data.forward_kinematics();
             let expected = world_from_base * chain.forward(position_rad).expect("as many joints");
             let [w, x, y, z] = data.xquat()[tip_ix];
-            let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
             assert!((expected.translation.vector - Vector3::from(data.xpos()[tip_ix])).norm() < TOLERANCE);
-            assert!(expected.rotation.angle_to(&turn) < 10.0 * TOLERANCE);
+            assert!(expected.rotation.angle_to(&rotation) < 10.0 * TOLERANCE);
         }
     }
 }

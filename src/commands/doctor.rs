@@ -4,12 +4,11 @@ mod franka;
 mod listen;
 
 use super::number_in_range;
-use crate::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::exit::Exit;
-use crate::open;
 use crate::open_gpu::open_gpu;
-use crate::print;
-use crate::stop::Stop;
+use crate::{print, signals};
+use capture::config::{ArmDriver, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use capture::open;
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use serde::Serialize;
@@ -93,7 +92,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     findings.extend(rig.iter().flat_map(|rig| senders(rig).into_iter().chain(files(rig))));
     print_findings(&findings, args.json)?;
     if let (Some(rig), Some(secs)) = (&rig, args.listen) {
-        let result = listen::listen(rig, secs, &Stop::on_ctrl_c()?)?;
+        let result = listen::listen(rig, secs, &signals::stop_on_signals()?)?;
         for device in &result.devices {
             if args.json {
                 print::json(device)?;
@@ -552,10 +551,10 @@ mod tests {
     fn occupied_udp_ports_and_missing_files_are_reported() {
         let occupied = UdpSocket::bind("127.0.0.1:0").expect("a free port");
         let overrides = [
-            crate::config::Override::new("base.driver", "udp"),
-            crate::config::Override::new("base.address", occupied.local_addr().expect("bound").to_string()),
-            crate::config::Override::new("camera.wrist.driver", "realsense"),
-            crate::config::Override::new("camera.wrist.realsense.file", "nowhere.bag"),
+            capture::Override::new("base.driver", "udp"),
+            capture::Override::new("base.address", occupied.local_addr().expect("bound").to_string()),
+            capture::Override::new("camera.wrist.driver", "realsense"),
+            capture::Override::new("camera.wrist.realsense.file", "nowhere.bag"),
         ];
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &overrides).expect("a bundled rig file");
@@ -570,8 +569,7 @@ mod tests {
     #[test]
     fn invalid_rig_is_reported_without_opening_devices() {
         let rig = |name: &str, overrides: &[(&'static str, &'static str)]| {
-            let overrides: Vec<_> =
-                overrides.iter().map(|(key, value)| crate::config::Override::new(key, *value)).collect();
+            let overrides: Vec<_> = overrides.iter().map(|(key, value)| capture::Override::new(key, *value)).collect();
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs").join(name);
             Rig::load(&path, &overrides).expect("a bundled rig file")
         };

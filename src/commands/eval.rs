@@ -1,14 +1,15 @@
 //! `fieldrig eval`: scores a saved model on test images.
 
-use crate::config::{Override, Rig};
-use crate::data::{self, Data, DataArgs, Purpose};
-use crate::evaluate::{Evaluator, ImageScores, Scores, warn_if_hardly_covered};
+use crate::console::ReadBar;
+use crate::data_args::DataArgs;
 use crate::exit::{self, Exit};
-use crate::join::KeyframeList;
 use crate::open_gpu::open_gpu;
-use crate::{method, print};
-use keyframe::{Keyframe, Split};
+use crate::print;
+use capture::config::{Override, Rig};
+use keyframe::{Keyframe, KeyframeList, Split};
 use serde::Serialize;
+use session::evaluate::{ImageScores, Scores, warn_if_hardly_covered};
+use session::{Data, Evaluator, Purpose, methods};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -48,11 +49,12 @@ struct NamedScores {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     // Checked before the data, which takes long to read.
-    args.images.holdout()?;
-    data::expect(&args.data)?;
-    let mut model = method::load(open_gpu()?, &args.model)?;
+    args.images.options().holdout()?;
+    session::expect(&args.data)?;
+    let mut model = methods::load(open_gpu()?, &args.model)?.method;
     let overrides = training_overrides(&args.model);
-    let data = Data::load(&args.data, &args.images, Purpose::Scoring, &overrides, args.json)?;
+    let bar = ReadBar::new(args.json);
+    let data = Data::load(&args.data, &args.images.options(), Purpose::Scoring, &overrides, &|read| bar.show(read))?;
     let tests = data.of_split(Split::Test);
     let n_trained_on = n_trained_on(args, &tests, data.rig.is_some());
     if n_trained_on > 0 {

@@ -1,21 +1,19 @@
 //! `fieldrig export`: converts models and recordings to formats of other programs.
 
-use crate::config::Override;
 use crate::exit::{self, BadArgument, Exit};
-use crate::export::{Written, write_nerfstudio};
-use crate::join::{Join, KeyframeList, SampleUse};
-use crate::method::{self, ModelKind};
-use crate::open;
 use crate::open_gpu::open_gpu;
-use crate::partial::{self, Partial};
-use crate::print::{self, counted};
-use crate::run_folder;
-use crate::splat_file;
-use crate::stations::Stations;
+use crate::{print, signals};
 use anyhow::{Context, ensure};
+use capture::config::Override;
+use capture::{Join, SampleUse, Stations, open};
+use clap::builder::{PossibleValue, PossibleValuesParser};
+use keyframe::{KeyframeList, counted, listed};
+use session::partial::Partial;
+use session::{Written, methods, run_folder, write_nerfstudio};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use trainer::tsdf::TsdfModel;
-use trainer::tsdf::mesh::{Mesh, write_glb, write_ply};
+use trainer::ModelKind;
+use trainer::method_entry::{Export, ExportRequest, ExportWriter, Exported};
 
 /// Flags of `export`.
 #[derive(Debug, clap::Args)]
@@ -24,8 +22,8 @@ pub(crate) struct Args {
     #[arg(value_name = "MODEL|REC")]
     from: PathBuf,
     /// Output format
-    #[arg(long, value_enum)]
-    to: Format,
+    #[arg(long, value_parser = PossibleValuesParser::new(formats()))]
+    to: String,
     /// File (ply, spz, glb) or folder (nerfstudio) to write; must not exist
     #[arg(long, value_name = "PATH")]
     out: PathBuf,
@@ -38,29 +36,28 @@ pub(crate) struct Args {
     keyframes: Option<PathBuf>,
 }
 
-/// Output formats.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Format {
-    /// From a model: its splats, or the mesh of a distance field, as .ply
-    Ply,
-    /// From a model: its splats as .spz, a tenth of the size of .ply; values are rounded
-    Spz,
-    /// From a distance field: its mesh as .glb, y up
-    Glb,
-    /// From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists
-    Nerfstudio,
+/// The format of recordings, a folder.
+const NERFSTUDIO: &str = "nerfstudio";
+
+/// The formats of all methods, and that of recordings.
+fn formats() -> Vec<PossibleValue> {
+    let mut contents: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
+    for export in exports() {
+        contents.entry(export.format).or_default().push(export.contents);
+    }
+    let format = |(format, contents): (_, Vec<&str>)| {
+        let contents = listed(&contents, "or");
+        PossibleValue::new(format).help(format!("From a model: its {contents}, as .{format}"))
+    };
+    let nerfstudio = PossibleValue::new(NERFSTUDIO).help(
+        "From a recording: a folder with PNG photos, 16-bit depth, and transforms.json with poses and split lists",
+    );
+    contents.into_iter().map(format).chain([nerfstudio]).collect()
 }
 
-impl Format {
-    /// The file extension; `None` for a folder.
-    fn extension(self) -> Option<&'static str> {
-        match self {
-            Self::Ply => Some("ply"),
-            Self::Spz => Some("spz"),
-            Self::Glb => Some("glb"),
-            Self::Nerfstudio => None,
-        }
-    }
+/// The formats of all methods.
+fn exports() -> impl Iterator<Item = &'static Export> {
+    ModelKind::ALL.iter().flat_map(|kind| kind.entry().exports)
 }
 
 fn parse_cell_width(text: &str) -> Result<f64, String> {
@@ -71,47 +68,49 @@ fn parse_cell_width(text: &str) -> Result<f64, String> {
 /// What the input contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Contents {
-    Splats,
-    DistanceField,
-    NeuralField,
+    Model(ModelKind),
     Recording,
 }
 
 /// Converts the model or recording and prints what was written. A truncated recording is a loss.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let contents = contents(&args.from)?;
-    if args.cell_m.is_some() && contents != Contents::DistanceField {
+    let has_cells = |kind: ModelKind| kind.entry().exports.iter().any(|export| export.has_cells);
+    if args.cell_m.is_some() && !matches!(contents, Contents::Model(kind) if has_cells(kind)) {
         return Err(BadArgument(format!("--cell-m: {} has no mesh", args.from.display())).into());
     }
     check_file(args)?;
-    partial::remove_on_signals()?;
-    match (args.to, contents) {
-        (Format::Ply, Contents::Splats) => export_splats(&args.from, splat_file::Format::Ply, &args.out),
-        (Format::Spz, Contents::Splats) => export_splats(&args.from, splat_file::Format::Spz, &args.out),
-        (Format::Ply | Format::Glb, Contents::DistanceField) => export_mesh(args),
-        (Format::Nerfstudio, Contents::Recording) => export_recording(args),
-        (Format::Glb, Contents::Splats) => Err(unsupported("splats have no mesh; glb needs a distance field", args)),
-        (Format::Spz, Contents::DistanceField) => {
-            Err(unsupported("a distance field has no splats; export its mesh as ply or glb", args))
-        }
-        (_, Contents::NeuralField) => Err(unsupported("a neural field has neither splats nor a mesh", args)),
-        (Format::Ply | Format::Spz | Format::Glb, Contents::Recording) => {
+    signals::remove_partial_files_on_signals()?;
+    match (contents, &*args.to) {
+        (Contents::Recording, NERFSTUDIO) => export_recording(args),
+        (Contents::Recording, _) => {
             Err(unsupported("this is a recording; splats and meshes are exported from a model", args))
         }
-        (Format::Nerfstudio, _) => Err(unsupported("this is a model; nerfstudio is exported from a recording", args)),
+        (Contents::Model(_), NERFSTUDIO) => {
+            Err(unsupported("this is a model; nerfstudio is exported from a recording", args))
+        }
+        (Contents::Model(kind), format) => match kind.entry().exports.iter().find(|export| export.format == format) {
+            Some(export) => export_model(export, args),
+            None => Err(unsupported(&describe_exports(kind, format), args)),
+        },
     }
+}
+
+/// Why a model cannot be exported to a format.
+fn describe_exports(kind: ModelKind, format: &str) -> String {
+    let formats: Vec<&str> = kind.entry().exports.iter().map(|export| export.format).collect();
+    let model = kind.entry().model;
+    if formats.is_empty() {
+        return format!("{model} cannot be exported");
+    }
+    format!("{model} cannot be exported as {format}, only as {}", listed(&formats, "or"))
 }
 
 fn contents(path: &Path) -> anyhow::Result<Contents> {
     ensure!(path.exists(), BadArgument(format!("{} does not exist", path.display())));
-    match method::kind_in(path)? {
-        Some(ModelKind::Tsdf) => return Ok(Contents::DistanceField),
-        Some(ModelKind::Nerf) => return Ok(Contents::NeuralField),
-        Some(ModelKind::Splat) | None => {}
-    }
-    if splat_file::is_splat_file(path) {
+    if let Some(kind) = methods::kind_of(path)? {
         run_folder::expect_model(path)?;
-        return Ok(Contents::Splats);
+        return Ok(Contents::Model(kind));
     }
     let sentence = "not a model folder, a splat file or a recording";
     ensure!(path.is_file(), BadArgument(format!("{}: {sentence}", path.display())));
@@ -120,7 +119,10 @@ fn contents(path: &Path) -> anyhow::Result<Contents> {
 
 /// Rejects an output file that exists or has the wrong extension.
 fn check_file(args: &Args) -> Result<(), BadArgument> {
-    let Some(extension) = args.to.extension() else { return Ok(()) };
+    let extension = &args.to;
+    if extension == NERFSTUDIO {
+        return Ok(());
+    }
     let out = args.out.display();
     if !args.out.extension().is_some_and(|actual| actual.eq_ignore_ascii_case(extension)) {
         return Err(BadArgument(format!("--out {out}: the file name must end in .{extension}")));
@@ -135,39 +137,23 @@ fn unsupported(sentence: &str, args: &Args) -> anyhow::Error {
     BadArgument(format!("{}: {sentence}", args.from.display())).into()
 }
 
-/// Exports the splats after validating them.
-fn export_splats(model: &Path, format: splat_file::Format, out: &Path) -> anyhow::Result<Exit> {
-    let splats = splat_file::read(model)?;
-    let partial = Partial::file(out);
-    splat_file::write(out, format, &splats)?;
-    partial.keep();
-    let n_splats = counted(splats.n_splats() as u64, "splat");
-    print::report(format!("{n_splats} of color degree {} -> {}", splats.sh_degree, out.display()));
-    Ok(Exit::Done)
-}
-
-/// Exports the mesh, extracted from the voxels.
-fn export_mesh(args: &Args) -> anyhow::Result<Exit> {
-    let mesh = TsdfModel::load(open_gpu()?, &args.from)?.mesh()?;
-    let coarser = args.cell_m.map(|cell_m| mesh.clustered(cell_m));
-    let written = coarser.as_ref().unwrap_or(&mesh);
-    if let Some(cell_m) = args.cell_m
-        && written.triangles.is_empty()
-    {
-        return Err(BadArgument(format!(
-            "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
-        ))
-        .into());
-    }
+/// Exports a model.
+fn export_model(export: &Export, args: &Args) -> anyhow::Result<Exit> {
+    let request = ExportRequest { model: &args.from, out: &args.out, cell_m: args.cell_m };
     let partial = Partial::file(&args.out);
-    match args.to {
-        Format::Glb => write_glb(&args.out, written)?,
-        _ => write_ply(&args.out, written)?,
-    }
+    let exported = match export.write {
+        ExportWriter::Cpu(write) => write(&request),
+        ExportWriter::Gpu(write) => write(open_gpu()?, &request),
+    };
+    let Exported { n_items, item, detail } = exported.map_err(|error| match error {
+        trainer::Error::EmptyMesh { cell_m } => anyhow::Error::new(BadArgument(format!(
+            "--cell-m {cell_m}: no triangles are left at this cell width; use a smaller one"
+        ))),
+        error => error.into(),
+    })?;
     partial.keep();
-    let triangles = |mesh: &Mesh| counted(mesh.triangles.len() as u64, "triangle");
-    let replaced = if coarser.is_some() { format!(" instead of {}", triangles(&mesh)) } else { String::new() };
-    print::report(format!("{}{replaced} -> {}", triangles(written), args.out.display()));
+    let separator = if detail.is_empty() { "" } else { " " };
+    print::report(format!("{}{separator}{detail} -> {}", counted(n_items, item), args.out.display()));
     Ok(Exit::Done)
 }
 
@@ -193,7 +179,7 @@ fn export_recording(args: &Args) -> anyhow::Result<Exit> {
         .with_context(|| format!("cannot export {}", args.from.display()))?;
     log::info!("{}", join.counts());
     print::report(format!("{} -> {}", sentence(written), args.out.display()));
-    let mut data_losses = join.counts().data_losses(SampleUse::Watched);
+    let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
     data_losses.extend(opened.damage.get().cloned());
     data_losses.extend(missing_from_list);
     Ok(exit::from_losses(&data_losses))

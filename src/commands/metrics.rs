@@ -1,10 +1,10 @@
 //! `fieldrig metrics`: compares two images.
 
-use crate::evaluate::load_lpips;
 use crate::print;
 use anyhow::{Context, bail};
 use image::DynamicImage;
 use serde::Serialize;
+use session::evaluate::load_lpips;
 use std::path::{Path, PathBuf};
 use trainer::eval::{PixelPair, depth_rmse_m, psnr, ssim};
 

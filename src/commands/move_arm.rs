@@ -1,11 +1,10 @@
 //! `fieldrig move`: moves an arm to given joint positions, within its limits, under supervision.
 
-use crate::config::Rig;
 use crate::exit::{BadArgument, Exit};
-use crate::open;
-use crate::print;
-use crate::stop::Stop;
+use crate::{print, signals};
 use anyhow::{Context, bail};
+use capture::config::Rig;
+use capture::{Stop, open};
 use drivers::motion::{JointTarget, Motion, OnLoss};
 use drivers::{Error, MovableArm, clock};
 use indicatif::ProgressBar;
@@ -69,7 +68,7 @@ struct ArrivedEvent<'a> {
 
 /// Moves the arm, then holds it if its motors would release it on exit.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let rig = Rig::load(&args.rig_file, &[])?;
     let Some(motion) = rig.arm.motion.as_ref() else {
         return Err(BadArgument(

@@ -1,11 +1,10 @@
 //! `fieldrig record`: writes everything that the devices send to a recording.
 
 use super::number_in_range;
-use crate::config::{ArmDriver, BaseDriver, Override, Rig};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::open::{self, Devices, Opened};
-use crate::print;
-use crate::stop::Stop;
+use crate::{print, signals};
+use capture::config::{ArmDriver, BaseDriver, Override, Rig};
+use capture::open::{self, Devices, Opened};
 use drivers::recording::Recording;
 use drivers::{Image, Sample, Source};
 use kinematics::Stamp;
@@ -147,7 +146,7 @@ fn check_end(args: &Args, rig: &Rig) -> Result<(), BadArgument> {
 
 /// Records until the time limit, the end of the devices, or Ctrl-C.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let overrides = if args.lockstep { vec![Override::new("sim.lockstep", true)] } else { Vec::new() };
     let rig = Rig::load(&args.rig_file, &overrides)?;
     check_end(args, &rig)?;

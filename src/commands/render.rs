@@ -1,14 +1,16 @@
 //! `fieldrig render`: renders images of a saved model.
 
-use crate::camera_path::{CameraPath, PathCamera};
-use crate::evaluate::{covered_frac, warn_if_hardly_covered};
 use crate::exit::{BadArgument, Exit};
 use crate::open_gpu::open_gpu;
-use crate::partial::{self, Partial};
-use crate::run_folder::expect_model;
-use crate::{method, print};
+use crate::{print, signals};
 use anyhow::Context;
+use keyframe::counted;
 use serde::Serialize;
+use session::camera_path::{CameraPath, PathCamera};
+use session::evaluate::{covered_frac, warn_if_hardly_covered};
+use session::methods;
+use session::partial::Partial;
+use session::run_folder::expect_model;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 use trainer::{Aabb, Picture, Projection, RenderRequest};
@@ -92,7 +94,7 @@ struct RenderedPicture {
     depth: Option<PathBuf>,
     size_px: [u32; 2],
     /// Wall time from the request to the pixels, milliseconds.
-    draw_ms: f64,
+    draw_millis: f64,
 }
 
 /// Renders every camera of the path.
@@ -106,18 +108,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let requests = path.cameras.iter().map(|camera| args.request(camera, size_px)).collect::<Result<Vec<_>, _>>()?;
     expect_model(&args.model)?;
     check_no_overwrite(&args.out, requests.len())?;
-    partial::remove_on_signals()?;
-    let mut model = method::load(open_gpu()?, &args.model)?;
+    signals::remove_partial_files_on_signals()?;
+    let mut model = methods::load(open_gpu()?, &args.model)?.method;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create the folder {}", args.out.display()))?;
     let bar = print::bar(Some(requests.len() as u64), "{bar:30} {pos} of {len}", args.json);
     let mut covered_fracs = Vec::new();
     for (ix, request) in requests.iter().enumerate() {
         let since = Instant::now();
         let picture = model.render(request)?;
-        let draw_ms = since.elapsed().as_secs_f64() * 1e3;
+        let draw_millis = since.elapsed().as_secs_f64() * 1e3;
         covered_fracs.push(covered_frac(&picture));
         let (picture, depth) = write(&args.out, ix, &picture, args.depth)?;
-        let rendered = RenderedPicture { picture, depth, size_px, draw_ms };
+        let rendered = RenderedPicture { picture, depth, size_px, draw_millis };
         bar.inc(1);
         if args.json {
             print::report_json(&rendered)?;
@@ -126,7 +128,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     bar.finish_and_clear();
     warn_if_hardly_covered(&covered_fracs);
     if !args.json {
-        let n_pictures = print::counted(requests.len() as u64, "image");
+        let n_pictures = counted(requests.len() as u64, "image");
         print::report(format_args!("{n_pictures} in {}", args.out.display()));
     }
     Ok(Exit::Done)

@@ -1,32 +1,27 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
-use crate::clock::Clock;
-use crate::config::{ArmDriver, Override, Rig};
-use crate::decisions::{DecisionLog, RunDescription, Settings};
-use crate::evaluate::Evaluator;
+use crate::checkpoint_args::CheckpointArgs;
+use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
-use crate::feed::{Feed, Input};
-use crate::join::{Counts, Join, Refusal, SampleUse};
-use crate::live::{Live, LiveOptions, Pace};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
-use crate::next_commands::{DataSource, quoted};
-use crate::open::{self, Devices, Opened};
 use crate::open_gpu::open_gpu;
-use crate::print;
-use crate::recovery::{self, GpuUnrecoverable, Recovery};
-use crate::run_folder::{self, CreatedFolders};
-use crate::session::{self, EndingSession, Evaluators, FinishedModel, Limits, OutputMode, Session};
-use crate::stations::{StationReport, Stations};
-use crate::stop::Stop;
-use crate::stored_keyframes::StoredKeyframes;
-use crate::training_args::{AvailableData, CountArg, REALIGN, Refine, TrainingArgs};
-use crate::viewer::{ModelViewer, ServedModel};
+use crate::training_args::TrainingArgs;
+use crate::{print, signals};
 use anyhow::Context;
+use capture::config::{ArmDriver, Override, Rig};
+use capture::open::{self, Devices, Opened};
+use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
 use drivers::Source;
-use keyframe::{Keyframe, Split};
+use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
 use serde::Serialize;
+use session::methods::{self, COUNT};
+use session::next_commands::{DataSource, quoted};
+use session::run_folder::{self, CreatedFolders};
+use session::{
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
+    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session,
+    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
+};
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
 use std::net::SocketAddr;
@@ -35,7 +30,8 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
-use trainer::splat::SplatOptions;
+use trainer::splat::CountPolicy;
+use trainer::{CommonOptions, ModelKind, ModelSpec, Resumed};
 use viz::{Hub, RunResult, Server, ServerConfig};
 
 /// Flags of `run`.
@@ -125,7 +121,7 @@ struct RunDetails {
     seed: u64,
     keyframes: usize,
     evicted: u64,
-    refused: BTreeMap<&'static str, u64>,
+    rejected: BTreeMap<&'static str, u64>,
     device_skipped: u64,
     /// Number of range scans, which are stored in addition to the keyframes, and of their points.
     range_scans: usize,
@@ -141,8 +137,9 @@ struct RunDetails {
 /// Runs until a limit, the end of the devices, or Ctrl-C; saves the model, its keyframes and the effective rig file.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
-    let ended = drive(args, &mut created);
-    created.keep_or_remove(ended)
+    let result = drive(args, &mut created);
+    created.keep_unless(result.as_ref().is_err_and(exit::is_rejection));
+    result
 }
 
 fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
@@ -158,7 +155,7 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let args = &previous.as_ref().map_or_else(|| args.clone(), |previous| args.with_flags_of(previous));
     let mut running = start(args, previous.as_ref(), created)?;
-    let ended = loop {
+    let result = loop {
         match running.run_time_slice() {
             Ok(true) => {}
             Ok(false) => match running.live.wait() {
@@ -171,16 +168,16 @@ fn drive(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     };
     let Running { live, rig, folders, damage, stop, server, .. } = running;
     let hub = live.hub();
-    if let Err(error) = ended {
+    if let Err(error) = result {
         stop.request();
-        if recovery::is_gpu_error(&error) || error.is::<GpuUnrecoverable>() {
-            return Err(keep_input(live, &folders, error));
+        if error.is_gpu_error() || error.is_gpu_unrecoverable() {
+            return Err(keep_input(live, &folders, error).into());
         }
         log::error!("training failed; saving the model so far: {error:#}");
         if let Err(error) = save(live, args, &rig, folders, &damage) {
             log::error!("{error:#}");
         }
-        return Err(error);
+        return Err(error.into());
     }
     if live.has_exhausted_input() {
         log::info!("the devices have ended and all their data is in the model");
@@ -233,7 +230,7 @@ pub(super) struct Running {
 impl Running {
     /// Takes keyframes, trains for one slice, renders and publishes the status; returns `false` when the run is over or
     /// interrupted.
-    pub(super) fn run_time_slice(&mut self) -> anyhow::Result<bool> {
+    pub(super) fn run_time_slice(&mut self) -> session::Result<bool> {
         if self.stop.requested() || self.live.is_over() {
             return Ok(false);
         }
@@ -263,28 +260,30 @@ pub(super) fn start(
             run_folder::check_no_unfinished_run(out)?;
         }
     }
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let mut overrides = args.overrides();
     overrides.extend(previous.map(PreviousRun::overrides).into_iter().flatten());
     let rig = Rig::load(&args.rig_file, &overrides)?;
-    let kinds = rig.train.methods.clone();
-    args.training.check_for(&kinds)?;
+    let kinds = methods_of(&rig)?;
+    args.training.options().check_for(&kinds)?;
     let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
-    args.training.check_learned(&kinds, available)?;
-    let cameras = args.training.refining(available, Refine::None)?.with_scene;
-    let count = args.training.count(CountArg::ToCap);
-    let options = SplatOptions { cameras, count, ..method::options(&rig.train, args.steps)? };
+    let training = args.training.options();
+    let cameras = training.refining(available, Refine::None)?.with_scene;
+    training.check_learned(&kinds, available)?;
+    let (common, mut settings) = methods::options(&rig.train, args.steps);
+    settings.push((COUNT, serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap))));
+    let common = CommonOptions { cameras, ..common };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
     let models: Vec<Resumed> = match previous {
-        Some(previous) => vec![method::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
+        Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {
-            let start = |kind: &ModelKind| {
-                let model_spec = ModelSpec { kind: *kind, options: options.clone() };
-                let method = model_spec.clone().start(gpu.clone())?;
+            let start = |model_spec: ModelSpec| {
+                let method = model_spec.start(gpu.clone())?;
                 Ok(Resumed { model_spec, method, untrained: Vec::new() })
             };
-            kinds.iter().map(start).collect::<anyhow::Result<_>>()?
+            let model_specs = methods::specs(&kinds, &common, &settings)?;
+            model_specs.into_iter().map(start).collect::<session::Result<_>>()?
         }
     };
     let hub = Hub::new();
@@ -295,7 +294,7 @@ pub(super) fn start(
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, source, held)?;
-    let feed = Feed::start(input, hub.clone(), stop.clone())?;
+    let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
         during_training: Evaluator::psnr_only(),
@@ -332,10 +331,10 @@ pub(super) fn start(
             settings,
             resume_command: args.resume_command(folder),
         };
-        let output = OutputMode::of_command(args.json);
-        let checkpoints = Checkpoints::new(folder, args.checkpoints);
+        let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
+        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
         let run_flags = RunFlags { depth_from: None, flags: args.flags(limits) };
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
             .with_stepwise_scoring()
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags).with_keyframes(folder)))
@@ -355,7 +354,7 @@ pub(super) fn start(
         }
         sessions.push(session);
     }
-    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes };
+    let options = LiveOptions { pace, start_keyframes: rig.join.start_keyframes, notes, open_gpu };
 
     let held = sessions.first().map_or(Vec::new(), |session| session.keyframes().to_vec());
     let live = Live::new(sessions, feed, hub, options).resume_from(held);
@@ -364,7 +363,7 @@ pub(super) fn start(
 
 /// Closes the recording and writes the keyframe lists after a GPU failure; returns the error, extended by what was
 /// saved.
-fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyhow::Error {
+fn keep_input(mut live: Live, folders: &[PathBuf], error: session::Error) -> session::Error {
     let recoverable = live.describe_recoverable();
     let (sessions, input_result) = live.finish();
     for (session, folder) in sessions.iter().zip(folders) {
@@ -381,8 +380,8 @@ fn keep_input(mut live: Live, folders: &[PathBuf], error: anyhow::Error) -> anyh
         }
         Err(error) => log::error!("{error:#}"),
     }
-    let is_already_reported = recoverable.is_empty() || error.is::<GpuUnrecoverable>();
-    if is_already_reported { error } else { error.context(format!("the run stopped early; {recoverable}")) }
+    let is_already_reported = recoverable.is_empty() || error.is_gpu_unrecoverable();
+    if is_already_reported { error } else { error.with_context(format!("the run stopped early; {recoverable}")) }
 }
 
 /// Saves the models, then reports errors of the input.
@@ -408,7 +407,7 @@ fn save(
             if n_train > 0 {
                 session::finish(sessions.into_iter().zip(folders).map(ending).collect())?;
             }
-            return Err(error);
+            return Err(error.into());
         }
     };
     // A disk that is too full for the lists may still have space for the models.
@@ -421,7 +420,7 @@ fn save(
     let mut data_losses = counts.data_losses(if args.record.is_some() && args.from.is_none() {
         SampleUse::Recorded
     } else {
-        SampleUse::Watched
+        SampleUse::ProcessedOnly
     });
     // Keyframes that are missing from the recording cannot be scored on it later.
     let is_recorded = input_result.recording_error.is_none();
@@ -434,7 +433,7 @@ fn save(
             seed: rig.train.seed,
             keyframes: session.keyframes().len(),
             evicted: counts.evicted,
-            refused: counts.refused.iter().map(|(why, n)| (why.name(), *n)).collect(),
+            rejected: counts.rejected.iter().map(|(why, n)| (why.name(), *n)).collect(),
             device_skipped: counts.device_skipped,
             range_scans: input_result.join.range_scans().count(),
             range_points: input_result.join.range_scans().map(|scan| scan.points_in_world_m.len()).sum(),
@@ -449,6 +448,9 @@ fn save(
     if n_train > 0 {
         let finished = session::finish(sessions.into_iter().zip(folders).map(ending).collect());
         models = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+        if !args.json {
+            print_next_commands(&models);
+        }
     }
     publish_end(&hub, &models);
     listed?;
@@ -486,7 +488,7 @@ impl PreviousRun {
             "continuing the run in {} after {:.1} s, with {}",
             folder.display(),
             checkpoint.seconds,
-            print::counted(keyframes.len() as u64, "keyframe")
+            counted(keyframes.len() as u64, "keyframe")
         );
         Ok(Self { folder: folder.to_owned(), checkpoint, keyframes })
     }
@@ -502,7 +504,7 @@ impl PreviousRun {
 
 impl Args {
     fn overrides(&self) -> Vec<Override> {
-        let mut overrides = self.training.overrides();
+        let mut overrides = self.training.options().overrides();
         if self.lockstep {
             overrides.push(Override::new("sim.lockstep", true));
         }
@@ -525,10 +527,10 @@ impl Args {
             (SIM, is_on(self.sim)),
             (LOCKSTEP, is_on(self.lockstep)),
             (RECORD, self.record.as_ref().map(|file| file.display().to_string())),
-            (REALIGN, self.training.realign().map(|is_on| is_on.to_string())),
+            (REALIGN, self.training.options().realign().map(|is_on| is_on.to_string())),
         ];
         let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
-        flags.chain(self.checkpoints.flag()).collect()
+        flags.chain(self.checkpoints.options().flag()).collect()
     }
 
     /// These flags, with missing ones taken from the previous run.
@@ -547,7 +549,7 @@ impl Args {
             steps_per_keyframe: self.steps_per_keyframe.or_else(|| flag(STEPS_PER_KEYFRAME)?.parse().ok()),
             sim: self.sim || flag(SIM).is_some(),
             lockstep: self.lockstep || flag(LOCKSTEP).is_some(),
-            checkpoints: self.checkpoints.or_previous(&previous.checkpoint.flags),
+            checkpoints: self.checkpoints.options().or_previous(&previous.checkpoint.flags).into(),
             ..self.clone()
         }
     }
@@ -603,8 +605,8 @@ impl Args {
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
-            Some(recording) => open::recording(recording, Some(rig), &[]),
-            None => open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real }),
+            Some(recording) => Ok(open::recording(recording, Some(rig), &[])?),
+            None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
         }
     }
 
@@ -654,7 +656,7 @@ fn no_model_reason(n_keyframes: usize, counts: &Counts, rig: &Rig) -> String {
     let quoted = |names: Vec<&str>| names.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     let expected = quoted(rig.cameras.iter().map(|camera| &*camera.name).collect());
     let unknown = quoted(counts.unknown_cameras.iter().map(|name| &**name).collect());
-    let n_unknown = counts.refused.get(&Refusal::UnknownCamera).copied().unwrap_or_default();
+    let n_unknown = counts.rejected.get(&Rejection::UnknownCamera).copied().unwrap_or_default();
     match (n_keyframes, counts.accepted) {
         (1, _) => format!("nothing to train on: the only keyframe is a test image ({counts})"),
         (2.., _) => format!("nothing to train on: all {n_keyframes} keyframes are test images ({counts})"),
@@ -689,10 +691,10 @@ mod tests {
     fn run_without_a_model_reports_the_reason() {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
         let rig = Rig::load(&path, &[]).expect("a rig");
-        let counts = |images, accepted, refused: &[(Refusal, u64)]| Counts {
+        let counts = |images, accepted, rejected: &[(Rejection, u64)]| Counts {
             images,
             accepted,
-            refused: refused.iter().copied().collect(),
+            rejected: rejected.iter().copied().collect(),
             unknown_cameras: ["front".into()].into(),
             ..Counts::default()
         };
@@ -700,8 +702,8 @@ mod tests {
             (1, counts(1, 1, &[]), "the only keyframe is a test image (1 keyframe of 1 image)"),
             (0, counts(1, 1, &[]), "ended before the trainer received a keyframe"),
             (0, counts(0, 0, &[]), "no image was received"),
-            (0, counts(7, 0, &[(Refusal::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
-            (0, counts(7, 0, &[(Refusal::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
+            (0, counts(7, 0, &[(Rejection::UnknownCamera, 7)]), "(\"wrist\"): all 7 are from \"front\""),
+            (0, counts(7, 0, &[(Rejection::NoPose, 7)]), "0 keyframes of 7 images; 7 no joint states or base pose"),
         ] {
             let message = no_model_reason(n_keyframes, &counts, &rig);
             assert!(message.contains(expected), "{message}");

@@ -1,36 +1,31 @@
 //! `fieldrig train`: trains models on a dataset folder or a recording.
 
-use crate::checkpoints::{self, CheckpointArgs, Checkpoints, RunFlags};
-use crate::clock::Clock;
-use crate::config::{Override, Rig};
-use crate::corrected_rig;
-use crate::data::{Data, DataArgs, Purpose};
-use crate::decisions::{DecisionLog, RunDescription, Settings};
-use crate::depth_from::{self, DepthSource, RenderedDepth};
-use crate::evaluate::Evaluator;
+use crate::checkpoint_args::CheckpointArgs;
+use crate::console::{Console, OutputMode, ReadBar, print_next_commands};
+use crate::data_args::DataArgs;
 use crate::exit::{self, BadArgument, Exit};
-use crate::method::{self, ModelKind, ModelSpec, Resumed};
-use crate::next_commands::{DataSource, quoted};
 use crate::open_gpu::open_gpu;
-use crate::print;
-use crate::recoveries;
-use crate::recovery::{self, Recovery};
-use crate::replay::Replay;
-use crate::run_folder::{self, CreatedFolders};
-use crate::session::{self, EndingSession, Evaluators, Limits, OutputMode, Session};
-use crate::stations::StationReport;
-use crate::stop::Stop;
-use crate::training;
-use crate::training_args::{REALIGN, TrainingArgs};
+use crate::training_args::TrainingArgs;
+use crate::{print, signals};
 use calibration::Alignment;
-use keyframe::{Keyframe, Split};
+use capture::StationReport;
+use capture::config::{Override, Rig};
+use keyframe::{Keyframe, Split, counted};
 use serde::Serialize;
+use session::depth_from::{self, DepthSource, RenderedDepth};
+use session::next_commands::{DataSource, quoted};
+use session::run_folder::{self, CreatedFolders};
+use session::{
+    Checkpoints, Clock, Data, DecisionLog, EndingSession, Evaluator, Evaluators, Limits, Purpose, REALIGN, Recovery,
+    Replay, RunDescription, RunFlags, Session, Settings, checkpoints, corrected_rig, recoveries, recovery,
+};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use trainer::checkpoint::Checkpoint;
 use trainer::gpu::Gpu;
+use trainer::{ModelKind, ModelSpec, Resumed};
 
 /// Training time if no flag limits it.
 const DEFAULT_SECONDS: f64 = 120.0;
@@ -71,7 +66,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     images: DataArgs,
     /// Render this model (a folder, or a splat file) to get depth for images that have none, or have it on less than
-    /// half of their pixels. All methods treat it as measured. The model must be of the same place, in the same world
+    /// half of their pixels. All methods treat it as measured. The model must be of the same scene, in the same world
     /// frame. --refine then estimates parameters jointly with the scene
     #[arg(long, value_name = "MODEL")]
     depth_from: Option<PathBuf>,
@@ -104,7 +99,7 @@ struct TrainDetails<'a> {
     seed: u64,
     startup_secs: f64,
     n_train: usize,
-    n_selection: usize,
+    n_validation: usize,
     n_test: usize,
     data_losses: &'a [String],
     /// Estimated base pose at each station after the first.
@@ -119,14 +114,15 @@ struct TrainDetails<'a> {
 /// Loads the data, trains until a limit or Ctrl-C, scores on the evaluation schedule, and saves.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     let mut created = CreatedFolders::default();
-    let ended = train(args, &mut created);
-    created.keep_or_remove(ended)
+    let result = train(args, &mut created);
+    created.keep_unless(result.as_ref().is_err_and(exit::is_rejection));
+    result
 }
 
 fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let started = Instant::now();
     let replay = args.replay_decisions.as_deref().map(Replay::load).transpose()?;
-    training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
+    session::limits(args.seconds, args.steps, DEFAULT_SECONDS)?; // Checked before anything is read.
     if let Some(out) = &args.out {
         run_folder::check_no_model(out)?;
         run_folder::check_not_data_folder(out, &args.data)?;
@@ -134,7 +130,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             run_folder::check_no_unfinished_run(out)?;
         }
     }
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let checkpoint = args.resume.as_deref().map(checkpoints::read).transpose()?;
     let subject = args.resume.as_deref().map(|folder| format!("the checkpoint in {}", folder.display()));
     if let (Some(checkpoint), Some(subject)) = (&checkpoint, &subject) {
@@ -153,7 +149,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         (Some(_), _) => Limits::default(),
         (None, checkpoint) => {
             let previous_secs = checkpoint.as_ref().map_or(0.0, |checkpoint| checkpoint.seconds);
-            training::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
+            session::limits(args.seconds, args.steps, previous_secs + DEFAULT_SECONDS)?
         }
     };
     let depth_from = args.depth_from.as_deref().map(DepthSource::find).transpose()?;
@@ -161,8 +157,8 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     if let Some(replay) = &replay {
         replay.check_depth_from(depth_model_sha256)?;
     }
-    let (mut images, mut overrides) = (args.images.clone(), args.training.overrides());
-    let mut realign = args.training.realign();
+    let (mut images, mut overrides) = (args.images.options(), args.training.options().overrides());
+    let mut realign = args.training.options().realign();
     if let Some(replay) = &replay {
         images.scale = Some(replay.decisions.settings.scale);
     }
@@ -174,14 +170,15 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         realign = checkpoint.flags.get(REALIGN).map(|is_on| is_on == "true");
         overrides.extend(realign.map(|is_on| Override::new(REALIGN, is_on)));
     } else if replay.is_none() {
-        training::check_before_data(&args.training, &args.data, &images)?;
+        session::check_before_data(&args.training.options(), &args.data, &images)?;
     }
     let evaluator = Evaluator::thorough(args.lpips_weights.as_deref())?;
     let evaluators =
         Evaluators { during_training: evaluator.clone(), max_images_during_training: usize::MAX, at_end: evaluator };
+    let bar = ReadBar::new(args.json);
     let mut data = match &replay {
-        Some(replay) => replay.load_data(&args.data, args.images.rig.clone(), args.json)?,
-        None => Data::load(&args.data, &images, Purpose::Training, &overrides, args.json)?,
+        Some(replay) => replay.load_data(&args.data, args.images.options().rig, &|read| bar.show(read))?,
+        None => Data::load(&args.data, &images, Purpose::Training, &overrides, &|read| bar.show(read))?,
     };
     if let Some(file) = &args.write_rig {
         let Some(rig) = &data.rig else {
@@ -192,7 +189,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     }
     let gpu = open_gpu()?;
     if let Some(source) = &depth_from {
-        data.render_depth(gpu.clone(), source, args.json)?;
+        data.render_depth(gpu.clone(), source, &|read| bar.show(read))?;
     }
     if let Some(replay) = &replay {
         replay.check_data(&args.data, &data)?;
@@ -226,7 +223,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let (mut sessions, mut seeds) = (Vec::new(), Vec::new());
     for (Resumed { model_spec: ModelSpec { kind, options }, method, .. }, folder) in models.into_iter().zip(&folders) {
         run_folder::write_keyframe_list(&folder.join("keyframes.txt"), &data.keyframes)?;
-        seeds.push(options.seed);
+        seeds.push(options.common.seed);
         let description = RunDescription {
             method: kind.name(),
             data: Some(&args.data),
@@ -248,9 +245,9 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
         for keyframe in data.keyframes.iter().filter(|keyframe| !is_untrained(keyframe)) {
             decisions.restored(from_step.unwrap_or_default(), keyframe);
         }
-        let output = OutputMode::of_command(args.json);
-        let checkpoints = Checkpoints::new(folder, args.checkpoints);
-        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, output)
+        let console = Console::new(OutputMode::of_command(args.json), limits, kinds.len());
+        let checkpoints = Checkpoints::new(folder, args.checkpoints.options());
+        let session = Session::new(gpu.clone(), (kind, method), evaluators.clone(), limits, Box::new(console))
             .with_stop(&stop)
             .with_checkpoints(checkpoints.map(|to| to.with_flags(run_flags.clone())))
             .with_profile(args.profile)
@@ -268,7 +265,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     let preparation_time = if checkpoint.is_some() { Duration::ZERO } else { data.preparation_time };
     match &replay {
         Some(replay) => replay.drive(&mut sessions[0], &untrained, &stop)?,
-        None => training::drive(&mut sessions, &untrained, preparation_time, &stop)?,
+        None => session::drive(&mut sessions, &untrained, preparation_time, &stop, open_gpu)?,
     }
 
     let alignment = sessions.iter().find_map(Session::alignment).cloned();
@@ -280,7 +277,7 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
             seed,
             startup_secs,
             n_train: data.of_split(Split::Train).len(),
-            n_selection: data.of_split(Split::Validation).len(),
+            n_validation: data.of_split(Split::Validation).len(),
             n_test: data.of_split(Split::Test).len(),
             data_losses: &data.data_losses,
             stations: &data.stations,
@@ -292,7 +289,10 @@ fn train(args: &Args, created: &mut CreatedFolders) -> anyhow::Result<Exit> {
     };
     let recoverable = recoveries::describe_recoverable(&mut sessions);
     let finished = session::finish(sessions.into_iter().zip(folders).zip(seeds).map(ending).collect());
-    finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+    let finished = finished.map_err(|error| recovery::with_recoverable(error, &recoverable))?;
+    if !args.json {
+        print_next_commands(&finished);
+    }
     if let Some(file) = &args.write_rig {
         write_rig(&Data::rig_as_given(&args.data, &images)?, alignment.as_ref(), file)?;
     }
@@ -325,14 +325,16 @@ impl Args {
         checkpoint: Option<&Checkpoint>,
     ) -> anyhow::Result<Vec<Resumed>> {
         if let Some(checkpoint) = checkpoint {
-            return Ok(vec![self.resumed(method::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
+            return Ok(vec![self.resumed(trainer::resume(gpu.clone(), checkpoint, &data.keyframes)?)]);
         }
         let model_specs = match replay {
             Some(replay) => vec![replay.model_spec()],
-            None => training::model_specs(&self.training, data, self.plan_steps.or(self.steps), gpu.is_software())?,
+            None => {
+                session::model_specs(&self.training.options(), data, self.plan_steps.or(self.steps), gpu.is_software())?
+            }
         };
         let start = |model_spec: ModelSpec| {
-            let method = model_spec.clone().start(gpu.clone())?;
+            let method = model_spec.start(gpu.clone())?;
             Ok(Resumed { model_spec, method, untrained: data.keyframes.clone() })
         };
         model_specs.into_iter().map(start).collect()
@@ -353,7 +355,7 @@ impl Args {
             (PROFILE, self.profile.then(|| true.to_string())),
         ];
         let flags = given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?)));
-        flags.chain(self.checkpoints.flag()).collect()
+        flags.chain(self.checkpoints.options().flag()).collect()
     }
 
     /// These flags, with missing ones taken from the previous run.
@@ -369,7 +371,7 @@ impl Args {
             lpips_weights: self.lpips_weights.clone().or_else(|| path(LPIPS_WEIGHTS)),
             write_rig: self.write_rig.clone().or_else(|| path(WRITE_RIG)),
             profile: self.profile || flag(PROFILE).is_some(),
-            checkpoints: self.checkpoints.or_previous(&checkpoint.flags),
+            checkpoints: self.checkpoints.options().or_previous(&checkpoint.flags).into(),
             ..self.clone()
         }
     }
@@ -385,7 +387,7 @@ impl Args {
         let asks_for_more = self.seconds.is_some()
             || self.steps.is_some()
             || self.replay_decisions.is_some()
-            || !self.images.flags().is_empty();
+            || !self.images.options().flags().is_empty();
         let has_model = || self.resume.as_deref().is_some_and(|folder| run_folder::check_no_model(folder).is_err());
         checkpoint.is_finished && !asks_for_more && has_model()
     }
@@ -416,14 +418,14 @@ impl Args {
 
     /// Logs differences from an uninterrupted run.
     fn resumed(&self, resumed: Resumed) -> Resumed {
-        let (planned, step) = (resumed.model_spec.options.n_planned_steps, resumed.method.progress().step);
+        let (planned, step) = (resumed.model_spec.options.common.n_planned_steps, resumed.method.progress().step);
         log::info!("continuing from step {step} of {planned} planned steps");
         if self.steps.is_some_and(|steps| steps > planned) {
             log::warn!("the learning rate was planned to decay over {planned} steps: later steps change little");
         }
         let n_new = resumed.untrained.iter().filter(|keyframe| keyframe.split != Split::Test).count();
         if n_new > 0 {
-            log::warn!("{} that are not in the checkpoint", print::counted(n_new as u64, "new image"));
+            log::warn!("{} that are not in the checkpoint", counted(n_new as u64, "new image"));
         }
         resumed
     }

@@ -2,18 +2,15 @@
 
 use super::run::{address, notes};
 use crate::exit::{BadArgument, Exit};
-use crate::method::{self, LoadedModel};
-use crate::model_bounds::Bounds;
 use crate::open_gpu::open_gpu;
-use crate::stop::Stop;
-use crate::viewer::{ModelViewer, ServedModel};
-use crate::{camera_list, print, run_folder, scene_hint};
+use crate::{print, signals};
 use kinematics::Transform;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use serde_json::{Value, json};
+use session::{ModelViewer, ServedModel, camera_list, methods, run_folder, scene_hint};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use trainer::Progress;
+use trainer::{Bounds, LoadedModel, ModelKind, Progress};
 use viz::{Hub, KeyframePose, ModelStatus, SceneHint, Server, ServerConfig, Status};
 
 /// Flags of `view`.
@@ -61,7 +58,7 @@ impl Up {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     check_is_model(&args.model)?;
     let paths = run_folder::models_at(&args.model)?;
-    let stop = Stop::on_ctrl_c_logging("stopping; Ctrl-C again exits at once")?;
+    let stop = signals::stop_on_signals_logging("stopping; Ctrl-C again exits at once")?;
     let gpu = open_gpu()?;
     let hub = Hub::new();
     // Before the models are loaded, so that an address in use is reported at once.
@@ -69,10 +66,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
 
     let model_from_page = args.up.model_from_page();
     let cameras = cameras(&paths);
-    let models = paths.iter().map(|path| method::load_with_bounds(gpu.clone(), path, cameras.is_empty()));
-    let models = models.collect::<anyhow::Result<Vec<LoadedModel>>>()?;
+    let models = paths.iter().map(|path| methods::load(gpu.clone(), path));
+    let mut models = models.collect::<session::Result<Vec<LoadedModel>>>()?;
+    let bounds = if cameras.is_empty() { bounds(&mut models)? } else { None };
     let mut statuses =
-        paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind.name(), &model.method.progress()));
+        paths.iter().zip(&models).map(|(path, model)| model_status(path, model.kind, &model.method.progress()));
     let report = report(&paths[0]);
     let status = Status {
         state: "viewing".to_owned(),
@@ -84,14 +82,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         ..Status::default()
     };
     let cameras = in_page(cameras, &model_from_page);
-    if let Some(hint) = first_view(&cameras, models.iter().find_map(|model| model.bounds), &model_from_page) {
+    if let Some(hint) = first_view(&cameras, bounds, &model_from_page) {
         hub.set_scene_hint(hint);
     }
     hub.set_keyframes(cameras);
     hub.set_status(status);
 
     args.print_url(&server.url(), &models)?;
-    let models = models.into_iter().map(|LoadedModel { kind, method, .. }| ServedModel { kind, method }).collect();
+    let models = models.into_iter().map(|LoadedModel { kind, method }| ServedModel { kind, method }).collect();
     ModelViewer::new(models, hub).with_model_from_page(model_from_page).serve(&stop);
     Ok(Exit::Done)
 }
@@ -163,6 +161,16 @@ fn in_page(cameras: Vec<KeyframePose>, model_from_page: &Transform) -> Vec<Keyfr
     cameras.into_iter().map(in_page).collect()
 }
 
+/// Bounds of the first model that has any.
+fn bounds(models: &mut [LoadedModel]) -> anyhow::Result<Option<Bounds>> {
+    for model in models {
+        if let Some(bounds) = model.method.bounds()? {
+            return Ok(Some(bounds));
+        }
+    }
+    Ok(None)
+}
+
 /// The initial view: from the first camera or, without cameras, from outside the model; `None` for an empty model.
 fn first_view(cameras: &[KeyframePose], bounds: Option<Bounds>, model_from_page: &Transform) -> Option<SceneHint> {
     let poses = cameras.iter().map(|camera| camera.world_from_camera).collect();
@@ -180,15 +188,16 @@ fn report(model: &Path) -> Value {
 }
 
 /// Size and scores of a model at the end of its training.
-fn model_status(model: &Path, method: &str, progress: &Progress) -> ModelStatus {
+fn model_status(model: &Path, kind: ModelKind, progress: &Progress) -> ModelStatus {
     let report = report(model);
     let (done, evaluations) = (&report["done"], report["evaluations"].as_array());
     let point = |evaluation: &Value| Some((evaluation["seconds"].as_f64()?, evaluation["psnr"].as_f64()?));
     ModelStatus {
-        method: method.to_owned(),
+        method: kind.name().to_owned(),
         step: done["steps"].as_u64().unwrap_or(progress.step),
         step_millis: None,
         primitives: progress.primitives,
+        primitives_label: kind.entry().primitives_label.to_owned(),
         bytes: progress.bytes,
         psnr: done["psnr"].as_f64(),
         psnr_history: evaluations.into_iter().flatten().chain([done]).filter_map(point).collect(),
@@ -224,14 +233,14 @@ mod tests {
     fn model_status_uses_the_report_scores() {
         let folder = tempfile::tempdir().expect("a folder");
         let progress = Progress { primitives: 5, bytes: 80, ..Progress::default() };
-        let status = model_status(folder.path(), "splat", &progress);
+        let status = model_status(folder.path(), ModelKind::default(), &progress);
         assert_eq!((status.psnr, status.step, status.primitives, status.bytes), (None, 0, 5, 80));
         let text = json!({
             "done": { "psnr": 23.5, "steps": 700, "seconds": 8.0 },
             "evaluations": [{ "seconds": 0.5, "psnr": 20.0 }, { "seconds": 1.0, "psnr": null }, { "seconds": 2.0, "psnr": 22.0 }],
         });
         std::fs::write(folder.path().join("report.json"), text.to_string()).expect("the file is writable");
-        let status = model_status(folder.path(), "splat", &progress);
+        let status = model_status(folder.path(), ModelKind::default(), &progress);
         assert_eq!((status.psnr, status.step), (Some(23.5), 700));
         assert_eq!(status.psnr_history, [(0.5, 20.0), (2.0, 22.0), (8.0, 23.5)]);
     }

@@ -38,7 +38,7 @@ fn libfranka_moves_emulated_robot_and_recovers_from_reflex() {
         address: (ip, 1337).into(),
         version: FciVersion::V10,
         chain: chain("panda_link8"),
-        flange_from_ee: Transform::identity(),
+        flange_from_tool: Transform::identity(),
         limits: Limits::fr3(),
     };
     let emulated = EmulatedRobot::start(config, ideal_joints(REST_RAD)).unwrap();
@@ -98,7 +98,7 @@ fn ten_thousand_motion_cycles_with_both_controllers() {
         address: (Ipv4Addr::LOCALHOST, 0).into(),
         version: FciVersion::V10,
         chain: chain("panda_link8"),
-        flange_from_ee: Transform::identity(),
+        flange_from_tool: Transform::identity(),
         limits: Limits::fr3(),
     };
     let emulated = EmulatedRobot::start(config, ideal_joints([0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7])).unwrap();

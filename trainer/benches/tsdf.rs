@@ -45,7 +45,7 @@ impl Fusion {
         let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
         eprintln!("{}", gpu.describe());
         let options = TsdfOptions { voxel_m: Some(0.01), noise_per_m2: Some(1.5e-3), ..TsdfOptions::default() };
-        let model = TsdfModel::new(gpu, options).expect("the options are valid");
+        let model = TsdfModel::new(gpu, options.into()).expect("the options are valid");
         let mut fusion = Self { model, keyframes: keyframes(), n_pushed: 0 };
         for _ in 0..N_KEYFRAMES {
             fusion.push();

@@ -4,9 +4,10 @@
 //! Splats, which support more trials of camera parameters, implement alignment separately.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
-use crate::gpu::PassTiming;
-use crate::model_metadata::read_metadata;
-use crate::{Error, Method, Picture, Progress, RenderRequest};
+use crate::gpu::{Gpu, PassTiming};
+use crate::model_metadata::{METADATA_FILE, read_metadata};
+use crate::model_options::CommonOptions;
+use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
@@ -73,9 +74,17 @@ impl<M: Restartable + 'static> Aligned<M> {
         }
     }
 
+    /// The model itself if no alignment is requested, otherwise with alignment.
+    pub fn if_requested(model: M, common: &CommonOptions, gpu: &Gpu) -> Box<dyn Method> {
+        if common.align == CameraRefinement::default() {
+            return Box::new(model);
+        }
+        Box::new(Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps))
+    }
+
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
-        let alignment_task = AlignmentTask::Done(read_metadata(&folder.join("model.json"))?.alignment);
+        let alignment_task = AlignmentTask::Done(read_metadata(folder)?.alignment);
         Ok(Self {
             model,
             choice: CameraRefinement::default(),
@@ -177,10 +186,6 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
         self.model.is_idle() && (self.alignment_task.is_done() || self.model.progress().step == 0)
     }
 
-    fn primitive(&self) -> &'static str {
-        self.model.primitive()
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         Ok(self.n_steps_before_restart + self.model.n_total_steps()?)
     }
@@ -209,6 +214,10 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
         self.model.depth_stride()
     }
 
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        self.model.bounds()
+    }
+
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
         let learned = self.model.learned_correction(&keyframe.camera)?;
         Ok(self.alignment_task.calibrated_camera(keyframe, learned.as_ref()))
@@ -233,7 +242,7 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
         self.model.save(folder)?;
         let Some(alignment) = self.alignment_task.result() else { return Ok(()) };
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         let invalid_file =
             |error: serde_json::Error| Error::SplatFile { path: path.clone(), reason: error.to_string() };
         let bytes = std::fs::read(&path).map_err(|source| Error::Read { path: path.clone(), source })?;
@@ -268,10 +277,12 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::{Gpu, GpuOptions};
+    use crate::gpu::GpuOptions;
+    use crate::mean_color::MeanColor;
+    use crate::model_options::ModelOptions;
     use crate::nerf::{NerfBudget, NerfModel, NerfOptions};
     use crate::test_scenes as scenes;
-    use crate::tsdf::{TsdfModel, TsdfOptions};
+    use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
     use keyframe::Split;
@@ -280,23 +291,22 @@ mod tests {
     const ALIGNMENT_STEP: u64 = 6;
 
     fn tsdf(gpu: &Arc<Gpu>) -> TsdfModel {
-        TsdfModel::new(gpu.clone(), TsdfOptions::default()).unwrap()
+        TsdfModel::new(gpu.clone(), ModelOptions::default()).unwrap()
     }
 
     fn nerf(gpu: &Arc<Gpu>) -> NerfModel {
         let nerf_budget =
             NerfBudget { n_rays: 64, n_samples: 1 << 10, n_cells: 32, max_log2_entries: 10, ..NerfBudget::SMALL };
-        let options = NerfOptions {
-            nerf_budget: Some(nerf_budget),
-            n_planned_steps: 4 * ALIGNMENT_STEP,
-            ..NerfOptions::default()
+        let options = ModelOptions {
+            common: CommonOptions { n_planned_steps: 4 * ALIGNMENT_STEP, ..CommonOptions::default() },
+            specific: NerfOptions { nerf_budget: Some(nerf_budget), ..NerfOptions::default() },
         };
         NerfModel::new(gpu.clone(), options).unwrap()
     }
 
     type Resume<M> = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<(M, Vec<Arc<Keyframe>>), Error>;
 
-    fn learn(model: &mut dyn Method, n_steps: u64) {
+    fn train(model: &mut dyn Method, n_steps: u64) {
         for _ in 0..n_steps {
             model.step(1).unwrap();
         }
@@ -307,6 +317,12 @@ mod tests {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_restart(&gpu, tsdf(&gpu), TsdfModel::resume, TsdfModel::load);
         check_restart(&gpu, nerf(&gpu), NerfModel::resume, NerfModel::load);
+        check_restart(
+            &gpu,
+            MeanColor::new(ModelOptions::default()),
+            |_, checkpoint, keyframes| MeanColor::resume(checkpoint, keyframes),
+            |_, folder| MeanColor::load(folder),
+        );
     }
 
     fn check_restart<M: Restartable + 'static>(
@@ -321,12 +337,12 @@ mod tests {
         let mut uninterrupted =
             Aligned::new(model, CameraRefinement::Always(ParamSet::EXTRINSICS), true, 4 * ALIGNMENT_STEP);
         keyframes.iter().for_each(|keyframe| uninterrupted.push(keyframe.clone()).unwrap());
-        learn(&mut uninterrupted, ALIGNMENT_STEP - 2);
+        train(&mut uninterrupted, ALIGNMENT_STEP - 2);
         let early = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        learn(&mut uninterrupted, 2);
+        train(&mut uninterrupted, 2);
         assert!(uninterrupted.alignment().is_none() && uninterrupted.progress().step == ALIGNMENT_STEP);
         let due = uninterrupted.checkpoint().unwrap().finish().unwrap();
-        learn(&mut uninterrupted, 1);
+        train(&mut uninterrupted, 1);
         assert_eq!(
             (uninterrupted.progress().step, uninterrupted.n_total_steps().unwrap()),
             (1, ALIGNMENT_STEP + 1),
@@ -336,7 +352,7 @@ mod tests {
         let (degrees, mm) = remaining(&correction, &miscalibration.extrinsics);
         assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
         assert_eq!(uninterrupted.calibrated_camera(test).unwrap(), correction.apply(test));
-        learn(&mut uninterrupted, 2);
+        train(&mut uninterrupted, 2);
 
         let resumed = |checkpoint: &Checkpoint| {
             Aligned::resume(checkpoint, &keyframes, |own_checkpoint, keyframes| {
@@ -350,17 +366,17 @@ mod tests {
         };
         assert!(!untrained.is_empty() && untrained.iter().all(is_original));
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 3);
+        train(&mut *interrupted, 3);
         let (mut interrupted, untrained) = resumed(&interrupted.checkpoint().unwrap().finish().unwrap());
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 2);
+        train(&mut *interrupted, 2);
         let [uninterrupted_end, interrupted_end] = [&mut uninterrupted as &mut dyn Method, &mut *interrupted]
             .map(|model| model.checkpoint().unwrap().finish().unwrap());
         assert_eq!(uninterrupted_end, interrupted_end);
 
         let (mut interrupted, untrained) = resumed(&due);
         untrained.into_iter().for_each(|keyframe| interrupted.push(keyframe).unwrap());
-        learn(&mut *interrupted, 3);
+        train(&mut *interrupted, 3);
         assert_eq!(
             interrupted.checkpoint().unwrap().finish().unwrap(),
             uninterrupted_end,
@@ -371,7 +387,7 @@ mod tests {
         uninterrupted.save(folder.path()).unwrap();
         let loaded = || Aligned::load(load(gpu.clone(), folder.path()).unwrap(), folder.path()).unwrap();
         assert_eq!(loaded().calibrated_camera(test).unwrap(), correction.apply(test));
-        std::fs::remove_file(folder.path().join("model.json")).unwrap();
+        std::fs::remove_file(folder.path().join(METADATA_FILE)).unwrap();
         assert_eq!(
             loaded().calibrated_camera(test).unwrap(),
             CalibratedCamera::of(test),
@@ -384,6 +400,7 @@ mod tests {
         let gpu = Gpu::open(&GpuOptions::default()).unwrap();
         check_training_continues(tsdf(&gpu));
         check_training_continues(nerf(&gpu));
+        check_training_continues(MeanColor::new(ModelOptions::default()));
     }
 
     fn check_training_continues<M: Restartable + 'static>(model: M) {

@@ -190,6 +190,50 @@ pub enum Error {
     /// A checkpoint belongs to different keyframes.
     #[error("the checkpoint belongs to different data: {0}")]
     CheckpointData(String),
+    /// No registered method has this name.
+    #[error("unknown method {name:?}")]
+    UnknownMethod {
+        /// The name.
+        name: String,
+    },
+    /// The options of a model are invalid.
+    #[error("invalid options for the method {method}: {reason}")]
+    InvalidOptions {
+        /// Name of the method.
+        method: &'static str,
+        /// Description of the problem.
+        reason: String,
+    },
+    /// The `model.json` of a saved model is invalid.
+    #[error("{} is damaged", path.display())]
+    ModelMetadata {
+        /// The file.
+        path: PathBuf,
+        /// Cause.
+        source: serde_json::Error,
+    },
+    /// The method of a saved model cannot be determined.
+    #[error("{} is not a model of a known method", path.display())]
+    UnknownModel {
+        /// Folder or file.
+        path: PathBuf,
+    },
+    /// Splats cannot be read.
+    #[error("no splats in {}{hint}", path.display())]
+    NoSplats {
+        /// Folder or file.
+        path: PathBuf,
+        /// What to do instead, as the end of the sentence.
+        hint: &'static str,
+        /// Cause.
+        source: Box<Error>,
+    },
+    /// A mesh has no triangles left after simplification.
+    #[error("no triangles are left at a cell width of {cell_m} m")]
+    EmptyMesh {
+        /// Width of a cell, meters.
+        cell_m: f64,
+    },
     /// Arrays of splats are inconsistent.
     #[error("splats: {0}")]
     SplatArrays(String),

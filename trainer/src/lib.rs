@@ -10,25 +10,32 @@
 //! ```
 
 mod aligned;
+mod bounds;
 pub mod checkpoint;
 mod error;
 pub mod eval;
+mod failed_model;
 pub mod gpu;
 mod keyframe_signature;
 pub mod loss;
+#[cfg(test)]
+mod mean_color;
 pub mod method;
+pub mod method_entry;
 #[cfg(test)]
 mod mismatches;
 mod model_metadata;
+mod model_options;
+mod model_spec;
 pub mod nerf;
 pub mod optim;
-pub mod ply;
 #[cfg(test)]
 mod random;
+mod registry;
 pub mod request;
 pub mod sort;
+pub mod spherical_harmonics;
 pub mod splat;
-pub mod spz;
 #[cfg(test)]
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;
@@ -40,6 +47,11 @@ pub mod tsdf;
 mod view;
 
 pub use aligned::{Aligned, Restartable, ResumedModel};
+pub use bounds::Bounds;
 pub use error::Error;
+pub use failed_model::FailedModel;
 pub use method::{Method, Progress};
+pub use model_options::{CommonOptions, MethodOptions, ModelOptions};
+pub use model_spec::{LoadedModel, ModelSpec, Resumed, load, resume};
+pub use registry::ModelKind;
 pub use request::{Aabb, Picture, Projection, RenderRequest};

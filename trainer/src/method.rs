@@ -1,5 +1,6 @@
 //! The interface of all scene models.
 
+use crate::bounds::Bounds;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::PassTiming;
 use crate::{Error, Picture, RenderRequest};
@@ -48,8 +49,6 @@ pub trait Method {
     fn step(&mut self, n: u64) -> Result<u64, Error>;
     /// Whether more steps would do nothing until a keyframe arrives.
     fn is_idle(&self) -> bool;
-    /// Name of the items that [`Progress::primitives`] counts, in the singular.
-    fn primitive(&self) -> &'static str;
     /// Waits for queued updates and returns the total number of updates, including those of rejected trials. Unlike
     /// [`Progress::step`], it never decreases.
     fn n_total_steps(&mut self) -> Result<u64, Error>;
@@ -73,6 +72,10 @@ pub trait Method {
     /// if rays are expensive.
     fn depth_stride(&self) -> u32 {
         1
+    }
+    /// A sphere that contains most of the model; `None` if the model is empty or does not support this.
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        Ok(None)
     }
     /// The camera of a keyframe with the model's corrections for the camera, but not those for this single image.
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error>;

@@ -5,6 +5,9 @@ use calibration::{Alignment, CameraCorrection};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+/// File with the description of a saved model, in its folder.
+pub(crate) const METADATA_FILE: &str = "model.json";
+
 /// Camera corrections and alignment of a saved model.
 #[derive(Default, serde::Deserialize)]
 #[serde(default)]
@@ -13,14 +16,15 @@ pub(crate) struct ModelMetadata {
     pub(crate) alignment: Option<Alignment>,
 }
 
-/// Reads the camera corrections of a saved model; empty if the file does not exist or lacks them.
+/// Reads the camera corrections of a saved model in a folder; empty if the file does not exist or lacks them.
 ///
 /// # Errors
 ///
 /// Fails if the file cannot be read or parsed.
-pub(crate) fn read_metadata(path: &Path) -> Result<ModelMetadata, Error> {
-    let invalid_file = |reason: String| Error::SplatFile { path: path.to_owned(), reason };
-    match std::fs::read(path) {
+pub(crate) fn read_metadata(folder: &Path) -> Result<ModelMetadata, Error> {
+    let path = folder.join(METADATA_FILE);
+    let invalid_file = |reason: String| Error::SplatFile { path: path.clone(), reason };
+    match std::fs::read(&path) {
         Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| invalid_file(error.to_string())),
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(ModelMetadata::default()),
         Err(error) => Err(invalid_file(error.to_string())),

@@ -1,12 +1,13 @@
 //! Options and requests that suit the scenes of known shapes.
 
+use crate::model_options::ModelOptions;
 use crate::tsdf::TsdfOptions;
 use crate::{Projection, RenderRequest};
 pub(crate) use keyframe::scenes::*;
 use kinematics::Transform;
 
-pub(crate) fn options() -> TsdfOptions {
-    TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() }
+pub(crate) fn options() -> ModelOptions<TsdfOptions> {
+    ModelOptions::from(TsdfOptions { voxel_m: Some(0.02), noise_per_m2: Some(1e-4), ..TsdfOptions::default() })
 }
 
 pub(crate) fn request(world_from_camera: Transform) -> RenderRequest {

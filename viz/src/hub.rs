@@ -48,10 +48,10 @@ impl Hub {
     }
 
     /// Sets the result of the run. Clients continue to show it after the server has stopped.
-    pub fn set_run_result(&self, ended: RunResult) {
+    pub fn set_run_result(&self, result: RunResult) {
         self.change_status(|status| {
             "finished".clone_into(&mut status.state);
-            status.ended = Some(ended);
+            status.result = Some(result);
         });
     }
 

@@ -19,7 +19,7 @@ pub struct Status {
     /// Number of stored keyframes.
     pub keyframes: u64,
     /// Number of images rejected as keyframes, by reason.
-    pub refused: BTreeMap<String, u64>,
+    pub rejected: BTreeMap<String, u64>,
     /// The model rendered for clients that do not choose one.
     #[serde(flatten)]
     pub model: ModelStatus,
@@ -28,7 +28,7 @@ pub struct Status {
     /// Messages that the operator should read, for example that a camera disconnected.
     pub notes: Vec<String>,
     /// The result, once the run has ended and its model is saved.
-    pub ended: Option<RunResult>,
+    pub result: Option<RunResult>,
 }
 
 /// Result of a run that has ended.
@@ -45,7 +45,7 @@ pub struct RunResult {
 /// Status of a model.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ModelStatus {
-    /// `splat`, `nerf` or `tsdf`.
+    /// Name of the method.
     pub method: String,
     /// Number of optimizer steps so far.
     pub step: u64,
@@ -53,6 +53,8 @@ pub struct ModelStatus {
     pub step_millis: Option<f64>,
     /// Number of splats, voxel blocks or table entries.
     pub primitives: u64,
+    /// Label of that number, such as `Voxel blocks`.
+    pub primitives_label: String,
     /// GPU memory used by the model, bytes.
     pub bytes: u64,
     /// Mean PSNR over the test keyframes, dB; `None` before the first evaluation.

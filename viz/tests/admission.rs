@@ -299,7 +299,7 @@ fn run_result_arrives_before_goodbye() {
     let model = ModelStatus { psnr: Some(26.5), ..ModelStatus::default() };
     hub.set_status(Status { state: "training".to_owned(), keyframes: 40, model, ..Status::default() });
     let mut client = Client::connect(server.address());
-    assert_eq!(client.text_of("status")["ended"], Value::Null);
+    assert_eq!(client.text_of("status")["result"], Value::Null);
     hub.set_state("saving");
     let saving = client.text_of("status");
     assert_eq!((&saving["state"], &saving["psnr"], &saving["keyframes"]), (&json!("saving"), &json!(26.5), &json!(40)));
@@ -308,7 +308,7 @@ fn run_result_arrives_before_goodbye() {
     drop(server);
     let ended = client.text_of("status");
     assert_eq!((&ended["state"], &ended["psnr"]), (&json!("finished"), &json!(26.5)));
-    assert_eq!(ended["ended"], json!({"folder": "runs/kitchen", "scores": "PSNR 26.50 dB", "seconds": 98.0}));
+    assert_eq!(ended["result"], json!({"folder": "runs/kitchen", "scores": "PSNR 26.50 dB", "seconds": 98.0}));
     client.text_of("goodbye");
 }
 

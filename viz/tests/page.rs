@@ -152,19 +152,25 @@ fn publish_updates(hub: &Hub) {
         state: "training".to_owned(),
         seconds: 98.4,
         keyframes: 143,
-        refused: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
+        rejected: BTreeMap::from([("too little motion".to_owned(), 812), ("blurred".to_owned(), 31)]),
         model: ModelStatus {
             method: "splat".to_owned(),
             step: 1520,
             step_millis: Some(41.7),
             primitives: 84_512,
+            primitives_label: "Splats".to_owned(),
             bytes: 61_210_112,
             psnr: Some(26.76),
             psnr_history: (0..50).map(curve).collect(),
         },
-        others: vec![ModelStatus { method: "tsdf".to_owned(), step: 143, ..ModelStatus::default() }],
+        others: vec![ModelStatus {
+            method: "tsdf".to_owned(),
+            step: 143,
+            primitives_label: "Voxel blocks".to_owned(),
+            ..ModelStatus::default()
+        }],
         notes: Vec::new(),
-        ended: None,
+        result: None,
     });
 }
 
@@ -187,7 +193,7 @@ fn page_renders_scene_and_overlays_correctly() {
     std::fs::write(scratch.join("page.png"), browser.screenshot()).expect("written");
     assert_eq!(browser.text("psnr"), "26.76");
     assert_eq!(browser.text("primitives"), "84,512");
-    assert_eq!(browser.text("refused-total"), "843");
+    assert_eq!(browser.text("rejected-total"), "843");
     let at_rest = render_thread.requests();
     let full = at_rest.last().expect("drawn").clone();
     let widths: Vec<_> = at_rest.iter().map(|request| request.size_px[0]).collect();
@@ -217,14 +223,14 @@ fn check_switch(browser: &mut Browser, render_thread: &RenderThread) {
     };
     assert!(render_thread.methods().iter().all(Option::is_none), "no model was chosen");
     press(browser, "tsdf");
-    wait_for(browser, "the other model's values", |browser| browser.text("primitives-name") == "Voxel blocks");
+    wait_for(browser, "the other model's values", |browser| browser.text("primitives-label") == "Voxel blocks");
     wait_for(browser, "its picture", |_| render_thread.methods().last() == Some(&Some("tsdf".to_owned())));
     press(browser, "splat");
     wait_for(browser, "the first model's picture", |_| {
         render_thread.methods().last() == Some(&Some("splat".to_owned()))
     });
     wait_for(browser, "a full picture of it", |browser| browser.text("picture-text").contains("100 %"));
-    assert_eq!(browser.text("primitives-name"), "Splats");
+    assert_eq!(browser.text("primitives-label"), "Splats");
 }
 
 /// The live camera's frustum is drawn according to the request's projection.
@@ -245,11 +251,11 @@ fn check_live_frustum(browser: &mut Browser, request: &RenderRequest) {
     let eye = Point3::from(camera.world_from_camera.translation.vector);
     for (u, v) in [(0.0, 0.0), (640.0, 0.0), (640.0, 480.0), (0.0, 480.0)] {
         for share in [0.3, 0.6, 0.9] {
-            let place = pixel_of(request, eye + (corner(u, v) - eye) * share);
+            let center_px = pixel_of(request, eye + (corner(u, v) - eye) * share);
             let is_near = (-REACH_PX..=REACH_PX)
-                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (place.0 + dx, place.1 + dy)))
+                .flat_map(|dy| (-REACH_PX..=REACH_PX).map(move |dx| (center_px.0 + dx, center_px.1 + dy)))
                 .any(|(x, y)| is_accent(pixel(&shot, x, y)));
-            assert!(is_near, "no line of the frustum near {place:?}");
+            assert!(is_near, "no line of the frustum near {center_px:?}");
         }
     }
 }

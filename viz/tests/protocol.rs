@@ -53,8 +53,9 @@ fn client_receives_hello_then_current_state() {
     let (hub, server) = start();
     hub.set_status(Status {
         state: "training".to_owned(),
-        refused: [("blurred".to_owned(), 3)].into(),
+        rejected: [("blurred".to_owned(), 3)].into(),
         model: ModelStatus {
+            primitives_label: "Splats".to_owned(),
             psnr: Some(24.5),
             psnr_history: vec![(1.0, 20.0), (2.0, 24.5)],
             ..model_status("splat", 1200)
@@ -83,7 +84,8 @@ fn client_receives_hello_then_current_state() {
     let status = client.text_of("status");
     assert_eq!((&status["step"], &status["psnr"]), (&json!(1200), &json!(24.5)));
     assert_eq!(status["psnr_history"], json!([[1.0, 20.0], [2.0, 24.5]]));
-    assert_eq!(status["refused"], json!({"blurred": 3}));
+    assert_eq!(status["rejected"], json!({"blurred": 3}));
+    assert_eq!(status["primitives_label"], json!("Splats"));
     assert_eq!((&status["others"][0]["method"], &status["others"][0]["step"]), (&json!("tsdf"), &json!(30)));
     let keyframes = client.text_of("keyframes");
     assert_eq!(keyframes["keyframes"][0]["focal_px"], json!([600.0, 601.0]));

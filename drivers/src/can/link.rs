@@ -198,7 +198,7 @@ fn missing_interface(interface: &str) -> io::Error {
         );
     }
     let others = match interfaces(Path::new("/sys")).as_slice() {
-        [] => "this computer has none; check that the adapter is plugged in and its driver is loaded".to_owned(),
+        [] => "this computer has none; check that the adapter is connected and its driver is loaded".to_owned(),
         names => format!("existing interfaces: {}", names.join(", ")),
     };
     io::Error::new(io::ErrorKind::NotFound, format!("no such interface: {others}"))

@@ -237,8 +237,8 @@ pub(super) fn map_pdo_at_every_sync(
 ) -> Vec<(Object, i64)> {
     let id = i64::from(pdo.id(direction, node).value());
     let mut entries = vec![(pdo.communication(direction, 1), id | PDO_OFF), (pdo.mapping(direction, 0), 0)];
-    for (place, object) in (1..).zip(objects) {
-        entries.push((pdo.mapping(direction, place), object.mapped().into()));
+    for (entry, object) in (1..).zip(objects) {
+        entries.push((pdo.mapping(direction, entry), object.mapped().into()));
     }
     entries.push((pdo.mapping(direction, 0), i64::try_from(objects.len()).expect("at most eight objects")));
     entries.extend([(pdo.communication(direction, 2), EVERY_SYNC), (pdo.communication(direction, 1), id)]);

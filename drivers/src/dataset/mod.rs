@@ -1,33 +1,33 @@
 //! Datasets on disk: posed photos in nerfstudio and TUM RGB-D folders.
 
-mod frame;
 pub mod nerfstudio;
+mod posed_image;
 pub mod tum;
 
-pub use frame::{DatasetFrame, DepthFile, DepthImage, FrameImages};
+pub use posed_image::{DatasetImage, DepthFile, DepthImage, LoadedImage};
 
 use crate::Error;
 use std::path::{Path, PathBuf};
 
-/// The usable frames of a folder.
+/// The usable images of a folder.
 #[derive(Clone, Debug)]
 pub struct Dataset {
     /// The folder.
     pub path: PathBuf,
     /// Sorted by file name (nerfstudio) or time (TUM); never empty.
-    pub frames: Vec<DatasetFrame>,
-    /// Number of frames skipped because their image file does not exist.
+    pub images: Vec<DatasetImage>,
+    /// Number of images skipped because their file does not exist.
     pub n_missing: usize,
-    /// Number of frames skipped because their image is broken or has no pose or depth close enough in time.
+    /// Number of images skipped because their file is broken, or they have no pose or depth close enough in time.
     pub n_unusable: usize,
-    /// Notes for the user: one sentence each, with the names of the first skipped frames.
+    /// Notes for the user: one sentence each, with the names of the first skipped images.
     pub notes: Vec<String>,
     /// Broken data that are missing from the result: one sentence each.
     pub data_losses: Vec<String>,
 }
 
 impl Dataset {
-    /// Whether the stamps are real times. Otherwise, they only count the frames.
+    /// Whether the stamps are real times. Otherwise, they only count the images.
     pub fn has_times(&self) -> bool {
         !is_nerfstudio(&self.path) && self.path.join(tum::COLOR_LIST).is_file()
     }
@@ -56,34 +56,34 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
 /// Positions beyond this are assumed to be mistakes, meters.
 const MAX_POSITION_M: f64 = 1e4;
 
-/// Frames skipped while reading.
+/// Images skipped while reading.
 #[derive(Debug, Default)]
-struct SkippedFrames {
+struct SkippedImages {
     missing: Vec<String>,
     /// Names with the reason; also in `broken`.
     unusable: Vec<(String, String)>,
     broken: Vec<(String, String)>,
 }
 
-impl SkippedFrames {
+impl SkippedImages {
     /// Maximum number of names in a note.
     const MAX_NAMED: usize = 5;
 
     /// Builds the dataset. Fails if it is empty.
-    fn dataset(self, path: &Path, frames: Vec<DatasetFrame>, mut notes: Vec<String>) -> Result<Dataset, Error> {
+    fn dataset(self, path: &Path, images: Vec<DatasetImage>, mut notes: Vec<String>) -> Result<Dataset, Error> {
         let (n_missing, n_unusable) = (self.missing.len(), self.unusable.len() + self.broken.len());
-        if frames.is_empty() {
+        if images.is_empty() {
             let first_reason = self.broken.iter().chain(&self.unusable).next();
             let first_reason = first_reason.map(|(name, reason)| format!(" ({name}: {reason})")).unwrap_or_default();
             return Err(Error::EmptyDataset { path: path.to_owned(), n_missing, n_unusable, first_reason });
         }
         if n_missing > 0 {
-            let (images, verb) = plural(n_missing, "image");
-            notes.push(format!("{images} {verb} missing: {}", first_names(&self.missing)));
+            let (what, verb) = plural(n_missing, "image");
+            notes.push(format!("{what} {verb} missing: {}", first_names(&self.missing)));
         }
         notes.extend(unusable_note(&self.unusable));
         let data_losses = unusable_note(&self.broken).into_iter().collect();
-        Ok(Dataset { path: path.to_owned(), frames, n_missing, n_unusable, notes, data_losses })
+        Ok(Dataset { path: path.to_owned(), images, n_missing, n_unusable, notes, data_losses })
     }
 }
 
@@ -100,8 +100,8 @@ fn plural(n: usize, noun: &str) -> (String, &'static str) {
 
 /// Joins the first names, with an ellipsis if there are more.
 fn first_names(names: &[String]) -> String {
-    let more = if names.len() > SkippedFrames::MAX_NAMED { ", ..." } else { "" };
-    format!("{}{more}", names[..names.len().min(SkippedFrames::MAX_NAMED)].join(", "))
+    let more = if names.len() > SkippedImages::MAX_NAMED { ", ..." } else { "" };
+    format!("{}{more}", names[..names.len().min(SkippedImages::MAX_NAMED)].join(", "))
 }
 
 #[cfg(test)]

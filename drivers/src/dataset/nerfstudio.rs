@@ -2,8 +2,8 @@
 //!
 //! Their cameras look along -z with y up (OpenGL). Poses are converted to our convention only here.
 
-use super::frame::image_size_px;
-use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames, plural};
+use super::posed_image::image_size_px;
+use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages, plural};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -20,7 +20,7 @@ const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 
 /// Reads a folder, or the file itself.
 ///
-/// Frames are sorted by file name. The following images are skipped and counted: duplicates, missing or broken files,
+/// Images are sorted by file name. The following images are skipped and counted: duplicates, missing or broken files,
 /// poses that are not finite or not rigid, and poses that are implausibly far away.
 ///
 /// # Errors
@@ -42,7 +42,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         return Err(file_error(format!("depth_unit_scale_factor is {meters_per_count}, expected a number above 0")));
     }
 
-    let (mut frames, mut skipped, mut notes) = (Vec::new(), SkippedFrames::default(), Vec::new());
+    let (mut images, mut skipped, mut notes) = (Vec::new(), SkippedImages::default(), Vec::new());
     for (ix, entry) in document.frames.iter().enumerate() {
         if ix > 0 && document.frames[ix - 1].file_path == entry.file_path {
             skipped.unusable.push((entry.file_path.clone(), "listed twice, only the first entry is used".to_owned()));
@@ -89,7 +89,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
             ));
         }
         let depth_path = entry.depth_file_path.as_ref().and_then(|name| find_image(&folder, name));
-        frames.push(DatasetFrame {
+        images.push(DatasetImage {
             name: entry.file_path.clone(),
             intrinsics,
             world_from_camera,
@@ -108,7 +108,7 @@ pub fn read(path: &Path) -> Result<Dataset, Error> {
         let (images, verb) = plural(n_missing_depth, "depth image");
         notes.push(format!("{images} {verb} missing"));
     }
-    skipped.dataset(&folder, frames, notes)
+    skipped.dataset(&folder, images, notes)
 }
 
 /// The whole file. Unknown keys are ignored.

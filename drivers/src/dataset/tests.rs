@@ -47,9 +47,9 @@ fn read_error(folder: &tempfile::TempDir) -> String {
 fn fox_is_read_without_missing_photos() {
     let Some(folder) = test_data::folder("fox") else { return };
     let dataset = read(&folder).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
+    assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (50, 17, 0));
     assert!(dataset.notes[0].starts_with("17 images are missing: "), "{:?}", dataset.notes);
-    let first = &dataset.frames[0];
+    let first = &dataset.images[0];
     assert_eq!(first.name, "images/0001.jpg");
     assert_eq!(
         first.intrinsics.lens,
@@ -62,15 +62,15 @@ fn fox_is_read_without_missing_photos() {
     let down = first.world_from_camera * Vector3::y();
     assert!(down.z < -0.99, "{down}");
     assert_eq!(first.load().unwrap().rgba_srgb.len(), 540 * 960 * 4);
-    assert!(dataset.frames.windows(2).all(|pair| pair[0].name < pair[1].name && pair[0].stamp < pair[1].stamp));
+    assert!(dataset.images.windows(2).all(|pair| pair[0].name < pair[1].name && pair[0].stamp < pair[1].stamp));
 }
 
 #[test]
 fn redkitchen_has_depth_in_meters() {
     let Some(folder) = test_data::folder("redkitchen") else { return };
     let dataset = read(&folder).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.notes.len()), (50, 0, 0));
-    let depth = dataset.frames[10].load().unwrap().depth.unwrap();
+    assert_eq!((dataset.images.len(), dataset.n_missing, dataset.notes.len()), (50, 0, 0));
+    let depth = dataset.images[10].load().unwrap().depth.unwrap();
     assert_eq!(depth.intrinsics.focal_px, [525.0, 525.0]);
     let known: Vec<f32> = depth.depth_m.iter().copied().filter(|&depth_m| depth_m > 0.0).collect();
     assert!(known.len() > 100_000 && known.iter().all(|depth_m| (0.3..10.0).contains(depth_m)));
@@ -82,10 +82,10 @@ fn poses_are_converted_and_frames_sorted() {
     document["frames"][1]["transform_matrix"][0][3] = json!(2.0);
     write_transforms(&folder, &document);
     let dataset = read(&folder.path().join("transforms.json")).unwrap();
-    assert_eq!(dataset.frames.iter().map(|frame| frame.name.as_str()).collect::<Vec<_>>(), ["a.png", "b.png"]);
-    let point = dataset.frames[0].world_from_camera * Point3::new(0.5, 1.0, 3.0);
+    assert_eq!(dataset.images.iter().map(|image| image.name.as_str()).collect::<Vec<_>>(), ["a.png", "b.png"]);
+    let point = dataset.images[0].world_from_camera * Point3::new(0.5, 1.0, 3.0);
     assert!((point - Point3::new(2.5, -1.0, -3.0)).norm() < EXACT_M);
-    let intrinsics = &dataset.frames[1].intrinsics;
+    let intrinsics = &dataset.images[1].intrinsics;
     assert_eq!((intrinsics.focal_px, intrinsics.principal_px), ([5.0, 6.0], [4.5, 3.25]));
     assert_eq!(intrinsics.lens, Lens::Pinhole);
 }
@@ -99,7 +99,7 @@ fn frames_may_have_their_own_fisheye_and_no_extension() {
     document["frames"][0]["fl_x"] = json!(7.0);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    let fisheye = dataset.frames.iter().find(|frame| frame.name == "./b").unwrap();
+    let fisheye = dataset.images.iter().find(|image| image.name == "./b").unwrap();
     assert_eq!(fisheye.intrinsics.lens, Lens::KannalaBrandt([0.0, 0.0, 0.0, 0.25]));
     assert_eq!(fisheye.intrinsics.focal_px, [7.0, 6.0]);
     fisheye.load().unwrap();
@@ -112,9 +112,9 @@ fn lens_parameters_follow_the_size_of_the_images() {
     document["h"] = json!(12);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!(dataset.frames[0].intrinsics.focal_px, [2.5, 3.0]);
+    assert_eq!(dataset.images[0].intrinsics.focal_px, [2.5, 3.0]);
     assert_eq!(dataset.notes, ["images are 8x6, which differs from transforms.json; lens parameters are scaled"]);
-    dataset.frames[0].load().unwrap();
+    dataset.images[0].load().unwrap();
 }
 
 #[test]
@@ -129,10 +129,10 @@ fn masks_and_resized_depth_are_decoded() {
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
     assert_eq!(dataset.notes, ["1 depth image is missing"]);
-    let images = dataset.frames[0].load().unwrap();
-    let alphas: Vec<u8> = images.rgba_srgb.chunks_exact(4).take(8).map(|pixel| pixel[3]).collect();
+    let loaded = dataset.images[0].load().unwrap();
+    let alphas: Vec<u8> = loaded.rgba_srgb.chunks_exact(4).take(8).map(|pixel| pixel[3]).collect();
     assert_eq!(alphas, [0, 0, 255, 255, 255, 255, 255, 255]);
-    let depth = images.depth.unwrap();
+    let depth = loaded.depth.unwrap();
     assert_eq!((depth.intrinsics.size_px, depth.intrinsics.focal_px), ([4, 3], [2.5, 3.0]));
     assert_eq!(depth.depth_m[..4], [0.0, 0.1, 0.2, 13.107]);
 }
@@ -148,7 +148,7 @@ fn missing_and_garbage_images_are_skipped_and_counted() {
     document["frames"].as_array_mut().unwrap().push(entry);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (2, 1, 1));
+    assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (2, 1, 1));
     assert_eq!(dataset.notes, ["1 image is missing: none.png"]);
     assert!(dataset.data_losses[0].starts_with("1 image cannot be used: garbage.jpg ("), "{:?}", dataset.data_losses);
     for name in ["a.png", "b.png"] {
@@ -165,7 +165,7 @@ fn duplicate_photo_is_used_once() {
     document["frames"].as_array_mut().unwrap().push(duplicate);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_unusable), (2, 1));
+    assert_eq!((dataset.images.len(), dataset.n_unusable), (2, 1));
     assert!(dataset.notes[0].contains("b.png (listed twice"), "{:?}", dataset.notes);
 }
 
@@ -177,7 +177,7 @@ fn truncated_photo_error_names_it() {
     let bytes = std::fs::read(&photo).unwrap();
     std::fs::write(&photo, &bytes[..bytes.len() - 30]).unwrap();
     let dataset = read(folder.path()).unwrap();
-    let text = dataset.frames[0].load().unwrap_err().to_string();
+    let text = dataset.images[0].load().unwrap_err().to_string();
     assert!(text.contains("a.png") && text.contains("does not decode"), "{text}");
 }
 
@@ -187,7 +187,7 @@ fn implausibly_far_pose_skips_frame() {
     document["frames"][1]["transform_matrix"][2][3] = json!(1e30);
     write_transforms(&folder, &document);
     let dataset = read(folder.path()).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
+    assert_eq!((dataset.images.len(), dataset.n_unusable), (1, 1));
     assert_eq!(dataset.data_losses, ["1 image cannot be used: a.png (its pose is 1e30 m away, the maximum is 1e4 m)"]);
 }
 
@@ -197,9 +197,9 @@ fn undecodable_depth_keeps_photo() {
     document["frames"][1]["depth_file_path"] = json!("depth.png");
     std::fs::write(folder.path().join("depth.png"), b"not an image").unwrap();
     write_transforms(&folder, &document);
-    let images = read(folder.path()).unwrap().frames[0].load().unwrap();
-    assert_eq!((images.rgba_srgb.len(), images.depth), (8 * 6 * 4, None));
-    assert!(images.depth_error.is_some_and(|reason| reason.contains("depth.png")));
+    let loaded = read(folder.path()).unwrap().images[0].load().unwrap();
+    assert_eq!((loaded.rgba_srgb.len(), loaded.depth), (8 * 6 * 4, None));
+    assert!(loaded.depth_error.is_some_and(|reason| reason.contains("depth.png")));
 }
 
 #[test]
@@ -252,7 +252,7 @@ fn invalid_pose_skips_image_with_note() {
         let dataset = read(folder.path()).unwrap();
         let [note] = &dataset.data_losses[..] else { panic!("{:?}", dataset.data_losses) };
         assert!(note.contains("b.png (") && note.contains(reason), "{note}");
-        assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
+        assert_eq!((dataset.images.len(), dataset.n_unusable), (1, 1));
     }
 }
 
@@ -294,10 +294,10 @@ fn tum_folder() -> tempfile::TempDir {
 fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     let folder = tum_folder();
     let dataset = read(folder.path()).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
+    assert_eq!((dataset.images.len(), dataset.n_missing, dataset.n_unusable), (3, 1, 1));
     assert!(dataset.notes.iter().any(|note| note.contains("rgb/9.000000.png (no pose within 20 ms)")));
     assert!(dataset.notes.contains(&"1 photo has no depth image within 20 ms".to_owned()), "{:?}", dataset.notes);
-    let second = &dataset.frames[1];
+    let second = &dataset.images[1];
     assert_eq!(second.stamp, Stamp(1_100_000_000));
     // Halfway between two poses. The depth image was taken 10 ms later and 1 cm further.
     assert!((second.world_from_camera.translation.vector - Vector3::new(0.105, 2.0, 3.0)).norm() < EXACT_M);
@@ -305,7 +305,7 @@ fn tum_photos_interpolate_pose_and_use_nearest_depth() {
     assert!((depth.world_from_camera.translation.x - 0.115).abs() < EXACT_M);
     assert_eq!(second.load().unwrap().depth.unwrap().depth_m, [1.0; 48]);
     assert_eq!(second.intrinsics.principal_px, [4.0, 3.0]);
-    assert!(dataset.frames[2].depth.is_none());
+    assert!(dataset.images[2].depth.is_none());
 }
 
 #[test]
@@ -318,7 +318,7 @@ fn tum_intrinsics_come_from_file_or_folder_name() {
     for name in ["rgb", "depth", "rgb.txt", "depth.txt", "groundtruth.txt"] {
         std::fs::rename(folder.path().join(name), named.join(name)).unwrap();
     }
-    let intrinsics = read(&named).unwrap().frames[0].intrinsics.clone();
+    let intrinsics = read(&named).unwrap().images[0].intrinsics.clone();
     assert_eq!((intrinsics.focal_px[0], intrinsics.size_px), (517.306_408, [8, 6]));
     assert_eq!(intrinsics.lens, Lens::BrownConrady([0.262_383, -0.953_104, -0.005_358, 0.002_628, 1.163_314]));
     std::fs::write(named.join("calibration.txt"), "500 500 1").unwrap();
@@ -336,7 +336,7 @@ fn broken_tum_list_error_names_line() {
     std::fs::write(folder.path().join("groundtruth.txt"), "1.0 nan 0 0 0 0 0 1\n").unwrap();
     assert!(read_error(&folder).contains("no pose within 20 ms"), "an invalid pose is skipped");
     std::fs::write(folder.path().join("groundtruth.txt"), "0.99 0 0 0 0 0 0 0\n1.0 0 0 0 0 0 0 1\n").unwrap();
-    assert_eq!(read(folder.path()).unwrap().frames.len(), 1);
+    assert_eq!(read(folder.path()).unwrap().images.len(), 1);
 }
 
 #[test]
@@ -347,6 +347,6 @@ fn tum_extreme_stamps_and_poses_are_not_matched() {
     write("depth.txt", "-9223372036 depth/1.015000.png\n");
     write("groundtruth.txt", "-9223372036 0 0 0 0 0 0 1\n0.995 1e308 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n");
     let dataset = read(folder.path()).unwrap();
-    assert_eq!((dataset.frames.len(), dataset.n_unusable), (1, 1));
-    assert!(dataset.frames[0].depth.is_none());
+    assert_eq!((dataset.images.len(), dataset.n_unusable), (1, 1));
+    assert!(dataset.images[0].depth.is_none());
 }

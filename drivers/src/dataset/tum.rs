@@ -3,8 +3,8 @@
 //! Source: Sturm, Engelhard, Endres, Burgard, Cremers 2012, and the file formats documented on the web pages of the
 //! benchmark.
 
-use super::frame::image_size_px;
-use super::{Dataset, DatasetFrame, DepthFile, MAX_POSITION_M, SkippedFrames};
+use super::posed_image::image_size_px;
+use super::{Dataset, DatasetImage, DepthFile, MAX_POSITION_M, SkippedImages};
 use crate::Error;
 use kinematics::{Intrinsics, Lens, Stamp, Transform, transform};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -42,7 +42,7 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         false => Vec::new(),
     };
     let poses = Poses::read(folder)?;
-    let (mut frames, mut skipped) = (Vec::new(), SkippedFrames::default());
+    let (mut images, mut skipped) = (Vec::new(), SkippedImages::default());
     let mut n_without_depth = 0;
     for (stamp, name) in colors {
         let image_path = folder.join(&name);
@@ -64,14 +64,14 @@ pub fn read(folder: &Path) -> Result<Dataset, Error> {
         });
         n_without_depth += usize::from(depth.is_none());
         let intrinsics = Intrinsics { size_px, ..camera.clone() };
-        frames.push(DatasetFrame { name, intrinsics, world_from_camera, stamp, image_path, depth, mask_path: None });
+        images.push(DatasetImage { name, intrinsics, world_from_camera, stamp, image_path, depth, mask_path: None });
     }
     let notes = match n_without_depth {
         0 => Vec::new(),
         1 => vec!["1 photo has no depth image within 20 ms".to_owned()],
         n => vec![format!("{n} photos have no depth image within 20 ms")],
     };
-    skipped.dataset(folder, frames, notes)
+    skipped.dataset(folder, images, notes)
 }
 
 /// Lens parameters. The caller sets the size to that of each photo.

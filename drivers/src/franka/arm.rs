@@ -173,15 +173,15 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
     let q: Vec<f64> = sequence.iter().map(|ix| state.q[*ix]).collect();
     let ours = chain.forward(&q).map_err(chain_error)?;
     let matrix = |name, matrix| pose(matrix).map_err(|error| format!("its {name} is not a valid pose: {error}"));
-    let (base_from_ee, flange_from_ee) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
-    let reported = base_from_ee * flange_from_ee.inverse();
+    let (base_from_tool, flange_from_tool) = (matrix("O_T_EE", &state.O_T_EE)?, matrix("F_T_EE", &state.F_T_EE)?);
+    let reported = base_from_tool * flange_from_tool.inverse();
     let (error_m, error_rad) = difference(&ours, &reported);
     if error_m <= MAX_POSE_ERROR_M && error_rad <= MAX_POSE_ERROR_RAD {
         return Ok(());
     }
-    let (ee_error_m, ee_error_rad) = difference(&ours, &base_from_ee);
+    let (tool_error_m, tool_error_rad) = difference(&ours, &base_from_tool);
     let tip = chain.tip_link();
-    let likely_cause = if ee_error_m <= MAX_POSE_ERROR_M && ee_error_rad <= MAX_POSE_ERROR_RAD {
+    let likely_cause = if tool_error_m <= MAX_POSE_ERROR_M && tool_error_rad <= MAX_POSE_ERROR_RAD {
         format!(
             "{tip:?} is at the robot's end effector: arm.flange_link must name the flange, which differs from it by F_T_EE"
         )
@@ -189,7 +189,7 @@ fn check_kinematics(config: &ArmConfig, state: &RobotState) -> Result<(), String
         format!(
             "likely causes: arm.flange_link is not the flange (panda_link8, fr3_link8), the end effector was changed in Desk, \
              arm.joints is in the wrong order, or arm.urdf is of another robot; {tip:?} is {} from the robot's end effector",
-            format_difference(ee_error_m, ee_error_rad)
+            format_difference(tool_error_m, tool_error_rad)
         )
     };
     Err(format!(

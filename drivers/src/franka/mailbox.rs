@@ -1,4 +1,4 @@
-//! Exchanges orders and results between the caller that commands an arm and the thread that moves it.
+//! Exchanges commands and results between the caller that commands an arm and the thread that moves it.
 
 use super::MotionStatistics;
 use crate::motion::{JointTarget, Motion};
@@ -6,7 +6,7 @@ use franka::RobotMode;
 use parking_lot::{Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-/// Orders to the thread, and its results.
+/// Commands to the thread, and its results.
 #[derive(Debug)]
 pub(super) struct MotionMailbox {
     mailbox_state: Mutex<MailboxState>,
@@ -15,12 +15,12 @@ pub(super) struct MotionMailbox {
 
 #[derive(Debug)]
 pub(super) struct MailboxState {
-    /// The newest order that the thread has not processed yet.
-    pub(super) order: Option<MotionOrder>,
+    /// The newest command that the thread has not processed yet.
+    pub(super) command: Option<MotionCommand>,
     /// ID of a motion that the robot has accepted and the thread has not processed yet.
     pub(super) started_motion: Option<u32>,
-    /// Whether a motion that accepts orders is active or about to start.
-    pub(super) accepts_orders: bool,
+    /// Whether a motion that accepts commands is active or about to start.
+    pub(super) accepts_commands: bool,
     /// Whether no motion is active and the next one may start.
     pub(super) is_idle: bool,
     /// Whether the motion should end as soon as the arm is at rest.
@@ -33,7 +33,7 @@ pub(super) struct MailboxState {
 }
 
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum MotionOrder {
+pub(super) enum MotionCommand {
     SetTarget(JointTarget),
     Stop,
 }
@@ -41,9 +41,9 @@ pub(super) enum MotionOrder {
 impl Default for MotionMailbox {
     fn default() -> Self {
         let mailbox_state = MailboxState {
-            order: None,
+            command: None,
             started_motion: None,
-            accepts_orders: false,
+            accepts_commands: false,
             is_idle: true,
             is_shutting_down: false,
             is_lost: false,

@@ -2,7 +2,7 @@
 //! millisecond.
 
 use super::limits::RobotLimits;
-use super::mailbox::{MotionMailbox, MotionOrder};
+use super::mailbox::{MotionCommand, MotionMailbox};
 use super::reference::{CommandFate, Reference};
 use super::request::{self, MotionResponse};
 use super::session::{Session, error_text};
@@ -99,7 +99,7 @@ impl MotionLoop {
             },
             MotionState::Beginning { id, n_waited } => self.start_motion(id, n_waited, stamped),
             MotionState::ActiveMotion(active) if state.robot_mode != RobotMode::Move => {
-                self.mailbox.update(|mailbox_state| mailbox_state.accepts_orders = false);
+                self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
                 MotionState::Ending { id: active.id, n_waited: 0, reason: cause(state) }
             }
             MotionState::ActiveMotion(active) => self.run(active, stamped),
@@ -171,8 +171,8 @@ impl MotionLoop {
             n => active.reference.advance(active.sent, n, state),
         };
         (active.reference, active.number, active.sent) = (reference, *number, None);
-        let order = self.take_order(&mut active, n_states, fate, stamped);
-        let position_rad = match self.next_position(&mut active, order.as_ref(), fate) {
+        let command = self.take_command(&mut active, n_states, fate, stamped);
+        let position_rad = match self.next_position(&mut active, command.as_ref(), fate) {
             Ok(position_rad) => position_rad,
             Err(why) => return self.halt(active.id, why),
         };
@@ -182,14 +182,14 @@ impl MotionLoop {
         MotionState::ActiveMotion(active)
     }
 
-    /// Updates the statistics, takes the pending order, and updates whether the arm is at rest.
-    fn take_order(
+    /// Updates the statistics, takes the pending command, and updates whether the arm is at rest.
+    fn take_command(
         &self,
         active: &mut ActiveMotion,
         n_states: u64,
         fate: CommandFate,
         stamped: &StampedState<'_>,
-    ) -> Option<MotionOrder> {
+    ) -> Option<MotionCommand> {
         active.n_cycles += 1;
         let mut mailbox_state = self.mailbox.lock();
         mailbox_state.statistics.n_cycles += 1;
@@ -201,30 +201,30 @@ impl MotionLoop {
         if active.n_cycles > N_SUCCESS_WINDOW {
             mailbox_state.statistics.count_robot_success(stamped.numbered.state.control_command_success_rate);
         }
-        let order = mailbox_state.order.take();
-        let is_at_rest = active.generator.is_at_rest() && order.is_none();
+        let command = mailbox_state.command.take();
+        let is_at_rest = active.generator.is_at_rest() && command.is_none();
         active.n_at_rest = if is_at_rest { active.n_at_rest + 1 } else { 0 };
         if is_at_rest && (active.n_at_rest > MAX_AT_REST || mailbox_state.is_shutting_down) {
-            (active.is_ending, mailbox_state.accepts_orders) = (true, false);
+            (active.is_ending, mailbox_state.accepts_commands) = (true, false);
         }
         let motion = if is_at_rest { Motion::Holding } else { Motion::Moving };
         if mailbox_state.motion != motion {
             mailbox_state.motion = motion;
         }
-        order
+        command
     }
 
     /// Computes the next joint positions.
     fn next_position(
         &self,
         active: &mut ActiveMotion,
-        order: Option<&MotionOrder>,
+        command: Option<&MotionCommand>,
         fate: CommandFate,
     ) -> Result<[f64; super::N_JOINTS], String> {
         let ActiveMotion { generator, reference, .. } = active;
-        match order {
-            Some(MotionOrder::SetTarget(target)) => drop(generator.set_target(target)?),
-            Some(MotionOrder::Stop) => generator.stop(),
+        match command {
+            Some(MotionCommand::SetTarget(target)) => drop(generator.set_target(target)?),
+            Some(MotionCommand::Stop) => generator.stop(),
             None => {}
         }
         // At rest the robot stays where it is, even if commands were lost.
@@ -260,7 +260,7 @@ impl MotionLoop {
             Ok(()) => reason,
             Err(why) => format!("{reason}; {why}"),
         };
-        self.mailbox.update(|mailbox_state| mailbox_state.accepts_orders = false);
+        self.mailbox.update(|mailbox_state| mailbox_state.accepts_commands = false);
         MotionState::Ending { id, n_waited: 0, reason: Some(reason) }
     }
 
@@ -287,7 +287,7 @@ impl MotionLoop {
         match reason {
             Some(reason) => self.stop_because(reason),
             None => self.mailbox.update(|mailbox_state| {
-                (mailbox_state.is_idle, mailbox_state.accepts_orders, mailbox_state.order, mailbox_state.motion) =
+                (mailbox_state.is_idle, mailbox_state.accepts_commands, mailbox_state.command, mailbox_state.motion) =
                     (true, false, None, Motion::Holding);
             }),
         }
@@ -297,8 +297,8 @@ impl MotionLoop {
     fn stop_because(&self, reason: String) {
         log::warn!("{}: {reason}", self.device);
         self.mailbox.update(|mailbox_state| {
-            // An order from before the stop must not be executed after the recovery.
-            (mailbox_state.is_idle, mailbox_state.accepts_orders, mailbox_state.order) = (true, false, None);
+            // A command from before the stop must not be executed after the recovery.
+            (mailbox_state.is_idle, mailbox_state.accepts_commands, mailbox_state.command) = (true, false, None);
             mailbox_state.motion = Motion::Stopped { reason };
         });
     }

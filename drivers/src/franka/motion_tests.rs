@@ -241,7 +241,7 @@ fn stricter_robot_triggers_reflex_and_recovers() {
         address,
         version: FciVersion::V5,
         chain: chain("link8"),
-        flange_from_ee: Transform::identity(),
+        flange_from_tool: Transform::identity(),
         limits,
     };
     let emulated = EmulatedRobot::start(config_5, joint_simulator).unwrap();

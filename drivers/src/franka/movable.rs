@@ -1,7 +1,7 @@
 //! A movable arm. A motion starts with the first target and ends a second after the arm came to rest.
 
 use super::limits::{RobotLimits, clamp_to_range};
-use super::mailbox::{MailboxState, MotionMailbox, MotionOrder};
+use super::mailbox::{MailboxState, MotionCommand, MotionMailbox};
 use super::motion_loop::MotionLoop;
 use super::request::{self, ContactConfig};
 use super::session::Session;
@@ -119,10 +119,10 @@ impl MovableFrankaArm {
         let id = request::start_motion(&self.session);
         let id = id.map_err(|why| self.fault(format!("it refused to start a motion: {why}")))?;
         self.mailbox.update(|mailbox_state| {
-            (mailbox_state.started_motion, mailbox_state.accepts_orders, mailbox_state.is_idle) =
+            (mailbox_state.started_motion, mailbox_state.accepts_commands, mailbox_state.is_idle) =
                 (Some(id), true, false);
-            (mailbox_state.order, mailbox_state.motion) =
-                (Some(MotionOrder::SetTarget(target.clone())), Motion::Moving);
+            (mailbox_state.command, mailbox_state.motion) =
+                (Some(MotionCommand::SetTarget(target.clone())), Motion::Moving);
         });
         Ok(())
     }
@@ -154,9 +154,9 @@ impl MovableArm for MovableFrankaArm {
             drop(mailbox_state);
             return Err(self.fault(why));
         }
-        if mailbox_state.accepts_orders {
-            (mailbox_state.order, mailbox_state.motion) =
-                (Some(MotionOrder::SetTarget(target.clone())), Motion::Moving);
+        if mailbox_state.accepts_commands {
+            (mailbox_state.command, mailbox_state.motion) =
+                (Some(MotionCommand::SetTarget(target.clone())), Motion::Moving);
             return Ok(target);
         }
         drop(mailbox_state);
@@ -170,14 +170,14 @@ impl MovableArm for MovableFrankaArm {
 
     fn stop(&mut self) -> Result<(), Error> {
         let mut mailbox_state = self.mailbox.lock();
-        if mailbox_state.accepts_orders {
-            mailbox_state.order = Some(MotionOrder::Stop);
+        if mailbox_state.accepts_commands {
+            mailbox_state.command = Some(MotionCommand::Stop);
         }
         Ok(())
     }
 
     /// Clears the reflex, if one stopped the arm. A user stop or locked joints must be released by a person first;
-    /// the error says so.
+    /// the error names the cause.
     fn recover(&mut self) -> Result<(), Error> {
         let Some(mailbox_state) =
             self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost)
@@ -213,7 +213,7 @@ impl Drop for MovableFrankaArm {
     fn drop(&mut self) {
         self.mailbox.update(|mailbox_state| {
             mailbox_state.is_shutting_down = true;
-            mailbox_state.order = mailbox_state.accepts_orders.then_some(MotionOrder::Stop);
+            mailbox_state.command = mailbox_state.accepts_commands.then_some(MotionCommand::Stop);
         });
         if self.mailbox.wait(STOP_TIMEOUT, |mailbox_state| mailbox_state.is_idle || mailbox_state.is_lost).is_none() {
             log::warn!("arm at {}: the motion did not end", self.address);

@@ -24,10 +24,10 @@ pub(super) fn chain(tip: &str) -> Chain {
 
 pub(super) fn robot(version: FciVersion, joint_simulator: JointSimulator) -> EmulatedRobot {
     let limits = if version == FciVersion::V5 { Limits::panda() } else { Limits::fr3() };
-    let flange_from_ee = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
+    let flange_from_tool = Transform::new([0.0, 0.0, 0.1034].into(), [0.0, 0.0, -std::f64::consts::FRAC_PI_4].into());
     let address = FREE_PORT.parse().unwrap();
     EmulatedRobot::start(
-        RobotConfig { address, version, chain: chain("link8"), flange_from_ee, limits },
+        RobotConfig { address, version, chain: chain("link8"), flange_from_tool, limits },
         joint_simulator,
     )
     .unwrap()

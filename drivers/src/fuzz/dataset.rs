@@ -32,10 +32,10 @@ pub fn tum(bytes: &[u8]) {
 
 fn read(folder: &Scratch) {
     let Ok(dataset) = dataset::read(&folder.0) else { return };
-    assert!(!dataset.frames.is_empty());
-    for frame in &dataset.frames {
-        assert!(transform::is_finite(&frame.world_from_camera), "{frame:?}");
-        let _ = frame.load();
+    assert!(!dataset.images.is_empty());
+    for image in &dataset.images {
+        assert!(transform::is_finite(&image.world_from_camera), "{image:?}");
+        let _ = image.load();
     }
 }
 

@@ -17,7 +17,7 @@ pub enum Problem {
     },
     /// No camera is connected, or not the requested one.
     #[error(
-        "no RealSense camera {}is plugged in; connected cameras: {}",
+        "no RealSense camera {}is connected; found: {}",
         if serial.is_empty() { String::new() } else { format!("with the serial number {serial:?} ") },
         if connected.is_empty() { "none (check with `lsusb -d 8086:` and install the udev rules of the SDK)".to_owned() }
         else { connected.join(", ") }
@@ -29,7 +29,7 @@ pub enum Problem {
         connected: Vec<String>,
     },
     /// Several cameras are connected and the rig file does not select one.
-    #[error("several RealSense cameras are plugged in: set device = \"SERIAL\" in the rig file to one of {}", connected.join(", "))]
+    #[error("several RealSense cameras are connected: set device = \"SERIAL\" in the rig file to one of {}", connected.join(", "))]
     Ambiguous {
         /// Names and serial numbers of the connected cameras.
         connected: Vec<String>,

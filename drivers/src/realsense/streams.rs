@@ -92,8 +92,9 @@ impl StreamRequest {
             modes.iter().enumerate().flat_map(of_sensor)
         };
         let mode_at = |(sensor, mode): (usize, usize)| &modes[sensor].modes[mode];
-        let rank = |place: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*place).format);
-        all().filter(|place| self.fits(mode_at(*place), rate_hz)).min_by_key(rank).ok_or_else(|| {
+        let rank =
+            |indices: &(usize, usize)| self.formats.iter().position(|format| *format == mode_at(*indices).format);
+        all().filter(|indices| self.fits(mode_at(*indices), rate_hz)).min_by_key(rank).ok_or_else(|| {
             let offered: BTreeSet<String> =
                 all().map(mode_at).filter(|mode| self.is_of_stream(mode)).map(describe).collect();
             let offered: Vec<_> = offered.into_iter().collect();
@@ -127,7 +128,7 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<A
         depth: depth.map(|depth| depth_calibration(device, depth, mode_at(depth), mode_at(image))).transpose()?,
     };
     let chosen: Vec<_> = std::iter::once(image).chain(depth).collect();
-    let description: Vec<_> = chosen.iter().map(|place| describe(mode_at(*place))).collect();
+    let description: Vec<_> = chosen.iter().map(|indices| describe(mode_at(*indices))).collect();
     let started = ActiveStreams {
         calibration,
         format: FORMATS
@@ -142,7 +143,7 @@ pub(super) fn start(config: &Config, device: &Device, queue: &Queue) -> Result<A
     };
     for sensor in &started.sensors {
         let sensor_modes: Vec<_> =
-            chosen.iter().filter(|place| place.0 == *sensor).map(|place| mode_at(*place)).collect();
+            chosen.iter().filter(|indices| indices.0 == *sensor).map(|indices| mode_at(*indices)).collect();
         device.sensors[*sensor].open(&sensor_modes).inspect_err(|_| started.stop(device))?;
     }
     started.run(device, queue, config.file.is_some()).inspect_err(|_| started.stop(device))?;

@@ -315,7 +315,7 @@ mod tests {
                 )
             };
         }
-        let (codes, places) = rows!(
+        let (codes, offsets) = rows!(
             QUERYCAP, ENUM_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF, STREAMON, STREAMOFF, G_PARM, S_PARM, ENUMINPUT,
             G_CTRL, S_CTRL, QUERYCTRL, QUERYMENU, G_INPUT, ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS;
             Capability.device_caps = "v4l2_capability, device_caps",
@@ -337,7 +337,7 @@ mod tests {
             Input.status = "v4l2_input, status",
             Input.capabilities = "v4l2_input, capabilities"
         );
-        let expected: Vec<(String, u64)> = codes.into_iter().chain(places).collect();
+        let expected: Vec<(String, u64)> = codes.into_iter().chain(offsets).collect();
         let c_print = |(what, _): &(String, u64)| format!("printf(\"%llu\\n\", (unsigned long long){what});\n");
         let program = format!(
             "#include <stddef.h>\n#include <stdio.h>\n#include <linux/videodev2.h>\nint main(void) {{\n{}return 0; }}\n",

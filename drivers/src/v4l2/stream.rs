@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 /// Number of image buffers: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
 /// A stamp that is earlier than the start of the stream or later than now by more than this is of another clock,
-/// whatever its flag says.
+/// regardless of its flag.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images.
 const MAX_EXPOSURE_QUERY_FRAC: f64 = 0.25;

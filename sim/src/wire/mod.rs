@@ -78,7 +78,7 @@ impl JointTrack {
     /// Fails if readings are out of order or non-finite, or if the script is empty.
     pub fn new(readings: &[JointState], playback_clock: PlaybackClock) -> Result<Self, HistoryError> {
         let (Some(first), Some(last)) = (readings.first(), readings.last()) else {
-            return Err(HistoryError::NotYet { newest: None, asked: playback_clock.scripted });
+            return Err(HistoryError::NotYet { newest: None, requested: playback_clock.scripted });
         };
         let mut history = JointHistory::new(MAX_GAP, readings.len().max(2));
         readings.iter().try_for_each(|state| history.push(state.clone()))?;

@@ -1,25 +1,12 @@
 //! `fieldrig bench budget`: accuracy over the number of splats, and the number that the trainer chooses.
 
-use crate::bench::page::{Findings, Table};
-use crate::bench::runs::{BenchArgs, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{db_per_doubling, extent};
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::{ModelKind, ModelSpec};
-use crate::open_gpu::open_gpu;
-use crate::training;
-use kinematics::quantile::median;
-use serde::Serialize;
-use std::collections::HashSet;
+use super::runs_args::RunsArgs;
+use crate::exit::Exit;
+use bench::budget::BudgetOptions;
 use std::path::PathBuf;
-use trainer::splat::{CountPolicy, SplatOptions};
 
-/// Training time of a run if no flag limits it.
-const DEFAULT_SECONDS: f64 = 60.0;
 /// Maximum number of splats in a rig file.
 const MAX_CAP: i64 = 100_000_000;
-/// Gain below which doubling the splats is not worthwhile, dB.
-const MIN_GAIN_DB: f64 = 0.1;
 
 /// Flags of `bench budget`.
 #[derive(Debug, clap::Args)]
@@ -45,204 +32,22 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     #[command(flatten)]
-    bench: BenchArgs,
+    runs: RunsArgs,
 }
 
-/// The runs with one limit.
-#[derive(Clone, Debug, Serialize)]
-struct Capped {
-    /// The limit; `None` if the trainer chooses the number.
-    cap: Option<u32>,
-    /// Median number of splats at the end.
-    primitives: f64,
-    /// Median PSNR at the end, dB.
-    psnr: f64,
-    psnr_extent: [f64; 2],
-    runs: Vec<Run>,
+pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
+    args.runs.run(|host| bench::budget::run(&args.options(), host))
 }
 
-/// Gain from more splats, between two limits.
-#[derive(Debug, Serialize)]
-struct Gain {
-    to_cap: Option<u32>,
-    from_primitives: f64,
-    to_primitives: f64,
-    db_per_doubling: f64,
-}
-
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    if args.bench.training.max_splats.is_some() || args.bench.training.count.is_some() {
-        return Err(
-            BadArgument("--max-splats, --count: this bench sets them; choose limits with --splats".into()).into()
-        );
-    }
-    let mut caps: Vec<Option<u32>> = args.splats.iter().copied().map(Some).collect();
-    caps.sort_unstable();
-    caps.dedup();
-    // The number chosen by the trainer comes first, because most readers want it.
-    caps.insert(0, None);
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    runs.expect(caps.len() * usize::try_from(args.seeds)?);
-    let data = runs.load(&args.data, &mut HashSet::new())?;
-    let base_options = data.splats()?;
-    let mut capped = Vec::new();
-    let mut page = None;
-    for cap in caps {
-        let mut finished = Vec::new();
-        let cap_name = cap.map_or_else(|| "no cap".to_owned(), |cap| format!("cap {cap}"));
-        for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
-            let (max_splats, count) = match cap {
-                Some(cap) => (cap, CountPolicy::ToCap),
-                None => (base_options.max_splats, CountPolicy::Tested),
-            };
-            finished.push(runs.run(Job {
-                name: format!("budget {} {cap_name} seed {seed}", data.name),
-                data: &data,
-                model_spec: ModelSpec {
-                    kind: ModelKind::Splat,
-                    options: SplatOptions { seed, max_splats, count, ..base_options.clone() },
-                },
-                limits,
-                disturbed: None,
-                variant: None,
-                keyframes: &|| data.data.keyframes.clone(),
-                is_thorough: false,
-            })?);
+impl Args {
+    fn options(&self) -> BudgetOptions {
+        BudgetOptions {
+            data: self.data.clone(),
+            splats: self.splats.clone(),
+            seconds: self.seconds,
+            steps: self.steps,
+            seeds: self.seeds,
+            runs: self.runs.options(),
         }
-        capped.extend(Capped::of(cap, finished));
-        page = Some(findings(args, &runs, &data, &capped)?);
-    }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data.data.data_losses))
-}
-
-impl Capped {
-    fn of(cap: Option<u32>, runs: Vec<Run>) -> Option<Self> {
-        let sizes: Vec<f64> = runs.iter().map(|run| run.end.primitives as f64).collect();
-        let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
-        Some(Self { cap, primitives: median(&sizes)?, psnr: median(&ends)?, psnr_extent: extent(&ends)?, runs })
-    }
-
-    fn point(&self) -> Point {
-        let [low, high] = self.psnr_extent;
-        Point { x: self.primitives.max(1.0), y: self.psnr, low, high }
-    }
-
-    fn cap_label(&self) -> String {
-        self.cap.map_or_else(|| "none".to_owned(), |cap| cap.to_string())
-    }
-}
-
-/// Gains per doubling between neighboring limits, where the number of splats grew.
-fn gains(by_cap: &[&Capped]) -> Vec<Gain> {
-    let pairs = by_cap.windows(2);
-    let gain = |pair: &[&Capped]| {
-        let [fewer, more] = [pair[0], pair[1]].map(|capped| (capped.primitives, capped.psnr));
-        let db_per_doubling = db_per_doubling(fewer, more)?;
-        Some(Gain { to_cap: pair[1].cap, from_primitives: fewer.0, to_primitives: more.0, db_per_doubling })
-    };
-    pairs.filter_map(gain).collect()
-}
-
-/// Writes the findings so far.
-fn findings(args: &Args, runs: &Runs<'_>, data: &NamedData, capped: &[Capped]) -> anyhow::Result<(Findings, PathBuf)> {
-    let by_cap: Vec<&Capped> = capped.iter().filter(|capped| capped.cap.is_some()).collect();
-    let chosen = capped.iter().find(|capped| capped.cap.is_none());
-    let gains = gains(&by_cap);
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
-    let spread = if args.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", args.seeds)
-    } else {
-        "one run per cap".to_owned()
-    };
-    let subtitle = format!("{}, splat, {length}; {spread}", data.name);
-    let x = |label: &str| Axis { label: label.to_owned(), scale: Scale::Log, ticks: Vec::new() };
-    let line = |label: &str, points: Vec<Point>| Line { label: label.to_owned(), points, is_peer: false };
-    let own_curve_point = chosen.map(Capped::point);
-    let own_marker = chosen.map(|chosen| Marker {
-        x: chosen.primitives.max(1.0),
-        label: format!("chosen by the trainer: {} splats, {:.2} dB", chosen.primitives, chosen.psnr),
-        line_ix: 1,
-    });
-    let mut points: Vec<Point> = by_cap.iter().map(|capped| capped.point()).collect();
-    points.sort_by(|a, b| a.x.total_cmp(&b.x));
-    let accuracy = Chart {
-        title: "PSNR of test images over the number of splats".into(),
-        subtitle: subtitle.clone(),
-        x: x("splats at the end (log)"),
-        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("with a cap", points), line("no cap", own_curve_point.into_iter().collect())],
-        thresholds: Vec::new(),
-        markers: own_marker.into_iter().collect(),
-    };
-    let gain_point = |gain: &Gain| {
-        let x = (gain.from_primitives * gain.to_primitives).sqrt();
-        Point { x, y: gain.db_per_doubling, low: gain.db_per_doubling, high: gain.db_per_doubling }
-    };
-    let gain_chart = Chart {
-        title: "Gain from doubling the splats".into(),
-        subtitle: format!("{subtitle}; each point between two neighboring caps"),
-        x: x("splats (log)"),
-        y: Axis { label: "gain, dB per doubling".into(), scale: Scale::Linear, ticks: Vec::new() },
-        lines: vec![line("gain per doubling", gains.iter().map(gain_point).collect())],
-        thresholds: vec![(MIN_GAIN_DB, format!("{MIN_GAIN_DB} dB: minimum worthwhile gain"))],
-        markers: Vec::new(),
-    };
-    let row = |capped: &Capped| {
-        let gain = gains.iter().find(|gain| capped.cap.is_some() && gain.to_cap == capped.cap);
-        vec![
-            capped.cap_label(),
-            format!("{:.0}", capped.primitives),
-            format!("{:.2}", capped.psnr),
-            gain.map_or_else(|| "-".to_owned(), |gain| format!("{:+.2}", gain.db_per_doubling)),
-        ]
-    };
-    let head = ["cap", "splats", "PSNR, dB", "gain per doubling, dB"].map(str::to_owned).to_vec();
-    let findings = Findings {
-        name: "budget",
-        title: format!("Accuracy over size: {}", data.name),
-        sentences: vec![
-            format!(
-                "Each point is a model trained for {length} with a cap on its splats and scored on test images. \
- In the run without a cap, the trainer chooses the number (at most {}): it is halved as long as \
- that costs less than {MIN_GAIN_DB} dB on validation images.",
-                data.splats()?.max_splats
-            ),
-            format!("Doubling the splats is not worthwhile if it gains less than {MIN_GAIN_DB} dB."),
-            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
-        ],
-        charts: vec![("", accuracy), ("-gain", gain_chart)],
-        tables: vec![Table { title: format!("After {length}"), head, rows: capped.iter().map(row).collect() }],
-        numbers: serde_json::json!({
-            "bench": "budget",
-            "data": data.path,
-            "method": ModelKind::Splat.name(),
-            "adapter": runs.adapter(),
-            "automatic": chosen,
-            "caps": by_cap,
-            "gains": gains,
-        }),
-    };
-    let page = findings.write(runs.out())?;
-    Ok((findings, page))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::bench::runs::tests::run;
-
-    #[test]
-    fn gains_are_between_caps_that_were_reached() {
-        let capped = |cap: u32, n_splats: u64, psnr: f64| {
-            Capped::of(Some(cap), vec![run("a", &[(1.0, psnr)], n_splats)]).expect("a run")
-        };
-        let all = [capped(1000, 1000, 20.0), capped(4000, 4000, 23.0), capped(8000, 4100, 23.1)];
-        let gains = gains(&all.iter().collect::<Vec<_>>());
-        assert_eq!((gains.len(), gains[0].to_cap), (1, Some(4000)), "{gains:?}");
-        assert!((gains[0].db_per_doubling - 1.5).abs() < 1e-12);
     }
 }

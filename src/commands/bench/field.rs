@@ -2,13 +2,7 @@
 
 use crate::open_gpu::open_gpu;
 use crate::print;
-use anyhow::Context;
-use serde::Serialize;
-use trainer::nerf::bench::time_steps;
-
-/// Samples of a step if the flag is not given, on a GPU and on the CPU.
-const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
-const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
+use bench::field::{FieldOptions, FieldRow};
 
 /// Flags of `bench field`.
 #[derive(Debug, clap::Args)]
@@ -31,54 +25,36 @@ pub(crate) struct Args {
     json: bool,
 }
 
-#[derive(Serialize)]
-struct Row {
-    rays: u32,
-    samples: u32,
-    step_ms: f64,
-    step_wall_ms: f64,
-    /// Time to render as many samples of an image.
-    colors_ms: f64,
-    peak_mb: u64,
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    passes: Vec<(&'static str, f64)>,
+pub(super) fn run(args: &Args) -> anyhow::Result<()> {
+    bench::field::measure(&args.options(), open_gpu, |row| args.print(row))
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    let is_software = open_gpu()?.is_software();
-    let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
-    let n_repeats = args.repeats.unwrap_or(if is_software { 3 } else { 100 }) as usize;
-    for (row_ix, n_samples) in
-        (if args.samples.is_empty() { default_samples } else { &args.samples }).iter().enumerate()
-    {
-        // A new device for each row, so that the memory peak is that of the row.
-        let gpu = open_gpu()?;
-        if row_ix == 0 {
-            log::info!("{}", gpu.describe());
+impl Args {
+    fn options(&self) -> FieldOptions {
+        FieldOptions {
+            n_rays: self.rays,
+            n_samples: self.samples.clone(),
+            n_repeats: self.repeats,
+            profile: self.profile,
         }
-        let n_samples = (n_samples / args.rays).max(1) * args.rays;
-        let figures = time_steps(&gpu, args.rays, n_samples, n_repeats)
-            .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
-        let row = Row {
-            rays: figures.n_rays,
-            samples: figures.n_samples,
-            step_ms: figures.step_millis,
-            step_wall_ms: figures.step_wall_millis,
-            colors_ms: figures.colors_millis,
-            peak_mb: figures.peak_bytes >> 20,
-            passes: super::profile(&figures.passes, args.profile),
-        };
-        if args.json {
-            print::json(&row)?;
-            continue;
+    }
+
+    fn print(&self, row: &FieldRow) -> anyhow::Result<()> {
+        if self.json {
+            return print::json(row);
         }
         print::line(format_args!(
             "{} rays {:>8} samples: step {:.3} ms (wall {:.3}), rendering as many samples {:.3} ms, peak {} MB",
-            row.rays, row.samples, row.step_ms, row.step_wall_ms, row.colors_ms, row.peak_mb
+            row.rays,
+            row.samples,
+            row.step_millis,
+            row.step_wall_millis,
+            row.colors_millis,
+            row.peak_bytes >> 20
         ))?;
         for (name, millis) in &row.passes {
             print::line(format_args!("    {millis:>9.4} ms  {name}"))?;
         }
+        Ok(())
     }
-    Ok(())
 }

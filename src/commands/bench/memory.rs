@@ -1,35 +1,23 @@
 //! `fieldrig bench memory`: memory use of a long run, and its growth rate once the keyframe store is full.
 
-use crate::bench::memory::{Excluded, Growth, Sample, resident_bytes};
-use crate::bench::page::{Findings, Table};
-use crate::bench::statistics::extent;
-use crate::bench::viewer::Viewer;
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale};
-use crate::commands::run::{self, Running};
+use super::runs_args::print_result;
+use crate::commands::run;
 use crate::exit::{BadArgument, Exit};
 use crate::print;
-use crate::run_folder::CreatedFolders;
 use anyhow::Context;
+use bench::memory::MemoryRun;
+use bench::{BenchResult, Sample, Viewer};
 use clap::Parser;
-use kinematics::quantile::{Rank, quantile};
-use std::collections::BTreeMap;
+use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Maximum time between two lines on stdout.
 const PRINT_PERIOD: Duration = Duration::from_secs(60);
 /// Charts and numbers are written this often, so that an interrupted bench leaves results.
 const WRITE_PERIOD: Duration = Duration::from_secs(60);
-/// Maximum number of points of a line in the chart.
-const MAX_POINTS: usize = 60;
-/// Labels of GPU buffers that hold images of keyframes.
-const IMAGE_BUFFERS: [&str; 3] = ["splat.target_image", "splat.target_depth", "splat.held_back"];
-/// Number of GPU buffers in the table, the largest first.
-const MAX_GPU_BUFFERS: usize = 12;
 const BYTES_PER_MB: f64 = 1e6;
-const SECS_PER_MINUTE: f64 = 60.0;
 
 /// Flags of `bench memory`.
 #[derive(Debug, clap::Args)]
@@ -69,7 +57,7 @@ struct RunFlags {
     args: run::Args,
 }
 
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
     args.check()?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     // Checkpoints are part of a run, so they are written, and removed afterwards with their folder.
@@ -80,33 +68,28 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
     {
         log::warn!("cannot remove {}: {error}", run_folder.display());
     }
-    let mut measured = measured?;
-    let findings = findings(args, &measured)?;
-    findings.print_summary(&findings.write(&args.out)?, args.json)?;
-    match measured.input_error.take() {
+    let (measured, input_error) = measured?;
+    let findings = measured.findings()?;
+    let page = findings.write(&args.out)?;
+    print_result(&BenchResult { findings, page, data_losses: Vec::new() }, args.json)?;
+    match input_error {
         Some(error) => Err(anyhow::Error::new(error).context("the devices failed before the end of the run")),
         None => Ok(Exit::Done),
     }
 }
 
-/// The measurements of a run.
-#[derive(Debug, Default)]
-struct MemoryRun {
-    /// Whether GPU memory is host memory.
-    is_software: bool,
-    samples: Vec<Sample>,
-    /// GPU buffers at the last sample, bytes by label.
-    gpu_buffers: BTreeMap<Arc<str>, u64>,
-    /// Error that ended the devices early.
-    input_error: Option<drivers::Error>,
-}
-
-fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<MemoryRun> {
+/// The measurements of a run, and the error that ended its devices early.
+fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.server.address();
-    let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<anyhow::Result<_>>()?;
+    let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<bench::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
-    let mut measured = MemoryRun { is_software: running.gpu.is_software(), ..MemoryRun::default() };
+    let mut measured = MemoryRun {
+        input: args.input(),
+        n_viewers: args.viewers,
+        is_software: running.gpu.is_software(),
+        ..MemoryRun::default()
+    };
     let mut due = Instant::now();
     let (mut last_printed, mut written) = (None, Instant::now());
     while running.run_time_slice()? {
@@ -115,9 +98,7 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<MemoryRun> {
             continue;
         }
         due = now + every;
-        measured.gpu_buffers = running.gpu.live_bytes_by_label();
-        let sample = sample(&running, &viewers, &measured.gpu_buffers)?;
-        measured.samples.push(sample);
+        let sample = measured.add_sample(&running.live, &running.gpu, &viewers)?;
         if args.json {
             print::report_json(&serde_json::json!({ "event": "sample", "sample": sample }))?;
         } else if last_printed.is_none_or(|last_printed: Instant| last_printed.elapsed() >= PRINT_PERIOD) {
@@ -125,32 +106,12 @@ fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<MemoryRun> {
             last_printed = Some(now);
         }
         if written.elapsed() >= WRITE_PERIOD {
-            findings(args, &measured)?.write(&args.out)?;
+            measured.findings()?.write(&args.out)?;
             written = Instant::now();
         }
     }
     drop(viewers);
-    measured.input_error = running.discard()?;
-    Ok(measured)
-}
-
-fn sample(running: &Running, viewers: &[Viewer], gpu_buffers: &BTreeMap<Arc<str>, u64>) -> anyhow::Result<Sample> {
-    let (live, gpu) = (&running.live, &running.gpu);
-    let sessions = live.sessions();
-    Ok(Sample {
-        seconds: sessions.first().map_or(0.0, |session| session.secs()),
-        resident_bytes: resident_bytes()?.0,
-        gpu_bytes: gpu.live_bytes(),
-        gpu_reserved_bytes: gpu.reserved_bytes(),
-        model_bytes: sessions.iter().map(|session| session.progress().bytes).sum(),
-        gpu_image_bytes: IMAGE_BUFFERS.iter().filter_map(|label| gpu_buffers.get(*label)).sum(),
-        keyframe_bytes: live.keyframes().iter().map(|keyframe| keyframe.bytes()).sum(),
-        keyframes: live.keyframes().len(),
-        evicted: live.n_evicted(),
-        step: sessions.first().map_or(0, |session| session.progress().step),
-        viewers: viewers.iter().filter(|viewer| viewer.is_connected()).count(),
-        pictures: viewers.iter().map(Viewer::n_pictures).sum(),
-    })
+    Ok((measured, running.discard()?))
 }
 
 fn describe(sample: &Sample) -> String {
@@ -211,127 +172,6 @@ impl Args {
     }
 }
 
-/// One component of memory use.
-struct MemoryComponent {
-    label: &'static str,
-    bytes: fn(&Sample) -> Option<u64>,
-}
-
-const COMPONENTS: [MemoryComponent; 6] = [
-    MemoryComponent { label: "resident", bytes: |sample| Some(sample.resident_bytes) },
-    MemoryComponent { label: "GPU buffers", bytes: |sample| Some(sample.gpu_bytes) },
-    MemoryComponent { label: "keyframes on the host", bytes: |sample| Some(sample.keyframe_bytes) },
-    MemoryComponent { label: "model", bytes: |sample| Some(sample.model_bytes) },
-    MemoryComponent { label: "images on the GPU", bytes: |sample| Some(sample.gpu_image_bytes) },
-    MemoryComponent { label: "reserved for GPU buffers", bytes: |sample| sample.gpu_reserved_bytes },
-];
-
-/// The median and range of each group of samples.
-fn line(component: &MemoryComponent, samples: &[Sample]) -> Line {
-    let of_group = |group: &[Sample]| {
-        let mut mb: Vec<f64> =
-            group.iter().filter_map(component.bytes).map(|bytes| bytes as f64 / BYTES_PER_MB).collect();
-        let [low, high] = extent(&mb)?;
-        let x = group[group.len() / 2].seconds / SECS_PER_MINUTE;
-        Some(Point { x, y: quantile(&mut mb, 0.5, Rank::Upper)?, low, high })
-    };
-    let n_each = samples.len().div_ceil(MAX_POINTS).max(1);
-    Line {
-        label: component.label.to_owned(),
-        points: samples.chunks(n_each).filter_map(of_group).collect(),
-        is_peer: false,
-    }
-}
-
-fn findings(args: &Args, measured: &MemoryRun) -> anyhow::Result<Findings> {
-    let samples = &measured.samples;
-    let growths: Vec<(&str, Growth)> = match measured.is_software {
-        true => {
-            vec![("without the model", Excluded::Model), ("without model and training buffers", Excluded::Training)]
-        }
-        false => vec![("of the host", Excluded::Nothing)],
-    }
-    .into_iter()
-    .filter_map(|(name, excluded)| Some((name, Growth::of(samples, excluded)?)))
-    .collect();
-    let rate = growths.first().map_or("too short to measure a growth rate".to_owned(), |(name, growth)| {
-        let since = if growth.store_was_full { "with a full keyframe store" } else { "in the second half" };
-        format!("{:+.2} % per hour {name} {since}", growth.percent_per_hour)
-    });
-    let conditions = format!("{}, {}", args.input(), print::counted(args.viewers, "viewer"));
-    let lines: Vec<Line> =
-        COMPONENTS.iter().map(|component| line(component, samples)).filter(|line| !line.points.is_empty()).collect();
-    let full = samples.iter().find(|sample| sample.evicted > 0);
-    let markers = full.map(|sample| Marker {
-        x: sample.seconds / SECS_PER_MINUTE,
-        label: format!("store full: {} keyframes", sample.keyframes),
-        line_ix: 2,
-    });
-    let mut rows = Vec::new();
-    let mut add = |name: &str, value: String| rows.push(vec![name.to_owned(), value]);
-    let mb = |bytes: f64| format!("{:.1} MB", bytes / BYTES_PER_MB);
-    if let Some(last) = samples.last() {
-        for component in &COMPONENTS {
-            if let Some(bytes) = (component.bytes)(last) {
-                add(&format!("{} at the end", component.label), mb(bytes as f64));
-            }
-        }
-        add("peak of resident memory", mb(resident_bytes()?.1 as f64));
-        add("keyframes", format!("{}, {} evicted", last.keyframes, last.evicted));
-        add("steps", last.step.to_string());
-        add("pictures for viewers", last.pictures.to_string());
-    }
-    for (name, growth) in &growths {
-        let (from, to) = (growth.from_seconds, growth.to_seconds);
-        let of = format!("{} per hour, {:+.2} %", mb(growth.bytes_per_hour), growth.percent_per_hour);
-        add(&format!("growth {name}, {from:.0} s to {to:.0} s"), of);
-    }
-    let mut gpu_buffers: Vec<(&Arc<str>, u64)> =
-        measured.gpu_buffers.iter().map(|(label, bytes)| (label, *bytes)).collect();
-    gpu_buffers.sort_by_key(|(_, bytes)| std::cmp::Reverse(*bytes));
-    let gpu_rows =
-        gpu_buffers.iter().take(MAX_GPU_BUFFERS).map(|(label, bytes)| vec![label.to_string(), mb(*bytes as f64)]);
-    Ok(Findings {
-        name: "memory",
-        title: "Memory of a long run".to_owned(),
-        sentences: vec![
-            format!("{conditions}: {rate}."),
-            "Growth is that of resident memory from one minute after the keyframe store is full: the median of the slopes between \
-             all pairs of samples. On a software adapter, resident memory includes GPU buffers; the model, and the working memory of \
-             training, which grows with the model, are subtracted."
-                .to_owned(),
-        ],
-        charts: vec![(
-            "",
-            Chart {
-                title: "Memory of a long run".to_owned(),
-                subtitle: format!("{conditions}; {rate}"),
-                x: Axis { label: "minutes since the first image".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                y: Axis { label: "MB".to_owned(), scale: Scale::Linear, ticks: Vec::new() },
-                lines,
-                thresholds: Vec::new(),
-                markers: markers.into_iter().collect(),
-            },
-        )],
-        tables: vec![
-            Table { title: "Memory".to_owned(), head: vec!["quantity".to_owned(), "value".to_owned()], rows },
-            Table {
-                title: "Largest GPU buffers at the end".to_owned(),
-                head: vec!["label".to_owned(), "size".to_owned()],
-                rows: gpu_rows.collect(),
-            },
-        ],
-        numbers: serde_json::json!({
-            "input": args.input(),
-            "viewers": args.viewers,
-            "growth": growths.iter().map(|(name, growth)| (*name, growth)).collect::<BTreeMap<_, _>>(),
-            "gpu_buffers": gpu_buffers.iter().map(|(label, bytes)| (label.as_ref(), bytes)).collect::<BTreeMap<_, _>>(),
-            "peak_resident_bytes": resident_bytes()?.1,
-            "samples": samples,
-        }),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -357,38 +197,5 @@ mod tests {
             let error_message = args(&[flags[0].as_str()]).check().expect_err("out of range").to_string();
             assert!(error_message.starts_with("--"), "{error_message}");
         }
-    }
-
-    #[test]
-    fn findings_report_memory_growth() {
-        let sample = |ix: u64| Sample {
-            seconds: ix as f64,
-            resident_bytes: 1_000_000_000 + 10_000 * ix,
-            gpu_bytes: 400_000_000,
-            keyframe_bytes: 300_000_000,
-            keyframes: 100,
-            evicted: u64::from(ix > 30),
-            ..Sample::default()
-        };
-        let samples: Vec<Sample> = (0..600).map(sample).collect();
-        let gpu_buffers = BTreeMap::from([("small".into(), 1), ("large".into(), 2)]);
-        let mut measured = MemoryRun { is_software: true, samples, gpu_buffers, input_error: None };
-        let of_host =
-            MemoryRun { is_software: false, ..MemoryRun { samples: measured.samples.clone(), ..MemoryRun::default() } };
-        let of_host = findings(&args(&["--sim"]), &of_host).expect("numbers");
-        assert!(
-            of_host.sentences[0].contains("+3.59") && of_host.sentences[0].contains("host"),
-            "{}",
-            of_host.sentences[0]
-        );
-        measured.samples.iter_mut().for_each(|sample| sample.model_bytes = sample.resident_bytes - 900_000_000);
-        let findings = findings(&args(&["--sim"]), &measured).expect("numbers");
-        assert!(findings.sentences[0].contains("+0.00 % per hour without the model"), "{}", findings.sentences[0]);
-        assert_eq!(findings.tables[1].rows[0][0], "large");
-        let chart = &findings.charts[0].1;
-        assert_eq!(chart.lines.len(), 5, "the reserved memory is unknown");
-        assert!(chart.lines.iter().all(|line| line.points.len() <= MAX_POINTS), "{}", chart.lines[0].points.len());
-        assert_eq!(chart.markers[0].label, "store full: 100 keyframes");
-        assert_eq!(findings.numbers["samples"].as_array().map(Vec::len), Some(600));
     }
 }

@@ -6,12 +6,12 @@ mod curve;
 mod field;
 mod kernels;
 mod memory;
+mod runs_args;
 mod stability;
 mod stamps;
 
 use crate::exit::Exit;
 use clap::{Parser, Subcommand};
-use trainer::gpu::PassTiming;
 
 /// Flags of `bench`.
 #[derive(Debug, Parser)]
@@ -38,11 +38,6 @@ enum BenchCommand {
     Stamps(stamps::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),
-}
-
-/// Names and milliseconds of the passes, if requested.
-fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
-    if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {

@@ -1,35 +1,10 @@
 //! `fieldrig bench stability`: accuracy over the size of a disturbance, and its break points.
 
-use crate::bench::disturb::Disturbance;
-use crate::bench::page::{Findings, Table};
-use crate::bench::runs::{BenchArgs, Disturbed, Job, NamedData, Run, Runs};
-use crate::bench::statistics::{Interpolation, break_point, extent};
-use crate::bench::variant::{CAMERAS_AS_GIVEN, Variant};
-use crate::chart::{Axis, Chart, Line, Marker, Point, Scale, compact_number};
-use crate::exit::{self, BadArgument, Exit};
-use crate::method::ModelSpec;
-use crate::open_gpu::open_gpu;
-use crate::session::Limits;
-use crate::training;
-use anyhow::ensure;
-use keyframe::{Keyframe, Split};
-use kinematics::quantile::median;
-use serde::Serialize;
-use std::collections::HashSet;
+use super::runs_args::RunsArgs;
+use crate::exit::Exit;
+use bench::Disturbance;
+use bench::stability::StabilityOptions;
 use std::path::PathBuf;
-use std::sync::Arc;
-use trainer::splat::SplatOptions;
-
-/// Training time of a run if no flag limits it.
-const DEFAULT_SECONDS: f64 = 30.0;
-/// Losses of PSNR whose disturbance level is reported, dB.
-const BREAKS_DB: [f64; 2] = [1.0, 3.0];
-const NANOS_PER_SEC: f64 = 1e9;
-/// Nanoseconds between consecutive images whose stamps only count them.
-const NANOS_PER_COUNT: f64 = 1e6;
-
-/// All variants are trained on the same disturbed data; each gives one line per chart.
-const VARIANTS: &[Variant] = &[Variant { name: "with --refine", change: |options| options }, CAMERAS_AS_GIVEN];
 
 /// Flags of `bench stability`.
 #[derive(Debug, clap::Args)]
@@ -56,7 +31,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: u64,
     #[command(flatten)]
-    bench: BenchArgs,
+    runs: RunsArgs,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -73,419 +48,36 @@ enum DisturbanceArg {
     All,
 }
 
-/// Measurements to make of one disturbance.
-struct DisturbancePlan {
-    disturbance: Disturbance,
-    /// Sizes, starting with the undisturbed data.
-    levels: Vec<f64>,
-    nanos_per_sec: f64,
-    rate_hz: Option<f64>,
-}
-
-/// Results of one disturbance.
-#[derive(Debug, Serialize)]
-struct DisturbanceResult {
-    name: &'static str,
-    unit: &'static str,
-    variants: Vec<Curve>,
-    #[serde(skip)]
-    disturbance: Disturbance,
-}
-
-/// Results of one variant under one disturbance.
-#[derive(Clone, Debug, Serialize)]
-struct Curve {
-    name: &'static str,
-    /// Results by size, starting with the undisturbed data.
-    points: Vec<Level>,
-    breaks: Vec<Break>,
-}
-
-#[derive(Clone, Debug, Serialize)]
-struct Level {
-    level: f64,
-    /// Median PSNR, dB.
-    psnr: f64,
-    psnr_extent: [f64; 2],
-    runs: Vec<Run>,
-}
-
-/// Size at which the PSNR has fallen by `drop_db` from the undisturbed one; `None` if none of the sizes reaches it.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-struct Break {
-    drop_db: f64,
-    level: Option<f64>,
-}
-
-pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let limits = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?;
-    args.check()?;
-    let mut runs = Runs::open(&args.bench, open_gpu()?)?;
-    let data = runs.load(&args.data, &mut HashSet::new())?;
-    let plans = args.plans(&data)?;
-    let n_levels: usize = plans.iter().map(|plan| plan.levels.len()).sum();
-    let variants = distinguished(&data.single_model_spec()?.options);
-    runs.expect(n_levels * variants.len() * usize::try_from(args.seeds)?);
-    let mut results: Vec<DisturbanceResult> = Vec::new();
-    let mut page = None;
-    for plan in &plans {
-        results.push(DisturbanceResult {
-            name: plan.disturbance.name(),
-            unit: plan.disturbance.unit(),
-            variants: Vec::new(),
-            disturbance: plan.disturbance,
-        });
-        for &variant in &variants {
-            let mut curve = Curve { name: variant.name, points: Vec::new(), breaks: Vec::new() };
-            for level in &plan.levels {
-                let finished = measure(args, &mut runs, &data, limits, plan, variant, *level)?;
-                curve.add(plan.disturbance, *level, finished);
-                // Written after every size, so that an interrupted bench leaves results.
-                let variants = &mut results.last_mut().expect("pushed above").variants;
-                variants.retain(|curve| curve.name != variant.name);
-                variants.push(curve.clone());
-                page = Some(findings(args, &runs, &data, &results)?);
-            }
-        }
-    }
-    if let Some((findings, page)) = page {
-        findings.print_summary(&page, args.bench.json)?;
-    }
-    Ok(exit::from_losses(&data.data.data_losses))
-}
-
-/// The variants that differ for these options. If no camera parameters are refined, there is only one.
-fn distinguished(options: &SplatOptions) -> Vec<&'static Variant> {
-    let mut distinguished: Vec<&Variant> = Vec::new();
-    for variant in VARIANTS {
-        let changed = variant.options(options);
-        if distinguished.iter().all(|other| other.options(options) != changed) {
-            distinguished.push(variant);
-        }
-    }
-    if distinguished.len() < VARIANTS.len() {
-        log::warn!("no camera parameters are refined, so only one variant is measured; see --refine");
-    }
-    distinguished
-}
-
-/// Trains with one size of the disturbance, once per seed.
-fn measure(
-    args: &Args,
-    runs: &mut Runs<'_>,
-    data: &NamedData,
-    limits: Limits,
-    plan: &DisturbancePlan,
-    variant: &Variant,
-    level: f64,
-) -> anyhow::Result<Vec<Run>> {
-    let disturbance = plan.disturbance;
-    let is_undisturbed = is_undisturbed(disturbance, level, n_train(data));
-    // All disturbances share the undisturbed run, so that it is trained only once.
-    let size = if is_undisturbed {
-        "undisturbed".to_owned()
-    } else {
-        format!("{} {level} {}", disturbance.name(), disturbance.unit())
-    };
-    let disturbed = (!is_undisturbed).then(|| Disturbed {
-        disturbance: disturbance.name().to_owned(),
-        level,
-        unit: disturbance.unit().to_owned(),
-        rate_hz: plan.rate_hz,
-    });
-    let mut finished = Vec::new();
-    let ModelSpec { kind, options: base_options } = data.single_model_spec()?;
-    for seed in base_options.seed..base_options.seed.saturating_add(args.seeds) {
-        finished.push(runs.run(Job {
-            name: format!("stability {} {} {size} seed {seed}", data.name, variant.name),
-            data,
-            model_spec: ModelSpec {
-                kind: *kind,
-                options: variant.options(&SplatOptions { seed, ..base_options.clone() }),
-            },
-            limits,
-            disturbed: disturbed.clone(),
-            variant: Some(variant.name.to_owned()),
-            keyframes: &|| disturb(plan, &data.data.keyframes, level, seed, is_undisturbed),
-            is_thorough: false,
-        })?);
-    }
-    Ok(finished)
-}
-
-fn disturb(
-    plan: &DisturbancePlan,
-    keyframes: &[Arc<Keyframe>],
-    level: f64,
-    seed: u64,
-    is_undisturbed: bool,
-) -> Vec<Arc<Keyframe>> {
-    if is_undisturbed { keyframes.to_vec() } else { plan.disturbance.apply(keyframes, level, seed, plan.nanos_per_sec) }
-}
-
-/// Number of training images if nothing is disturbed.
-fn n_train(data: &NamedData) -> usize {
-    data.data.keyframes.iter().filter(|keyframe| keyframe.split != Split::Test).count()
-}
-
-/// Whether this size leaves the data unchanged.
-fn is_undisturbed(disturbance: Disturbance, level: f64, n_train: usize) -> bool {
-    if disturbance == Disturbance::Keyframes { level >= n_train as f64 } else { level == 0.0 }
+pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
+    args.runs.run(|host| bench::stability::run(&args.options(), host))
 }
 
 impl Args {
-    fn disturbances(&self) -> Vec<Disturbance> {
-        let is_selected = |disturbance: Disturbance| {
-            self.disturb.iter().any(|selected| match selected {
-                DisturbanceArg::All => true,
-                DisturbanceArg::PoseNoise => disturbance == Disturbance::PoseNoise,
-                DisturbanceArg::ClockOffset => disturbance == Disturbance::ClockOffset,
-                DisturbanceArg::Exposure => disturbance == Disturbance::Exposure,
-                DisturbanceArg::Keyframes => disturbance == Disturbance::Keyframes,
-            })
-        };
-        Disturbance::ALL.into_iter().filter(|disturbance| is_selected(*disturbance)).collect()
-    }
-
-    fn check(&self) -> Result<(), BadArgument> {
-        let selected = self.disturbances();
-        if !self.levels.is_empty() && selected.len() != 1 {
-            return Err(BadArgument("--levels: needs a single disturbance in --disturb, because units differ".into()));
-        }
-        let min_level = if selected == [Disturbance::Keyframes] { 1.0 } else { 0.0 };
-        if let Some(level) = self.levels.iter().find(|level| !level.is_finite() || **level < min_level) {
-            return Err(BadArgument(format!("--levels {level}: must be a number of at least {min_level}")));
-        }
-        if self.rate_hz.is_some_and(|rate| !rate.is_finite() || rate <= 0.0) {
-            return Err(BadArgument("--rate-hz: must be a number above 0".into()));
-        }
-        Ok(())
-    }
-
-    /// The measurements to make. A clock offset without image times is an error, or is skipped for `all`.
-    fn plans(&self, data: &NamedData) -> anyhow::Result<Vec<DisturbancePlan>> {
-        let mut selected = self.disturbances();
-        let (nanos_per_sec, rate_hz) = match (data.data.has_times, self.rate_hz) {
-            (true, _) => (NANOS_PER_SEC, None),
-            (false, Some(rate_hz)) => (NANOS_PER_COUNT * rate_hz, Some(rate_hz)),
-            (false, None) => {
-                let reason = "the images have no times; give their rate with --rate-hz";
-                let message = format!("clock-offset: {}: {reason}", data.path.display());
-                if self.disturb.contains(&DisturbanceArg::ClockOffset) {
-                    return Err(BadArgument(message).into());
-                }
-                if selected.contains(&Disturbance::ClockOffset) {
-                    log::warn!("skipped: {message}");
-                }
-                selected.retain(|disturbance| *disturbance != Disturbance::ClockOffset);
-                (NANOS_PER_SEC, None)
-            }
-        };
-        ensure!(!selected.is_empty(), "no disturbance is left to measure");
-        let plan = |disturbance: Disturbance| {
-            let requested = if self.levels.is_empty() { disturbance.default_levels() } else { &self.levels };
-            let rate_hz = rate_hz.filter(|_| disturbance == Disturbance::ClockOffset);
-            DisturbancePlan {
-                disturbance,
-                levels: levels(disturbance, requested, n_train(data)),
-                nanos_per_sec,
-                rate_hz,
-            }
-        };
-        Ok(selected.into_iter().map(plan).collect())
-    }
-}
-
-/// The sizes to measure, from none to the largest.
-fn levels(disturbance: Disturbance, requested: &[f64], n_train: usize) -> Vec<f64> {
-    let mut levels = requested.to_vec();
-    if disturbance == Disturbance::Keyframes {
-        levels.iter_mut().for_each(|level| *level = level.round());
-        levels.retain(|level| *level < n_train as f64);
-        levels.push(n_train as f64);
-    } else {
-        levels.push(0.0);
-    }
-    levels.sort_by(f64::total_cmp);
-    levels.dedup();
-    if disturbance == Disturbance::Keyframes {
-        levels.reverse();
-    }
-    levels
-}
-
-impl Curve {
-    fn add(&mut self, disturbance: Disturbance, level: f64, runs: Vec<Run>) {
-        let ends: Vec<f64> = runs.iter().map(Run::psnr).collect();
-        let Some((psnr, psnr_extent)) = median(&ends).zip(extent(&ends)) else { return };
-        self.points.push(Level { level, psnr, psnr_extent, runs });
-        let curve: Vec<(f64, f64)> = self.points.iter().map(|point| (point.level, point.psnr)).collect();
-        let break_at = |drop_db| Break { drop_db, level: break_point(&curve, drop_db, disturbance.interpolation()) };
-        self.breaks = BREAKS_DB.map(break_at).into();
-    }
-
-    fn line(&self, label: &str) -> Line {
-        let point = |at: &Level| Point { x: at.level, y: at.psnr, low: at.psnr_extent[0], high: at.psnr_extent[1] };
-        let mut points: Vec<Point> = self.points.iter().map(point).collect();
-        points.sort_by(|a, b| a.x.total_cmp(&b.x));
-        Line { label: label.to_owned(), points, is_peer: false }
-    }
-}
-
-impl DisturbanceResult {
-    /// `of_one` is the label of the line if there is only one variant.
-    fn chart(&self, subtitle: &str, of_one: &str) -> Chart {
-        let levels = || {
-            let mut levels: Vec<f64> =
-                self.variants.iter().flat_map(|curve| &curve.points).map(|point| point.level).collect();
-            levels.sort_by(f64::total_cmp);
-            levels.dedup();
-            levels
-        };
-        let (scale, ticks) = match self.disturbance.interpolation() {
-            Interpolation::Log => (Scale::Log, levels()),
-            Interpolation::Linear => (Scale::Levels(levels()), Vec::new()),
-        };
-        let marker = |line_ix: usize, at: &Break| {
-            let level = at.level?;
-            let label = format!("-{} dB at {} {}", at.drop_db, significant_digits(level), self.unit);
-            let label =
-                if self.variants.len() > 1 { format!("{}: {label}", self.variants[line_ix].name) } else { label };
-            Some(Marker { x: level, label, line_ix })
-        };
-        let curves = self.variants.iter().enumerate();
-        let label = |curve: &Curve| if self.variants.len() > 1 { curve.name } else { of_one };
-        Chart {
-            title: format!("PSNR of test images with {}", describe(self.disturbance)),
-            subtitle: subtitle.to_owned(),
-            x: Axis { label: self.disturbance.axis().to_owned(), scale, ticks },
-            y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
-            lines: self.variants.iter().map(|curve| curve.line(label(curve))).collect(),
-            thresholds: Vec::new(),
-            markers: curves.flat_map(|(ix, curve)| curve.breaks.iter().filter_map(move |at| marker(ix, at))).collect(),
+    fn options(&self) -> StabilityOptions {
+        let is_selected =
+            |disturbance: &Disturbance| self.disturb.iter().any(|selected| selected.includes(*disturbance));
+        StabilityOptions {
+            data: self.data.clone(),
+            disturbances: Disturbance::ALL.into_iter().filter(is_selected).collect(),
+            can_skip_clock_offset: !self.disturb.contains(&DisturbanceArg::ClockOffset),
+            levels: self.levels.clone(),
+            rate_hz: self.rate_hz,
+            seconds: self.seconds,
+            steps: self.steps,
+            seeds: self.seeds,
+            runs: self.runs.options(),
         }
     }
-
-    fn rows(&self) -> impl Iterator<Item = Vec<String>> {
-        self.variants.iter().map(|curve| {
-            let undisturbed = curve.points.first().map_or(0.0, |point| point.psnr);
-            let mut row = vec![self.name.to_owned(), curve.name.to_owned(), format!("{undisturbed:.2}")];
-            row.extend(curve.breaks.iter().map(|at| match at.level {
-                Some(level) => format!("{} {}", significant_digits(level), self.unit),
-                None => "not reached".to_owned(),
-            }));
-            row
-        })
-    }
 }
 
-fn describe(disturbance: Disturbance) -> &'static str {
-    match disturbance {
-        Disturbance::PoseNoise => "pose noise",
-        Disturbance::ClockOffset => "a clock offset",
-        Disturbance::Exposure => "an exposure step",
-        Disturbance::Keyframes => "few training images",
-    }
-}
-
-/// Formats a level with two or three significant digits; a single curve does not support more.
-fn significant_digits(level: f64) -> String {
-    match level {
-        level if level >= 10.0 => format!("{level:.0}"),
-        level if level >= 1.0 => format!("{level:.1}"),
-        level => format!("{level:.2}"),
-    }
-}
-
-/// Writes the findings so far.
-fn findings(
-    args: &Args,
-    runs: &Runs<'_>,
-    data: &NamedData,
-    results: &[DisturbanceResult],
-) -> anyhow::Result<(Findings, PathBuf)> {
-    let length = training::limits(args.seconds, args.steps, DEFAULT_SECONDS)?.describe();
-    let spread = if args.seeds > 1 {
-        format!("median of {} seeds; band: minimum to maximum", args.seeds)
-    } else {
-        "one run per size".to_owned()
-    };
-    let subtitle = format!("after {length}; {spread}");
-    let label = format!("{}, {}", data.name, data.single_model_spec()?.kind.name());
-    let part = |disturbance: Disturbance| match disturbance {
-        Disturbance::PoseNoise => "-pose-noise",
-        Disturbance::ClockOffset => "-clock-offset",
-        Disturbance::Exposure => "-exposure",
-        Disturbance::Keyframes => "-keyframes",
-    };
-    let charts = results.iter().map(|result| (part(result.disturbance), result.chart(&subtitle, &label)));
-    let head = ["disturbance", "variant", "undisturbed, dB", "-1 dB at", "-3 dB at"].map(str::to_owned).to_vec();
-    let level_rows = results.iter().flat_map(|result| {
-        result.variants.iter().flat_map(|curve| {
-            curve.points.iter().map(|point| {
-                vec![
-                    format!("{}, {}", result.name, curve.name),
-                    format!("{} {}", compact_number(point.level), result.unit),
-                    format!("{:.2}", point.psnr),
-                    format!("{:+.2}", point.psnr - curve.points[0].psnr),
-                ]
-            })
-        })
-    });
-    let level_head = ["disturbance, variant", "size", "PSNR, dB", "change, dB"].map(str::to_owned).to_vec();
-    let findings = Findings {
-        name: "stability",
-        title: format!("Stability: {}", data.name),
-        sentences: vec![
-            format!(
-                "Each point is a model trained for {length} on disturbed images and scored on undisturbed test images. A break point is the size at which the PSNR has fallen by 1 or 3 dB from the undisturbed one."
-            ),
-            "Pose noise also rotates each camera, by 0.1 degrees per millimeter. Poses with a clock offset are interpolated between neighboring images. An exposure step darkens the first half of the capture and brightens the second, by half the step each."
-                .into(),
-            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
-        ],
-        charts: charts.collect(),
-        tables: vec![
-            Table { title: "Break points".into(), head, rows: results.iter().flat_map(DisturbanceResult::rows).collect() },
-            Table { title: format!("After {length}"), head: level_head, rows: level_rows.collect() },
-        ],
-        numbers: serde_json::json!({
-            "bench": "stability",
-            "data": data.path,
-            "method": data.single_model_spec()?.kind.name(),
-            "adapter": runs.adapter(),
-            "disturbances": results,
-        }),
-    };
-    let page = findings.write(runs.out())?;
-    Ok((findings, page))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::bench::runs::tests::run;
-
-    #[test]
-    fn levels_start_undisturbed_and_clip_to_available_keyframes() {
-        assert_eq!(levels(Disturbance::PoseNoise, &[5.0, 2.0, 2.0], 40), [0.0, 2.0, 5.0]);
-        assert_eq!(
-            levels(Disturbance::Keyframes, Disturbance::Keyframes.default_levels(), 44),
-            [44.0, 20.0, 10.0, 5.0, 3.0]
-        );
-        assert!(is_undisturbed(Disturbance::Keyframes, 44.0, 44) && !is_undisturbed(Disturbance::Keyframes, 20.0, 44));
-        assert!(is_undisturbed(Disturbance::Exposure, 0.0, 44) && !is_undisturbed(Disturbance::Exposure, 0.1, 44));
-    }
-
-    #[test]
-    fn break_points_are_computed_from_points() {
-        let mut curve = Curve { name: "plain", points: Vec::new(), breaks: Vec::new() };
-        for (level, psnr) in [(100.0, 30.0), (25.0, 28.0), (5.0, 20.0)] {
-            curve.add(Disturbance::Keyframes, level, vec![run("a", &[(1.0, psnr)], 10)]);
+impl DisturbanceArg {
+    fn includes(self, disturbance: Disturbance) -> bool {
+        match self {
+            Self::All => true,
+            Self::PoseNoise => disturbance == Disturbance::PoseNoise,
+            Self::ClockOffset => disturbance == Disturbance::ClockOffset,
+            Self::Exposure => disturbance == Disturbance::Exposure,
+            Self::Keyframes => disturbance == Disturbance::Keyframes,
         }
-        let [first, second] = &curve.breaks[..] else { panic!("two breaks") };
-        assert!(first.level.is_some_and(|level| (level - 50.0).abs() < 1e-9), "{first:?}");
-        assert!(second.level.is_some_and(|level| (5.0..25.0).contains(&level)), "{second:?}");
-        assert_eq!(curve.line("plain").points[0].x, 5.0, "lines run from left to right");
     }
 }

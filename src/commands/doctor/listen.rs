@@ -1,10 +1,9 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
-use crate::config::{BaseDriver, Rig};
-use crate::join::{Join, JoinEvent, Refusal};
-use crate::open::{self, Devices, Opened};
-use crate::stop::Stop;
+use capture::config::{BaseDriver, Rig};
+use capture::open::{self, Devices, Opened};
+use capture::{Join, JoinEvent, Rejection, Stop};
 use drivers::{Sample, clock};
 use kinematics::Stamp;
 use kinematics::quantile::{Rank, quantile};
@@ -136,10 +135,10 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
         })
         .collect();
     findings.extend(devices.iter().filter_map(problem));
-    let refused: Vec<_> = join.counts().refused.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
-    let n_posed = join.counts().images - join.counts().refused.get(&Refusal::NoPose).copied().unwrap_or(0);
-    if !refused.is_empty() {
-        let message = format!("images that did not become keyframes: {}", refused.join(", "));
+    let rejected: Vec<_> = join.counts().rejected.iter().map(|(why, n)| format!("{n} {}", why.name())).collect();
+    let n_posed = join.counts().images - join.counts().rejected.get(&Rejection::NoPose).copied().unwrap_or(0);
+    if !rejected.is_empty() {
+        let message = format!("images that did not become keyframes: {}", rejected.join(", "));
         findings.push(if 2 * n_posed < join.counts().images {
             let remedy =
                 "each image needs joint states, and base poses if the base moves, around its time: check their source";
@@ -153,7 +152,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
 
 /// The devices of a rig with their rates, as far as the rig file gives them.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
-    use crate::config::ArmDriver;
+    use capture::config::ArmDriver;
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));

@@ -1,7 +1,7 @@
 //! Writes the images of a recording as files of a RealSense camera.
 
-use crate::config::{Camera, CameraDriver, Rig};
 use anyhow::Context;
+use capture::config::{Camera, CameraDriver, Rig};
 use drivers::realsense::Pace;
 use drivers::realsense::emulated::{BagWriter, EmulatedCamera, EmulatedDepth};
 use drivers::{Image, PixelFormat};

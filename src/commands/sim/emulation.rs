@@ -2,12 +2,12 @@
 
 use super::Args;
 use super::bag::CameraFiles;
-use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::exit::{BadArgument, Exit};
-use crate::open::{self, Devices, FCI_PORT, Opened};
-use crate::print;
-use crate::stop::Stop;
+use crate::{print, signals};
 use anyhow::{Context, bail};
+use capture::Stop;
+use capture::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
+use capture::open::{self, Devices, FCI_PORT, Opened};
 use drivers::franka::FciVersion;
 use drivers::franka::emulated::{EmulatedRobot, Limits, RobotConfig};
 use drivers::{Sample, can, clock};
@@ -48,7 +48,7 @@ struct ReadyEvent<'a> {
 }
 
 pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
-    let stop = Stop::on_ctrl_c()?;
+    let stop = signals::stop_on_signals()?;
     let (name, mut rig) = load(&args.rig_or_scene)?;
     check(&rig)?;
     if rig.arm.driver == ArmDriver::Franka {
@@ -259,7 +259,7 @@ fn robot_config(rig: &Rig, fci: &str) -> anyhow::Result<RobotConfig> {
     };
     let address = fci_address(&rig.arm.address)?;
     let chain = open::franka_chain(rig)?;
-    Ok(RobotConfig { address, version, chain, flange_from_ee: Transform::identity(), limits })
+    Ok(RobotConfig { address, version, chain, flange_from_tool: Transform::identity(), limits })
 }
 
 /// Address at which a controller listens; it must be one of this computer.

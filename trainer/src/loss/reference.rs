@@ -5,7 +5,7 @@
 //! all pixels, masked or not, and do not divide our depth residual by the coverage, so that it stays linear in the
 //! image.
 
-use crate::splat::reference::{RenderedImage, Upstream};
+use super::rendered_image::{RenderedImage, Upstream};
 
 /// Radius of the SSIM window, pixels.
 pub const WINDOW_RADIUS: usize = 5;

@@ -145,7 +145,8 @@ fn bench(options: &GpuOptions, twin: &Field, rays: &[Ray], scales: &[f32]) -> Be
     gpu.write(&samples.spans, 0, bytemuck::cast_slice(&spans));
     let embeddings: Vec<[f64; EMBEDDING_DIM]> =
         rays.iter().map(|ray| ray.embedding.clone().try_into().unwrap()).collect();
-    let image_params = gpu.storage_with("terms", bytemuck::cast_slice(&params::image_params_of(&embeddings))).unwrap();
+    let image_params =
+        gpu.storage_with("image_params", bytemuck::cast_slice(&params::image_params_of(&embeddings))).unwrap();
     let gradients = FieldGradients::new(&gpu, &twin.shape).unwrap();
     gpu.write(&gradients.scales, 0, bytemuck::cast_slice(scales));
     let loss = RayLoss {
@@ -424,7 +425,7 @@ fn optimizer_steps_match_twin() {
         passes.convert_weights(&mut list);
         passes.forward(&mut list, kept_step);
         passes.backward(&mut list, kept_step, gradients);
-        passes.learn(&mut list, [&rules[0], &rules[1]], kept_step, gradients, &moments);
+        passes.update(&mut list, [&rules[0], &rules[1]], kept_step, gradients, &moments);
         list.submit(gpu);
 
         let gradient = expected(&twin, &rays);
@@ -492,7 +493,7 @@ fn first_step_follows_summed_gradients() {
         passes.convert_weights(&mut list);
         passes.forward(&mut list, step);
         passes.backward(&mut list, step, gradients);
-        passes.learn(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
+        passes.update(&mut list, [&rules[0], &rules[1]], step, gradients, &moments);
         list.submit(gpu);
         let before = weights(&twin, widths);
         let got: Vec<f32> = gpu.read(&field.weights, before.len()).unwrap();

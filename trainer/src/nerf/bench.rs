@@ -4,12 +4,13 @@
 //! their colors are noise. The occupancy is not updated.
 
 use super::field_trainer::{Compiled, FieldTrainer, STEPS_PER_SUBMIT};
-use super::options::{NerfBudget, NerfOptions};
+use super::options::NerfBudget;
 use super::params::Ray;
 use super::reference::grid::GridShape;
 use super::sizes::Sizes;
 use crate::Error;
 use crate::gpu::{Gpu, PassTiming, f32_of, f32s_of};
+use crate::model_options::ModelOptions;
 use calibration::ParamSet;
 use kinematics::random::{hash, unit_from_bits};
 use nalgebra::Vector3;
@@ -44,7 +45,7 @@ pub struct StepFigures {
 
 /// Times steps of `n_rays` rays with `n_samples` samples in total, which is a multiple of `n_rays`.
 pub fn time_steps(gpu: &Gpu, n_rays: u32, n_samples: u32, n_repeats: usize) -> Result<StepFigures, Error> {
-    let options = NerfOptions::default();
+    let options = ModelOptions::default();
     let nerf_budget = NerfBudget { n_rays, n_samples, ..NerfBudget::FULL };
     let (n_levels, coarsest, finest, log2_entries) = GRID_SHAPE;
     let shape = GridShape::between(coarsest, finest, n_levels, log2_entries);

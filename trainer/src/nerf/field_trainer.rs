@@ -13,6 +13,7 @@ use super::passes::{Canvas, FieldPasses};
 use super::reference::march as reference;
 use super::sizes::{MAX_LEVELS, MIN_LEVELS, Sizes};
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, f32_of};
+use crate::model_options::ModelOptions;
 use crate::view::Camera;
 use crate::{Error, Picture};
 use calibration::{EMBEDDING_DIM, ParamSet};
@@ -100,7 +101,12 @@ impl Compiled {
 
 impl FieldTrainer {
     /// A field with random initial parameters.
-    pub(crate) fn new(gpu: &Gpu, options: &NerfOptions, sizes: Sizes, compiled: Arc<Compiled>) -> Result<Self, Error> {
+    pub(crate) fn new(
+        gpu: &Gpu,
+        options: &ModelOptions<NerfOptions>,
+        sizes: Sizes,
+        compiled: Arc<Compiled>,
+    ) -> Result<Self, Error> {
         let NerfBudget { n_rays, n_samples, .. } = sizes.nerf_budget;
         let shape = sizes.shape();
         let widths = compiled.widths.clone();
@@ -125,7 +131,7 @@ impl FieldTrainer {
             gradients,
             sizes,
         };
-        field_trainer.initialize(gpu, options.seed, &widths);
+        field_trainer.initialize(gpu, options.common.seed, &widths);
         Ok(field_trainer)
     }
 
@@ -164,7 +170,7 @@ impl FieldTrainer {
     pub(crate) fn record_step(
         &mut self,
         gpu: &Gpu,
-        options: &NerfOptions,
+        options: &ModelOptions<NerfOptions>,
         slot_ix: usize,
         step: u64,
         rays: &[Ray],
@@ -199,7 +205,7 @@ impl FieldTrainer {
             }
             passes.update_images(list, moments, images);
         }
-        passes.learn(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
+        passes.update(list, [&self.rules[0], &self.rules[1]], kept, gradients, moments);
         Ok(())
     }
 
@@ -208,7 +214,7 @@ impl FieldTrainer {
     pub(crate) fn render_rays(
         &mut self,
         gpu: &Gpu,
-        options: &NerfOptions,
+        options: &ModelOptions<NerfOptions>,
         rays: &[Ray],
         embeddings: &[[f64; EMBEDDING_DIM]],
     ) -> Result<Vec<RayColor>, Error> {
@@ -330,7 +336,7 @@ impl FieldTrainer {
     fn write_slot(
         &mut self,
         gpu: &Gpu,
-        options: &NerfOptions,
+        options: &ModelOptions<NerfOptions>,
         slot_ix: usize,
         step: u64,
         rays: &[Ray],
@@ -348,11 +354,11 @@ impl FieldTrainer {
         let [red, green, blue] = background(options, step);
         let loss = RayLoss {
             background_srgb: [red, green, blue, 0.0],
-            distance_weight: f32_of(options.distance_weight),
+            distance_weight: f32_of(options.specific.distance_weight),
             distance_clip: DISTANCE_CLIP,
-            distortion: f32_of(options.distortion),
+            distortion: f32_of(options.specific.distortion),
             near: DISTORTION_NEAR,
-            line_of_sight: f32_of(options.line_of_sight),
+            line_of_sight: f32_of(options.specific.line_of_sight),
             band: 2.0 * march_of(self.sizes.nerf_budget).step,
             band_frac: DEPTH_BAND_FRAC,
             unused: 0.0,
@@ -508,8 +514,8 @@ pub(crate) struct RayColor {
 }
 
 /// A random background: the field must not use the background to explain the images.
-fn background(options: &NerfOptions, step: u64) -> [f32; 3] {
-    [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.seed ^ hash(step << 2 | ix)))))
+fn background(options: &ModelOptions<NerfOptions>, step: u64) -> [f32; 3] {
+    [0, 1, 2].map(|ix| f32_of(unit_from_bits(hash(options.common.seed ^ hash(step << 2 | ix)))))
 }
 
 /// Parameters and optimizer state of the first images.
@@ -561,14 +567,14 @@ fn march_of(nerf_budget: NerfBudget) -> March {
     }
 }
 
-fn rule(options: &NerfOptions, weight_decay: f32) -> AdamRule {
+fn rule(options: &ModelOptions<NerfOptions>, weight_decay: f32) -> AdamRule {
     AdamRule {
-        rate: f32_of(options.rate),
-        final_rate_frac: f32_of(options.final_rate_frac),
+        rate: f32_of(options.specific.rate),
+        final_rate_frac: f32_of(options.specific.final_rate_frac),
         betas: [0.9, 0.99],
         epsilon: 1e-15,
         weight_decay,
-        n_planned_steps: options.n_planned_steps as f32,
+        n_planned_steps: options.common.n_planned_steps as f32,
         unused: 0.0,
     }
 }

@@ -5,8 +5,10 @@ mod against_twin;
 pub mod bench;
 mod buffers;
 mod carve;
+mod entry;
 mod extent;
 mod field_trainer;
+mod files;
 mod kernels;
 #[cfg(test)]
 mod march_against_twin;
@@ -20,6 +22,7 @@ mod sizes;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use entry::ENTRY;
 pub use extent::Extent;
 pub use model::NerfModel;
 pub use options::{NerfBudget, NerfOptions};

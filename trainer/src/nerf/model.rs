@@ -12,8 +12,9 @@ use super::sizes::Sizes;
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, PendingRead};
 use crate::method::submit_millis;
+use crate::model_options::ModelOptions;
 use crate::view::{Camera, projections};
-use crate::{Error, Method, Picture, Progress, RenderRequest, Restartable};
+use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest, Restartable};
 use calibration::Alignment;
 use calibration::TrialReport;
 use calibration::{CalibratedCamera, CameraCorrection, EMBEDDING_DIM, ParamSet};
@@ -39,7 +40,7 @@ const SOFTWARE_DEPTH_STRIDE: u32 = 3;
 #[derive(Debug)]
 pub struct NerfModel {
     gpu: Arc<Gpu>,
-    options: NerfOptions,
+    options: ModelOptions<NerfOptions>,
     images: Vec<RayImage>,
     field: Option<(Extent, FieldTrainer)>,
     /// Shared by all fields that this model creates.
@@ -75,11 +76,11 @@ struct InFlight {
 
 impl NerfModel {
     /// A model without keyframes.
-    pub fn new(gpu: Arc<Gpu>, options: NerfOptions) -> Result<Self, Error> {
+    pub fn new(gpu: Arc<Gpu>, options: ModelOptions<NerfOptions>) -> Result<Self, Error> {
         Ok(Self {
             gpu,
-            learned_params: images::given(&options.cameras),
-            trials: Trials::of(&options.cameras),
+            learned_params: images::given(&options.common.cameras),
+            trials: Trials::of(&options.common.cameras),
             options,
             images: Vec::new(),
             validation_images: Vec::new(),
@@ -98,7 +99,7 @@ impl NerfModel {
     }
 
     /// Options of this model.
-    pub fn options(&self) -> &NerfOptions {
+    pub fn options(&self) -> &ModelOptions<NerfOptions> {
         &self.options
     }
 
@@ -117,7 +118,11 @@ impl NerfModel {
     }
 
     fn nerf_budget(&self) -> NerfBudget {
-        self.options.nerf_budget.unwrap_or(if self.gpu.is_software() { NerfBudget::SMALL } else { NerfBudget::FULL })
+        self.options.specific.nerf_budget.unwrap_or(if self.gpu.is_software() {
+            NerfBudget::SMALL
+        } else {
+            NerfBudget::FULL
+        })
     }
 
     /// Creates a field if there is none or if the scene has outgrown it, and refines its cells when due. Returns
@@ -190,7 +195,7 @@ impl NerfModel {
     }
 
     fn refinement_step(&self) -> u64 {
-        (self.options.n_planned_steps / REFINE_DIVISOR).max(1)
+        (self.options.common.n_planned_steps / REFINE_DIVISOR).max(1)
     }
 
     /// Refines the cells when due: coarse cells need fewer updates at first, fine ones separate empty space better
@@ -216,14 +221,14 @@ impl NerfModel {
 
     /// Records the next step as the `slot_ix`-th of a submit.
     fn record(&mut self, slot_ix: usize) -> Result<(), Error> {
-        let learned_params = self.params_learned_now();
+        let learned_params = self.current_params();
         let Some((extent, field_trainer)) = &mut self.field else { return Ok(()) };
         if !learned_params.is_empty() {
             field_trainer.allocate_images(&self.gpu, self.images.len(), learned_params)?;
         }
         self.corrections = None;
         let n_rays = field_trainer.sizes.nerf_budget.n_rays;
-        let draw = RaySampling { seed: self.options.seed, step: self.step, n_rays, begin: NEAR_DISTANCE };
+        let draw = RaySampling { seed: self.options.common.seed, step: self.step, n_rays, begin: NEAR_DISTANCE };
         let rays = rays::draw(&self.images, extent, &draw);
         field_trainer.record_step(&self.gpu, &self.options, slot_ix, self.step, &rays, learned_params)?;
         self.step += 1;
@@ -340,10 +345,6 @@ impl Method for NerfModel {
         self.images.is_empty()
     }
 
-    fn primitive(&self) -> &'static str {
-        "entry"
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
         Ok(self.step + self.n_discarded_steps)
@@ -367,6 +368,10 @@ impl Method for NerfModel {
 
     fn set_watched(&mut self, watched: bool) {
         self.is_watched = watched;
+    }
+
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        Ok(self.extent().map(|extent| Bounds { center_m: extent.center_m, radius_m: extent.radius_m }))
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {

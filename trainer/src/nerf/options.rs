@@ -1,18 +1,12 @@
 //! Training options of a neural field.
 
-use calibration::CameraRefinement;
+use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
-/// Settings of a [`super::NerfModel`].
+/// Options of a [`super::NerfModel`], besides those that all methods share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct NerfOptions {
-    /// Seeds every random choice.
-    pub seed: u64,
-    /// Maximum GPU memory for the field (its parameters, gradients and the optimizer's moments), in bytes.
-    pub max_bytes: Option<u64>,
-    /// Number of steps over which the learning rate decays.
-    pub n_planned_steps: u64,
     /// Weight of the absolute difference of distances, per scene radius, relative to the squared difference of colors.
     pub distance_weight: f64,
     /// Weight of the line-of-sight loss, which penalizes opacity away from the measured depth.
@@ -23,8 +17,6 @@ pub struct NerfOptions {
     pub rate: f64,
     /// Fraction of the initial rate that remains after the planned steps.
     pub final_rate_frac: f64,
-    /// Which camera parameters to optimize with the field. A field supports only poses and appearance of images.
-    pub cameras: CameraRefinement,
     /// Sizes of batch and networks; `None`: chosen for the adapter.
     pub nerf_budget: Option<NerfBudget>,
 }
@@ -88,18 +80,18 @@ impl NerfBudget {
     }
 }
 
+impl MethodOptions for NerfOptions {
+    const METHOD: &'static str = "nerf";
+}
+
 impl Default for NerfOptions {
     fn default() -> Self {
         Self {
-            seed: 0,
-            max_bytes: None,
-            n_planned_steps: 7000,
             distance_weight: 0.05,
             line_of_sight: 0.1,
             distortion: 0.01,
             rate: 2e-2,
             final_rate_frac: 0.03,
-            cameras: CameraRefinement::default(),
             nerf_budget: None,
         }
     }

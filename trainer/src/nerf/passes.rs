@@ -335,7 +335,7 @@ impl FieldPasses<'_> {
 
     /// One optimizer step, with separate rules for grid and weights. Resets the gradients of the grid to zero. Run
     /// after [`FieldPasses::backward`].
-    pub(crate) fn learn(
+    pub(crate) fn update(
         &self,
         list: &mut Passes,
         [grid_rule, weights_rule]: [&Buffer; 2],

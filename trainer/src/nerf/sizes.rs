@@ -4,6 +4,7 @@ use super::extent::{Extent, pixel_size_m};
 use super::options::{NerfBudget, NerfOptions};
 use super::reference::grid::GridShape;
 use crate::Error;
+use crate::model_options::ModelOptions;
 use keyframe::{DepthMap, Keyframe};
 use serde::{Deserialize, Serialize};
 
@@ -53,7 +54,7 @@ fn has_dense_depth<'a>(keyframes: impl Iterator<Item = &'a Keyframe>) -> bool {
 impl Sizes {
     /// Chooses levels down to the size of a pixel, and entries for the number of pixels in an image, within the limits.
     pub(crate) fn choose<'a>(
-        options: &NerfOptions,
+        options: &ModelOptions<NerfOptions>,
         nerf_budget: NerfBudget,
         max_binding_bytes: u64,
         keyframes: impl Iterator<Item = &'a Keyframe> + Clone,
@@ -74,7 +75,7 @@ impl Sizes {
         let entries_for_pixels = (n_pixels.max(1) as f64 / PIXELS_PER_ENTRY).log2().ceil() as u32;
         let max_log2_entries_allowed = nerf_budget.max_log2_entries.max(MIN_LOG2_ENTRIES);
         let mut log2_entries = entries_for_pixels.clamp(MIN_LOG2_ENTRIES, max_log2_entries_allowed);
-        let max_bytes = options.max_bytes.unwrap_or(u64::MAX);
+        let max_bytes = options.common.max_bytes.unwrap_or(u64::MAX);
         loop {
             let shape = GridShape::between(N_CELLS_COARSEST, finest, n_levels, log2_entries);
             let n_entries = u64::from(shape.n_entries_total());

@@ -9,8 +9,9 @@ use super::sizes::Sizes;
 use super::{NerfModel, params};
 use crate::eval::{self, PixelPair};
 use crate::gpu::{Gpu, GpuOptions};
+use crate::model_options::{CommonOptions, ModelOptions};
 use crate::test_scenes as scenes;
-use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
+use crate::{Aabb, Error, Method, ModelKind, Picture, Projection, RenderRequest};
 use calibration::{CameraRefinement, ParamSet, rigid_transform};
 use keyframe::{DepthMap, Keyframe, Split};
 use kinematics::{Stamp, Transform, Twist};
@@ -21,7 +22,7 @@ use std::sync::Arc;
 const BALL_CENTER: Point3<f64> = Point3::new(0.3, -0.2, 0.1);
 const N_STEPS: u64 = 160;
 
-fn options() -> NerfOptions {
+fn options() -> ModelOptions<NerfOptions> {
     let nerf_budget = NerfBudget {
         n_rays: 256,
         n_samples: 1 << 13,
@@ -32,7 +33,18 @@ fn options() -> NerfOptions {
         max_levels: 6,
         picture_rays: 1 << 10,
     };
-    NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: 300, ..NerfOptions::default() }
+    ModelOptions {
+        common: CommonOptions { n_planned_steps: 300, ..CommonOptions::default() },
+        specific: NerfOptions { nerf_budget: Some(nerf_budget), ..NerfOptions::default() },
+    }
+}
+
+/// Options for a number of planned steps with these camera parameters.
+fn with_cameras(cameras: CameraRefinement, n_planned_steps: u64) -> ModelOptions<NerfOptions> {
+    options().with(|options| {
+        options.common.cameras = cameras;
+        options.common.n_planned_steps = n_planned_steps;
+    })
 }
 
 /// The ball alone: the pixels around it are black and have no depth.
@@ -55,7 +67,7 @@ fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
-fn model_with(options: NerfOptions, keyframes: &[Arc<Keyframe>]) -> NerfModel {
+fn model_with(options: ModelOptions<NerfOptions>, keyframes: &[Arc<Keyframe>]) -> NerfModel {
     let mut model = NerfModel::new(gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -121,7 +133,7 @@ fn novel_view_is_accurate_and_deterministic() {
         one_by_one.step(1).unwrap();
     }
     assert!(state(&mut model) == state(&mut one_by_one), "results must not depend on the number of steps per submit");
-    let mut other = model_with(NerfOptions { seed: 1, ..options() }, &seen);
+    let mut other = model_with(options().with(|options| options.common.seed = 1), &seen);
     train_until(&mut other, 4);
     let mut first = model_with(options(), &seen);
     train_until(&mut first, 4);
@@ -143,7 +155,7 @@ fn resume_and_load_are_bit_exact() {
 
     let folder = tempfile::tempdir().unwrap();
     half.save(folder.path()).unwrap();
-    assert!(NerfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap().map(ModelKind::name), Some("nerf"));
     let mut loaded = NerfModel::load(gpu(), folder.path()).unwrap();
     let request = request(&keyframes[1]);
     let (drawn, again) = (half.render(&request).unwrap(), loaded.render(&request).unwrap());
@@ -207,8 +219,11 @@ fn renders_crop_range_and_equirectangular() {
 fn occupancy_cells_are_refined() {
     const PLANNED: u64 = 40;
     const END: u64 = 8;
-    let nerf_budget = NerfBudget { n_cells: NerfBudget::FULL.n_cells, ..options().nerf_budget.unwrap() };
-    let options = NerfOptions { nerf_budget: Some(nerf_budget), n_planned_steps: PLANNED, ..options() };
+    let nerf_budget = NerfBudget { n_cells: NerfBudget::FULL.n_cells, ..options().specific.nerf_budget.unwrap() };
+    let options = options().with(|options| {
+        options.common.n_planned_steps = PLANNED;
+        options.specific.nerf_budget = Some(nerf_budget);
+    });
     let keyframes = ball_on_floor(5);
     let mut whole = model_with(options.clone(), &keyframes);
     let mut parts = Vec::new();
@@ -258,7 +273,7 @@ fn drifting_poses_are_corrected() {
         off.sum::<f64>() / given.len() as f64
     };
     let poses = ParamSet::IMAGE_POSES;
-    let options = |cameras| NerfOptions { cameras, n_planned_steps: 600, ..options() };
+    let options = |cameras| with_cameras(cameras, 600);
     let mut model = model_with(options(CameraRefinement::Try(vec![poses])), &drifted_keyframes);
     let before_m = mean_position_error_m(&mut model, &drifted_keyframes);
     train_until(&mut model, 90); // In the middle of the trial.
@@ -309,7 +324,7 @@ fn drifting_poses_are_corrected() {
 /// rendered with the interpolated embedding of their neighbors in time, and others with the mean embedding.
 #[test]
 fn changing_light_is_modeled() {
-    let options = |cameras| NerfOptions { cameras, n_planned_steps: 480, ..options() };
+    let options = |cameras| with_cameras(cameras, 480);
     let is_validation = |keyframe: &Keyframe| keyframe.stamp.0 % 4 == 2;
     let even: Vec<Arc<Keyframe>> = ball_on_floor(32)
         .iter()
@@ -387,10 +402,10 @@ fn non_finite_keyframes_leave_no_nan() {
     let mut model = model_with(options(), &all);
     train_until(&mut model, 40);
     let checkpoint = state(&mut model);
-    let floats = ["grid", "grid_moments", "density_0", "density_1", "color_0", "color_1", "color_2"];
-    for array in checkpoint.arrays.iter().filter(|array| floats.contains(&array.name.as_str())) {
+    for name in ["grid", "weights", "grid_moments", "weight_moments", "scales", "cell_occupancy"] {
+        let array = checkpoint.arrays.iter().find(|array| array.name == name).expect(name);
         let values: Vec<f32> = bytemuck::pod_collect_to_vec(&array.bytes);
-        assert!(values.iter().all(|value| value.is_finite()), "{}", array.name);
+        assert!(values.iter().all(|value| value.is_finite()), "{name}");
     }
     assert!(model.render(&request(&keyframes[4])).unwrap().depth_m.iter().all(|depth| depth.is_finite()));
     let torn = Keyframe { rgba_srgb: vec![0; 12].into(), ..(*keyframes[1]).clone() };
@@ -426,10 +441,10 @@ fn rays_pass_pixel_centers_at_row_time() {
     for (x, y) in [(0, 0), (width - 1, height - 1), (width / 2, height / 2)] {
         let (origin, direction, distance) = image.reading(&extent, (y * width + x) as usize);
         let tau = ((f64::from(y) + 0.5) / f64::from(height) - 0.5) * 0.04;
-        let place =
+        let normalized =
             |pixel: u32, axis: usize| (f64::from(pixel) + 0.5 - keyframe.principal_px[axis]) / keyframe.focal_px[axis];
         // A rotation about z moves the ray's x and y.
-        let (u, v) = (place(x, 0), place(y, 1));
+        let (u, v) = (normalized(x, 0), normalized(y, 1));
         let seen = Vector3::new(u - tau * 2.0 * v, v + tau * 2.0 * u, 1.0);
         let pose = &keyframe.world_from_camera;
         let expected = (pose * Point3::from(linear_m_s * tau) - Point3::from(extent.center_m)) / 2.0;
@@ -496,12 +511,12 @@ fn outgrown_field_restarts_and_budget_is_enforced() {
     assert_eq!(model.progress().step, 6);
 
     let bytes = model.progress().bytes;
-    let mut small = model_with(NerfOptions { max_bytes: Some(bytes / 2), ..options() }, &near);
+    let mut small = model_with(options().with(|options| options.common.max_bytes = Some(bytes / 2)), &near);
     train_until(&mut small, 1);
     let keyframes = || near.iter().map(|keyframe| &**keyframe);
     let sizes = |max_bytes| {
-        let options = NerfOptions { max_bytes: Some(max_bytes), ..options() };
-        Sizes::choose(&options, options.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
+        let options = options().with(|options| options.common.max_bytes = Some(max_bytes));
+        Sizes::choose(&options, options.specific.nerf_budget.unwrap(), 1 << 27, keyframes(), &before)
     };
     let n_entries = |sizes: &Sizes| sizes.shape().n_entries_total();
     assert!(n_entries(&sizes(900_000).unwrap()) < n_entries(&sizes(1 << 30).unwrap()));

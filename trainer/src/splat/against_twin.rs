@@ -4,7 +4,7 @@
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
 use super::camera_params::CameraParams;
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use super::reference::{self, RenderedImage, Splat, Upstream, View, scene};
@@ -27,7 +27,7 @@ const MARGIN: f64 = 1e-4;
 pub(super) struct KernelFixture {
     pub(super) gpu: Arc<Gpu>,
     pub(super) draw: DrawPipelines,
-    pub(super) learn: LearnPipelines,
+    pub(super) train: TrainPipelines,
     pub(super) splats: SplatBuffers,
     pub(super) scratch: Scratch,
     pub(super) image_buffers: ImageBuffers,
@@ -70,7 +70,7 @@ impl KernelFixture {
     pub(super) fn new(options: &GpuOptions, view: &View, arrays: &SplatArrays) -> Self {
         let gpu = Gpu::open(options).unwrap();
         let draw = DrawPipelines::new(&gpu).unwrap();
-        let learn = LearnPipelines::new(&gpu).unwrap();
+        let train = TrainPipelines::new(&gpu).unwrap();
         let n_splats = u32::try_from(arrays.means.len()).unwrap();
         let mut splats = SplatBuffers::new(&gpu, n_splats, 3).unwrap();
         splats.append(&gpu, arrays);
@@ -86,7 +86,7 @@ impl KernelFixture {
         counters[status::N_SPLATS as usize] = n_splats;
         let status = gpu.storage_with("status", bytemuck::cast_slice(&counters)).unwrap();
         let view_buffer = gpu.uniform_with("view", &camera_of(view).view());
-        Self { draw, learn, splats, scratch, image_buffers, status, view: view_buffer, size_px: view.size_px, gpu }
+        Self { draw, train, splats, scratch, image_buffers, status, view: view_buffer, size_px: view.size_px, gpu }
     }
 
     pub(super) fn passes(&self) -> ViewPasses<'_> {
@@ -258,18 +258,18 @@ fn check_gradients(
     let gpu = &fixture.gpu;
     let target_buffers = TargetBuffers::new(gpu, target, weights);
     let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
-    let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
+    let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
     let mut passes = Passes::default();
     let view_passes = fixture.passes();
     view_passes.draw(&mut passes, &fixture.draw);
-    view_passes.compare(&mut passes, &fixture.learn, &target_buffers.target());
-    view_passes.backward(&mut passes, &fixture.learn);
+    view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
+    view_passes.backward(&mut passes, &fixture.train);
     view_passes.update(&mut passes, &gradients_only, &rule, true);
     let all =
         ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET | ParamSet::LENS | ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS;
     let mut cameras = CameraParams::new(gpu, all).unwrap();
     let lens = cameras.lens(gpu, &moving_keyframe()).unwrap();
-    let refine = LearnPipelines::camera_gradients_only(gpu).unwrap();
+    let refine = TrainPipelines::camera_gradients_only(gpu).unwrap();
     cameras.refine_with(&view_passes, &mut passes, &refine, &lens);
     passes.submit(gpu);
     check_camera_gradients(&cameras.param_values(gpu), view, splats, &expected.view, upstream, weights.background_rgb);
@@ -452,11 +452,11 @@ fn hidden_splats_have_no_gradient() {
         gpu.write(&fixture.image_buffers.upstream, 0, bytemuck::cast_slice(&vec![1.0f32; 4 * n_pixels]));
         gpu.write(&fixture.image_buffers.pixel_totals, 0, bytemuck::cast_slice(&vec![1.0f32; 2 * n_pixels]));
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
-        let gradients_only = LearnPipelines::gradients_only(gpu).unwrap();
+        let gradients_only = TrainPipelines::gradients_only(gpu).unwrap();
         let mut passes = Passes::default();
         let view_passes = fixture.passes();
         view_passes.draw(&mut passes, &fixture.draw);
-        view_passes.backward(&mut passes, &fixture.learn);
+        view_passes.backward(&mut passes, &fixture.train);
         view_passes.update(&mut passes, &gradients_only, &rule, true);
         passes.submit(gpu);
         let got = fixture.splats.read(gpu).unwrap();
@@ -515,13 +515,13 @@ fn camera_params_start_at_zero_and_step_by_their_rate() {
         let target_buffers = TargetBuffers::new(gpu, &target, &weights);
         let rule = gpu.uniform_with("rule", &<Rule as bytemuck::Zeroable>::zeroed());
         let mut passes = Passes::default();
-        cameras.correct(gpu, &mut passes, &fixture.learn, &fixture.view, &lens);
+        cameras.correct(gpu, &mut passes, &fixture.train, &fixture.view, &lens);
         let view_passes = ViewPasses { view: &cameras.corrected, ..fixture.passes() };
         view_passes.draw(&mut passes, &fixture.draw);
-        view_passes.compare(&mut passes, &fixture.learn, &Target { gains: &cameras.gains, ..target_buffers.target() });
-        view_passes.backward(&mut passes, &fixture.learn);
-        view_passes.update(&mut passes, &fixture.learn.update_with_camera, &rule, true);
-        cameras.refine(&view_passes, &mut passes, &fixture.learn, &lens);
+        view_passes.compare(&mut passes, &fixture.train, &Target { gains: &cameras.gains, ..target_buffers.target() });
+        view_passes.backward(&mut passes, &fixture.train);
+        view_passes.update(&mut passes, &fixture.train.update_with_camera, &rule, true);
+        cameras.refine(&view_passes, &mut passes, &fixture.train, &lens);
         passes.submit(gpu);
         let corrected: Vec<f32> = gpu.read(&cameras.corrected, 20).unwrap();
         let base = camera_of(&view).view();

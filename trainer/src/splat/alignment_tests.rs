@@ -5,22 +5,22 @@ use super::training_tests::train;
 use super::{SplatOptions, SplatTrainer};
 use crate::Method;
 use crate::gpu::{Gpu, GpuOptions};
+use crate::model_options::{CommonOptions, ModelOptions};
 use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{Keyframe, Split};
 use std::sync::Arc;
 
 fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>]) -> SplatTrainer {
-    let options = SplatOptions {
+    let common = CommonOptions {
         align: CameraRefinement::Try(vec![ParamSet::EXTRINSICS]),
         cameras: CameraRefinement::Try(vec![ParamSet::IMAGE_POSES]),
-        max_splats: 2000,
         n_planned_steps: 120,
-        coarse_steps: Some([1000, 1000]),
-        sh_degree: 0,
-        ..SplatOptions::default()
+        ..CommonOptions::default()
     };
-    let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
+    let specific =
+        SplatOptions { max_splats: 2000, coarse_steps: Some([1000, 1000]), sh_degree: 0, ..SplatOptions::default() };
+    let mut trainer = SplatTrainer::new(gpu.clone(), ModelOptions { common, specific }).unwrap();
     for keyframe in keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
@@ -69,7 +69,7 @@ fn wrong_extrinsics_are_corrected_and_resuming_is_exact() {
     let folder = tempfile::tempdir().unwrap();
     uninterrupted.save(folder.path()).unwrap();
     let arrays = uninterrupted.arrays().unwrap();
-    let loaded = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &arrays).unwrap();
+    let loaded = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &arrays).unwrap();
     let mut loaded = loaded.with_saved_corrections(folder.path()).unwrap();
     assert_eq!(loaded.calibrated_camera(test).unwrap(), correction.apply(test));
 }

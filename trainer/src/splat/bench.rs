@@ -5,7 +5,7 @@
 
 use super::arrays::SplatArrays;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::kernels::{DrawPipelines, TrainPipelines};
 use super::params::{Camera, LOW_PASS_PX2, Rule, Supervision, status};
 use super::passes::{Target, ViewPasses};
 use crate::Error;
@@ -78,7 +78,7 @@ pub struct Repeats {
 struct KernelBench {
     gpu: Arc<Gpu>,
     draw: DrawPipelines,
-    learn: LearnPipelines,
+    train: TrainPipelines,
     splats: SplatBuffers,
     scratch: Scratch,
     image_buffers: ImageBuffers,
@@ -130,7 +130,7 @@ pub fn time_kernels(
 impl KernelBench {
     fn new(gpu: Arc<Gpu>, cloud: &SplatArrays, size_px: [u32; 2], eye: Eye) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
-        let learn = LearnPipelines::new(&gpu)?;
+        let train = TrainPipelines::new(&gpu)?;
         let n_splats =
             u32::try_from(cloud.n_splats()).map_err(|_| Error::SplatArrays("more than 2^32 splats".to_owned()))?;
         let mut splats = SplatBuffers::new(&gpu, n_splats, cloud.sh_degree)?;
@@ -167,7 +167,7 @@ impl KernelBench {
             rule: gpu.uniform_with("bench.rule", &rule()),
             rule_visible: gpu.uniform_with("bench.rule_touched", &Rule { update_all: 0, ..rule() }),
             draw,
-            learn,
+            train,
             splats,
             size_px,
             gpu,
@@ -215,15 +215,15 @@ impl KernelBench {
 
     fn record_step(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule, false);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule, false);
         self.record_end(passes);
     }
 
     fn record_step_visible(&self, passes: &mut Passes) {
         let view = self.record_gradients(passes);
-        view.backward(passes, &self.learn);
-        view.update(passes, &self.learn.update, &self.rule_visible, false);
+        view.backward(passes, &self.train);
+        view.update(passes, &self.train.update, &self.rule_visible, false);
         self.record_end(passes);
     }
 
@@ -233,7 +233,7 @@ impl KernelBench {
         view.draw(passes, &self.draw);
         view.compare(
             passes,
-            &self.learn,
+            &self.train,
             &Target {
                 image: &self.image,
                 depth: &self.depth,
@@ -246,7 +246,7 @@ impl KernelBench {
     }
 
     fn record_end(&self, passes: &mut Passes) {
-        passes.dispatch(&self.gpu, &self.learn.advance, 1, &[("status", &self.status)]);
+        passes.dispatch(&self.gpu, &self.train.advance, 1, &[("status", &self.status)]);
     }
 
     fn n_visible(&self) -> Result<u64, Error> {

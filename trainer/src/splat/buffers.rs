@@ -300,11 +300,11 @@ pub(crate) struct ImageBuffers {
 }
 
 impl ImageBuffers {
-    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`; those of gradients only if `learned`.
-    pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, learned: bool) -> Result<Self, Error> {
+    /// Allocates buffers for pictures of up to `n_pixels` and `n_tiles`; those of gradients only if `for_training`.
+    pub(crate) fn new(gpu: &Gpu, n_pixels: u32, n_tiles: u32, for_training: bool) -> Result<Self, Error> {
         let each = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_pixels));
         let gradient_buffer =
-            |name: &str, bytes: u64| gpu.storage(name, if learned { bytes * u64::from(n_pixels) } else { 0 });
+            |name: &str, bytes: u64| gpu.storage(name, if for_training { bytes * u64::from(n_pixels) } else { 0 });
         let tiles = |name: &str, bytes: u64| gpu.storage(name, bytes * u64::from(n_tiles));
         Ok(Self {
             n_pixels,

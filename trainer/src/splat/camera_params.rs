@@ -3,7 +3,7 @@
 //! All images of a camera share its parameters; each image can have its own in addition. Nothing is read back during
 //! training: `correct_view` prepares the view of a step, and `refine_camera` updates its parameters.
 
-use super::kernels::LearnPipelines;
+use super::kernels::TrainPipelines;
 use super::params::{CameraRule, Lens, N_PARAMS};
 use super::passes::ViewPasses;
 use crate::Error;
@@ -170,7 +170,14 @@ impl CameraParams {
     }
 
     /// Records the pass that prepares the view of a step.
-    pub(crate) fn correct(&self, gpu: &Gpu, passes: &mut Passes, learn: &LearnPipelines, base: &Buffer, lens: &Buffer) {
+    pub(crate) fn correct(
+        &self,
+        gpu: &Gpu,
+        passes: &mut Passes,
+        pipelines: &TrainPipelines,
+        base: &Buffer,
+        lens: &Buffer,
+    ) {
         let buffers = [
             ("base", base),
             ("lens", lens),
@@ -179,12 +186,12 @@ impl CameraParams {
             ("corrected", &self.corrected),
             ("gains", &self.gains),
         ];
-        passes.dispatch(gpu, &learn.correct_view, 1, &buffers);
+        passes.dispatch(gpu, &pipelines.correct_view, 1, &buffers);
     }
 
     /// Records the pass that updates the parameters.
-    pub(crate) fn refine(&self, view: &ViewPasses<'_>, passes: &mut Passes, learn: &LearnPipelines, lens: &Buffer) {
-        self.refine_with(view, passes, &learn.refine_camera, lens);
+    pub(crate) fn refine(&self, view: &ViewPasses<'_>, passes: &mut Passes, pipelines: &TrainPipelines, lens: &Buffer) {
+        self.refine_with(view, passes, &pipelines.refine_camera, lens);
     }
 
     pub(crate) fn refine_with(&self, view: &ViewPasses<'_>, passes: &mut Passes, refine: &Pipeline, lens: &Buffer) {

@@ -115,9 +115,9 @@ fn optimizer_steps_match_the_twin() {
         let mut passes = Passes::default();
         let view_passes = fixture.passes();
         view_passes.draw(&mut passes, &fixture.draw);
-        view_passes.compare(&mut passes, &fixture.learn, &target_buffers.target());
-        view_passes.backward(&mut passes, &fixture.learn);
-        view_passes.update(&mut passes, &fixture.learn.update, &rule, false);
+        view_passes.compare(&mut passes, &fixture.train, &target_buffers.target());
+        view_passes.backward(&mut passes, &fixture.train);
+        view_passes.update(&mut passes, &fixture.train.update, &rule, false);
         passes.submit(gpu);
         gpu.write(&fixture.status, 4 * status::STEP as u64, bytemuck::bytes_of(&(step + 1)));
     }
@@ -175,7 +175,7 @@ fn growth_matches_the_twin() {
     gpu.write(&fixture.splats.moments, 0, bytemuck::cast_slice(&moments));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.train, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
     fixture.splats.set_n_splats(&gpu, N_AFTER);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
@@ -230,7 +230,7 @@ fn dead_splats_have_no_children() {
     gpu.write(&fixture.splats.error_sums, 0, bytemuck::cast_slice(&errors));
     let buffers = growth_buffers(&gpu, &growth);
     let mut passes = Passes::default();
-    grow(&gpu, &mut passes, &fixture.learn, &fixture.splats, &buffers, &growth);
+    grow(&gpu, &mut passes, &fixture.train, &fixture.splats, &buffers, &growth);
     passes.submit(&gpu);
     let parents: Vec<u32> = gpu.read(&buffers.parents, N_AFTER as usize).unwrap();
     let of_dead =

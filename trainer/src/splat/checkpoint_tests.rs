@@ -1,7 +1,7 @@
 //! Tests of checkpoints: a model that was interrupted and resumed is bit-identical to one that was not.
 
+use super::SplatTrainer;
 use super::training_tests::{keyframes, options, train};
-use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
 use crate::{Error, Method};
@@ -17,7 +17,10 @@ fn checkpoint_of(trainer: &mut SplatTrainer) -> Checkpoint {
 }
 
 fn new_trainer(gpu: &Arc<Gpu>, keyframes: &[Arc<Keyframe>], max_splats: u32) -> SplatTrainer {
-    let options = SplatOptions { n_planned_steps: 500, max_splats, ..options() };
+    let options = options().with(|options| {
+        options.common.n_planned_steps = 500;
+        options.specific.max_splats = max_splats;
+    });
     let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
     for keyframe in keyframes {
         trainer.push(keyframe.clone()).unwrap();

@@ -216,7 +216,7 @@ pub(crate) enum Ssim {
 
 /// Additional pipelines for training.
 #[derive(Debug)]
-pub(crate) struct LearnPipelines {
+pub(crate) struct TrainPipelines {
     pub(crate) ssim: Ssim,
     pub(crate) loss: Pipeline,
     pub(crate) loss_without_ssim: Pipeline,
@@ -235,7 +235,7 @@ pub(crate) struct LearnPipelines {
     pub(crate) gather: Pipeline,
 }
 
-impl LearnPipelines {
+impl TrainPipelines {
     pub(crate) fn new(gpu: &Gpu) -> Result<Self, Error> {
         let blend = blend(gpu);
         let lanes: Vec<_> = blend.subgroup.map(|lanes| ("SUBGROUP", f64::from(lanes))).into_iter().collect();

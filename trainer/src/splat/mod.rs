@@ -6,6 +6,7 @@ mod against_twin;
 mod alignment_tests;
 pub mod arrays;
 pub mod bench;
+mod bounds;
 mod buffers;
 mod camera_params;
 #[cfg(test)]
@@ -13,15 +14,19 @@ mod change_against_twin;
 #[cfg(test)]
 mod checkpoint_tests;
 pub mod cloud;
+mod entry;
+mod file;
 pub mod kernels;
 #[cfg(test)]
 mod non_finite_tests;
 mod options;
 mod params;
 mod passes;
+pub mod ply;
 pub mod reference;
 mod seed;
 mod snapshot;
+pub mod spz;
 mod trainer;
 #[cfg(test)]
 mod training_tests;
@@ -30,6 +35,7 @@ mod trial_tests;
 mod trials;
 mod views;
 
+pub(crate) use entry::ENTRY;
 pub use options::SplatOptions;
 pub use trainer::SplatTrainer;
 pub use trials::CountPolicy;

@@ -1,25 +1,19 @@
 //! Options of the splat model.
 
 use super::trials::CountPolicy;
-use calibration::CameraRefinement;
+use crate::model_options::{MethodOptions, ModelOptions};
 use serde::{Deserialize, Serialize};
 
-/// Settings of a [`super::SplatTrainer`].
+/// Options of a [`super::SplatTrainer`], besides those that all methods share.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SplatOptions {
-    /// Seeds every random choice.
-    pub seed: u64,
     /// Maximum number of splats.
     pub max_splats: u32,
     /// How the number of splats is chosen.
     pub count: CountPolicy,
-    /// Maximum GPU memory of the model (parameters and the optimizer's moments), bytes.
-    pub max_bytes: Option<u64>,
     /// Highest degree of spherical harmonics, 0 to 3.
     pub sh_degree: u32,
-    /// Steps over which learning rates decay and the model grows.
-    pub n_planned_steps: u64,
     /// Weight of D-SSIM in the color loss, 0 to 1.
     pub dssim_frac: f64,
     /// Weight of the depth loss, per meter.
@@ -39,25 +33,20 @@ pub struct SplatOptions {
     /// selects few coarse steps on a GPU and many on a CPU, where the time of a step is proportional to the number of
     /// pixels.
     pub coarse_steps: Option<[u64; 2]>,
-    /// Camera parameters that are optimized with the splats.
-    pub cameras: CameraRefinement,
-    /// Camera parameters that are estimated by registering keyframes with depth, before the splats are trained on
-    /// them.
-    #[serde(default)]
-    pub align: CameraRefinement,
     /// Maximum number of splats added for one depth image; `None` selects fewer on a CPU.
     pub seeds_per_image: Option<f64>,
+}
+
+impl MethodOptions for SplatOptions {
+    const METHOD: &'static str = "splat";
 }
 
 impl Default for SplatOptions {
     fn default() -> Self {
         Self {
-            seed: 0,
             max_splats: 400_000,
             count: CountPolicy::default(),
-            max_bytes: None,
             sh_degree: 3,
-            n_planned_steps: 7000,
             dssim_frac: 0.2,
             depth_per_m: 0.1,
             random_background: 0.25,
@@ -65,8 +54,6 @@ impl Default for SplatOptions {
             growth_frac: 0.1,
             noise: 5e5,
             coarse_steps: None,
-            cameras: CameraRefinement::default(),
-            align: CameraRefinement::default(),
             seeds_per_image: None,
         }
     }
@@ -78,10 +65,12 @@ impl SplatOptions {
         let n_floats = 12 + 3; // Means, rotations and shapes are padded to 4 each.
         4 * (3 * n_floats + u64::from(super::buffers::n_sh_rest(self.sh_degree)) + 1 + 1)
     }
+}
 
-    /// Maximum number of splats allowed by both limits.
+impl ModelOptions<SplatOptions> {
+    /// Maximum number of splats allowed by the limits on splats and bytes (parameters and the optimizer's moments).
     pub(crate) fn cap(&self) -> u32 {
-        let by_bytes = self.max_bytes.map_or(u64::MAX, |bytes| bytes / self.bytes_per_splat());
-        self.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
+        let by_bytes = self.common.max_bytes.map_or(u64::MAX, |bytes| bytes / self.specific.bytes_per_splat());
+        self.specific.max_splats.min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 }

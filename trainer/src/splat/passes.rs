@@ -1,7 +1,7 @@
 //! The stages of drawing and training, as lists of passes.
 
 use super::buffers::{BLOCK, GROUP, ImageBuffers, Scratch, SplatBuffers, WINDOW_BINS, n_bins, n_tiles};
-use super::kernels::{DrawPipelines, LearnPipelines, Ssim};
+use super::kernels::{DrawPipelines, Ssim, TrainPipelines};
 use super::params::{Growth, TILE_PX};
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 
@@ -45,7 +45,7 @@ pub(crate) struct GrowthBuffers {
 pub(crate) fn grow(
     gpu: &Gpu,
     passes: &mut Passes,
-    pipelines: &LearnPipelines,
+    pipelines: &TrainPipelines,
     splats: &SplatBuffers,
     buffers: &GrowthBuffers,
     growth: &Growth,
@@ -216,7 +216,7 @@ impl ViewPasses<'_> {
     }
 
     /// Compares the picture with its target and computes the gradient with respect to every pixel.
-    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &LearnPipelines, target: &Target<'_>) {
+    pub(crate) fn compare(&self, passes: &mut Passes, pipelines: &TrainPipelines, target: &Target<'_>) {
         let Self { gpu, image_buffers, status, view, .. } = *self;
         let n_groups = u64::from(n_tiles(self.size_px));
         let base = [
@@ -258,7 +258,7 @@ impl ViewPasses<'_> {
     }
 
     /// Propagates the gradients from the pixels to the intersections.
-    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &LearnPipelines) {
+    pub(crate) fn backward(&self, passes: &mut Passes, pipelines: &TrainPipelines) {
         let Self { gpu, scratch, image_buffers, status, view, size_px, .. } = *self;
         passes.dispatch(
             gpu,
@@ -281,7 +281,7 @@ impl ViewPasses<'_> {
 
     /// Adds each splat's contribution to the picture. Requires a previous [`ViewPasses::backward`] with an error of
     /// one at every pixel.
-    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &LearnPipelines, contributions: &Buffer) {
+    pub(crate) fn contribute(&self, passes: &mut Passes, pipelines: &TrainPipelines, contributions: &Buffer) {
         let buffers = [
             ("model", &self.splats.model),
             ("status", self.status),

@@ -78,15 +78,15 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     workgroupBarrier(); // The totals are where `gradient_of` reads them.
     let param = min(lane, N_PARAMS - 1u);
     let gradient = gradient_of(param);
-    let learns = lane < N_PARAMS && status[FAILED] == 0u && is_finite(gradient);
+    let is_usable = lane < N_PARAMS && status[FAILED] == 0u && is_finite(gradient);
     let bit = 1u << param;
     if GRADIENTS_ONLY {
-        if learns { params[lens.camera_params + param].x = gradient; }
+        if is_usable { params[lens.camera_params + param].x = gradient; }
     } else {
-        if learns && (rule.camera_mask & bit) != 0u {
+        if is_usable && (rule.camera_mask & bit) != 0u {
             params[lens.camera_params + param] = adam_step(params[lens.camera_params + param], gradient, rate_of(param), 0.0);
         }
-        if learns && (rule.image_mask & bit) != 0u {
+        if is_usable && (rule.image_mask & bit) != 0u {
             params[lens.image_params + param] = adam_step(params[lens.image_params + param], gradient, rate_of(param), rule.image_decay);
         }
     }

@@ -26,7 +26,7 @@ const N_RANDOM: usize = 50_000;
 const RANDOM_OPACITY: f64 = 0.1;
 const SH_0: f64 = 0.282_094_791_773_878_14;
 
-/// Creates discs and remembers the positions that already have splats.
+/// Creates discs and stores the positions that already have splats.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Seeder {
     /// Octave of the spacing, and the occupied cell at that size.

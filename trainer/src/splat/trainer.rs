@@ -7,12 +7,15 @@ mod model_size;
 mod scoring;
 
 use super::arrays::SplatArrays;
+use super::bounds::bounds;
 use super::buffers::{ImageBuffers, Scratch, ScratchSize, SplatBuffers, n_bins, n_sh_rest, n_tiles};
 use super::camera_params::CameraParams;
-use super::kernels::{DrawPipelines, LearnPipelines};
+use super::file::IN_FOLDER;
+use super::kernels::{DrawPipelines, TrainPipelines};
 use super::options::SplatOptions;
 use super::params::{Camera, Growth, Rule, Supervision, View, status};
 use super::passes::{self, GrowthBuffers, Target, ViewPasses};
+use super::ply;
 use super::seed::{self, Density, Seeder};
 use super::snapshot::{Seeding, Snapshot};
 use super::trials::{Due, SecondHalf, SplatTrials, TrialContext, TrialEnd, ValidationImage};
@@ -20,9 +23,10 @@ use super::views::{self, Keep, Level, LevelImages, Order, TrainView};
 use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, PendingRead, Pipeline, f32_of};
 use crate::method::submit_millis;
-use crate::model_metadata::read_metadata;
+use crate::model_metadata::{METADATA_FILE, read_metadata};
+use crate::model_options::{MethodOptions, ModelOptions};
 use crate::view::projections;
-use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, ply};
+use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask};
 use calibration::{CalibratedCamera, CameraCorrection, ParamSet};
@@ -69,14 +73,14 @@ const MAX_COST: f64 = 0.1;
 #[derive(Debug)]
 pub struct SplatTrainer {
     gpu: Arc<Gpu>,
-    options: SplatOptions,
+    options: ModelOptions<SplatOptions>,
     draw: DrawPipelines,
-    learn: Learn,
+    train: TrainPipelineState,
     splats: SplatBuffers,
     scratch: Option<(ScratchSize, Scratch)>,
     training_buffers: Option<ImageBuffers>,
     drawing_buffers: Option<ImageBuffers>,
-    learn_status: Buffer,
+    train_status: Buffer,
     draw_status: Buffer,
     draw_view: Buffer,
     rule: Buffer,
@@ -134,26 +138,27 @@ enum RequestedParts<'a> {
     },
 }
 
+/// Whether the training pipelines are compiled.
 #[derive(Debug)]
-enum Learn {
+enum TrainPipelineState {
     OnDemand,
     Compiling(Compiling),
-    Ready(Arc<LearnPipelines>),
+    Ready(Arc<TrainPipelines>),
     Failed,
 }
 
 /// Pipelines being compiled on a thread. Dropping it waits for the thread, because NVIDIA's driver corrupts the heap
 /// if a process exits while the driver compiles.
 #[derive(Debug)]
-struct Compiling(Option<JoinHandle<Result<LearnPipelines, Error>>>);
+struct Compiling(Option<JoinHandle<Result<TrainPipelines, Error>>>);
 
 impl Compiling {
     fn start(gpu: &Arc<Gpu>) -> Self {
         let gpu = gpu.clone();
-        Self(Some(std::thread::spawn(move || LearnPipelines::new(&gpu))))
+        Self(Some(std::thread::spawn(move || TrainPipelines::new(&gpu))))
     }
 
-    fn finish(&mut self) -> Result<LearnPipelines, Error> {
+    fn finish(&mut self) -> Result<TrainPipelines, Error> {
         self.0.take().and_then(|thread| thread.join().ok()).unwrap_or(Err(Error::DeviceLost))
     }
 }
@@ -165,7 +170,7 @@ impl Drop for Compiling {
 }
 
 /// The resources of one training step.
-struct LearnedView<'a> {
+struct PreparedView<'a> {
     view: ViewPasses<'a>,
     level: &'a Level,
     /// Present if camera parameters are optimized.
@@ -181,23 +186,27 @@ struct InFlight {
 
 impl SplatTrainer {
     /// Creates an empty model. It can draw at once; the training pipelines are compiled on another thread.
-    pub fn new(gpu: Arc<Gpu>, options: SplatOptions) -> Result<Self, Error> {
-        let learn = Learn::Compiling(Compiling::start(&gpu));
-        Self::with_learn(gpu, options, learn)
+    pub fn new(gpu: Arc<Gpu>, options: ModelOptions<SplatOptions>) -> Result<Self, Error> {
+        let train = TrainPipelineState::Compiling(Compiling::start(&gpu));
+        Self::with_pipelines(gpu, options, train)
     }
 
-    fn with_learn(gpu: Arc<Gpu>, options: SplatOptions, learn: Learn) -> Result<Self, Error> {
+    fn with_pipelines(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        train: TrainPipelineState,
+    ) -> Result<Self, Error> {
         let draw = DrawPipelines::new(&gpu)?;
         let zeros = [0u8; 4 * status::LEN];
         let software = gpu.is_software();
         Ok(Self {
             draw,
-            learn,
-            splats: SplatBuffers::new(&gpu, 1, options.sh_degree)?,
+            train,
+            splats: SplatBuffers::new(&gpu, 1, options.specific.sh_degree)?,
             scratch: None,
             training_buffers: None,
             drawing_buffers: None,
-            learn_status: gpu.storage_with("splat.learn_status", &zeros)?,
+            train_status: gpu.storage_with("splat.train_status", &zeros)?,
             draw_status: gpu.storage_with("splat.draw_status", &zeros)?,
             draw_view: gpu.uniform_with("splat.draw_view", &<View as bytemuck::Zeroable>::zeroed()),
             rule: gpu.uniform_with("splat.rule", &<Rule as bytemuck::Zeroable>::zeroed()),
@@ -205,36 +214,37 @@ impl SplatTrainer {
                 "splat.supervision",
                 &Supervision {
                     background_srgb: [0.0; 4],
-                    dssim_frac: f32_of(options.dssim_frac),
-                    depth_weight: f32_of(options.depth_per_m),
+                    dssim_frac: f32_of(options.specific.dssim_frac),
+                    depth_weight: f32_of(options.specific.depth_per_m),
                     depth_clip_m: f32_of(DEPTH_CLIP_M),
-                    random_background: f32_of(options.random_background),
+                    random_background: f32_of(options.specific.random_background),
                 },
             ),
             plain: gpu.uniform_with("splat.background", &<Supervision as bytemuck::Zeroable>::zeroed()),
             cameras: CameraParams::new(
                 &gpu,
-                match &options.cameras {
+                match &options.common.cameras {
                     CameraRefinement::Always(params) => *params,
                     CameraRefinement::Try(_) => ParamSet::empty(),
                 },
             )?,
             saved_corrections: BTreeMap::new(),
-            alignment_task: AlignmentTask::new(&options.align),
-            trials: SplatTrials::new(&options.cameras, options.count),
+            alignment_task: AlignmentTask::new(&options.common.align),
+            trials: SplatTrials::new(&options.common.cameras, options.specific.count),
             passes: Passes::default(),
             seeder: Seeder::default(),
             pending: Vec::new(),
             unseeded: Vec::new(),
             seeds_per_image: options
+                .specific
                 .seeds_per_image
                 .unwrap_or(if software { 4_000.0 } else { 20_000.0 })
                 .min(f64::from(options.cap()) * SEED_SHARE),
-            coarse_steps: options.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
+            coarse_steps: options.specific.coarse_steps.unwrap_or(if software { [500, 4000] } else { [150, 400] }),
             views: Vec::new(),
             max_image_bytes: if software { SOFTWARE_IMAGE_BYTES } else { u64::MAX },
             n_image_requests: 0,
-            order: Order::new(options.seed),
+            order: Order::new(options.common.seed),
             scene_size_m: 1.0,
             has_depth: false,
             step: 0,
@@ -255,16 +265,20 @@ impl SplatTrainer {
 
     /// Creates a model of given splats, for drawing or training. The training pipelines are compiled at the first
     /// step.
-    pub fn from_arrays(gpu: Arc<Gpu>, options: SplatOptions, arrays: &SplatArrays) -> Result<Self, Error> {
-        let options = SplatOptions { sh_degree: arrays.sh_degree, ..options };
-        let mut trainer = Self::with_learn(gpu, options, Learn::OnDemand)?;
+    pub fn from_arrays(
+        gpu: Arc<Gpu>,
+        options: ModelOptions<SplatOptions>,
+        arrays: &SplatArrays,
+    ) -> Result<Self, Error> {
+        let options = options.with(|options| options.specific.sh_degree = arrays.sh_degree);
+        let mut trainer = Self::with_pipelines(gpu, options, TrainPipelineState::OnDemand)?;
         trainer.add(arrays)?;
         Ok(trainer)
     }
 
     /// Loads the camera corrections of a saved model from its `model.json`.
     pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
-        let metadata = read_metadata(&folder.join("model.json"))?;
+        let metadata = read_metadata(folder)?;
         self.saved_corrections = metadata.cameras;
         self.alignment_task = AlignmentTask::Done(metadata.alignment);
         Ok(self)
@@ -278,7 +292,7 @@ impl SplatTrainer {
     }
 
     /// The options.
-    pub fn options(&self) -> &SplatOptions {
+    pub fn options(&self) -> &ModelOptions<SplatOptions> {
         &self.options
     }
 
@@ -322,7 +336,7 @@ impl SplatTrainer {
 
     #[cfg(test)]
     pub(super) fn n_steps_on_gpu(&self) -> u64 {
-        self.gpu.read::<u32>(&self.learn_status, status::LEN).unwrap()[status::STEP].into()
+        self.gpu.read::<u32>(&self.train_status, status::LEN).unwrap()[status::STEP].into()
     }
 
     /// Number of positions that are seeded.
@@ -341,16 +355,16 @@ impl SplatTrainer {
         self.n_non_finite
     }
 
-    fn learn(&mut self) -> Result<Arc<LearnPipelines>, Error> {
-        if let Learn::Ready(ready) = &self.learn {
+    fn train_pipelines(&mut self) -> Result<Arc<TrainPipelines>, Error> {
+        if let TrainPipelineState::Ready(ready) = &self.train {
             return Ok(ready.clone());
         }
-        let ready = Arc::new(match std::mem::replace(&mut self.learn, Learn::Failed) {
-            Learn::Compiling(mut thread) => thread.finish()?,
-            Learn::OnDemand => LearnPipelines::new(&self.gpu)?,
-            Learn::Ready(_) | Learn::Failed => return Err(Error::DeviceLost),
+        let ready = Arc::new(match std::mem::replace(&mut self.train, TrainPipelineState::Failed) {
+            TrainPipelineState::Compiling(mut thread) => thread.finish()?,
+            TrainPipelineState::OnDemand => TrainPipelines::new(&self.gpu)?,
+            TrainPipelineState::Ready(_) | TrainPipelineState::Failed => return Err(Error::DeviceLost),
         });
-        self.learn = Learn::Ready(ready.clone());
+        self.train = TrainPipelineState::Ready(ready.clone());
         Ok(ready)
     }
 
@@ -405,7 +419,7 @@ impl SplatTrainer {
     }
 
     fn write_n_splats(&self) {
-        for status in [&self.learn_status, &self.draw_status] {
+        for status in [&self.train_status, &self.draw_status] {
             self.write_n_splats_to(status, self.splats.n_splats);
         }
     }
@@ -453,7 +467,7 @@ impl SplatTrainer {
         }
         if self.splats.n_splats == 0 && !self.views.is_empty() {
             let keyframes: Vec<&Keyframe> = self.views.iter().map(|view| view.keyframe.as_ref()).collect();
-            let cloud = seed::random_cloud(&keyframes, self.options.seed, self.options.cap() as usize);
+            let cloud = seed::random_cloud(&keyframes, self.options.common.seed, self.options.cap() as usize);
             self.add(&cloud)?;
         }
         Ok(())
@@ -477,11 +491,11 @@ impl SplatTrainer {
             // it.
             let step = self.step - self.step % GROWTH_PERIOD;
             let completed =
-                step.saturating_sub(self.schedule_start) as f64 / self.options.n_planned_steps.max(1) as f64;
+                step.saturating_sub(self.schedule_start) as f64 / self.options.common.n_planned_steps.max(1) as f64;
             self.cameras.write_rule(&self.gpu, completed, self.scene_size_m);
         }
         let size = f32_of(self.scene_size_m);
-        let cost = (self.options.cost_images / self.views.len().max(1) as f64).powi(2).min(MAX_COST);
+        let cost = (self.options.specific.cost_images / self.views.len().max(1) as f64).powi(2).min(MAX_COST);
         let cost = f32_of(cost / f64::from(self.splats.n_splats.max(1)));
         let rule = Rule {
             mean_rate_m: 1.6e-4 * size,
@@ -490,16 +504,16 @@ impl SplatTrainer {
             opacity_rate: 5e-2,
             sh_dc_rate: 2.5e-3,
             sh_rest_rate: 2.5e-3 / 20.0,
-            noise: f32_of(self.options.noise),
+            noise: f32_of(self.options.specific.noise),
             final_mean_rate_frac: 0.01,
             betas: [0.9, 0.999],
             epsilon: 1e-15,
-            n_planned_steps: f32_of(self.options.n_planned_steps as f64),
+            n_planned_steps: f32_of(self.options.common.n_planned_steps as f64),
             schedule_start: f32_of(self.schedule_start as f64),
             opacity_cost: cost,
             scale_cost: cost,
             log_scale_range: [(1e-5 * size).ln(), (2.0 * size).ln()],
-            seed: (self.options.seed ^ (self.options.seed >> 32)) as u32,
+            seed: (self.options.common.seed ^ (self.options.common.seed >> 32)) as u32,
             update_all: u32::from(!self.has_depth),
             unused: 0,
         };
@@ -565,34 +579,39 @@ impl SplatTrainer {
     }
 
     /// Records the passes of one step.
-    fn record_step(&mut self, learn: &LearnPipelines, step: u64) -> Result<(), Error> {
+    fn record_step(&mut self, pipelines: &TrainPipelines, step: u64) -> Result<(), Error> {
         let view_ix = self.order.pick(step, self.views.len());
         let level_ix = self.make_ready(view_ix, level_at(step, self.coarse_steps))?;
         let mut list = std::mem::take(&mut self.passes);
-        let listed = self.list_step(&mut list, learn, (view_ix, level_ix));
+        let listed = self.list_step(&mut list, pipelines, (view_ix, level_ix));
         self.passes = list;
         listed
     }
 
-    fn list_step(&self, list: &mut Passes, learn: &LearnPipelines, place: (usize, usize)) -> Result<(), Error> {
-        let LearnedView { view, level, lens } = self.learned_view(list, learn, place)?;
+    fn list_step(
+        &self,
+        list: &mut Passes,
+        pipelines: &TrainPipelines,
+        view_level: (usize, usize),
+    ) -> Result<(), Error> {
+        let PreparedView { view, level, lens } = self.prepared_view(list, pipelines, view_level)?;
         let target = Target {
             image: &level.image,
             depth: &level.depth,
             supervision: &self.supervision,
             gains: &self.cameras.gains,
-            ssim: self.options.dssim_frac > 0.0,
+            ssim: self.options.specific.dssim_frac > 0.0,
         };
         view.draw(list, &self.draw);
-        view.compare(list, learn, &target);
-        view.backward(list, learn);
+        view.compare(list, pipelines, &target);
+        view.backward(list, pipelines);
         if let Some(lens) = lens {
-            view.update(list, &learn.update_with_camera, &self.rule, true);
-            self.cameras.refine(&view, list, learn, lens);
+            view.update(list, &pipelines.update_with_camera, &self.rule, true);
+            self.cameras.refine(&view, list, pipelines, lens);
         } else {
-            view.update(list, &learn.update, &self.rule, false);
+            view.update(list, &pipelines.update, &self.rule, false);
         }
-        list.dispatch(&self.gpu, &learn.advance, 1, &[("status", &self.learn_status)]);
+        list.dispatch(&self.gpu, &pipelines.advance, 1, &[("status", &self.train_status)]);
         Ok(())
     }
 
@@ -615,37 +634,37 @@ impl SplatTrainer {
     }
 
     /// A prepared view and level with its current camera parameters; records the pass that computes the view.
-    fn learned_view(
+    fn prepared_view(
         &self,
         list: &mut Passes,
-        learn: &LearnPipelines,
+        pipelines: &TrainPipelines,
         (view_ix, level_ix): (usize, usize),
-    ) -> Result<LearnedView<'_>, Error> {
+    ) -> Result<PreparedView<'_>, Error> {
         let (lens, level) = self.views[view_ix].ready_level(level_ix)?;
         let lens = lens.filter(|_| !self.cameras.set.is_empty());
         let (Some((_, scratch)), Some(image_buffers)) = (&self.scratch, &self.training_buffers) else {
             return Err(Error::DeviceLost);
         };
         if let Some(lens) = lens {
-            self.cameras.correct(&self.gpu, list, learn, &level.view, lens);
+            self.cameras.correct(&self.gpu, list, pipelines, &level.view, lens);
         }
         let view = ViewPasses {
             gpu: &self.gpu,
             splats: &self.splats,
             scratch,
             image_buffers,
-            status: &self.learn_status,
+            status: &self.train_status,
             view: if lens.is_some() { &self.cameras.corrected } else { &level.view },
             size_px: level.size_px,
         };
-        Ok(LearnedView { view, level, lens })
+        Ok(PreparedView { view, level, lens })
     }
 
     /// Ensures that a view of this size can be drawn, or trained on.
-    fn make_scratch(&mut self, size_px: [u32; 2], learn: bool) -> Result<(), Error> {
+    fn make_scratch(&mut self, size_px: [u32; 2], for_training: bool) -> Result<(), Error> {
         let n_splats = self.splats.capacity.max(self.displayed().capacity);
         let n_entries = (2 * n_splats).max(1 << 14);
-        let n_slots = if learn { 2 * n_entries } else { 0 };
+        let n_slots = if for_training { 2 * n_entries } else { 0 };
         self.ensure_scratch(ScratchSize { n_splats, n_entries, n_slots, n_bins: n_bins(size_px) })
     }
 
@@ -710,7 +729,7 @@ impl SplatTrainer {
         let failed = self.grow_scratch(&counters)?;
         if failed {
             self.step = u64::from(counters[status::STEP]);
-            self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
+            self.gpu.write(&self.train_status, 4 * status::FAILED as u64, &[0; 12]);
         }
         Ok(failed)
     }
@@ -725,12 +744,12 @@ impl SplatTrainer {
 
     /// Step at which growth ends.
     fn growth_end(&self) -> u64 {
-        let end = self.schedule_start + (GROWTH_END_FRAC * self.options.n_planned_steps as f64) as u64;
+        let end = self.schedule_start + (GROWTH_END_FRAC * self.options.common.n_planned_steps as f64) as u64;
         end.next_multiple_of(GROWTH_PERIOD) // Submits end at these steps.
     }
 
     /// Changes the splat count when due: replaces dead splats, and adds splats up to the limit.
-    fn grow_when_due(&mut self, learn: &LearnPipelines) -> Result<(), Error> {
+    fn grow_when_due(&mut self, pipelines: &TrainPipelines) -> Result<(), Error> {
         let due = self.step >= GROWTH_START
             && self.step < self.growth_end()
             && self.step.is_multiple_of(GROWTH_PERIOD)
@@ -745,7 +764,7 @@ impl SplatTrainer {
         self.last_growth_step = self.step;
         let n_before = self.splats.n_splats;
         let more = if self.trials.may_grow() && !self.is_full {
-            (f64::from(n_before) * self.options.growth_frac).ceil() as u32
+            (f64::from(n_before) * self.options.specific.growth_frac).ceil() as u32
         } else {
             0
         };
@@ -754,7 +773,7 @@ impl SplatTrainer {
         let growth = Growth {
             n_before,
             n_after,
-            key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.seed as u32,
+            key: (self.step as u32).wrapping_mul(0x9e37_79b9) ^ self.options.common.seed as u32,
             capacity: self.splats.capacity,
             n_sh_rest: n_sh_rest(self.splats.sh_degree),
             child_spread: CHILD_SPREAD,
@@ -770,7 +789,7 @@ impl SplatTrainer {
             }
             buffers => buffers?,
         };
-        passes::grow(&self.gpu, &mut self.passes, learn, &self.splats, &buffers, &growth);
+        passes::grow(&self.gpu, &mut self.passes, pipelines, &self.splats, &buffers, &growth);
         self.passes.submit(&self.gpu);
         self.passes.clear_bindings();
         self.splats.set_n_splats(&self.gpu, n_after);
@@ -815,7 +834,7 @@ impl SplatTrainer {
         self.schedule_start = schedule_start;
         self.write_n_splats();
         let step = u32::try_from(self.step).unwrap_or(u32::MAX);
-        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
+        self.gpu.write(&self.train_status, 4 * status::STEP as u64, bytemuck::bytes_of(&step));
         Ok(())
     }
 
@@ -910,7 +929,8 @@ impl SplatTrainer {
     fn add_keyframe(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         // At least half of the schedule remains for a late keyframe, so that learning rates are large enough and
         // growth continues.
-        self.schedule_start = self.schedule_start.max(self.step.saturating_sub(self.options.n_planned_steps / 2));
+        self.schedule_start =
+            self.schedule_start.max(self.step.saturating_sub(self.options.common.n_planned_steps / 2));
         self.add_view(keyframe)
     }
 
@@ -1041,10 +1061,10 @@ impl Method for SplatTrainer {
         if self.splats.n_splats == 0 {
             return Ok(0);
         }
-        let learn = self.learn()?;
+        let pipelines = self.train_pipelines()?;
         self.align_when_due()?;
         self.try_when_due()?;
-        self.grow_when_due(&learn)?;
+        self.grow_when_due(&pipelines)?;
         let max_millis = submit_millis(self.is_watched);
         let by_time = if self.step_millis > 0.0 { (max_millis / self.step_millis) as u64 } else { 1 };
         let to_next_change = GROWTH_PERIOD - self.step % GROWTH_PERIOD; // Growth and degrees change at these steps.
@@ -1059,9 +1079,9 @@ impl Method for SplatTrainer {
         let since = Instant::now();
         self.prepare_levels(n)?;
         for step in self.step..self.step + n {
-            self.record_step(&learn, step)?;
+            self.record_step(&pipelines, step)?;
         }
-        let status = self.passes.submit_reading(&self.gpu, &[(&self.learn_status, 4 * status::LEN)]);
+        let status = self.passes.submit_reading(&self.gpu, &[(&self.train_status, 4 * status::LEN)]);
         self.step += n;
         let failed = self.finish_in_flight()?; // The previous submit; this one runs meanwhile.
         if !failed {
@@ -1077,10 +1097,6 @@ impl Method for SplatTrainer {
         false // There are always steps to take, or it is not known yet that there are none.
     }
 
-    fn primitive(&self) -> &'static str {
-        "splat"
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
         Ok(self.step.wrapping_add(self.n_reverted_steps))
@@ -1091,15 +1107,15 @@ impl Method for SplatTrainer {
     }
 
     fn prepare(&mut self) -> Result<(), Error> {
-        self.learn().map(drop)
+        self.train_pipelines().map(drop)
     }
 
     fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
         self.finish_in_flight()?;
         self.prepare_training()?;
-        let learn = self.learn()?;
+        let pipelines = self.train_pipelines()?;
         self.write_rule();
-        self.record_step(&learn, self.step)?;
+        self.record_step(&pipelines, self.step)?;
         let timings = self.passes.submit_timed(&self.gpu)?;
         self.step += 1;
         Ok(timings)
@@ -1118,6 +1134,10 @@ impl Method for SplatTrainer {
         self.seed_from_depth()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };
         self.psnr_of_view(&Camera::from_request(request, focal_px, principal_px), request.background_srgb, keyframe)
+    }
+
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        Ok(bounds(&self.arrays()?))
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
@@ -1139,7 +1159,7 @@ impl Method for SplatTrainer {
     }
 
     fn report(&self) -> Vec<TrialReport> {
-        self.trials.finished.iter().map(Trial::part).collect()
+        self.trials.finished.iter().map(Trial::report).collect()
     }
 
     fn save(&mut self, folder: &Path) -> Result<(), Error> {
@@ -1150,18 +1170,18 @@ impl Method for SplatTrainer {
         }
         let arrays = self.arrays()?;
         std::fs::create_dir_all(folder).map_err(|source| Error::Write { path: folder.to_owned(), source })?;
-        ply::write(&folder.join("splats.ply"), &arrays)?;
+        ply::write(&folder.join(IN_FOLDER), &arrays)?;
         let metadata = serde_json::json!({
-            "method": "splat",
+            "method": SplatOptions::METHOD,
             "steps": self.step,
             "splats": arrays.n_splats(),
             "sh_degree": arrays.sh_degree,
-            "seed": self.options.seed,
+            "seed": self.options.common.seed,
             "trials": self.report(),
             "alignment": self.alignment_task.result(),
             "cameras": self.camera_corrections()?,
         });
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{metadata:#}\n")).map_err(|source| Error::Write { path, source })
     }
 
@@ -1185,7 +1205,7 @@ fn ensure_image_buffers(
     image_buffers: &mut Option<ImageBuffers>,
     passes: &mut Passes,
     size_px: [u32; 2],
-    learned: bool,
+    for_training: bool,
 ) -> Result<(), Error> {
     let (n_pixels, n_tiles) = (size_px[0] * size_px[1], n_tiles(size_px));
     if image_buffers
@@ -1197,7 +1217,7 @@ fn ensure_image_buffers(
         passes.submit(gpu);
         passes.clear_bindings();
         *image_buffers = None;
-        *image_buffers = Some(ImageBuffers::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), learned)?);
+        *image_buffers = Some(ImageBuffers::new(gpu, n_pixels.max(have.0), n_tiles.max(have.1), for_training)?);
     }
     Ok(())
 }

@@ -5,6 +5,7 @@ use super::cloud::synthetic_cloud;
 use super::{SplatOptions, SplatTrainer};
 use crate::eval::{PixelPair, psnr};
 use crate::gpu::{Gpu, GpuOptions, f32s_of};
+use crate::model_options::{CommonOptions, ModelOptions};
 use crate::{Method, Projection, RenderRequest};
 use calibration::{CameraRefinement, ParamSet};
 use keyframe::{DepthMap, Keyframe, Split};
@@ -62,7 +63,7 @@ pub(super) fn keyframes(gpu: &Arc<Gpu>, with_depth: bool) -> Vec<Arc<Keyframe>> 
 }
 
 pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc<Keyframe>> {
-    let mut truth = SplatTrainer::from_arrays(gpu.clone(), SplatOptions::default(), &scene()).unwrap();
+    let mut truth = SplatTrainer::from_arrays(gpu.clone(), ModelOptions::default(), &scene()).unwrap();
     (0..n)
         .map(|ix| {
             let world_from_camera = pose(ix);
@@ -97,13 +98,15 @@ pub(super) fn n_keyframes(gpu: &Arc<Gpu>, n: usize, with_depth: bool) -> Vec<Arc
         .collect()
 }
 
-pub(super) fn options() -> SplatOptions {
-    SplatOptions {
-        max_splats: 4000,
-        n_planned_steps: 300,
-        coarse_steps: Some([20, 60]),
-        sh_degree: 1,
-        ..SplatOptions::default()
+pub(super) fn options() -> ModelOptions<SplatOptions> {
+    ModelOptions {
+        common: CommonOptions { n_planned_steps: 300, ..CommonOptions::default() },
+        specific: SplatOptions {
+            max_splats: 4000,
+            coarse_steps: Some([20, 60]),
+            sh_degree: 1,
+            ..SplatOptions::default()
+        },
     }
 }
 
@@ -148,7 +151,7 @@ fn training_predicts_test_views_and_is_reproducible() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let run = |seed| {
-        let mut trainer = SplatTrainer::new(gpu.clone(), SplatOptions { seed, ..options() }).unwrap();
+        let mut trainer = SplatTrainer::new(gpu.clone(), options().with(|options| options.common.seed = seed)).unwrap();
         for keyframe in &keyframes {
             trainer.push(keyframe.clone()).unwrap();
         }
@@ -267,7 +270,7 @@ fn area_outside_a_depth_band_is_seeded_from_it() {
 fn late_keyframe_resumes_growth() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
-    let mut trainer = SplatTrainer::new(gpu, SplatOptions { max_splats: 8_000, ..options() }).unwrap();
+    let mut trainer = SplatTrainer::new(gpu, options().with(|options| options.specific.max_splats = 8_000)).unwrap();
     for keyframe in &keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
@@ -285,7 +288,11 @@ fn late_keyframe_resumes_growth() {
 /// A trainer on many images with a trial of lens parameters.
 fn trainer_with_lens_trial(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, max_splats: u32) -> SplatTrainer {
     let cameras = CameraRefinement::Try(vec![ParamSet::LENS]);
-    let options = SplatOptions { cameras, max_splats, n_planned_steps: 1500, ..options() };
+    let options = options().with(|options| {
+        options.common.cameras = cameras;
+        options.common.n_planned_steps = 1500;
+        options.specific.max_splats = max_splats;
+    });
     let mut trainer = SplatTrainer::new(gpu, options).unwrap();
     for keyframe in keyframes {
         trainer.push(keyframe.clone()).unwrap();
@@ -359,8 +366,8 @@ fn byte_limit_holds() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = keyframes(&gpu, true);
     let base = options();
-    let cap_bytes = 500 * base.bytes_per_splat();
-    let mut trainer = SplatTrainer::new(gpu, SplatOptions { max_bytes: Some(cap_bytes), ..base }).unwrap();
+    let cap_bytes = 500 * base.specific.bytes_per_splat();
+    let mut trainer = SplatTrainer::new(gpu, base.with(|options| options.common.max_bytes = Some(cap_bytes))).unwrap();
     for keyframe in &keyframes {
         trainer.push(keyframe.clone()).unwrap();
     }
@@ -377,7 +384,8 @@ fn scratch_memory_grows_when_a_view_needs_more() {
     arrays.opacity_logits.iter_mut().for_each(|opacity| *opacity = -3.0);
     let keyframes = keyframes(&gpu, true);
     let mut trainer =
-        SplatTrainer::from_arrays(gpu, SplatOptions { coarse_steps: Some([0, 0]), ..options() }, &arrays).unwrap();
+        SplatTrainer::from_arrays(gpu, options().with(|options| options.specific.coarse_steps = Some([0, 0])), &arrays)
+            .unwrap();
     for keyframe in &keyframes[1..4] {
         trainer.push(Arc::new(Keyframe { depth: None, ..keyframe.as_ref().clone() })).unwrap();
     }
@@ -395,7 +403,7 @@ fn scratch_memory_grows_when_a_view_needs_more() {
 #[test]
 fn equirectangular_agrees_with_pinhole() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
-    let mut trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &scene()).unwrap();
+    let mut trainer = SplatTrainer::from_arrays(gpu, ModelOptions::default(), &scene()).unwrap();
     let around = trainer
         .render(&RenderRequest { size_px: [512, 256], projection: Projection::Equirectangular, ..request(pose(2)) })
         .unwrap();
@@ -428,7 +436,7 @@ fn submit_length_changes_no_bit() {
     let keyframes = keyframes(&gpu, true);
     let params = ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET;
     let learned = |train: fn(&mut SplatTrainer, u64)| {
-        let options = SplatOptions { cameras: CameraRefinement::Always(params), ..options() };
+        let options = options().with(|options| options.common.cameras = CameraRefinement::Always(params));
         let mut trainer = SplatTrainer::new(gpu.clone(), options).unwrap();
         for keyframe in &keyframes {
             trainer.push(keyframe.clone()).unwrap();

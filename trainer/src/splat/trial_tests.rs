@@ -1,9 +1,9 @@
 //! Tests of trials while keyframes arrive and are removed: both halves train on the same data, no seed is lost, and a
 //! checkpoint contains the whole trial.
 
+use super::SplatTrainer;
 use super::training_tests::{n_keyframes, options};
 use super::trials::{MAX_SCORED, TRIAL_START};
-use super::{SplatOptions, SplatTrainer};
 use crate::Method;
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions};
@@ -17,14 +17,13 @@ const END: u64 = TRIAL_START + 2 * HALF;
 
 fn trainer_with_candidate(gpu: &Arc<Gpu>, candidate: ParamSet) -> SplatTrainer {
     // The splat count changes only when seeds are added.
-    let options = SplatOptions {
-        cameras: CameraRefinement::Try(vec![candidate]),
-        growth_frac: 0.0,
-        n_planned_steps: 1500,
-        max_splats: 20_000,
-        seeds_per_image: Some(300.0),
-        ..options()
-    };
+    let options = options().with(|options| {
+        options.common.cameras = CameraRefinement::Try(vec![candidate]);
+        options.common.n_planned_steps = 1500;
+        options.specific.growth_frac = 0.0;
+        options.specific.max_splats = 20_000;
+        options.specific.seeds_per_image = Some(300.0);
+    });
     SplatTrainer::new(gpu.clone(), options).unwrap()
 }
 
@@ -110,10 +109,10 @@ fn both_halves_score_the_same_images() {
     let gpu = Gpu::open(&GpuOptions::default()).unwrap();
     let keyframes = n_keyframes(&gpu, 60, true);
     let train = keyframes.iter().step_by(5).map(|keyframe| with_split(keyframe, Split::Train));
-    let selection: Vec<_> =
+    let validation: Vec<_> =
         (0..keyframes.len()).filter(|ix| ix % 5 != 0).map(|ix| with_split(&keyframes[ix], Split::Validation)).collect();
     let mut trainer = trainer_with_candidate(&gpu, ParamSet::empty());
-    let (early, late) = selection.split_at(N_FIRST);
+    let (early, late) = validation.split_at(N_FIRST);
     train.chain(early.iter().cloned()).for_each(|keyframe| trainer.push(keyframe).unwrap());
     // In both halves, more keyframes arrive than are scored, and two of the scored ones are removed.
     for (ix, keyframe) in late.iter().enumerate() {
@@ -125,7 +124,7 @@ fn both_halves_score_the_same_images() {
             _ => {}
         }
     }
-    assert!(selection.len() > MAX_SCORED + 4);
+    assert!(validation.len() > MAX_SCORED + 4);
     train_to(&mut trainer, END + 3);
     let [Trial { gain_db, standard_error_db, n_images, .. }] = trainer.trials() else {
         panic!("{:?}", trainer.trials())

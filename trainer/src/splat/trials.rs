@@ -493,9 +493,9 @@ mod tests {
         assert!(trial(&[20.5, 22.4, 24.6, 21.5]).kept, "a reduction may even improve the score");
         assert!(!trial(&[19.8, 21.7, 23.8, 20.7]).kept);
         assert!(!Trial::of(HALVED, &[20.0], &[20.0]).kept, "one image is not sufficient");
-        let part = trial(&[19.8, 21.7, 23.8, 20.7]).part();
-        assert!((part.gain_db - 0.25).abs() < 1e-12 && part.kept, "{part:?}");
-        assert!(!trial(&[19.94, 21.95, 23.93, 20.94]).part().kept);
+        let report = trial(&[19.8, 21.7, 23.8, 20.7]).report();
+        assert!((report.gain_db - 0.25).abs() < 1e-12 && report.kept, "{report:?}");
+        assert!(!trial(&[19.94, 21.95, 23.93, 20.94]).report().kept);
     }
 
     #[test]

@@ -115,7 +115,7 @@ fn main(@builtin(workgroup_id) wg: vec3u, @builtin(num_workgroups) n_wgs: vec3u,
     let block = folded(wg, n_wgs);
     let splat_ix = block * 256u + lane;
     var camera: CameraGradient;
-    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = learn(splat_ix); }
+    if splat_ix < model.n_splats && atomicLoad(&status[FAILED]) == 0u { camera = update_splat(splat_ix); }
     add_up_camera(lane, block, camera);
 }
 
@@ -132,7 +132,7 @@ fn gradient_of(splat_ix: u32, n_touched: u32) -> Gradient {
     return sum;
 }
 
-fn learn(splat_ix: u32) -> CameraGradient {
+fn update_splat(splat_ix: u32) -> CameraGradient {
     var camera: CameraGradient;
     let n_touched = tile_counts[splat_ix];
     if n_touched == 0u && rule.update_all == 0u && !GRADIENTS_ONLY { return camera; }

@@ -1,5 +1,6 @@
 //! Tests of the kernels against their f64 twins, with optional features and without.
 
+use super::TsdfModel;
 use super::block::{Blocks, GridCoord, N_VOXELS, stored_distance};
 use super::buffers::FieldBuffers;
 use super::capacity::Capacity;
@@ -10,9 +11,9 @@ use super::mesh_buffers::{MeshBuffers, MeshCapacity};
 use super::params::MeshVertex;
 use super::reference::{self, BlockTriangles, Ray, Vertex, VoxelBlocks};
 use super::tests::fuse_all;
-use super::{TsdfModel, TsdfOptions};
 use crate::gpu::{Gpu, GpuOptions};
 use crate::mismatches::Mismatches;
+use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, FOCAL_PX, PRINCIPAL_PX, SIZE_PX};
 use crate::{Method, RenderRequest};
 use keyframe::Keyframe;
@@ -186,7 +187,7 @@ fn readings_match_twin() {
     let depth = keyframe.depth.as_ref().unwrap();
     for options in gpu_variants() {
         let gpu = Gpu::open(&options).unwrap();
-        let voxel_grid = VoxelGrid::choose(&scenes::options(), depth).unwrap();
+        let voxel_grid = VoxelGrid::choose(&scenes::options().specific, None, depth).unwrap();
         let field = FieldBuffers::new(&gpu, &voxel_grid, Capacity { n_blocks: 2048, n_chunks: 256 }).unwrap();
         assert_eq!(field.field.bytes(), size_of::<Field>() as u64);
         let n = depth.depth_m.len();
@@ -231,7 +232,7 @@ fn non_finite_depth_is_ignored() {
             })
             .collect();
         let gpu = Gpu::open(&options).unwrap();
-        let mut model = TsdfModel::new(gpu, TsdfOptions::default()).unwrap();
+        let mut model = TsdfModel::new(gpu, ModelOptions::default()).unwrap();
         for keyframe in all_non_finite {
             model.push(keyframe).unwrap();
         }

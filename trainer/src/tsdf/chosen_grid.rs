@@ -48,7 +48,7 @@ impl VoxelGrid {
     /// neighbors: the 90th percentile of `|z[-1] - 2 z[0] + z[1]|` over `1.6449 sqrt(6)`. The median would be 0 for
     /// sensors that report depth in discrete steps.
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a weight is clamped to 16 bits")]
-    pub fn choose(options: &TsdfOptions, depth: &DepthMap) -> Option<Self> {
+    pub fn choose(options: &TsdfOptions, max_bytes: Option<u64>, depth: &DepthMap) -> Option<Self> {
         let mut depths: Vec<f64> = valid_depths(options, depth).map(|(_, z)| z).collect();
         let n_valid = depths.len();
         let median_m = quantile(&mut depths, 0.5, Rank::Upper)?;
@@ -57,7 +57,7 @@ impl VoxelGrid {
         let by_noise_m = noise_per_m2 * median_m * median_m;
         // A surface of n pixels has n (px / voxel)^2 voxels, and its truncation band has about a 16th as many blocks.
         let area_m2 = n_valid as f64 * px_m * px_m;
-        let by_bytes_m = options.max_bytes.map_or(0.0, |bytes| {
+        let by_bytes_m = max_bytes.map_or(0.0, |bytes| {
             let n_blocks = ONE_IMAGE_FRAC * bytes as f64 / BYTES_PER_BLOCK as f64;
             (area_m2 / (16.0 * n_blocks.max(1.0))).sqrt()
         });

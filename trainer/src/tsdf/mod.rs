@@ -3,9 +3,12 @@
 //! `docs/design/tsdf.md` follows a depth image through the kernels.
 
 pub mod block;
+mod bounds;
 mod buffers;
 mod capacity;
 mod chosen_grid;
+mod entry;
+mod files;
 pub mod kernels;
 mod marching;
 pub mod mesh;
@@ -23,5 +26,6 @@ mod against_twin;
 mod tests;
 
 pub use chosen_grid::VoxelGrid;
+pub(crate) use entry::ENTRY;
 pub use model::TsdfModel;
 pub use options::TsdfOptions;

@@ -6,6 +6,7 @@ mod meshing;
 mod saving;
 
 use super::block::{Blocks, GridCoord};
+use super::bounds::bounds;
 use super::buffers::FieldBuffers;
 use super::capacity::{self, BYTES_PER_BLOCK, BYTES_PER_CHUNK, Capacity};
 use super::chosen_grid::VoxelGrid;
@@ -19,8 +20,9 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming, Passes, PendingRead};
 use crate::keyframe_signature::KeyframeSignature;
 use crate::method::submit_millis;
+use crate::model_options::ModelOptions;
 use crate::view::{Camera, projections};
-use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, Restartable};
+use crate::{Bounds, Error, Method, Picture, Progress, Projection, RenderRequest, Restartable};
 use calibration::Alignment;
 use calibration::CalibratedCamera;
 use calibration::TrialReport;
@@ -48,7 +50,7 @@ pub(super) const MIN_BYTES: u64 =
 #[derive(Debug)]
 pub struct TsdfModel {
     gpu: Arc<Gpu>,
-    options: TsdfOptions,
+    options: ModelOptions<TsdfOptions>,
     pipelines: Pipelines,
     voxel_grid: Option<VoxelGrid>,
     field: Option<FieldBuffers>,
@@ -87,8 +89,8 @@ struct InFlight {
 
 impl TsdfModel {
     /// An empty model. Fails if `max_bytes` is below the minimum.
-    pub fn new(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
-        match options.max_bytes {
+    pub fn new(gpu: Arc<Gpu>, options: ModelOptions<TsdfOptions>) -> Result<Self, Error> {
+        match options.common.max_bytes {
             Some(max_bytes) if max_bytes < MIN_BYTES => {
                 Err(Error::BudgetTooSmall { model: "distance field", max_bytes, min_bytes: MIN_BYTES })
             }
@@ -97,7 +99,7 @@ impl TsdfModel {
     }
 
     /// An empty model. If `max_bytes` is below the minimum, it skips depth images that do not fit.
-    pub(super) fn without_budget_check(gpu: Arc<Gpu>, options: TsdfOptions) -> Result<Self, Error> {
+    pub(super) fn without_budget_check(gpu: Arc<Gpu>, options: ModelOptions<TsdfOptions>) -> Result<Self, Error> {
         Ok(Self {
             pipelines: Pipelines::new(&gpu)?,
             voxel_grid: None,
@@ -126,7 +128,7 @@ impl TsdfModel {
     }
 
     /// Options of this model.
-    pub fn options(&self) -> &TsdfOptions {
+    pub fn options(&self) -> &ModelOptions<TsdfOptions> {
         &self.options
     }
 
@@ -168,7 +170,7 @@ impl TsdfModel {
     fn max_blocks_with_table(&self, n_chunks: u32) -> u32 {
         let table_bytes = u64::from(n_chunks) * BYTES_PER_CHUNK;
         let n_blocks_in = |bytes: u64| bytes.saturating_sub(table_bytes) / BYTES_PER_BLOCK;
-        let by_bytes = self.options.max_bytes.map_or(u64::MAX, n_blocks_in);
+        let by_bytes = self.options.common.max_bytes.map_or(u64::MAX, n_blocks_in);
         capacity::max_blocks(&self.gpu).min(u32::try_from(by_bytes).unwrap_or(u32::MAX)).max(1)
     }
 
@@ -177,10 +179,10 @@ impl TsdfModel {
     fn begin(&mut self) -> Result<bool, Error> {
         // The size of one binding limits the field like a budget does.
         let max_bytes = Some(u64::from(self.max_blocks()) * BYTES_PER_BLOCK);
-        let options = TsdfOptions { max_bytes, ..self.options.clone() };
         while self.voxel_grid.is_none() {
             let Some(first) = self.pending.front() else { return Ok(false) };
-            let chosen_grid = first.depth.as_ref().and_then(|depth| VoxelGrid::choose(&options, depth));
+            let chosen_grid =
+                first.depth.as_ref().and_then(|depth| VoxelGrid::choose(&self.options.specific, max_bytes, depth));
             if let Some(voxel_grid) = chosen_grid {
                 let n_blocks = INITIAL_CAPACITY.n_blocks.min(self.max_blocks());
                 self.field =
@@ -406,10 +408,6 @@ impl Method for TsdfModel {
         self.pending.is_empty()
     }
 
-    fn primitive(&self) -> &'static str {
-        "block"
-    }
-
     fn n_total_steps(&mut self) -> Result<u64, Error> {
         self.finish_in_flight()?;
         Ok(self.step)
@@ -432,6 +430,11 @@ impl Method for TsdfModel {
 
     fn set_watched(&mut self, watched: bool) {
         self.is_watched = watched;
+    }
+
+    fn bounds(&mut self) -> Result<Option<Bounds>, Error> {
+        let Some(voxel_grid) = self.voxel_grid.clone() else { return Ok(None) };
+        Ok(bounds(self.blocks()?.keys(), &voxel_grid))
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {

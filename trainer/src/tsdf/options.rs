@@ -1,10 +1,12 @@
 //! Options of a distance field.
 
+use crate::model_options::MethodOptions;
 use serde::{Deserialize, Serialize};
 
-/// Settings of a [`super::TsdfModel`]. Nothing is random, so there is no seed.
+/// Options of a [`super::TsdfModel`], besides those that all methods share. Of the latter it uses the maximum number of
+/// bytes and the alignment; nothing is random.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct TsdfOptions {
     /// Edge of a voxel, meters; `None`: chosen from the first depth image, see [`super::VoxelGrid::choose`].
     pub voxel_m: Option<f64>,
@@ -18,20 +20,14 @@ pub struct TsdfOptions {
     /// Maximum weight of a voxel, in observations from 1 m; up to 255. With a smaller maximum, moved objects fade
     /// sooner.
     pub max_weight: f64,
-    /// Maximum GPU memory for blocks and their table, in bytes. When it is used up, the blocks farthest from the camera
-    /// move to host memory. (Growth of the table after that point is added on top.)
-    pub max_bytes: Option<u64>,
+}
+
+impl MethodOptions for TsdfOptions {
+    const METHOD: &'static str = "tsdf";
 }
 
 impl Default for TsdfOptions {
     fn default() -> Self {
-        Self {
-            voxel_m: None,
-            truncation_m: None,
-            noise_per_m2: None,
-            max_depth_m: 10.0,
-            max_weight: 64.0,
-            max_bytes: None,
-        }
+        Self { voxel_m: None, truncation_m: None, noise_per_m2: None, max_depth_m: 10.0, max_weight: 64.0 }
     }
 }

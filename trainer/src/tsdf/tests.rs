@@ -5,7 +5,7 @@ use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::{Gpu, GpuOptions, f32_of};
 use crate::test_scenes::{self as scenes, SIZE_PX, TestShape};
-use crate::{Aabb, Error, Method, Picture, Projection, RenderRequest};
+use crate::{Aabb, Error, Method, ModelKind, ModelOptions, Picture, Projection, RenderRequest};
 use keyframe::Keyframe;
 use kinematics::quantile::{Rank, quantile};
 use kinematics::random::Random;
@@ -17,7 +17,7 @@ fn gpu() -> Arc<Gpu> {
     Gpu::open(&GpuOptions::default()).unwrap()
 }
 
-fn model_with(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+fn model_with(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     let mut model = TsdfModel::new(gpu(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();
@@ -32,7 +32,7 @@ pub(super) fn fuse_all(model: &mut TsdfModel) {
     }
 }
 
-fn fused_model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+fn fused_model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     let mut model = model_with(options, keyframes);
     fuse_all(&mut model);
     model
@@ -153,7 +153,7 @@ fn removed_object_fades_faster_than_it_was_built() {
 
 #[test]
 fn keyframes_without_depth_are_ignored() {
-    let mut model = TsdfModel::new(gpu(), TsdfOptions::default()).unwrap();
+    let mut model = TsdfModel::new(gpu(), ModelOptions::default()).unwrap();
     let request = scenes::request(Transform::identity());
     let check = |model: &mut TsdfModel| {
         let picture = model.render(&request).unwrap();
@@ -247,7 +247,8 @@ fn fusion_is_deterministic() {
 #[test]
 fn rendering_fuses_at_most_one_keyframe() {
     // Voxels so fine that the first depth image overflows the pool at first.
-    let mut model = model_with(TsdfOptions { voxel_m: Some(0.006), ..scenes::options() }, &ball_on_floor(3));
+    let mut model =
+        model_with(scenes::options().with(|options| options.specific.voxel_m = Some(0.006)), &ball_on_floor(3));
     model.step(2).unwrap();
     model.render(&scenes::request(view_of(&ball_on_floor(1)[0]))).unwrap();
     assert!((1..=2).contains(&model.progress().step), "{:?}", model.progress());
@@ -267,7 +268,7 @@ fn step_fuses_exactly_the_requested_keyframes() {
 #[test]
 fn growing_pool_keeps_results() {
     // Voxels so fine that the initial pool and table are too small.
-    let fine = TsdfOptions { voxel_m: Some(0.006), ..scenes::options() };
+    let fine = scenes::options().with(|options| options.specific.voxel_m = Some(0.006));
     let keyframes = ball_on_floor(3);
     let mut grown = fused_model(fine.clone(), &keyframes);
     assert!(grown.progress().primitives > 4096, "{:?}", grown.progress());
@@ -283,7 +284,7 @@ fn swapping_to_host_memory_is_lossless() {
     // Two places, observed twice in alternation: only one of them fits at a time.
     let far = Point3::new(8.0, 0.0, 0.1);
     let shapes = [scenes::ball(BALL_CENTER), scenes::ball(far)];
-    let options = || TsdfOptions { max_depth_m: 3.0, ..scenes::options() };
+    let options = || scenes::options().with(|options| options.specific.max_depth_m = 3.0);
     let mut keyframes = Vec::new();
     for (from, at) in [(0, BALL_CENTER), (0, far), (2, BALL_CENTER), (2, far)] {
         for keyframe in &scenes::ring(&shapes, at, 4)[from..from + 2] {
@@ -295,7 +296,7 @@ fn swapping_to_host_memory_is_lossless() {
     let mut unlimited = fused_model(options(), &keyframes);
     let n_all = unlimited.progress().primitives;
     let model_with_budget = |max_bytes| {
-        let options = TsdfOptions { max_bytes: Some(max_bytes), ..options() };
+        let options = options().with(|options| options.common.max_bytes = Some(max_bytes));
         let mut model = TsdfModel::without_budget_check(gpu(), options).unwrap();
         keyframes.iter().for_each(|keyframe| model.push(keyframe.clone()).unwrap());
         fuse_all(&mut model);
@@ -320,7 +321,8 @@ fn swapping_to_host_memory_is_lossless() {
 #[test]
 fn memory_budget_is_kept_or_refused() {
     let min_bytes = super::model::MIN_BYTES;
-    let of = |max_bytes| TsdfOptions { max_bytes: Some(max_bytes), ..TsdfOptions::default() };
+    let of =
+        |max_bytes| ModelOptions::<TsdfOptions>::default().with(|options| options.common.max_bytes = Some(max_bytes));
     let message = TsdfModel::new(gpu(), of(min_bytes - 1)).unwrap_err().to_string();
     assert!(message.contains(&min_bytes.to_string()) && message.contains("distance field"), "{message}");
     let small = fused_model(of(min_bytes), &ball_on_floor(4));
@@ -333,9 +335,9 @@ fn saved_model_renders_identically() {
     let keyframes = ball_on_floor(4);
     let mut model = fused_model(scenes::options(), &keyframes);
     let folder = tempfile::tempdir().unwrap();
-    assert!(!TsdfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), None);
     model.save(folder.path()).unwrap();
-    assert!(TsdfModel::is_saved_in(folder.path()));
+    assert_eq!(ModelKind::of_saved(folder.path()).unwrap().map(ModelKind::name), Some("tsdf"));
     for name in ["mesh.ply", "mesh.glb", "model.json"] {
         assert!(std::fs::metadata(folder.path().join(name)).unwrap().len() > 100, "{name}");
     }
@@ -448,7 +450,7 @@ fn voxel_size_follows_pixel_size_and_noise() {
     let wall = TestShape::Plane { normal: Vector3::z(), offset_m: 0.0 };
     let exact = scenes::keyframe(0, &[wall], scenes::look_at(Point3::new(0.0, 0.0, 2.0), Point3::origin()));
     let depth = exact.depth.clone().unwrap();
-    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), &depth).unwrap();
+    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), None, &depth).unwrap();
     assert!((chosen_grid.voxel_m - 2.0 / 89.0).abs() < 1e-3, "{chosen_grid:?}");
     assert!(chosen_grid.noise_per_m2 < 1e-6);
     let mut noisy = depth.clone();
@@ -458,7 +460,7 @@ fn voxel_size_follows_pixel_size_and_noise() {
         noisy.depth_m.iter().map(|z| z + 0.08 * (0..4).map(|_| uniform()).sum::<f32>()).collect::<Vec<_>>().into();
     // The sum of four uniform numbers has a standard deviation of 1 / sqrt(3).
     let expected = 0.08 / 3.0f64.sqrt() / 4.0;
-    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), &noisy).unwrap();
+    let chosen_grid = super::VoxelGrid::choose(&TsdfOptions::default(), None, &noisy).unwrap();
     assert!((chosen_grid.noise_per_m2 / expected - 1.0).abs() < 0.1, "{chosen_grid:?}, expected {expected}");
     assert!(
         (chosen_grid.voxel_m / (4.0 * expected) - 1.0).abs() < 0.1

@@ -8,7 +8,7 @@ import type { RunResult } from "./protocol";
 export class Banner {
   private connection: ConnectionState = "connecting";
   private connectionText = "";
-  private ended: RunResult | null = null;
+  private result: RunResult | null = null;
 
   setConnection(state: ConnectionState, text: string): void {
     this.connection = state;
@@ -18,19 +18,19 @@ export class Banner {
 
   /** Whether the run has ended, so that the server may stop. */
   get isFinished(): boolean {
-    return this.ended !== null;
+    return this.result !== null;
   }
 
-  setRunResult(ended: RunResult | null): void {
-    this.ended = ended;
+  setRunResult(result: RunResult | null): void {
+    this.result = result;
     this.show();
   }
 
   private show(): void {
     const isBroken = this.connection === "silent" || this.connection === "lost";
     // Once a run has ended, a stopped server is expected.
-    const { ended, isFinished } = this;
-    const text = ended ? runResultText(ended) : isBroken ? capitalized(this.connectionText) : "";
+    const { result, isFinished } = this;
+    const text = result ? runResultText(result) : isBroken ? capitalized(this.connectionText) : "";
     const banner = element("banner");
     if (banner.textContent !== text) banner.textContent = text; // Otherwise screen readers would repeat it.
     banner.dataset.kind = isFinished ? "finished" : this.connection;
@@ -38,10 +38,10 @@ export class Banner {
   }
 }
 
-function runResultText(ended: RunResult): string {
-  const saved = ended.folder === null ? "no model was saved" : `model saved in ${ended.folder}`;
-  const scores = ended.scores === "" ? "" : `, ${ended.scores}`;
-  return `Finished after ${timeText(ended.seconds)}: ${saved}${scores}`;
+function runResultText(result: RunResult): string {
+  const saved = result.folder === null ? "no model was saved" : `model saved in ${result.folder}`;
+  const scores = result.scores === "" ? "" : `, ${result.scores}`;
+  return `Finished after ${timeText(result.seconds)}: ${saved}${scores}`;
 }
 
 function capitalized(text: string): string {

@@ -55,7 +55,7 @@ function receiveText(message: TextMessage): void {
       latestStatus = message;
       models.list(message);
       showStatus(message);
-      banner.setRunResult(message.ended);
+      banner.setRunResult(message.result);
       break;
     case "scene":
       view.setScene(message);

@@ -20,10 +20,10 @@ const VERTEX = /* glsl */ `
   uniform float emptyDepth;
   varying vec3 pointInPicture;
   void main() {
-    vec2 place = position.xy;
-    float depth = texture2D(depthMap, place).r;
+    vec2 uv = position.xy;
+    float depth = texture2D(depthMap, uv).r;
     if (!(depth > 0.0)) depth = emptyDepth;
-    pointInPicture = vec3((place * sizePx - principalPx) / focalPx, 1.0) * depth;
+    pointInPicture = vec3((uv * sizePx - principalPx) / focalPx, 1.0) * depth;
     gl_Position = projectionMatrix * viewMatrix * worldFromPicture * vec4(pointInPicture, 1.0);
   }`;
 
@@ -36,8 +36,8 @@ const FRAGMENT = /* glsl */ `
   uniform vec2 principalPx;
   varying vec3 pointInPicture;
   void main() {
-    vec2 place = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
-    gl_FragColor = vec4(texture2D(colorMap, place).rgb, 1.0);
+    vec2 uv = (focalPx * pointInPicture.xy / pointInPicture.z + principalPx) / sizePx;
+    gl_FragColor = vec4(texture2D(colorMap, uv).rgb, 1.0);
   }`;
 
 export class PictureLayer {

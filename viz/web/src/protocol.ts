@@ -25,6 +25,7 @@ export interface ModelStatus {
   step: number;
   step_millis: number | null;
   primitives: number;
+  primitives_label: string;
   bytes: number;
   psnr: number | null;
   psnr_history: [number, number][];
@@ -36,10 +37,10 @@ export interface Status extends ModelStatus {
   state: string;
   seconds: number;
   keyframes: number;
-  refused: Record<string, number>;
+  rejected: Record<string, number>;
   others: ModelStatus[];
   notes: string[];
-  ended: RunResult | null;
+  result: RunResult | null;
 }
 
 /** Result of a run that has ended. */

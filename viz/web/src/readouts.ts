@@ -4,8 +4,6 @@ import { Chart, timeText } from "./chart";
 import { element } from "./element";
 import type { ModelStatus, Status } from "./protocol";
 
-const PRIMITIVE_NAMES: Record<string, string> = { splat: "Splats", tsdf: "Voxel blocks", nerf: "Table entries" };
-
 export class Readouts {
   private readonly chart = new Chart(element("chart", HTMLCanvasElement));
 
@@ -16,13 +14,13 @@ export class Readouts {
     text("seconds", timeText(status.seconds));
     text("step", count(model.step));
     text("step-millis", model.step_millis === null ? "–" : `${model.step_millis.toPrecision(3)} ms`);
-    text("primitives-name", PRIMITIVE_NAMES[model.method] ?? "Primitives");
+    text("primitives-label", model.primitives_label || "Primitives");
     text("primitives", count(model.primitives));
     text("bytes", bytesText(model.bytes));
     text("keyframes", count(status.keyframes));
-    const reasons = Object.entries(status.refused).sort((a, b) => b[1] - a[1]);
-    text("refused-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
-    element("refused").replaceChildren(
+    const reasons = Object.entries(status.rejected).sort((a, b) => b[1] - a[1]);
+    text("rejected-total", count(reasons.reduce((sum, [, n]) => sum + n, 0)));
+    element("rejected").replaceChildren(
       ...reasons.flatMap(([reason, n]) => [child("dt", reason), child("dd", count(n))]),
     );
     element("notes-card").hidden = status.notes.length === 0;

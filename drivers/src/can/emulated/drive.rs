@@ -104,8 +104,8 @@ impl EmulatedMotor {
     /// Whether the first PDO delivers controlword and target at every SYNC.
     fn accepts_targets(&self, node: Node) -> bool {
         let mapped = [cia402::CONTROLWORD, cia402::TARGET_POSITION].map(|object| Some(object.mapped()));
-        let places = [1, 2].map(|place| self.object(Pdo::First.mapping(Direction::Receive, place)));
-        self.is_on(Pdo::First, Direction::Receive, node) && places == mapped
+        let entries = [1, 2].map(|entry| self.object(Pdo::First.mapping(Direction::Receive, entry)));
+        self.is_on(Pdo::First, Direction::Receive, node) && entries == mapped
     }
 
     fn is_on(&self, pdo: Pdo, direction: Direction, node: Node) -> bool {
@@ -187,8 +187,8 @@ impl EmulatedMotor {
     fn transmit(&self, pdo: Pdo, node: Node, units: Units) -> Result<Frame, CanError> {
         let n = self.object(pdo.mapping(Direction::Transmit, 0)).unwrap_or(0);
         let mut bytes = Vec::new();
-        for place in 1..=u8::try_from(n).unwrap_or(8) {
-            let mapped = self.object(pdo.mapping(Direction::Transmit, place)).unwrap_or(0);
+        for entry in 1..=u8::try_from(n).unwrap_or(8) {
+            let mapped = self.object(pdo.mapping(Direction::Transmit, entry)).unwrap_or(0);
             let mapped = Object::from_mapped(mapped)?;
             let motion = self.shaft.motion;
             let value = match mapped {

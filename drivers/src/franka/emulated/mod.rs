@@ -37,7 +37,7 @@ pub struct RobotConfig {
     /// Chain from the robot's base to its flange.
     pub chain: Chain,
     /// The end effector set in Desk, `F_T_NE`.
-    pub flange_from_ee: Transform,
+    pub flange_from_tool: Transform,
     /// Limits for motions.
     pub limits: Limits,
 }

@@ -29,8 +29,8 @@ const DEFAULT_CONTACT_NM: f64 = 20.0;
 /// The controller of one robot, without its sockets.
 pub(super) struct Robot {
     pub(super) config: RobotConfig,
-    pub(super) nominal_from_ee: Transform,
-    pub(super) ee_from_stiffness: Transform,
+    pub(super) nominal_from_tool: Transform,
+    pub(super) tool_from_stiffness: Transform,
     contact_nm: [f64; N_JOINTS],
     pub(super) joints: Joints,
     pub(super) commanded: CommandedJoints,
@@ -67,8 +67,8 @@ impl Robot {
         let commanded = CommandedJoints { position_rad: joints.position_rad, ..CommandedJoints::default() };
         Self {
             config,
-            nominal_from_ee: Transform::identity(),
-            ee_from_stiffness: Transform::identity(),
+            nominal_from_tool: Transform::identity(),
+            tool_from_stiffness: Transform::identity(),
             contact_nm: [DEFAULT_CONTACT_NM; N_JOINTS],
             joints,
             commanded,
@@ -151,8 +151,8 @@ impl Robot {
                 let Ok(matrix) = <[F64; 16]>::read_from_bytes(payload) else { return INVALID };
                 let Ok(pose) = pose(&f64s_to_f64(&matrix)) else { return INVALID };
                 match setting {
-                    Setting::NominalToEe => self.nominal_from_ee = pose,
-                    _ => self.ee_from_stiffness = pose,
+                    Setting::NominalToEe => self.nominal_from_tool = pose,
+                    _ => self.tool_from_stiffness = pose,
                 }
             }
             Setting::Collision => {

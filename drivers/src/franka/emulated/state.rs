@@ -16,21 +16,21 @@ macro_rules! state {
     ($robot:expr, $number:expr, $version:ident) => {{
         let robot: &Robot = $robot;
         let (joints, commanded) = (&robot.joints, &robot.commanded);
-        let flange_from_nominal = robot.config.flange_from_ee;
-        let flange_from_ee = flange_from_nominal * robot.nominal_from_ee;
-        let ee_at = |position_rad| columns(&(robot.base_from_flange(position_rad) * flange_from_ee));
+        let flange_from_nominal = robot.config.flange_from_tool;
+        let flange_from_tool = flange_from_nominal * robot.nominal_from_tool;
+        let tool_at = |position_rad| columns(&(robot.base_from_flange(position_rad) * flange_from_tool));
         let elbow = |position_rad: &[f64; N_JOINTS]| [position_rad[2], position_rad[3].signum()];
         let [motion_generator_mode, controller_mode, robot_mode] = robot.modes();
         let reasons = robot.reflex_reason.0.map(u8::from);
         $version::RobotState {
             message_id: U64::new($number),
-            O_T_EE: numbers(&ee_at(&joints.position_rad)),
-            O_T_EE_d: numbers(&ee_at(&commanded.position_rad)),
-            O_T_EE_c: numbers(&ee_at(&commanded.position_rad)),
-            F_T_EE: numbers(&columns(&flange_from_ee)),
+            O_T_EE: numbers(&tool_at(&joints.position_rad)),
+            O_T_EE_d: numbers(&tool_at(&commanded.position_rad)),
+            O_T_EE_c: numbers(&tool_at(&commanded.position_rad)),
+            F_T_EE: numbers(&columns(&flange_from_tool)),
             F_T_NE: numbers(&columns(&flange_from_nominal)),
-            NE_T_EE: numbers(&columns(&robot.nominal_from_ee)),
-            EE_T_K: numbers(&columns(&robot.ee_from_stiffness)),
+            NE_T_EE: numbers(&columns(&robot.nominal_from_tool)),
+            EE_T_K: numbers(&columns(&robot.tool_from_stiffness)),
             elbow: numbers(&elbow(&joints.position_rad)),
             elbow_d: numbers(&elbow(&commanded.position_rad)),
             elbow_c: numbers(&elbow(&commanded.position_rad)),

@@ -106,13 +106,13 @@ impl Pdo {
         Id::standard(base + 0x100 * u32::from(self as u8) + u32::from(node.0)).expect("the identifier is at most 0x57F")
     }
 
-    /// The mapping object: entry `place`, from 1, is one mapped object; entry 0 is their number.
-    pub fn mapping(self, direction: Direction, place: u8) -> Object {
+    /// The mapping object: entries from 1 are mapped objects; entry 0 is their number.
+    pub fn mapping(self, direction: Direction, entry: u8) -> Object {
         let base = match direction {
             Direction::Receive => 0x1600,
             Direction::Transmit => 0x1A00,
         };
-        Object { index: base + self as u16, subindex: place, n_bytes: if place == 0 { 1 } else { 4 } }
+        Object { index: base + self as u16, subindex: entry, n_bytes: if entry == 0 { 1 } else { 4 } }
     }
 
     /// The communication object: entry 1 is its identifier (bit 31 disables the PDO), entry 2 the transmission type.

@@ -5,9 +5,11 @@ use super::images::{FieldSnapshot, Trials};
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::keyframe_signature::{self, KeyframeSignature};
-use crate::model_metadata::read_metadata;
+use crate::model_metadata::{METADATA_FILE, read_metadata};
+use crate::model_options::{MethodOptions, ModelOptions};
 use crate::nerf::extent::Extent;
 use crate::nerf::field_trainer::FieldTrainer;
+use crate::nerf::files::FIELD_FILE;
 use crate::nerf::options::NerfOptions;
 use crate::nerf::params::{IMAGE_PARAM_STRIDE, ImageParam};
 use crate::nerf::rays::RayImage;
@@ -20,17 +22,15 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 
-const METHOD: &str = "nerf";
+const METHOD: &str = NerfOptions::METHOD;
 /// Name of the array of image parameters.
 const IMAGE_PARAMS: &str = "image_params";
-/// The saved field: a checkpoint of the arrays needed for rendering.
-const FIELD_FILE: &str = "field.nerf";
 
 /// The state without its arrays.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NerfState {
-    options: NerfOptions,
+    options: ModelOptions<NerfOptions>,
     step: u64,
     images: Vec<KeyframeSignature>,
     is_extent_stale: bool,
@@ -40,7 +40,7 @@ struct NerfState {
     /// Image parameters that are optimized together with the field.
     learned_params: ParamSet,
     are_trials_finished: bool,
-    parts: Vec<TrialReport>,
+    trials: Vec<TrialReport>,
     n_discarded_steps: u64,
     /// Number of images that the parameter array can hold.
     image_capacity: Option<u32>,
@@ -71,7 +71,7 @@ impl FieldTrainer {
     }
 
     /// Buffers needed to continue training, by name.
-    fn learned_params(&self) -> Vec<(String, &Buffer)> {
+    fn training_buffers(&self) -> Vec<(String, &Buffer)> {
         let mut all = self.render_buffers();
         all.extend(
             [
@@ -103,14 +103,9 @@ fn finish(gpu: &Gpu, reads: Vec<(String, PendingRead)>) -> Result<Vec<Array>, Er
 }
 
 impl NerfModel {
-    /// Whether a folder holds a saved field.
-    pub fn is_saved_in(folder: &Path) -> bool {
-        folder.join(FIELD_FILE).is_file()
-    }
-
     fn state(&self) -> Result<NerfState, Error> {
         Ok(NerfState {
-            options: NerfOptions { nerf_budget: Some(self.nerf_budget()), ..self.options.clone() },
+            options: self.options.clone().with(|options| options.specific.nerf_budget = Some(self.nerf_budget())),
             step: self.step,
             images: self.images.iter().map(|image| KeyframeSignature::of(&image.keyframe)).collect(),
             is_extent_stale: self.is_extent_stale,
@@ -118,7 +113,7 @@ impl NerfModel {
             field: self.field.as_ref().map(|(extent, field_trainer)| (*extent, field_trainer.sizes.clone())),
             learned_params: self.learned_params,
             are_trials_finished: self.trials.are_finished(),
-            parts: self.trials.finished.clone(),
+            trials: self.trials.finished.clone(),
             n_discarded_steps: self.n_discarded_steps,
             image_capacity: self
                 .field
@@ -132,7 +127,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&self.gpu, field_trainer.training_buffers()));
         let (step, n_hinted, learned_params) = (self.step, self.n_hinted, self.learned_params);
         Ok(FieldSnapshot { arrays: finish(&self.gpu, reads)?, step, n_hinted, learned_params })
     }
@@ -150,7 +145,7 @@ impl NerfModel {
             }
             None => field_trainer.drop_images(),
         }
-        for (name, buffer) in field_trainer.learned_params() {
+        for (name, buffer) in field_trainer.training_buffers() {
             if let Some(array) = snapshot.arrays.iter().find(|array| array.name == name) {
                 self.gpu.write(buffer, 0, &array.bytes);
             }
@@ -174,7 +169,7 @@ impl NerfModel {
         let reads = self
             .field
             .as_ref()
-            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.learned_params()));
+            .map_or(Vec::new(), |(_, field_trainer)| begin_read(&gpu, field_trainer.training_buffers()));
         Ok(PendingCheckpoint::new(move || Ok(Checkpoint::new(METHOD, state, finish(&gpu, reads)?))))
     }
 
@@ -205,7 +200,7 @@ impl NerfModel {
         model.step = state.step;
         model.n_discarded_steps = state.n_discarded_steps;
         model.learned_params = state.learned_params;
-        model.trials = Trials::of(&state.options.cameras).after(state.parts.clone(), state.are_trials_finished);
+        model.trials = Trials::of(&state.options.common.cameras).after(state.trials.clone(), state.are_trials_finished);
         Ok((model, state))
     }
 
@@ -216,7 +211,7 @@ impl NerfModel {
         checkpoint: &Checkpoint,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(Self, Vec<Arc<Keyframe>>), Error> {
-        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::learned_params)?;
+        let (mut model, state) = Self::of_state(gpu, checkpoint, FieldTrainer::training_buffers)?;
         let (images, rest) = keyframe_signature::match_keyframes(&state.images, keyframes, Arc::clone)?;
         model.images = images.into_iter().map(RayImage::new).collect();
         model.is_extent_stale = state.is_extent_stale;
@@ -228,7 +223,7 @@ impl NerfModel {
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let checkpoint = Checkpoint::read(&folder.join(FIELD_FILE))?;
         let mut model = Self::of_state(gpu, &checkpoint, FieldTrainer::render_buffers)?.0;
-        model.loaded_corrections = read_metadata(&folder.join("model.json"))?.cameras;
+        model.loaded_corrections = read_metadata(folder)?.cameras;
         Ok(model)
     }
 
@@ -252,7 +247,7 @@ impl NerfModel {
             "extent": self.extent(),
             "cameras": cameras,
         });
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }

@@ -116,8 +116,8 @@ impl Trials {
 
 impl NerfModel {
     /// Image parameters that the next step optimizes.
-    pub(super) fn params_learned_now(&self) -> ParamSet {
-        if self.step >= self.options.n_planned_steps / POSE_START_DIVISOR {
+    pub(super) fn current_params(&self) -> ParamSet {
+        if self.step >= self.options.common.n_planned_steps / POSE_START_DIVISOR {
             self.learned_params
         } else {
             ParamSet::empty()
@@ -126,7 +126,7 @@ impl NerfModel {
 
     /// The step at which a trial starts or changes its phase.
     fn next_trial_step(&self) -> Option<u64> {
-        let share = |of: u64| (self.options.n_planned_steps / of).max(1);
+        let share = |of: u64| (self.options.common.n_planned_steps / of).max(1);
         let at = match &self.trials.trial_phase {
             TrialPhase::Waiting => share(TRIAL_START_DIVISOR),
             TrialPhase::Variant { before } | TrialPhase::Baseline { before, .. } => {
@@ -161,7 +161,7 @@ impl NerfModel {
                 self.end_trials();
             }
             TrialPhase::Waiting => match self.rule_out(candidate)? {
-                Some(part) => self.end_trial(part),
+                Some(report) => self.end_trial(report),
                 None => {
                     let before = self.snapshot()?;
                     self.learned_params |= candidate;
@@ -177,27 +177,27 @@ impl NerfModel {
             }
             TrialPhase::Baseline { before, variant, variant_errors } => {
                 let baseline_errors = self.validation_errors()?;
-                let part = measure_gain(candidate, &variant_errors, &baseline_errors);
-                if part.kept {
+                let report = measure_gain(candidate, &variant_errors, &baseline_errors);
+                if report.kept {
                     self.n_discarded_steps += self.step - before.step;
                     self.restore(&variant)?;
                 }
-                self.end_trial(part);
+                self.end_trial(report);
             }
         }
         Ok(())
     }
 
-    fn end_trial(&mut self, part: TrialReport) {
+    fn end_trial(&mut self, report: TrialReport) {
         log::info!(
             "{}: {:+.2} dB on {} validation images (standard error {:.2}): {}",
-            part.part,
-            part.gain_db,
-            part.n_images,
-            part.standard_error_db,
-            if part.kept { "kept" } else { "rejected: no significant gain" },
+            report.candidate,
+            report.gain_db,
+            report.n_images,
+            report.standard_error_db,
+            if report.kept { "kept" } else { "rejected: no significant gain" },
         );
-        self.trials.finished.push(part);
+        self.trials.finished.push(report);
         self.trials.remaining.pop_front();
         if self.trials.are_finished() {
             self.end_trials();
@@ -248,15 +248,15 @@ impl NerfModel {
             own.error_with_gain(log_gain.exp())
         });
         let baseline = compared.iter().map(|own| own.error_with_gain(1.0));
-        let part = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
+        let report = measure_gain(candidate, &variant.collect::<Vec<_>>(), &baseline.collect::<Vec<_>>());
         log::info!(
             "{}: no trial: scaling brightness gains {:+.2} dB on {} validation images (standard error {:.2})",
-            part.part,
-            part.gain_db,
-            part.n_images,
-            part.standard_error_db
+            report.candidate,
+            report.gain_db,
+            report.n_images,
+            report.standard_error_db
         );
-        Ok((!part.kept).then_some(part))
+        Ok((!report.kept).then_some(report))
     }
 
     /// Mean squared color error of each validation image, with its pose and embedding interpolated from training images
@@ -331,7 +331,7 @@ impl NerfModel {
         }
         self.finish_in_flight()?;
         let corrections = self.learned_corrections()?;
-        let learned_params = self.params_learned_now();
+        let learned_params = self.current_params();
         let Some((_, field_trainer)) = &mut self.field else { return Ok(()) };
         let predicted = |image: &RayImage| {
             interpolate(&corrections.get(image.keyframe.camera.as_ref())?.appearance_embeddings, image.keyframe.stamp)
@@ -414,7 +414,7 @@ fn measure_gain(candidate: ParamSet, variant: &[f64], baseline: &[f64]) -> Trial
         .collect();
     let gain = Gain::of(&gains);
     TrialReport {
-        part: candidate.to_string(),
+        candidate: candidate.to_string(),
         gain_db: gain.mean_db,
         standard_error_db: gain.standard_error_db,
         n_images: gain.n_images,

@@ -109,5 +109,5 @@ impl Field {
 
 /// Real spherical harmonics up to degree 3 of a direction of length 1, constant term first.
 pub fn harmonics(direction: [f64; 3]) -> [f64; N_DIRECTION] {
-    crate::splat::reference::sh::basis(&direction.into())
+    crate::spherical_harmonics::basis(&direction.into())
 }

@@ -13,7 +13,6 @@ pub mod project;
 #[cfg(test)]
 pub(crate) mod random;
 pub mod rasterize;
-pub mod sh;
 
 #[cfg(test)]
 mod published_picture;
@@ -22,6 +21,7 @@ pub mod scene;
 #[cfg(test)]
 mod tests;
 
+pub use crate::loss::rendered_image::{RenderedImage, Upstream};
 use kinematics::Transform;
 pub use project::{project, project_backward};
 pub use rasterize::{Decisions, decide};
@@ -120,30 +120,6 @@ pub struct ProjectedGrad {
     pub depth: f64,
 }
 
-/// Output of a render, row by row.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct RenderedImage {
-    /// Color of the splats without background, premultiplied.
-    pub rgb: Vec<[f64; 3]>,
-    /// Fraction of the background that is visible, 0 to 1.
-    pub transmittance: Vec<f64>,
-    /// Depths along z with the weights of the colors, meters; divide by `1 - transmittance` for a mean depth.
-    pub depth: Vec<f64>,
-    /// Index of the last splat that contributed to the pixel.
-    pub last_contributor: Vec<Option<usize>>,
-}
-
-/// Gradient of a loss with respect to a [`RenderedImage`], row by row.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Upstream {
-    /// With respect to the color.
-    pub rgb: Vec<[f64; 3]>,
-    /// With respect to the transmittance.
-    pub transmittance: Vec<f64>,
-    /// With respect to the depth.
-    pub depth: Vec<f64>,
-}
-
 /// Gradient of a loss with respect to all inputs of a render.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderGrad {
@@ -184,10 +160,10 @@ pub fn render_backward(view: &View, splats: &[Splat], upstream: &Upstream) -> Re
 }
 
 fn project_decided(view: &View, splats: &[Splat], decisions: &Decisions) -> Vec<Projected> {
-    let place = |(splat, row_share): (&Splat, &Option<f64>)| {
+    let project_one = |(splat, row_share): (&Splat, &Option<f64>)| {
         row_share.map(|row_share| project::project_at(view, splat, row_share)).unwrap_or_default()
     };
-    splats.iter().zip(&decisions.row_shares).map(place).collect()
+    splats.iter().zip(&decisions.row_shares).map(project_one).collect()
 }
 
 impl ViewGrad {

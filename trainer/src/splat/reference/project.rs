@@ -3,7 +3,8 @@
 //! Source: Zwicker et al. 2001 (EWA splatting); the clamp of the Jacobian is that of gsplat (Ye et al. 2024). A
 //! rolling shutter moves the splat by its row's share of the readout; the gradient treats this share as constant.
 
-use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad, sh};
+use super::{Projected, ProjectedGrad, Splat, SplatGrad, View, ViewGrad};
+use crate::spherical_harmonics as sh;
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector2, Vector3};
 
 /// Minimum alpha that is drawn.

@@ -17,7 +17,7 @@ impl SplatTrainer {
     }
 
     fn alignment_step(&self) -> u64 {
-        alignment_step(self.gpu.is_software(), self.options.n_planned_steps)
+        alignment_step(self.gpu.is_software(), self.options.common.n_planned_steps)
     }
 
     /// Starts alignment, or applies its result when due.
@@ -25,7 +25,7 @@ impl SplatTrainer {
         if self.alignment_task.is_requested() {
             let views = self.views.iter().map(|view| view.keyframe.clone());
             let validation = self.trials.validation.iter().map(|validation| validation.keyframe.clone());
-            self.alignment_task.begin(views.chain(validation).collect(), &self.options.align);
+            self.alignment_task.begin(views.chain(validation).collect(), &self.options.common.align);
         }
         if self.step < self.alignment_step() || self.alignment_task.is_done() {
             return Ok(());
@@ -46,9 +46,9 @@ impl SplatTrainer {
         }
         self.step_millis = 0.0;
         self.passes.clear_bindings();
-        self.splats = SplatBuffers::new(&self.gpu, 1, self.options.sh_degree)?;
+        self.splats = SplatBuffers::new(&self.gpu, 1, self.options.specific.sh_degree)?;
         self.write_n_splats();
-        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, &[0; 4]);
+        self.gpu.write(&self.train_status, 4 * status::STEP as u64, &[0; 4]);
         self.cameras = CameraParams::new(&self.gpu, self.cameras.set)?;
         self.seeder = Seeder::default();
         self.unseeded.clear();

@@ -5,6 +5,7 @@ use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::{Buffer, Gpu, PendingRead};
 use crate::keyframe_signature::{self, KeyframeSignature};
+use crate::model_options::{MethodOptions, ModelOptions};
 use crate::splat::buffers::{N_PLANAR_BUFFERS, SplatBuffers};
 use crate::splat::camera_params::CameraSlots;
 use crate::splat::options::SplatOptions;
@@ -21,7 +22,7 @@ use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-const METHOD: &str = "splat";
+const METHOD: &str = SplatOptions::METHOD;
 /// Names of the arrays, in the order of [`SplatBuffers::planes`].
 const ARRAYS: [&str; N_PLANAR_BUFFERS] =
     ["means", "rotations", "shapes", "sh_dc", "sh_rest", "moments", "sh_dc_moments", "sh_rest_moments", "error_sums"];
@@ -36,7 +37,7 @@ const OTHER: &str = "other_";
 #[serde(deny_unknown_fields)]
 struct SavedState {
     /// Options with the values chosen for the adapter.
-    options: SplatOptions,
+    options: ModelOptions<SplatOptions>,
     step: u64,
     schedule_start: u64,
     last_growth_step: u64,
@@ -269,11 +270,10 @@ impl SplatTrainer {
         let position_of =
             |keyframe: &Arc<Keyframe>| self.views.iter().position(|view| Arc::ptr_eq(&view.keyframe, keyframe));
         let state = SavedState {
-            options: SplatOptions {
-                coarse_steps: Some(self.coarse_steps),
-                seeds_per_image: Some(self.seeds_per_image),
-                ..self.options.clone()
-            },
+            options: self.options.clone().with(|options| {
+                options.specific.coarse_steps = Some(self.coarse_steps);
+                options.specific.seeds_per_image = Some(self.seeds_per_image);
+            }),
             step: self.step,
             schedule_start: self.schedule_start,
             last_growth_step: self.last_growth_step,
@@ -333,7 +333,7 @@ impl SplatTrainer {
         let alignment_task = if state.is_aligned {
             AlignmentTask::Done(state.alignment.clone())
         } else {
-            AlignmentTask::new(&state.options.align)
+            AlignmentTask::new(&state.options.common.align)
         };
         // In the second half of a trial, some keyframes have yet to arrive again; in the first half, they are views.
         let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
@@ -360,7 +360,7 @@ impl SplatTrainer {
         trainer.splats = read_splats(&trainer.gpu, checkpoint, "", size)?;
         trainer.write_n_splats();
         for (ix, value) in [(status::STEP, step), (status::N_NON_FINITE, state.n_non_finite)] {
-            trainer.gpu.write(&trainer.learn_status, 4 * ix as u64, &value.to_le_bytes());
+            trainer.gpu.write(&trainer.train_status, 4 * ix as u64, &value.to_le_bytes());
         }
         trainer.seeder = read_seeds(checkpoint, "", state.n_seeds)?;
         trainer.cameras.restore(&trainer.gpu, &state.slots, state.params, checkpoint)?;

@@ -1,10 +1,10 @@
 //! Reduction of the model's size: contribution of each splat, pruning of the least contributing ones, and lower color
 //! degrees.
 
-use super::{LearnedView, SplatTrainer, VIEWS_AT_ONCE};
+use super::{PreparedView, SplatTrainer, VIEWS_AT_ONCE};
 use crate::Error;
 use crate::splat::buffers::SplatBuffers;
-use crate::splat::kernels::LearnPipelines;
+use crate::splat::kernels::TrainPipelines;
 use crate::splat::params::{Gathering, status};
 
 /// Maximum number of views over which contributions are summed.
@@ -12,7 +12,7 @@ const MAX_VIEWS: usize = 64;
 
 impl SplatTrainer {
     /// Contribution of each splat to the views: the sum of its blending weights, in pixels.
-    pub(super) fn contributions(&mut self, learn: &LearnPipelines) -> Result<Vec<f32>, Error> {
+    pub(super) fn contributions(&mut self, pipelines: &TrainPipelines) -> Result<Vec<f32>, Error> {
         let contributions = self.gpu.storage("splat.contributions", 4 * u64::from(self.splats.n_splats))?;
         let stride = self.views.len().div_ceil(MAX_VIEWS).max(1);
         let sampled_views: Vec<usize> = (0..self.views.len()).step_by(stride).collect();
@@ -35,17 +35,17 @@ impl SplatTrainer {
             }
             loop {
                 let mut list = std::mem::take(&mut self.passes);
-                let LearnedView { view, .. } = self.learned_view(&mut list, learn, (view_ix, 0))?;
+                let PreparedView { view, .. } = self.prepared_view(&mut list, pipelines, (view_ix, 0))?;
                 view.draw(&mut list, &self.draw);
-                view.backward(&mut list, learn);
-                view.contribute(&mut list, learn, &contributions); // Adds nothing if a buffer was too small.
+                view.backward(&mut list, pipelines);
+                view.contribute(&mut list, pipelines, &contributions); // Adds nothing if a buffer was too small.
                 list.submit(&self.gpu);
                 self.passes = list;
-                let counters: Vec<u32> = self.gpu.read(&self.learn_status, status::LEN)?;
+                let counters: Vec<u32> = self.gpu.read(&self.train_status, status::LEN)?;
                 if !self.grow_scratch(&counters)? {
                     break;
                 }
-                self.gpu.write(&self.learn_status, 4 * status::FAILED as u64, &[0; 12]);
+                self.gpu.write(&self.train_status, 4 * status::FAILED as u64, &[0; 12]);
             }
         }
         self.passes.clear_bindings();
@@ -54,14 +54,14 @@ impl SplatTrainer {
 
     /// Keeps the `n_kept` splats that contribute most, without changing their order.
     pub(super) fn keep_most_contributing(&mut self, n_kept: u32) -> Result<(), Error> {
-        let learn = self.learn()?;
-        let contributions = self.contributions(&learn)?;
+        let pipelines = self.train_pipelines()?;
+        let contributions = self.contributions(&pipelines)?;
         let mut by_contribution: Vec<u32> = (0..self.splats.n_splats).collect();
         by_contribution
             .sort_by(|a, b| contributions[*b as usize].total_cmp(&contributions[*a as usize]).then(a.cmp(b)));
         by_contribution.truncate(n_kept as usize);
         by_contribution.sort_unstable();
-        self.splats = gather_splats(self, &learn, &by_contribution)?;
+        self.splats = gather_splats(self, &pipelines, &by_contribution)?;
         self.passes.clear_bindings();
         self.write_n_splats();
         Ok(())
@@ -76,7 +76,7 @@ impl SplatTrainer {
 }
 
 /// Copies the splats with the given indices, and their moments.
-fn gather_splats(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
+fn gather_splats(trainer: &mut SplatTrainer, pipelines: &TrainPipelines, kept: &[u32]) -> Result<SplatBuffers, Error> {
     let (gpu, splats) = (&trainer.gpu, &trainer.splats);
     let n_kept = u32::try_from(kept.len()).expect("at most the number of splats, which is a u32");
     let mut fewer = SplatBuffers::new(gpu, n_kept, splats.sh_degree)?;
@@ -97,7 +97,7 @@ fn gather_splats(trainer: &mut SplatTrainer, learn: &LearnPipelines, kept: &[u32
             ("to_words", to),
         ];
         let n_words = u64::from(n_kept) * u64::from(words) * u64::from(*n_planes);
-        trainer.passes.dispatch(gpu, &learn.gather, n_words.div_ceil(256), &buffers);
+        trainer.passes.dispatch(gpu, &pipelines.gather, n_words.div_ceil(256), &buffers);
     }
     trainer.passes.submit(gpu);
     fewer.set_active_degree(gpu, splats.active_degree());
@@ -111,7 +111,6 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::{Gpu, GpuOptions};
-    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, test_psnr, train};
     use crate::splat::trials::CountPolicy;
     use calibration::Candidate;
@@ -121,7 +120,11 @@ mod tests {
     use std::sync::Arc;
 
     fn trained(count: CountPolicy, keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { count, max_splats: 4000, n_planned_steps: 1500, ..options() };
+        let options = options().with(|options| {
+            options.common.n_planned_steps = 1500;
+            options.specific.count = count;
+            options.specific.max_splats = 4000;
+        });
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();
@@ -141,8 +144,8 @@ mod tests {
     fn contributions_sum_to_coverage() {
         let (mut trainer, _) = some_trained(60);
         trainer.views.truncate(1);
-        let learn = trainer.learn().unwrap();
-        let contributions = trainer.contributions(&learn).unwrap();
+        let pipelines = trainer.train_pipelines().unwrap();
+        let contributions = trainer.contributions(&pipelines).unwrap();
         let n_pixels = trainer.views[0].keyframe.size_px.iter().product::<u32>() as usize;
         let image = &trainer.training_buffers.as_ref().unwrap().image;
         let colors: Vec<[f32; 4]> = trainer.gpu.read(image, n_pixels).unwrap();
@@ -154,8 +157,8 @@ mod tests {
     #[test]
     fn most_contributing_splats_are_kept_unchanged() {
         let (mut trainer, _) = some_trained(120);
-        let learn = trainer.learn().unwrap();
-        let contributions = trainer.contributions(&learn).unwrap();
+        let pipelines = trainer.train_pipelines().unwrap();
+        let contributions = trainer.contributions(&pipelines).unwrap();
         let before = words(&trainer);
         let n_kept = trainer.splats.n_splats / 3;
         trainer.keep_most_contributing(n_kept).unwrap();

@@ -1,6 +1,6 @@
 //! Scores of the model in training on images that it was not trained on.
 
-use super::{CameraCorrections, Learn, RequestedParts, SplatTrainer, VIEWS_AT_ONCE, corrected_camera};
+use super::{CameraCorrections, RequestedParts, SplatTrainer, TrainPipelineState, VIEWS_AT_ONCE, corrected_camera};
 use crate::Error;
 use crate::gpu::{Buffer, Gpu, Passes, Pipeline};
 use crate::splat::buffers::ImageBuffers;
@@ -100,8 +100,8 @@ impl SplatTrainer {
         background_srgb: [f32; 3],
         keyframe: &Keyframe,
     ) -> Result<Option<f64>, Error> {
-        let Learn::Ready(learn) = &self.learn else { return Ok(None) };
-        let learn = learn.clone();
+        let TrainPipelineState::Ready(pipelines) = &self.train else { return Ok(None) };
+        let pipelines = pipelines.clone();
         let rgba = keyframe.rgba_srgb.as_ref();
         if rgba.len() != 4 * camera.size_px[0] as usize * camera.size_px[1] as usize {
             return Ok(None);
@@ -116,7 +116,7 @@ impl SplatTrainer {
                 self.gpu.storage_with("splat.compared", rgba)?
             }
         };
-        let requested = RequestedParts::Comparison { score: &learn.score, image: &image };
+        let requested = RequestedParts::Comparison { score: &pipelines.score, image: &image };
         let take = |parts: &[&[u8]]| sum_up(&bytemuck::pod_collect_to_vec::<u8, [u32; 4]>(parts[0]));
         let products = self.draw_reading(camera, background_srgb, true, requested, take)?;
         self.compared = Some(image);
@@ -198,7 +198,7 @@ impl SplatTrainer {
         let keyframe = self.views[view_ix].keyframe.clone();
         self.draw_keyframe(&keyframe, corrections)?;
         let (_, Level { image, .. }) = self.views[view_ix].ready_level(0)?;
-        let rendered_view = RenderedView::of(&self.gpu, &self.learn, &self.drawing_buffers, &self.draw_view)?;
+        let rendered_view = RenderedView::of(&self.gpu, &self.train, &self.drawing_buffers, &self.draw_view)?;
         Ok(log_gains(&rendered_view.compare(&mut self.passes, &keyframe, image)?))
     }
 
@@ -211,9 +211,9 @@ impl SplatTrainer {
             self.draw_keyframe(&keyframe, &corrections)?;
             let image = match image {
                 Some(image) => image,
-                None => self.gpu.storage_with("splat.held_back", &keyframe.rgba_srgb)?,
+                None => self.gpu.storage_with("splat.validation", &keyframe.rgba_srgb)?,
             };
-            let rendered_view = RenderedView::of(&self.gpu, &self.learn, &self.drawing_buffers, &self.draw_view)?;
+            let rendered_view = RenderedView::of(&self.gpu, &self.train, &self.drawing_buffers, &self.draw_view)?;
             let products = rendered_view.compare(&mut self.passes, &keyframe, &image)?;
             if let Some(validation) = self.trials.validation(&id) {
                 validation.image = Some(image);
@@ -247,12 +247,14 @@ struct RenderedView<'a> {
 impl<'a> RenderedView<'a> {
     fn of(
         gpu: &'a Gpu,
-        learn: &'a Learn,
+        train: &'a TrainPipelineState,
         image_buffers: &'a Option<ImageBuffers>,
         view: &'a Buffer,
     ) -> Result<Self, Error> {
-        match (learn, image_buffers) {
-            (Learn::Ready(learn), Some(image_buffers)) => Ok(Self { gpu, score: &learn.score, view, image_buffers }),
+        match (train, image_buffers) {
+            (TrainPipelineState::Ready(pipelines), Some(image_buffers)) => {
+                Ok(Self { gpu, score: &pipelines.score, view, image_buffers })
+            }
             _ => Err(Error::DeviceLost),
         }
     }
@@ -272,7 +274,6 @@ mod tests {
     use crate::Method;
     use crate::eval::{PixelPair, psnr};
     use crate::gpu::GpuOptions;
-    use crate::splat::SplatOptions;
     use crate::splat::training_tests::{n_keyframes, options, request, train};
     use calibration::{CameraRefinement, ParamSet};
     use keyframe::Split;
@@ -280,7 +281,10 @@ mod tests {
     const GAINS: ParamSet = ParamSet::IMAGE_GAINS;
 
     fn trained(keyframes: &[Arc<Keyframe>], gpu: Arc<Gpu>, n_steps: u64) -> SplatTrainer {
-        let options = SplatOptions { cameras: CameraRefinement::Try(vec![GAINS]), n_planned_steps: 1000, ..options() };
+        let options = options().with(|options| {
+            options.common.cameras = CameraRefinement::Try(vec![GAINS]);
+            options.common.n_planned_steps = 1000;
+        });
         let mut trainer = SplatTrainer::new(gpu, options).unwrap();
         for keyframe in keyframes {
             trainer.push(keyframe.clone()).unwrap();

@@ -3,6 +3,7 @@
 use super::{Mesh, write_glb, write_ply};
 use crate::Method;
 use crate::gpu::{Gpu, GpuOptions};
+use crate::model_options::ModelOptions;
 use crate::test_scenes::{self as scenes, TestShape};
 use crate::tsdf::tests::fuse_all;
 use crate::tsdf::{TsdfModel, TsdfOptions};
@@ -11,7 +12,7 @@ use nalgebra::{Point3, Vector3};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-fn model(options: TsdfOptions, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
+fn model(options: ModelOptions<TsdfOptions>, keyframes: &[Arc<Keyframe>]) -> TsdfModel {
     let mut model = TsdfModel::new(Gpu::open(&GpuOptions::default()).unwrap(), options).unwrap();
     for keyframe in keyframes {
         model.push(keyframe.clone()).unwrap();

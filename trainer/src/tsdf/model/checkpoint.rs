@@ -10,11 +10,12 @@ use crate::Error;
 use crate::checkpoint::{Array, Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
 use crate::keyframe_signature::{self, KeyframeSignature};
+use crate::model_options::{MethodOptions, ModelOptions};
 use keyframe::Keyframe;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
-pub(super) const METHOD: &str = "tsdf";
+pub(super) const METHOD: &str = TsdfOptions::METHOD;
 const BLOCK_COORDS: &str = "block_coords";
 const GEOMETRY: &str = "geometry";
 const COLORS: &str = "colors";
@@ -23,7 +24,7 @@ const COLORS: &str = "colors";
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct TsdfState {
-    pub(super) options: TsdfOptions,
+    pub(super) options: ModelOptions<TsdfOptions>,
     pub(super) voxel_grid: Option<VoxelGrid>,
     pub(super) step: u64,
     pub(super) n_skipped: u64,

@@ -4,6 +4,8 @@ use super::TsdfModel;
 use super::checkpoint::{METHOD, invalid_state};
 use crate::checkpoint::{Array, Checkpoint};
 use crate::gpu::Gpu;
+use crate::model_metadata::METADATA_FILE;
+use crate::tsdf::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
 use crate::tsdf::mesh::{write_glb, write_ply};
 use crate::{Error, Method};
 use flate2::Compression;
@@ -13,17 +15,10 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-/// The blocks: a checkpoint with deflated arrays.
-const BLOCKS_FILE: &str = "field.blocks";
 /// Maximum size of an inflated array in bytes.
 const MAX_ARRAY_BYTES: u64 = 1 << 36;
 
 impl TsdfModel {
-    /// Whether a folder holds a saved field.
-    pub fn is_saved_in(folder: &Path) -> bool {
-        folder.join(BLOCKS_FILE).is_file()
-    }
-
     /// Loads a saved field, for rendering or further fusion.
     pub fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Self, Error> {
         let path = folder.join(BLOCKS_FILE);
@@ -43,8 +38,8 @@ impl TsdfModel {
         let write_error = |path: &Path, source| Error::Write { path: path.to_owned(), source };
         std::fs::create_dir_all(folder).map_err(|source| write_error(folder, source))?;
         let mesh = self.mesh()?;
-        write_ply(&folder.join("mesh.ply"), &mesh)?;
-        write_glb(&folder.join("mesh.glb"), &mesh)?;
+        write_ply(&folder.join(MESH_PLY), &mesh)?;
+        write_glb(&folder.join(MESH_GLB), &mesh)?;
         let blocks = folder.join(BLOCKS_FILE);
         let (state, arrays) = self.state()?;
         let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();
@@ -54,12 +49,12 @@ impl TsdfModel {
             "method": METHOD,
             "steps": self.step,
             "blocks": self.progress().primitives,
-            "refused_keyframes": self.n_skipped,
+            "skipped_keyframes": self.n_skipped,
             "vertices": mesh.positions_m.len(),
             "triangles": mesh.triangles.len(),
             "voxel_grid": self.voxel_grid,
         });
-        let path = folder.join("model.json");
+        let path = folder.join(METADATA_FILE);
         std::fs::write(&path, format!("{description:#}\n")).map_err(|source| write_error(&path, source))
     }
 }

@@ -72,7 +72,8 @@ fn server(version: FciVersion, limits: Limits) -> Server {
     let states = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
     listener.set_nonblocking(true).and_then(|()| states.set_nonblocking(true)).expect("an open socket");
     let address = listener.local_addr().expect("an open socket");
-    let config = RobotConfig { address, version, chain: CHAIN.clone(), flange_from_ee: Transform::identity(), limits };
+    let config =
+        RobotConfig { address, version, chain: CHAIN.clone(), flange_from_tool: Transform::identity(), limits };
     let joint_simulator: JointSimulator = Box::new(|_, commanded: &CommandedJoints| Joints {
         position_rad: commanded.position_rad,
         velocity_rad_s: commanded.velocity_rad_s,

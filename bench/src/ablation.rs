@@ -1,0 +1,237 @@
+//! Measures the contribution of each part of the method by training without it.
+
+use crate::findings::{BenchResult, Findings};
+use crate::runs::{Host, Job, NamedData, Run, Runs, RunsOptions};
+use crate::statistics::sample_std;
+use crate::variant::Variant;
+use crate::{Error, Result};
+use kinematics::quantile::median;
+use serde::Serialize;
+use session::Table;
+use std::collections::HashSet;
+use std::path::PathBuf;
+use trainer::splat::{CountPolicy, SplatOptions};
+use trainer::{MethodOptions, ModelOptions, ModelSpec};
+
+/// Training time of a run if no flag limits it.
+const DEFAULT_SECONDS: f64 = 16.0;
+/// Times at which the table lists the PSNR, seconds.
+const TABLE_SECS: [f64; 2] = [1.0, 4.0];
+
+/// The unchanged method, with which all variants are compared.
+const BASELINE: Variant<SplatOptions> = Variant { name: "baseline", change: |_| () };
+
+const VARIANTS: &[Variant<SplatOptions>] = &[
+    Variant { name: "no seeds from depth", change: |model| model.specific.seeds_per_image = Some(0.0) },
+    Variant { name: "no depth loss", change: |model| model.specific.depth_per_m = 0.0 },
+    Variant { name: "no structure loss", change: |model| model.specific.dssim_frac = 0.0 },
+    Variant { name: "full resolution from the start", change: |model| model.specific.coarse_steps = Some([0; 2]) },
+    Variant { name: "black background", change: |model| model.specific.random_background = 0.0 },
+    Variant { name: "no opacity and size regularization", change: |model| model.specific.cost_images = 0.0 },
+    Variant { name: "no growth", change: |model| model.specific.growth_frac = 0.0 },
+    Variant { name: "no position noise", change: |model| model.specific.noise = 0.0 },
+    Variant { name: "constant color per splat", change: |model| model.specific.sh_degree = 0 },
+    Variant { name: "grown to the cap", change: |model| model.specific.count = CountPolicy::ToCap },
+    Variant::CAMERAS_AS_GIVEN,
+];
+
+/// Options of [`run`].
+#[derive(Clone, Debug)]
+pub struct AblationOptions {
+    /// Folder or recording.
+    pub data: PathBuf,
+    /// Training time of each run, seconds; 16 if there is no other limit.
+    pub seconds: Option<f64>,
+    /// Optimizer steps of each run.
+    pub steps: Option<u64>,
+    /// Runs of each variant, with consecutive seeds.
+    pub seeds: u64,
+    /// Only the variants whose names contain one of these words; empty: all.
+    pub only: Vec<String>,
+    /// Models, images and folder.
+    pub runs: RunsOptions,
+}
+
+/// The runs of one variant.
+#[derive(Debug, Serialize)]
+struct VariantResult {
+    name: &'static str,
+    /// Medians, dB.
+    psnr: f64,
+    ssim: Option<f64>,
+    lpips: Option<f64>,
+    depth_rmse_m: Option<f64>,
+    primitives: f64,
+    /// Median over the seeds of the PSNR gain of the baseline over the variant, dB.
+    gain_db: f64,
+    /// Standard deviation of these gains; `None` with a single seed.
+    gain_std_db: Option<f64>,
+    runs: Vec<Run>,
+}
+
+/// Trains splats with and without each part of the method.
+///
+/// # Errors
+///
+/// If an option is invalid, the data cannot be read or scored, or training fails.
+pub fn run(options: &AblationOptions, host: &Host<'_>) -> Result<BenchResult> {
+    let limits = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?;
+    let mut runs = Runs::open(&options.runs, host)?;
+    let data = runs.load(&options.data, &mut HashSet::new())?;
+    let base_options = data.splats()?;
+    let is_selected = |change: &&Variant<SplatOptions>| {
+        options.only.is_empty() || options.only.iter().any(|word| change.name.contains(word))
+    };
+    let changes: Vec<&Variant<SplatOptions>> =
+        VARIANTS.iter().filter(|change| is_change(change, &base_options)).filter(is_selected).collect();
+    if changes.is_empty() {
+        let names: Vec<&str> = VARIANTS.iter().map(|change| change.name).collect();
+        return Err(Error::BadInput(format!("--only: no row has such a name; rows: {}", names.join(", "))));
+    }
+    if options.runs.training.count.is_some() {
+        return Err(Error::BadInput("--count: this bench sets it; remove the flag".into()));
+    }
+    runs.expect((changes.len() as u64 + 1) * options.seeds);
+    let mut baseline: Vec<Run> = Vec::new();
+    let mut rows: Vec<VariantResult> = Vec::new();
+    let mut page = None;
+    for change in std::iter::once(&BASELINE).chain(changes) {
+        let mut finished = Vec::new();
+        let first_seed = base_options.common.seed;
+        for seed in first_seed..first_seed.saturating_add(options.seeds) {
+            let seeded = base_options.clone().with(|model| model.common.seed = seed);
+            finished.push(runs.run(Job {
+                name: format!("ablation {} {} seed {seed}", data.name, change.name),
+                data: &data,
+                model_spec: ModelSpec::of(&change.options(&seeded))?,
+                limits,
+                disturbed: None,
+                variant: Some(change.name.to_owned()),
+                keyframes: &|| data.data.keyframes.clone(),
+                is_thorough: false,
+            })?);
+        }
+        if baseline.is_empty() {
+            baseline = finished.clone();
+        }
+        rows.extend(VariantResult::of(change.name, &baseline, finished));
+        page = Some(findings(options, &runs, &data, &rows)?);
+    }
+    BenchResult::of(page, data.data.data_losses)
+}
+
+/// Whether the variant changes any of these options.
+fn is_change(change: &Variant<SplatOptions>, options: &ModelOptions<SplatOptions>) -> bool {
+    change.options(options) != *options
+}
+
+impl VariantResult {
+    fn of(name: &'static str, baseline: &[Run], runs: Vec<Run>) -> Option<Self> {
+        let median_of = |of: &dyn Fn(&Run) -> Option<f64>| median(&runs.iter().filter_map(of).collect::<Vec<_>>());
+        let gain: Vec<f64> =
+            baseline.iter().zip(&runs).map(|(baseline, changed)| baseline.psnr() - changed.psnr()).collect();
+        Some(Self {
+            name,
+            psnr: median_of(&|run| Some(run.psnr()))?,
+            ssim: median_of(&|run| run.end.ssim),
+            lpips: median_of(&|run| run.end.lpips),
+            depth_rmse_m: median_of(&|run| run.end.depth_rmse_m),
+            primitives: median_of(&|run| Some(run.end.primitives as f64))?,
+            gain_db: median(&gain)?,
+            gain_std_db: sample_std(&gain),
+            runs,
+        })
+    }
+
+    fn row(&self) -> Vec<String> {
+        let number = |value: Option<f64>, places: usize| {
+            value.map_or_else(|| "-".to_owned(), |value| format!("{value:.places$}"))
+        };
+        let at = |secs: f64| {
+            let of_run = |run: &Run| {
+                run.curve().into_iter().find(|(time, _)| (time / secs - 1.0).abs() < 0.1).map(|(_, psnr)| psnr)
+            };
+            number(median(&self.runs.iter().filter_map(of_run).collect::<Vec<_>>()), 2)
+        };
+        let gain = if self.name == BASELINE.name {
+            "-".to_owned()
+        } else {
+            let spread = self.gain_std_db.map_or_else(String::new, |std| format!(" (std {std:.2})"));
+            format!("{:+.2}{spread}", self.gain_db)
+        };
+        let mut row = vec![self.name.to_owned()];
+        row.extend(TABLE_SECS.map(at));
+        row.extend([
+            format!("{:.2}", self.psnr),
+            gain,
+            number(self.ssim, 4),
+            number(self.lpips, 4),
+            number(self.depth_rmse_m.map(|meters| 1e3 * meters), 1),
+            format!("{:.0}", self.primitives),
+        ]);
+        row
+    }
+}
+
+/// Writes the findings so far.
+fn findings(
+    options: &AblationOptions,
+    runs: &Runs<'_>,
+    data: &NamedData,
+    rows: &[VariantResult],
+) -> Result<(Findings, PathBuf)> {
+    let length = session::limits(options.seconds, options.steps, DEFAULT_SECONDS)?.describe();
+    let mut head = vec!["trained".to_owned()];
+    head.extend(TABLE_SECS.map(|secs| format!("at {secs} s, dB")));
+    head.extend(["at the end, dB", "gain, dB", "SSIM", "LPIPS", "depth RMSE, mm", "splats"].map(str::to_owned));
+    let findings = Findings {
+        name: "ablation",
+        title: format!("Contribution of each part: {}", data.name),
+        sentences: vec![
+            format!(
+                "Each row is trained for {length} with one part removed or changed, and scored on test images; medians of {} seeds. \
+ Gain: PSNR of the baseline minus that of the row, for the same seed.",
+                options.seeds
+            ),
+            format!("{}; fieldrig {}.", runs.adapter(), env!("CARGO_PKG_VERSION")),
+        ],
+        charts: Vec::new(),
+        tables: vec![Table {
+            title: format!("After {length}"),
+            head,
+            rows: rows.iter().map(VariantResult::row).collect(),
+        }],
+        numbers: serde_json::json!({
+            "bench": "ablation",
+            "data": data.path,
+            "method": SplatOptions::METHOD,
+            "adapter": runs.adapter(),
+            "changes": rows,
+        }),
+    };
+    let page = findings.write(runs.out())?;
+    Ok((findings, page))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::runs::tests::run;
+
+    #[test]
+    fn gains_are_computed_per_seed() {
+        let baseline = [run("a", &[(1.0, 24.0), (4.0, 26.0)], 900), run("b", &[(1.0, 23.0), (4.0, 27.0)], 900)];
+        let changed = vec![run("a", &[(1.0, 20.0), (4.0, 25.0)], 800), run("b", &[(1.0, 21.0), (4.0, 25.0)], 1000)];
+        let changed = VariantResult::of("less", &baseline, changed).expect("two runs");
+        assert_eq!((changed.psnr, changed.gain_db, changed.primitives), (25.0, 1.5, 900.0));
+        assert_eq!(changed.row()[..5], ["less", "20.50", "25.00", "25.00", "+1.50 (std 0.71)"]);
+    }
+
+    #[test]
+    fn variants_without_effect_are_skipped() {
+        let options = SplatOptions { depth_per_m: 0.0, ..SplatOptions::default() }.into();
+        let tried: Vec<&str> =
+            VARIANTS.iter().filter(|change| is_change(change, &options)).map(|change| change.name).collect();
+        assert!(!tried.contains(&"no depth loss") && tried.contains(&"no growth"), "{tried:?}");
+    }
+}

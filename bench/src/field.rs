@@ -1,0 +1,87 @@
+//! Measures the training speed of a neural field.
+
+use crate::error::Context;
+use crate::kernels::profile;
+use crate::{Error, Result};
+use serde::Serialize;
+use session::OpenGpu;
+use trainer::nerf::bench::time_steps;
+
+/// Samples of a step if they are not given, on a GPU and on the CPU.
+const DEFAULT_SAMPLES: [u32; 2] = [1 << 17, 1 << 18];
+const DEFAULT_SAMPLES_ON_CPU: [u32; 1] = [1 << 14];
+/// Timed steps if they are not given, on a GPU and on the CPU.
+const DEFAULT_REPEATS: u32 = 100;
+const DEFAULT_REPEATS_ON_CPU: u32 = 3;
+
+/// Options of [`measure`].
+#[derive(Clone, Debug)]
+pub struct FieldOptions {
+    /// Rays per step.
+    pub n_rays: u32,
+    /// Samples per step, one row each; rounded down to a multiple of the rays, with at least one per ray. Empty: the
+    /// default ones.
+    pub n_samples: Vec<u32>,
+    /// Number of timed steps, whose median is reported; 100, or 3 on the CPU, if `None`.
+    pub n_repeats: Option<u32>,
+    /// Whether to report the GPU time of each pass.
+    pub profile: bool,
+}
+
+/// Times of a training step.
+#[derive(Clone, Debug, Serialize)]
+pub struct FieldRow {
+    /// Rays per step.
+    pub rays: u32,
+    /// Samples per step.
+    pub samples: u32,
+    /// GPU time of a step, milliseconds.
+    pub step_millis: f64,
+    /// Wall time of a step, milliseconds.
+    pub step_wall_millis: f64,
+    /// Time to render as many samples of an image, milliseconds.
+    pub colors_millis: f64,
+    /// Peak size of live GPU buffers, bytes.
+    pub peak_bytes: u64,
+    /// Names and milliseconds of the passes of a step, if requested.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub passes: Vec<(&'static str, f64)>,
+}
+
+/// Measures one number of samples after the other.
+///
+/// * `on_row`: takes each row; its error ends the bench.
+///
+/// # Errors
+///
+/// If the GPU cannot be opened or its memory is insufficient.
+pub fn measure<E: From<Error>>(
+    options: &FieldOptions,
+    open_gpu: OpenGpu,
+    mut on_row: impl FnMut(&FieldRow) -> Result<(), E>,
+) -> Result<(), E> {
+    let is_software = open_gpu()?.is_software();
+    let default_samples: &[u32] = if is_software { &DEFAULT_SAMPLES_ON_CPU } else { &DEFAULT_SAMPLES };
+    let n_samples = if options.n_samples.is_empty() { default_samples } else { &options.n_samples };
+    let n_repeats = options.n_repeats.unwrap_or(if is_software { DEFAULT_REPEATS_ON_CPU } else { DEFAULT_REPEATS });
+    for (row_ix, n_samples) in n_samples.iter().enumerate() {
+        // A new device for each row, so that the memory peak is that of the row.
+        let gpu = open_gpu()?;
+        if row_ix == 0 {
+            log::info!("{}", gpu.describe());
+        }
+        let n_samples = (n_samples / options.n_rays).max(1) * options.n_rays;
+        let figures = time_steps(&gpu, options.n_rays, n_samples, n_repeats as usize)
+            .with_context(|| format!("{n_samples} samples: try fewer --samples"))?;
+        on_row(&FieldRow {
+            rays: figures.n_rays,
+            samples: figures.n_samples,
+            step_millis: figures.step_millis,
+            step_wall_millis: figures.step_wall_millis,
+            colors_millis: figures.colors_millis,
+            peak_bytes: figures.peak_bytes,
+            passes: profile(&figures.passes, options.profile),
+        })?;
+    }
+    Ok(())
+}

@@ -1,0 +1,150 @@
+//! Measures the speed of the splat kernels.
+
+use crate::error::Context;
+use crate::{Error, Result};
+use serde::Serialize;
+use session::OpenGpu;
+use std::path::PathBuf;
+use std::time::Duration;
+use trainer::gpu::PassTiming;
+use trainer::splat::arrays::SplatArrays;
+use trainer::splat::bench::{Eye, Repeats, time_kernels};
+use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
+
+/// Settings if an option is not given.
+struct Defaults {
+    sizes_px: &'static [[u32; 2]],
+    n_splats: &'static [u32],
+    n_repeats: u32,
+}
+
+/// Defaults on a GPU.
+const DEFAULTS: Defaults = Defaults {
+    sizes_px: &[[1024, 1024], [1280, 720], [1920, 1080]],
+    n_splats: &[100_000, 300_000, 1_000_000, 3_000_000],
+    n_repeats: 30,
+};
+/// Defaults on the CPU, which needs seconds for what a GPU does in a millisecond, and supports only smaller buffers.
+const DEFAULTS_ON_CPU: Defaults = Defaults { sizes_px: &[[320, 240]], n_splats: &[10_000, 30_000], n_repeats: 3 };
+
+/// Options of [`measure`].
+#[derive(Clone, Debug)]
+pub struct KernelsOptions {
+    /// An `.npz` file with splats; a synthetic cloud if `None`.
+    pub cloud: Option<PathBuf>,
+    /// Image sizes, pixels; empty: the default ones.
+    pub sizes_px: Vec<[u32; 2]>,
+    /// Numbers of splats of the synthetic cloud; empty: the default ones.
+    pub n_splats: Vec<u32>,
+    /// Number of timed images and steps, whose median is reported; 30, or 3 on the CPU, if `None`.
+    pub n_repeats: Option<u32>,
+    /// Whether the camera is inside the cloud, where it sees only some of the splats.
+    pub inside: bool,
+    /// Whether to report the GPU time of each pass.
+    pub profile: bool,
+}
+
+/// Times of an image and of a training step.
+#[derive(Clone, Debug, Serialize)]
+pub struct KernelsRow {
+    /// Size of the image, pixels.
+    pub size_px: [u32; 2],
+    /// Number of splats.
+    pub n_splats: usize,
+    /// Number of intersections of splats with tiles.
+    pub n_intersections: u64,
+    /// GPU time of an image, milliseconds.
+    pub render_millis: f64,
+    /// GPU time of a step that updates every splat, milliseconds.
+    pub step_millis: f64,
+    /// GPU time of a step that updates only the visible splats, milliseconds.
+    pub step_visible_millis: f64,
+    /// Number of visible splats.
+    pub n_visible: u64,
+    /// Wall time of an image, milliseconds.
+    pub render_wall_millis: f64,
+    /// Wall time of a step, milliseconds.
+    pub step_wall_millis: f64,
+    /// Mean color of the image.
+    pub mean_rgb: [f64; 3],
+    /// Peak size of live GPU buffers, bytes.
+    pub peak_bytes: u64,
+    /// Names and milliseconds of the passes of a step, if requested.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub passes: Vec<(&'static str, f64)>,
+}
+
+/// Measures every number of splats at one image size after the other.
+///
+/// * `on_row`: takes each row; its error ends the bench.
+///
+/// # Errors
+///
+/// If the file of the cloud is invalid, the GPU cannot be opened, or its memory is insufficient.
+pub fn measure<E: From<Error>>(
+    options: &KernelsOptions,
+    open_gpu: OpenGpu,
+    mut on_row: impl FnMut(&KernelsRow) -> Result<(), E>,
+) -> Result<(), E> {
+    let given = options
+        .cloud
+        .as_deref()
+        .map(|path| load_cloud_npz(path).with_context(|| format!("cloud {path:?}")))
+        .transpose()?;
+    let defaults = if open_gpu()?.is_software() { DEFAULTS_ON_CPU } else { DEFAULTS };
+    let sizes_px = if options.sizes_px.is_empty() { defaults.sizes_px } else { &options.sizes_px };
+    let splat_counts = if options.n_splats.is_empty() { defaults.n_splats } else { &options.n_splats };
+    let counts = given.as_ref().map_or_else(
+        || splat_counts.iter().map(|n_splats| *n_splats as usize).collect(),
+        |cloud| vec![cloud.n_splats()],
+    );
+    let n_repeats = options.n_repeats.unwrap_or(defaults.n_repeats) as usize;
+    let eye = if options.inside { Eye::Inside } else { Eye::Outside };
+    for (size_ix, size_px) in sizes_px.iter().enumerate() {
+        for n_splats in &counts {
+            // A new device for each row, so that the memory peak is that of the row.
+            let gpu = open_gpu()?;
+            if size_ix == 0 && counts.first() == Some(n_splats) {
+                log::info!("{}", gpu.describe());
+            }
+            let synthetic;
+            let cloud: &SplatArrays = match &given {
+                Some(cloud) => cloud,
+                None => {
+                    synthetic = synthetic_cloud(*n_splats, 0);
+                    &synthetic
+                }
+            };
+            let repeats = Repeats {
+                n_warm_up: n_repeats.div_ceil(3),
+                warm_up: Duration::from_millis(300),
+                n_timed: n_repeats,
+                n_consecutive: 3 * n_repeats,
+            };
+            let figures = time_kernels(&gpu, cloud, *size_px, eye, repeats).with_context(|| {
+                let [width, height] = size_px;
+                format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
+            })?;
+            on_row(&KernelsRow {
+                size_px: *size_px,
+                n_splats: *n_splats,
+                n_intersections: figures.n_intersections,
+                render_millis: figures.render_millis,
+                step_millis: figures.step_millis,
+                step_visible_millis: figures.step_visible_millis,
+                n_visible: figures.n_visible,
+                render_wall_millis: figures.render_wall_millis,
+                step_wall_millis: figures.step_wall_millis,
+                mean_rgb: figures.mean_rgb,
+                peak_bytes: figures.peak_bytes,
+                passes: profile(&figures.passes, options.profile),
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// Names and milliseconds of the passes, if requested.
+pub(crate) fn profile(passes: &[PassTiming], is_requested: bool) -> Vec<(&'static str, f64)> {
+    if is_requested { passes.iter().map(|pass| (pass.name, pass.millis)).collect() } else { Vec::new() }
+}

@@ -1,0 +1,55 @@
+//! The experiments of `fieldrig bench`: they train many models, or measure a part of the program, and draw charts.
+//!
+//! Benches that train ([`curve`], [`budget`], [`ablation`] and [`stability`]) save each run to a file when it ends, so
+//! that a bench continued in the same folder does not repeat it. [`kernels`] and [`field`] measure the speed of the
+//! trainer, [`stamps`] the errors of image stamps, and [`memory`] evaluates samples of the memory of a long run. The
+//! results are [`Findings`]: JSON with every number, charts, and a page.
+//!
+//! The caller opens the GPU, requests stops and receives reports ([`Host`], [`BenchObserver`]).
+//!
+//! ```
+//! use bench::stamps::{StampsOptions, measure};
+//!
+//! let options = StampsOptions {
+//!     rates_hz: vec![30.0],
+//!     fixed_millis: 5.0,
+//!     jitter_millis: 75.0,
+//!     drift_ppm: 50.0,
+//!     seconds: 60.0,
+//!     settle_seconds: 10.0,
+//!     seeds: 2,
+//!     out: "bench-stamps".into(),
+//! };
+//! let errors = measure(&options)?;
+//! let [calibrated, uncalibrated] = &errors[..] else { panic!("one camera rate, calibrated and not") };
+//! assert!(calibrated.within_1_ms_frac > 0.99);
+//! // A fixed latency cannot be detected from stamps.
+//! assert!((uncalibrated.median_millis - 5.0).abs() < 0.5);
+//! # Ok::<(), bench::Error>(())
+//! ```
+
+pub mod ablation;
+pub mod budget;
+pub mod curve;
+mod disturb;
+mod error;
+pub mod field;
+mod findings;
+mod growth;
+pub mod kernels;
+pub mod memory;
+mod peer;
+mod runs;
+pub mod stability;
+pub mod stamps;
+mod statistics;
+mod variant;
+mod viewer;
+
+pub use disturb::Disturbance;
+pub use findings::{BenchResult, Findings};
+pub use growth::{Excluded, Growth, Sample, resident_bytes};
+pub use runs::{BenchObserver, Disturbed, Host, Run, RunReport, RunScores, RunSettings, RunsOptions};
+// Benches fail where sessions and files do, so their errors have the same causes and classes.
+pub use session::{Error, Result};
+pub use viewer::Viewer;

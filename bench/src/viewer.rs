@@ -1,0 +1,284 @@
+//! A viewer for benches: a WebSocket client that requests images back to back and discards them.
+//!
+//! It runs in the measured process, so it reads through one small buffer.
+
+use crate::Result;
+use crate::error::{Context, ensure, failed};
+use kinematics::Transform;
+use nalgebra::{Point3, Vector3};
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Size of the requested images, pixels.
+const SIZE_PX: [u32; 2] = [960, 720];
+/// Angle between two views on the circle around the scene, radians.
+const STEP_RAD: f64 = 0.05;
+/// The connection counts as dead after this long without a byte: the server sends its status several times a second.
+const MAX_SILENCE: Duration = Duration::from_secs(120);
+/// Maximum length of a text message; the list of keyframes is the longest.
+const MAX_TEXT_BYTES: u64 = 16 << 20;
+/// Maximum length of the header of a binary message.
+const MAX_HEADER_BYTES: u64 = 64 << 10;
+
+const TEXT: u8 = 1;
+const BINARY: u8 = 2;
+const CLOSE: u8 = 8;
+const PING: u8 = 9;
+const PONG: u8 = 10;
+
+/// A connected viewer; it disconnects when dropped.
+#[derive(Debug)]
+pub struct Viewer {
+    stream: TcpStream,
+    n_pictures: Arc<AtomicU64>,
+    thread: Option<JoinHandle<Result<()>>>,
+}
+
+impl Viewer {
+    /// Connects to a server on this machine and starts to request images.
+    ///
+    /// # Errors
+    ///
+    /// If the server does not accept the connection.
+    pub fn connect(address: SocketAddr) -> Result<Self> {
+        let stream = TcpStream::connect(address).with_context(|| format!("cannot connect to {address}"))?;
+        stream.set_read_timeout(Some(MAX_SILENCE)).context("cannot set a timeout")?;
+        let n_pictures = Arc::new(AtomicU64::new(0));
+        let mut client = Client {
+            reader: BufReader::new(stream.try_clone().context("cannot share a connection")?),
+            stream: stream.try_clone().context("cannot share a connection")?,
+            n_pictures: n_pictures.clone(),
+            n_requested: 0,
+            center_m: Point3::origin(),
+            radius_m: 1.0,
+        };
+        client.handshake(address)?;
+        let thread = std::thread::Builder::new().name("viewer".into()).spawn(move || client.run());
+        Ok(Self { stream, n_pictures, thread: Some(thread.context("cannot start a thread")?) })
+    }
+
+    /// Number of complete images received so far.
+    #[must_use]
+    pub fn n_pictures(&self) -> u64 {
+        self.n_pictures.load(Ordering::Relaxed)
+    }
+
+    /// Whether it still receives.
+    #[must_use]
+    pub fn is_connected(&self) -> bool {
+        self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
+}
+
+impl Drop for Viewer {
+    fn drop(&mut self) {
+        // Fails if the server has already closed the connection.
+        let _ = self.stream.shutdown(Shutdown::Both);
+        if let Some(Ok(Err(error))) = self.thread.take().map(JoinHandle::join) {
+            log::debug!("a viewer's connection ended: {error:#}");
+        }
+    }
+}
+
+struct Client {
+    reader: BufReader<TcpStream>,
+    stream: TcpStream,
+    n_pictures: Arc<AtomicU64>,
+    n_requested: u64,
+    /// Center of the scene in world.
+    center_m: Point3<f64>,
+    radius_m: f64,
+}
+
+impl Client {
+    fn handshake(&mut self, address: SocketAddr) -> Result<()> {
+        write!(
+            self.stream,
+            "GET /ws HTTP/1.1\r\nHost: {address}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
+             Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        )?;
+        let mut line = String::new();
+        self.reader.read_line(&mut line)?;
+        ensure!(line.starts_with("HTTP/1.1 101"), "the server responded {:?}, expected a WebSocket", line.trim_end());
+        while line.trim_end() != "" {
+            line.clear();
+            ensure!(self.reader.read_line(&mut line)? > 0, "the server closed the connection");
+        }
+        Ok(())
+    }
+
+    fn run(mut self) -> Result<()> {
+        self.request_picture()?;
+        loop {
+            let (opcode, n_bytes) = self.next_frame()?;
+            match opcode {
+                TEXT => self.handle_text(n_bytes)?,
+                BINARY => self.handle_binary(n_bytes)?,
+                PING => {
+                    let mut contents = Vec::new();
+                    (&mut self.reader).take(n_bytes.min(125)).read_to_end(&mut contents)?;
+                    self.send(PONG, &contents)?;
+                }
+                CLOSE => return Ok(()),
+                _ => self.skip(n_bytes)?,
+            }
+        }
+    }
+
+    fn handle_text(&mut self, n_bytes: u64) -> Result<()> {
+        ensure!(n_bytes <= MAX_TEXT_BYTES, "a text message of {n_bytes} bytes, expected at most {MAX_TEXT_BYTES}");
+        let message: Value = serde_json::from_reader((&mut self.reader).take(n_bytes))?;
+        match message["type"].as_str() {
+            Some("scene") => {
+                let number = |value: &Value| value.as_f64().ok_or_else(|| failed!("a scene message lacks a number"));
+                let center = &message["center_m"];
+                self.center_m = Point3::new(number(&center[0])?, number(&center[1])?, number(&center[2])?);
+                self.radius_m = number(&message["radius_m"])?;
+            }
+            // There is no image yet.
+            Some("error") => {
+                std::thread::sleep(Duration::from_millis(200));
+                self.request_picture()?;
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn handle_binary(&mut self, n_bytes: u64) -> Result<()> {
+        let mut length = [0; 4];
+        self.reader.read_exact(&mut length)?;
+        let n_header = u64::from(u32::from_le_bytes(length));
+        ensure!(n_header <= n_bytes.saturating_sub(4).min(MAX_HEADER_BYTES), "a header of {n_header} bytes");
+        let header: Value = serde_json::from_reader((&mut self.reader).take(n_header))?;
+        self.skip(n_bytes.saturating_sub(4 + n_header))?;
+        if header["type"] == "picture" && header["last"] == true {
+            self.n_pictures.fetch_add(1, Ordering::Relaxed);
+            self.request_picture()?;
+        }
+        Ok(())
+    }
+
+    /// Requests the next image on a circle around the scene.
+    fn request_picture(&mut self) -> Result<()> {
+        let angle = self.n_requested as f64 * STEP_RAD;
+        let offset = Vector3::new(angle.cos(), angle.sin(), 0.7) * 1.5 * self.radius_m;
+        // `face_towards` has z forward and y up, but a camera's y axis points down.
+        let world_from_camera = Transform::face_towards(&(self.center_m + offset), &self.center_m, &-Vector3::z());
+        let request = json!({
+            "type": "render",
+            "id": self.n_requested,
+            "world_from_camera": world_from_camera.to_homogeneous().transpose().as_slice(),
+            "size_px": SIZE_PX,
+            "projection": { "kind": "pinhole", "vertical_fov_rad": 0.9 },
+            "outputs": ["color", "depth"],
+        });
+        self.n_requested += 1;
+        self.send(TEXT, request.to_string().as_bytes())
+    }
+
+    /// Opcode and length of the next frame; the server sends each message as one frame.
+    fn next_frame(&mut self) -> Result<(u8, u64)> {
+        let mut head = [0; 2];
+        self.reader.read_exact(&mut head)?;
+        let is_final = head[0] & 0x80 != 0;
+        ensure!(is_final, "the server sent a fragmented message, expected one frame per message");
+        let n_bytes = match head[1] {
+            126 => {
+                let mut bytes = [0; 2];
+                self.reader.read_exact(&mut bytes)?;
+                u64::from(u16::from_be_bytes(bytes))
+            }
+            127 => {
+                let mut bytes = [0; 8];
+                self.reader.read_exact(&mut bytes)?;
+                u64::from_be_bytes(bytes)
+            }
+            short @ 0..126 => u64::from(short),
+            masked => return Err(failed!("the server sent a masked frame (length byte {masked})")),
+        };
+        Ok((head[0] & 0x0f, n_bytes))
+    }
+
+    fn skip(&mut self, n_bytes: u64) -> Result<()> {
+        let n_skipped = std::io::copy(&mut (&mut self.reader).take(n_bytes), &mut std::io::sink())?;
+        ensure!(n_skipped == n_bytes, "the server closed the connection within a message");
+        Ok(())
+    }
+
+    /// Sends a frame. Its mask is zero: the protocol requires one, but on loopback there is no proxy to protect.
+    fn send(&mut self, opcode: u8, contents: &[u8]) -> Result<()> {
+        let mut frame = vec![0x80 | opcode];
+        match u8::try_from(contents.len()) {
+            Ok(n @ 0..126) => frame.push(0x80 | n),
+            _ => {
+                frame.push(0x80 | 126);
+                let too_long = |_| failed!("a message of {} bytes, expected at most 65535", contents.len());
+                frame.extend(u16::try_from(contents.len()).map_err(too_long)?.to_be_bytes());
+            }
+        }
+        frame.extend([0; 4]);
+        frame.extend(contents);
+        Ok(self.stream.write_all(&frame)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Instant;
+    use trainer::Picture;
+    use viz::{Hub, Server, ServerConfig};
+
+    #[test]
+    fn viewer_receives_pictures_and_disconnects() {
+        let hub = Hub::new();
+        let listen = "127.0.0.1:0".parse().expect("an address");
+        let server = Server::start(ServerConfig { listen }, hub.clone()).expect("a free port");
+        let viewer = Viewer::connect(server.address()).expect("served");
+        let started = Instant::now();
+        let mut n_drawn = 0;
+        while viewer.n_pictures() < 3 {
+            assert!(viewer.is_connected() && started.elapsed() < Duration::from_secs(60), "{}", viewer.n_pictures());
+            let Some(pending) = hub.next_request() else {
+                std::thread::sleep(Duration::from_millis(1));
+                continue;
+            };
+            if n_drawn == 0 {
+                // The viewer repeats the request.
+                pending.fail("no image yet");
+            } else {
+                let size_px = pending.request.size_px;
+                let n = (size_px[0] * size_px[1]) as usize;
+                pending.deliver(Picture { size_px, rgba_srgb: vec![128; 4 * n], depth_m: vec![1.0; n] });
+            }
+            n_drawn += 1;
+        }
+        assert!(n_drawn >= 4, "one failed request and three images, with one stage each if the server renders fast");
+        drop(viewer);
+        while hub.n_clients() > 0 {
+            assert!(started.elapsed() < Duration::from_secs(60));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn connecting_to_a_non_websocket_server_fails() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+        let address = listener.local_addr().expect("bound");
+        let other = std::thread::spawn(move || {
+            let (mut stream, _) = listener.accept().expect("a client");
+            let n_read = stream.read(&mut [0; 4096]).expect("a request");
+            assert!(n_read > 0);
+            stream.write_all(b"HTTP/1.1 404 Not Found\r\n\r\n").expect("sent");
+        });
+        let error_message = Viewer::connect(address).expect_err("no WebSocket").to_string();
+        assert!(error_message.contains("404"), "{error_message}");
+        other.join().expect("no panic");
+    }
+}

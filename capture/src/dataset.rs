@@ -1,0 +1,168 @@
+//! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
+
+use crate::downscale;
+use crate::error::{Context, ensure};
+use drivers::dataset::{Dataset, DatasetImage, DepthImage};
+use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
+use kinematics::{Intrinsics, Undistortion};
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
+
+/// Name of the only camera of a dataset.
+const CAMERA: &str = "camera";
+
+/// The photos of a dataset as keyframes, undistorted and scaled, with poses as in the dataset.
+#[derive(Debug)]
+pub struct LoadedDataset {
+    /// In the order of the dataset.
+    pub keyframes: Vec<Arc<Keyframe>>,
+    /// Names of the photos, in the same order.
+    pub names: Vec<String>,
+    /// Notes for the user.
+    pub notes: Vec<String>,
+    /// Files that did not decode.
+    pub data_losses: Vec<String>,
+}
+
+/// Decodes all photos in parallel.
+///
+/// `holdout` assigns the splits. `scale_frac` scales the undistorted photos (not their depth) by averaging areas; 1
+/// keeps their size. `on_progress` receives the number of finished photos, from any thread. A photo that does not decode
+/// is skipped and reported in `data_losses`.
+///
+/// # Errors
+///
+/// If no photo decodes, the scaled photos would be too small, or `holdout` does not match the names.
+pub fn load(
+    dataset: &Dataset,
+    holdout: &Holdout,
+    scale_frac: f64,
+    on_progress: &(dyn Fn(usize) + Sync),
+) -> crate::Result<LoadedDataset> {
+    for image in &dataset.images {
+        downscale::intrinsics(&image.intrinsics, scale_frac).with_context(|| image.name.clone())?;
+    }
+    let names: Vec<&str> = dataset.images.iter().map(|image| image.name.as_str()).collect();
+    let splits = holdout.splits(&names).with_context(|| dataset.path.display().to_string())?;
+    let n_done = AtomicUsize::new(0);
+    let camera: Arc<str> = CAMERA.into();
+    let load_one = |(lens, image, split): (&LensMaps, &DatasetImage, Split)| {
+        let keyframe = keyframe(lens, image, scale_frac);
+        on_progress(n_done.fetch_add(1, Ordering::Relaxed) + 1);
+        (
+            image.name.clone(),
+            keyframe.map(|(keyframe, depth)| (Keyframe { camera: camera.clone(), split, ..keyframe }, depth)),
+        )
+    };
+
+    // Photos with the same lens follow each other, so only one set of maps is in memory at a time.
+    let mut results = Vec::with_capacity(names.len());
+    let mut start = 0;
+    for run in dataset.images.chunk_by(|a, b| a.intrinsics == b.intrinsics) {
+        let lens = LensMaps::of(&run[0].intrinsics);
+        let jobs = run.par_iter().zip(&splits[start..start + run.len()]);
+        results.par_extend(jobs.map(|(image, split)| load_one((&lens, image, *split))));
+        start += run.len();
+    }
+
+    let (notes, data_losses) = (dataset.notes.clone(), dataset.data_losses.clone());
+    let mut loaded = LoadedDataset { keyframes: Vec::new(), names: Vec::new(), notes, data_losses };
+    let (mut image_errors, mut depth_errors) = (Vec::new(), Vec::new());
+    for (name, result) in results {
+        match result {
+            Ok((keyframe, depth_error)) => {
+                loaded.keyframes.push(Arc::new(keyframe));
+                loaded.names.push(name);
+                depth_errors.extend(depth_error);
+            }
+            Err(error) => image_errors.push(format!("{error:#}")),
+        }
+    }
+    ensure!(
+        !loaded.keyframes.is_empty(),
+        "{}: no photo can be used: {}",
+        dataset.path.display(),
+        image_errors.join("; ")
+    );
+    for (what, errors) in [("image", image_errors), ("depth image", depth_errors)] {
+        if !errors.is_empty() {
+            let n_unusable = counted(errors.len() as u64, what);
+            loaded.data_losses.push(format!("{n_unusable} cannot be used: {}", errors.join("; ")));
+        }
+    }
+    Ok(loaded)
+}
+
+/// Undistortion maps of one lens; empty for a lens without distortion.
+struct LensMaps {
+    color: Option<Undistortion>,
+    /// For depth images whose size differs from that of the photos; computed for the first such image.
+    depth: OnceLock<Undistortion>,
+}
+
+impl LensMaps {
+    fn of(intrinsics: &Intrinsics) -> Self {
+        let color = (!intrinsics.is_pinhole()).then(|| Undistortion::new(intrinsics));
+        Self { color, depth: OnceLock::new() }
+    }
+
+    fn undistorted_color(&self, rgba: Vec<u8>) -> Result<Vec<u8>, kinematics::Error> {
+        match &self.color {
+            Some(map) => map.apply_rgba(&rgba),
+            None => Ok(rgba),
+        }
+    }
+
+    fn undistorted_depth(&self, depth: &DepthImage) -> Result<Vec<f32>, kinematics::Error> {
+        let Some(color) = &self.color else { return Ok(depth.depth_m.clone()) };
+        let size_px = depth.intrinsics.size_px;
+        if color.size_px() == size_px {
+            return color.apply_depth(&depth.depth_m);
+        }
+        let cached = self.depth.get_or_init(|| Undistortion::new(&depth.intrinsics));
+        match cached.size_px() == size_px {
+            true => cached.apply_depth(&depth.depth_m),
+            false => Undistortion::new(&depth.intrinsics).apply_depth(&depth.depth_m),
+        }
+    }
+}
+
+/// The keyframe of one photo, and an error message if its depth does not decode. The caller sets camera and split.
+fn keyframe(lens: &LensMaps, image: &DatasetImage, scale_frac: f64) -> crate::Result<(Keyframe, Option<String>)> {
+    let loaded = image.load()?;
+    let in_image = || image.name.clone();
+    let depth = loaded.depth.as_ref().zip(image.depth.as_ref()).map(|(depth, file)| {
+        Ok::<_, crate::Error>(DepthMap {
+            size_px: depth.intrinsics.size_px,
+            focal_px: depth.intrinsics.focal_px,
+            principal_px: depth.intrinsics.principal_px,
+            depth_m: lens.undistorted_depth(depth).with_context(in_image)?.into(),
+            world_from_camera: file.world_from_camera,
+        })
+    });
+    let depth = depth.transpose()?;
+    let rgba = lens.undistorted_color(loaded.rgba_srgb).with_context(in_image)?;
+    let scaled = image.intrinsics.scaled(scale_frac);
+    let rgba = downscale::rgba(rgba, image.intrinsics.size_px, scaled.size_px);
+    let keyframe = Keyframe {
+        camera: CAMERA.into(),
+        stamp: image.stamp,
+        size_px: scaled.size_px,
+        focal_px: scaled.focal_px,
+        principal_px: scaled.principal_px,
+        rgba_srgb: rgba.into(),
+        depth,
+        world_from_camera: image.world_from_camera,
+        twist: None,
+        readout_secs: 0.0,
+        joint_twists: [].into(),
+        base: None,
+        split: Split::Train,
+        truth: None,
+    };
+    Ok((keyframe, loaded.depth_error))
+}
+
+#[cfg(test)]
+mod tests;

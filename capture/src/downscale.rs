@@ -1,0 +1,119 @@
+//! Downscales training images by averaging areas, together with their intrinsics.
+
+use crate::Error;
+use kinematics::Intrinsics;
+
+/// Minimum side of a scaled image in pixels: smaller images contain too little detail for training.
+const MIN_SIDE_PX: u32 = 16;
+/// Allowed fractions of the width and height.
+const SCALE_RANGE: std::ops::RangeInclusive<f64> = 0.05..=1.0;
+
+/// Parses a scale factor for the width and height of training images, such as `0.5`.
+///
+/// # Errors
+///
+/// If the text is not a number from 0.05 to 1; the message gives the range.
+pub fn parse_scale(text: &str) -> Result<f64, String> {
+    let share = text.parse::<f64>().ok().filter(|share| SCALE_RANGE.contains(share));
+    share.ok_or_else(|| format!("must be a number from {} to {}", SCALE_RANGE.start(), SCALE_RANGE.end()))
+}
+
+/// Intrinsics of images scaled to the fraction `share` of their width and height; returns an error if they become too
+/// small.
+pub(crate) fn intrinsics(full: &Intrinsics, share: f64) -> Result<Intrinsics, Error> {
+    let scaled = full.scaled(share);
+    if scaled.size_px != full.size_px && scaled.size_px.iter().any(|side| *side < MIN_SIDE_PX) {
+        let [[from_width, from_height], [width, height]] = [full.size_px, scaled.size_px];
+        return Err(Error::BadInput(format!(
+            "scale {share}: images of {from_width}x{from_height} pixels would have {width}x{height}, \
+             the minimum is {MIN_SIDE_PX} along each side"
+        )));
+    }
+    Ok(scaled)
+}
+
+/// Scales an image `[height, width, 4]` with alpha from the size `from_px`, width and height, to the smaller `to_px`.
+///
+/// The color is unchanged if the sizes are equal. A new pixel is masked (alpha 0) if any pixel it covers is masked, so
+/// that no masked content leaks into the result.
+#[must_use]
+pub fn rgba(rgba: Vec<u8>, from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
+    let mut rgba = if from_px == to_px { rgba } else { area_mean(&rgba, from_px, to_px) };
+    for alpha in rgba.iter_mut().skip(3).step_by(4) {
+        *alpha = if *alpha == 255 { 255 } else { 0 };
+    }
+    rgba
+}
+
+/// Shrinks `[height, width, 4]`. Each new pixel is the mean over the area it covers, including fractions of pixels.
+fn area_mean(rgba: &[u8], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<u8> {
+    let [from_width, to_width] = [from_px[0] as usize, to_px[0] as usize];
+    let (columns, rows) = (coverage(from_px[0], to_px[0]), coverage(from_px[1], to_px[1]));
+    let mut out = Vec::with_capacity(4 * to_width * rows.len());
+    let mut sums = vec![[0.0_f32; 4]; from_width];
+    for covered_rows in &rows {
+        sums.fill([0.0; 4]);
+        for &(y, share) in covered_rows {
+            let row = rgba[4 * y * from_width..4 * (y + 1) * from_width].as_chunks::<4>().0;
+            for (sum, pixel) in sums.iter_mut().zip(row) {
+                (0..4).for_each(|channel| sum[channel] += share * f32::from(pixel[channel]));
+            }
+        }
+        for covered_columns in &columns {
+            let mean = |channel: usize| covered_columns.iter().map(|&(x, share)| share * sums[x][channel]).sum::<f32>();
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a mean of bytes is a byte")]
+            out.extend((0..4).map(|channel| mean(channel).round() as u8));
+        }
+    }
+    out
+}
+
+/// For each new pixel of a line, the old pixels it covers and their weights, which add up to 1.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positions lie inside the line")]
+fn coverage(from: u32, to: u32) -> Vec<Vec<(usize, f32)>> {
+    let ratio = f64::from(from) / f64::from(to);
+    let covered = |ix: u32| {
+        let (start, end) = (f64::from(ix) * ratio, (f64::from(ix + 1) * ratio).min(f64::from(from)));
+        let overlap = |source_ix: usize| ((source_ix as f64 + 1.0).min(end) - (source_ix as f64).max(start)) / ratio;
+        let source_pixels = start as usize..(end.ceil() as usize).min(from as usize);
+        source_pixels
+            .map(|source_ix| (source_ix, overlap(source_ix) as f32))
+            .filter(|(_, share)| *share > 1e-6)
+            .collect()
+    };
+    (0..to).map(covered).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use kinematics::Lens;
+
+    #[test]
+    fn partial_pixels_are_weighted_by_area() {
+        let shares = coverage(5, 2);
+        assert_eq!(shares[0], [(0, 0.4), (1, 0.4), (2, 0.2)]);
+        assert_eq!(shares[1], [(2, 0.2), (3, 0.4), (4, 0.4)]);
+    }
+
+    #[test]
+    fn scale_and_image_size_are_bounded() {
+        assert_eq!(parse_scale("0.05"), Ok(0.05));
+        for invalid in ["0", "0.049", "1.01", "nan", "-1", "half"] {
+            assert!(parse_scale(invalid).is_err_and(|message| message.contains("0.05 to 1")), "{invalid}");
+        }
+        let full = Intrinsics {
+            size_px: [160, 120],
+            focal_px: [100.0; 2],
+            principal_px: [80.0, 61.0],
+            lens: Lens::Pinhole,
+            rectified: true,
+        };
+        let half = intrinsics(&full, 0.5).expect("large enough");
+        assert_eq!((half.size_px, half.focal_px, half.principal_px), ([80, 60], [50.0; 2], [40.0, 30.5]));
+        let message = intrinsics(&full, 0.1).expect_err("12 rows").to_string();
+        assert!(message.contains("160x120") && message.contains("16x12"), "{message}");
+        let small = Intrinsics { size_px: [8, 6], ..full };
+        assert_eq!(intrinsics(&small, 1.0).expect("unchanged"), small);
+    }
+}

@@ -1,0 +1,308 @@
+//! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
+//! come out of a bounded queue.
+
+use crate::error::{Context, Error};
+use crate::join::{Change, Join, JoinEvent, PosedImage};
+use crate::stations::Stations;
+use crate::stop::Stop;
+use drivers::recording::Recorder;
+use drivers::{PixelFormat, Sample, Source, clock};
+use kinematics::{Stamp, Transform};
+use parking_lot::Mutex;
+use std::collections::{BTreeMap, HashMap};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, OnceLock};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live
+/// devices drop (and count) images.
+const MAX_WAITING: usize = 8;
+
+/// A live image that appears to be older than this was stamped by another clock, such as a simulator's.
+const MAX_LIVE_AGE_SECS: f64 = 60.0;
+
+/// Receives the camera images of a running input, for example to show them.
+pub trait ImageObserver: Send {
+    /// Whether anyone looks at images at the moment. If not, they are not decoded.
+    fn needs_images(&self) -> bool;
+
+    /// Takes an image.
+    fn observe(&self, image: ObservedImage);
+}
+
+/// A camera image with its pose, as it arrived.
+#[derive(Clone, Debug)]
+pub struct ObservedImage {
+    /// Name of the camera.
+    pub camera: Arc<str>,
+    /// Mid-exposure.
+    pub stamp: Stamp,
+    /// The same moment on this process's clock; the time of arrival if the stamp is on another clock.
+    pub captured_at: Instant,
+    /// Width and height, pixels.
+    pub size_px: [u32; 2],
+    /// The image, not undistorted.
+    pub pixels: ObservedPixels,
+    /// Pose of the camera at the stamp, with the correction of its station.
+    pub world_from_camera: Transform,
+    /// Focal length, pixels.
+    pub focal_px: [f64; 2],
+    /// Principal point, pixels.
+    pub principal_px: [f64; 2],
+}
+
+/// Pixels of an [`ObservedImage`].
+#[derive(Clone, Debug)]
+pub enum ObservedPixels {
+    /// A complete JPEG file.
+    Jpeg(Arc<[u8]>),
+    /// `[height, width, 3]`, sRGB.
+    Rgb(Arc<[u8]>),
+}
+
+/// State of the input that the run reads while it runs.
+#[derive(Debug, Default)]
+struct Shared {
+    first_image: OnceLock<Instant>,
+    rejected: Mutex<BTreeMap<String, u64>>,
+    source_failed: AtomicBool,
+}
+
+/// The parts of the input.
+pub struct Input {
+    /// The open devices or recording.
+    pub source: Box<dyn Source>,
+    /// Makes keyframes of the samples.
+    pub join: Join,
+    /// Corrects base poses at stations, if the base moves.
+    pub stations: Option<Stations>,
+    /// Records all samples, if they are recorded.
+    pub recorder: Option<Recorder>,
+    /// Whether devices are read in real time. The stamps of a recording are from another time.
+    pub is_live: bool,
+    /// Focal length and principal point of every camera, pixels.
+    pub camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
+}
+
+/// The input after it ended.
+pub struct InputResult {
+    /// The join with its keyframes and counts.
+    pub join: Join,
+    /// The stations with their reports, if the base moves.
+    pub stations: Option<Stations>,
+    /// Error that ended the input early.
+    pub input_error: Option<drivers::Error>,
+    /// Error that ended the recording early.
+    pub recording_error: Option<crate::Error>,
+}
+
+/// The running input.
+pub struct Feed {
+    changes: Receiver<Change>,
+    shared: Arc<Shared>,
+    thread: JoinHandle<InputResult>,
+    ended: bool,
+}
+
+impl Feed {
+    /// Starts to read `input`. The feed ends when the input ends, at `stop`, or at an error of the source.
+    ///
+    /// # Errors
+    ///
+    /// If no thread can be started.
+    pub fn start(input: Input, observer: Box<dyn ImageObserver>, stop: Stop) -> crate::Result<Self> {
+        let (sender, changes) = sync_channel(MAX_WAITING);
+        let shared = Arc::new(Shared::default());
+        let pump = Pump { input, observer, stop, sender, shared: shared.clone() };
+        let thread =
+            std::thread::Builder::new().name("input".into()).spawn(|| pump.run()).context("cannot start a thread")?;
+        Ok(Self { changes, shared, thread, ended: false })
+    }
+
+    /// Time at which the first image arrived; `None` before.
+    #[must_use]
+    pub fn first_image(&self) -> Option<Instant> {
+        self.shared.first_image.get().copied()
+    }
+
+    /// Number of rejected images so far, by [`Rejection::name`](crate::Rejection::name).
+    #[must_use]
+    pub fn rejected(&self) -> BTreeMap<String, u64> {
+        self.shared.rejected.lock().clone()
+    }
+
+    /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
+    pub fn next(&mut self, timeout: Duration) -> Option<Change> {
+        match self.changes.recv_timeout(timeout) {
+            Ok(change) => Some(change),
+            Err(RecvTimeoutError::Timeout) => None,
+            Err(RecvTimeoutError::Disconnected) => {
+                self.ended = true;
+                None
+            }
+        }
+    }
+
+    /// Whether the input ended and all its changes were taken.
+    #[must_use]
+    pub fn ended(&self) -> bool {
+        self.ended
+    }
+
+    /// Whether the source failed.
+    #[must_use]
+    pub fn source_failed(&self) -> bool {
+        self.shared.source_failed.load(Ordering::Relaxed)
+    }
+
+    /// Ends the input and waits for its thread, which closes the recording.
+    ///
+    /// # Errors
+    ///
+    /// If the thread panicked, which is a bug.
+    pub fn finish(self) -> crate::Result<InputResult> {
+        // Wakes an input thread that is waiting to send.
+        drop(self.changes);
+        self.thread.join().map_err(|_| Error::Failed("the input thread panicked: this is a bug".into()))
+    }
+}
+
+struct Pump {
+    input: Input,
+    observer: Box<dyn ImageObserver>,
+    stop: Stop,
+    sender: SyncSender<Change>,
+    shared: Arc<Shared>,
+}
+
+/// The trainer accepts no more keyframes.
+struct TrainerGone;
+
+impl Pump {
+    fn run(mut self) -> InputResult {
+        let mut recording_error = None;
+        let mut input_error = None;
+        while !self.stop.requested() {
+            let sample = match self.input.source.next_sample() {
+                Ok(Some(sample)) => sample,
+                Ok(None) => break,
+                Err(error) => {
+                    self.shared.source_failed.store(true, Ordering::Relaxed);
+                    input_error = Some(error);
+                    break;
+                }
+            };
+            if let (Some(recorder), None) = (&mut self.input.recorder, &recording_error)
+                && let Err(error) = recorder.write(&sample)
+            {
+                let error = Error::from(error);
+                log::error!("the recording ends here, the run continues: {error:#}");
+                recording_error = Some(error);
+            }
+            if matches!(sample, Sample::Image(_)) {
+                self.shared.first_image.get_or_init(Instant::now);
+            }
+            let newest = sample.stamp();
+            let events = self.input.join.push(sample);
+            let newest = self.input.join.shifted(newest);
+            if self.forward(events).and_then(|()| self.advance_to(newest)).is_err() {
+                break;
+            }
+        }
+        let events = self.input.join.finish();
+        // If the trainer has ended, it needs no more keyframes.
+        let _ = self.forward(events).and_then(|()| self.release_held());
+        if let (Some(recorder), None) = (self.input.recorder.take(), &recording_error)
+            && let Err(error) = recorder.finish()
+        {
+            recording_error = Some(error.into());
+        }
+        InputResult { join: self.input.join, stations: self.input.stations, input_error, recording_error }
+    }
+
+    fn forward(&mut self, events: Vec<JoinEvent>) -> Result<(), TrainerGone> {
+        for event in events {
+            match event {
+                JoinEvent::Accepted(keyframe) => self.apply(Change::Accepted(keyframe))?,
+                JoinEvent::Evicted { camera, stamp } => self.apply(Change::Evicted { camera, stamp })?,
+                JoinEvent::PosedImage(posed_image) => self.publish_image(&posed_image),
+                JoinEvent::Rejected { why, .. } => {
+                    *self.shared.rejected.lock().entry(why.name().to_owned()).or_default() += 1;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn apply(&mut self, change: Change) -> Result<(), TrainerGone> {
+        let forwarded = match &mut self.input.stations {
+            Some(stations) => stations.push(change),
+            None => vec![change],
+        };
+        self.send(forwarded)
+    }
+
+    fn advance_to(&mut self, newest: Stamp) -> Result<(), TrainerGone> {
+        let forwarded = self.input.stations.as_mut().map(|stations| stations.advance_to(newest));
+        self.send(forwarded.unwrap_or_default())
+    }
+
+    /// Releases the keyframes that wait for a station, because no more will come.
+    fn release_held(&mut self) -> Result<(), TrainerGone> {
+        let forwarded = self.input.stations.as_mut().map(Stations::finish);
+        self.send(forwarded.unwrap_or_default())
+    }
+
+    fn send(&self, changes: Vec<Change>) -> Result<(), TrainerGone> {
+        changes.into_iter().try_for_each(|change| self.sender.send(change).map_err(|_| TrainerGone))
+    }
+
+    /// Passes a camera image to the observer.
+    fn publish_image(&self, posed_image: &PosedImage) {
+        if !self.observer.needs_images() {
+            return;
+        }
+        let image = &posed_image.image;
+        let pixels = match image.format {
+            PixelFormat::Rgb8 => ObservedPixels::Rgb(image.data.clone()),
+            // Some cameras send JPEG without tables, which browsers cannot show.
+            PixelFormat::Jpeg => match drivers::jpeg::first_image(&image.data) {
+                Ok(jpeg) => ObservedPixels::Jpeg(jpeg.as_ref().into()),
+                Err(_) => return,
+            },
+            PixelFormat::Bgr8 | PixelFormat::Gray8 | PixelFormat::Yuv { .. } | PixelFormat::Png => {
+                match image.decode_rgb() {
+                    Ok(rgb) => ObservedPixels::Rgb(rgb.into()),
+                    // The join counts images that do not decode.
+                    Err(_) => return,
+                }
+            }
+            PixelFormat::DepthU16 { .. } => return,
+        };
+        let Some(&(focal_px, principal_px)) = self.input.camera_intrinsics.get(&image.camera) else { return };
+        let pose = |stations: &Stations| stations.corrected_pose(&image.camera, &posed_image.world_from_camera);
+        self.observer.observe(ObservedImage {
+            camera: image.camera.clone(),
+            stamp: image.stamp,
+            captured_at: self.captured_at(image.stamp),
+            size_px: image.size_px,
+            pixels,
+            world_from_camera: self.input.stations.as_ref().map_or(posed_image.world_from_camera, pose),
+            focal_px,
+            principal_px,
+        });
+    }
+
+    /// Time at which an image was captured, or now if its stamp is on another clock (recordings, simulations).
+    fn captured_at(&self, stamp: Stamp) -> Instant {
+        let now = Instant::now();
+        let age_secs = clock::now().secs_since(stamp);
+        if self.input.is_live && (0.0..MAX_LIVE_AGE_SECS).contains(&age_secs) {
+            now.checked_sub(Duration::from_secs_f64(age_secs)).unwrap_or(now)
+        } else {
+            now
+        }
+    }
+}

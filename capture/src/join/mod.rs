@@ -1,0 +1,459 @@
+//! Joins images, joint readings and calibration to keyframes. This is the only place where devices and trainer meet.
+//!
+//! Samples are pushed one by one. The result depends only on their order, so a live lockstep run, its recording and the
+//! replay of that recording give bit-identical keyframes.
+
+mod accept;
+mod assemble;
+mod change;
+mod motion;
+mod pixels;
+mod ranges;
+mod rejection;
+mod spacing;
+mod station_detector;
+mod store;
+#[cfg(test)]
+mod tests;
+mod waiting;
+
+pub use change::Change;
+pub(crate) use motion::{CameraPose, Motion};
+pub use rejection::{Counts, Rejection, SampleUse};
+
+use crate::config::{self, BaseDriver, CameraDriver, Parent, Rig};
+use crate::error::Context;
+use accept::Acceptance;
+use assemble::Undistorter;
+use drivers::{Image, Sample, TruthImage};
+use keyframe::{Keyframe, KeyframeList, RangePoints, Split};
+use kinematics::{HistoryError, Stamp, Transform};
+use ranges::RangeScans;
+use spacing::Spacing;
+use std::sync::Arc;
+use store::KeyframeStore;
+use waiting::{Partner, Waiting};
+
+/// Converts samples to keyframes.
+///
+/// Samples go in one by one with [`Join::push`]; [`Join::finish`] ends the stream. The store of keyframes is bounded:
+/// beyond its limits, the most redundant keyframe is evicted.
+pub struct Join {
+    motion: Motion,
+    cameras: Vec<CameraState>,
+    store: KeyframeStore,
+    ranges: RangeScans,
+    list: Option<KeyframeList>,
+    /// The first image that was compared with the list.
+    first_image: Option<(Arc<str>, Stamp)>,
+    counts: Counts,
+    /// Whether the warning about joint limits was logged.
+    warned_joint_limits: bool,
+    max_wait_secs: f64,
+    default_depth_m: f64,
+    /// The latest stamp of all samples. The join uses no other clock.
+    newest: Stamp,
+    /// The latest stamp of the keyframes of the resumed run.
+    newest_resumed: Option<Stamp>,
+    /// Nanoseconds added to the stamps of new keyframes so that they follow earlier ones; `None` before the first
+    /// keyframe.
+    stamp_offset_nanos: Option<i64>,
+}
+
+/// An event that follows from a sample.
+#[derive(Clone, Debug)]
+pub enum JoinEvent {
+    /// A new keyframe was added to the store.
+    Accepted(Arc<Keyframe>),
+    /// A keyframe was evicted from the full store.
+    Evicted {
+        /// Name of its camera.
+        camera: Arc<str>,
+        /// Its stamp.
+        stamp: Stamp,
+    },
+    /// A color image with a known pose, whether or not it becomes a keyframe.
+    PosedImage(PosedImage),
+    /// A color image did not become a keyframe.
+    Rejected {
+        /// The reason.
+        why: Rejection,
+    },
+}
+
+/// A color image and its camera pose.
+#[derive(Clone, Debug)]
+pub struct PosedImage {
+    /// As delivered by the device; not undistorted.
+    pub image: Image,
+    /// Pose of the camera at mid-exposure, without the correction of a station.
+    pub world_from_camera: Transform,
+}
+
+/// One camera of the rig.
+struct CameraState {
+    config: config::Camera,
+    color_undistorter: Undistorter,
+    depth_undistorter: Option<Undistorter>,
+    acceptance: Acceptance,
+    waiting: Waiting,
+    n_accepted: usize,
+    warned_undecodable: bool,
+}
+
+/// A color image with all available data for it.
+struct ReadyImage {
+    image: Image,
+    stamp: Stamp,
+    camera_pose: CameraPose,
+    depth: Option<(Image, CameraPose)>,
+    truth: Option<TruthImage>,
+}
+
+impl Join {
+    /// A join for the cameras and the arm of a rig.
+    ///
+    /// # Errors
+    ///
+    /// If the robot description does not match the rig, or the scaled training images would be too small.
+    pub fn new(rig: &Rig) -> crate::Result<Self> {
+        let join = &rig.join;
+        let spacing = Spacing { translation_m: join.min_translation_m, rotation_rad: join.min_rotation_rad };
+        Ok(Self {
+            motion: Motion::new(rig)?,
+            cameras: rig
+                .cameras
+                .iter()
+                .map(|camera| CameraState::new(camera, rig, spacing))
+                .collect::<Result<_, _>>()?,
+            store: KeyframeStore::new(join.max_keyframes, join.max_bytes, spacing),
+            ranges: RangeScans::new(rig),
+            list: None,
+            first_image: None,
+            counts: Counts::default(),
+            warned_joint_limits: false,
+            max_wait_secs: join.max_wait_millis * 1e-3,
+            default_depth_m: join.default_depth_m,
+            newest: Stamp(i64::MIN),
+            newest_resumed: None,
+            stamp_offset_nanos: None,
+        })
+    }
+
+    /// Accepts exactly the keyframes of a list, with its splits, without acceptance tests or store limits.
+    #[must_use]
+    pub fn taking_only(mut self, list: KeyframeList) -> Self {
+        self.store = KeyframeStore::new(usize::MAX, u64::MAX, Spacing { translation_m: 1.0, rotation_rad: 1.0 });
+        self.list = Some(list);
+        self
+    }
+
+    /// Continues a run with these keyframes. Returns the camera and stamp of those that do not fit into the store.
+    ///
+    /// Clocks restart with a simulation or a computer. If the first new keyframe would not follow the earlier ones, all
+    /// new keyframes get a stamp offset.
+    #[must_use]
+    pub fn resume_from(mut self, keyframes: &[Arc<Keyframe>]) -> (Self, Vec<(Arc<str>, Stamp)>) {
+        let mut evicted = Vec::new();
+        for keyframe in keyframes {
+            if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == keyframe.camera) {
+                camera.acceptance.accept_resumed(&keyframe.world_from_camera);
+                camera.n_accepted += 1;
+            }
+            evicted.extend(self.store.push(Arc::clone(keyframe)));
+        }
+        self.newest_resumed = keyframes.iter().map(|keyframe| keyframe.stamp).max();
+        (self, evicted)
+    }
+
+    /// Converts the stamp of a sample to the clock of the keyframes.
+    pub(crate) fn shifted(&self, stamp: Stamp) -> Stamp {
+        Stamp(stamp.0.saturating_add(self.stamp_offset_nanos.unwrap_or_default()))
+    }
+
+    /// Processes one sample and returns the resulting events.
+    pub fn push(&mut self, sample: Sample) -> Vec<JoinEvent> {
+        let mut events = Vec::new();
+        self.newest = self.newest.max(sample.stamp());
+        match sample {
+            Sample::Joints(state) => {
+                if !self.warned_joint_limits
+                    && let Some(joint_limit_warning) = self.motion.joint_limit_warning(&state)
+                {
+                    log::warn!("{joint_limit_warning}");
+                    self.warned_joint_limits = true;
+                }
+                let is_valid = self.motion.push_joints(state);
+                self.counts.joints_rejected += u64::from(!is_valid);
+            }
+            Sample::Base(pose) => {
+                let is_valid = self.motion.push_base(&pose);
+                self.counts.base_poses_rejected += u64::from(!is_valid);
+            }
+            Sample::Range(scan) => {
+                let is_queued = self.ranges.push(scan);
+                self.counts.range_scans_rejected += u64::from(!is_queued);
+            }
+            Sample::BaseTruth(truth) => self.motion.push_base_truth(&truth),
+            Sample::Image(image) => self.push_image(image, &mut events),
+            Sample::Truth(truth) => {
+                if let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == truth.image.camera) {
+                    camera.waiting.push_truth(truth);
+                }
+            }
+        }
+        self.process_ready(false, &mut events);
+        events
+    }
+
+    /// Ends the stream and decides about the images that are still waiting.
+    pub fn finish(&mut self) -> Vec<JoinEvent> {
+        let mut events = Vec::new();
+        self.process_ready(true, &mut events);
+        events
+    }
+
+    /// Counts of all samples so far.
+    #[must_use]
+    pub fn counts(&self) -> &Counts {
+        &self.counts
+    }
+
+    /// The keyframes in the store, in order of acceptance.
+    pub fn keyframes(&self) -> impl Iterator<Item = &Arc<Keyframe>> {
+        self.store.iter()
+    }
+
+    /// The newest scans of range scanners, with points in the world frame, oldest first.
+    pub fn range_scans(&self) -> impl Iterator<Item = &Arc<RangePoints>> {
+        self.ranges.iter()
+    }
+
+    /// Compares the result with the list of [`Join::taking_only`], as [`KeyframeList::check_found`] does; `None`
+    /// without a list or a difference.
+    ///
+    /// # Errors
+    ///
+    /// If no keyframe of the list was found.
+    pub fn check_list(&self) -> crate::Result<Option<String>> {
+        let Some(list) = &self.list else { return Ok(None) };
+        let found = self.keyframes().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
+        Ok(list.check_found(found, self.first_image.as_ref().map(|(camera, stamp)| (&**camera, *stamp)))?)
+    }
+
+    fn push_image(&mut self, image: Image, events: &mut Vec<JoinEvent>) {
+        self.counts.device_skipped += image.n_skipped;
+        self.counts.images += u64::from(!image.is_depth());
+        let Some(camera) = self.cameras.iter_mut().find(|camera| camera.config.name == image.camera) else {
+            if !image.is_depth() {
+                self.counts.unknown_cameras.insert(Arc::clone(&image.camera));
+                self.reject(&image.camera, image.stamp, Rejection::UnknownCamera, events);
+            }
+            return;
+        };
+        if image.is_depth() {
+            let stamp = camera.config.mid_exposure(image.stamp);
+            camera.waiting.push_depth(stamp, image);
+        } else if let Some(dropped_image) = camera.waiting.push_color(image) {
+            let stamp = camera.config.mid_exposure(dropped_image.stamp);
+            self.reject(&dropped_image.camera, stamp, Rejection::QueueFull, events);
+        }
+    }
+
+    /// Transforms range scans, then decides about every image that is ready, camera by camera, oldest first.
+    fn process_ready(&mut self, at_end: bool, events: &mut Vec<JoinEvent>) {
+        let counts_placed = self.ranges.process_ready(&self.motion, self.newest, at_end, self.max_wait_secs);
+        self.counts.range_scans += counts_placed.n_placed;
+        self.counts.range_scans_rejected += counts_placed.n_rejected;
+        for camera_ix in 0..self.cameras.len() {
+            while let Some(ready) = self.next_ready(camera_ix, at_end) {
+                match ready {
+                    Ok(ready) => {
+                        let posed_image = PosedImage {
+                            image: ready.image.clone(),
+                            world_from_camera: ready.camera_pose.world_from_camera,
+                        };
+                        events.push(JoinEvent::PosedImage(posed_image));
+                        self.decide(camera_ix, ready, events);
+                    }
+                    Err((camera, stamp)) => self.reject(&camera, stamp, Rejection::NoPose, events),
+                }
+            }
+        }
+    }
+
+    /// The oldest waiting image of a camera, once all its data have arrived. The error identifies an image that will
+    /// never have a pose.
+    fn next_ready(&mut self, camera_ix: usize, at_end: bool) -> Option<Result<ReadyImage, (Arc<str>, Stamp)>> {
+        let camera = &mut self.cameras[camera_ix];
+        let device_stamp = camera.waiting.oldest()?.stamp;
+        let stamp = camera.config.mid_exposure(device_stamp);
+        let overdue = at_end || self.newest.secs_since(stamp) > self.max_wait_secs;
+        let camera_pose = match self.motion.at(&camera.config, stamp) {
+            Err(HistoryError::NotYet { .. }) if !overdue => return None,
+            camera_pose => camera_pose,
+        };
+        let period_secs = 1.0 / camera.config.rate_hz;
+        let mut depth = None;
+        if camera.config.depth.is_some() && camera_pose.is_ok() {
+            let (depth_stamp, is_final) = camera.waiting.depth_near(stamp, 0.5 * period_secs);
+            if !is_final && !overdue {
+                return None;
+            }
+            if let Some(depth_stamp) = depth_stamp {
+                match self.motion.at(&camera.config, depth_stamp) {
+                    Err(HistoryError::NotYet { .. }) if !overdue => return None,
+                    Ok(camera_pose) => depth = camera.waiting.depth_at(depth_stamp).cloned().zip(Some(camera_pose)),
+                    Err(_) => {}
+                }
+            }
+        }
+        let truth = match camera.waiting.truth_of(device_stamp) {
+            Partner::NotYet if !overdue && camera_pose.is_ok() => return None,
+            Partner::Available(truth) => Some(truth.clone()),
+            Partner::NotYet | Partner::Never => None,
+        };
+        if truth.is_none() && overdue && camera_pose.is_ok() {
+            camera.waiting.stop_waiting_for_truth();
+        }
+        let image = camera.waiting.take_oldest()?;
+        camera.waiting.forget_before(stamp, device_stamp, period_secs);
+        match camera_pose {
+            Ok(camera_pose) => Some(Ok(ReadyImage { image, stamp, camera_pose, depth, truth })),
+            Err(_) => Some(Err((image.camera, stamp))),
+        }
+    }
+
+    fn decide(&mut self, camera_ix: usize, ready: ReadyImage, events: &mut Vec<JoinEvent>) {
+        let listed = self.list.as_ref().map(|list| list.split_of(&ready.image.camera, ready.stamp));
+        let (name, stamp) = (Arc::clone(&ready.image.camera), ready.stamp);
+        self.first_image.get_or_insert_with(|| (Arc::clone(&name), stamp));
+        let camera = &mut self.cameras[camera_ix];
+        let split = match listed {
+            Some(None) => return, // Not listed, which is not a rejection.
+            Some(Some(split)) => split,
+            None => Split::of(camera.n_accepted),
+        };
+        let keyframe = match camera.keyframe(ready, split, listed.is_none(), self.default_depth_m) {
+            Ok(keyframe) => keyframe,
+            Err(why) => return self.reject(&name, stamp, why, events),
+        };
+        camera.n_accepted += 1;
+        self.counts.accepted += 1;
+        let depth_from_ranges = if camera.config.depth.is_none() { self.ranges.depth_of(&keyframe) } else { None };
+        let stamp_offset_nanos = *self.stamp_offset_nanos.get_or_insert_with(|| match self.newest_resumed {
+            Some(earlier) if stamp <= earlier => earlier.plus_secs(1.0).0.saturating_sub(stamp.0),
+            _ => 0,
+        });
+        let stamp = Stamp(keyframe.stamp.0.saturating_add(stamp_offset_nanos));
+        let keyframe = Arc::new(Keyframe { depth: keyframe.depth.or(depth_from_ranges), stamp, ..keyframe });
+        self.counts.without_depth += u64::from(camera.config.depth.is_some() && keyframe.depth.is_none());
+        events.push(JoinEvent::Accepted(Arc::clone(&keyframe)));
+        for (camera, stamp) in self.store.push(keyframe) {
+            self.counts.evicted += 1;
+            events.push(JoinEvent::Evicted { camera, stamp });
+        }
+    }
+
+    fn reject(&mut self, camera: &str, stamp: Stamp, why: Rejection, events: &mut Vec<JoinEvent>) {
+        log::debug!("camera {camera:?}: the image at {} ns did not become a keyframe: {why}", stamp.0);
+        self.counts.reject(why);
+        events.push(JoinEvent::Rejected { why });
+    }
+}
+
+impl CameraState {
+    fn new(camera: &config::Camera, rig: &Rig, spacing: Spacing) -> crate::Result<Self> {
+        let named = || format!("camera {:?}", camera.name);
+        let is_fixed = match camera.parent {
+            Parent::Flange => false,
+            Parent::Base => rig.base.driver == BaseDriver::Fixed,
+            Parent::World => true,
+        };
+        if camera.readout_micros.is_none() && !is_fixed {
+            log::warn!("camera {:?}: readout_micros is not in the rig file; assuming a global shutter", camera.name);
+        }
+        if camera.stamp_to_mid_exposure.is_none() && camera.driver != CameraDriver::Sim {
+            log::warn!("camera {:?}: stamp_to_mid_exposure_millis is not in the rig file; assuming 0", camera.name);
+        }
+        // Depth keeps its size: it has its own intrinsics, and averages across depth edges would lie on no surface.
+        let depth_undistorter =
+            camera.depth.as_ref().map(|depth| Undistorter::new(&depth.intrinsics, 1.0)).transpose()?;
+        Ok(Self {
+            config: camera.clone(),
+            color_undistorter: Undistorter::new(&camera.intrinsics, rig.train.scale).with_context(named)?,
+            depth_undistorter,
+            acceptance: Acceptance::new(&rig.join, camera, is_fixed, spacing),
+            waiting: Waiting::new(camera.driver == CameraDriver::Sim && rig.sim.truth),
+            n_accepted: 0,
+            warned_undecodable: false,
+        })
+    }
+
+    /// The keyframe of an image, or the reason for rejecting it. `run_checks` is false if a list selects the keyframes.
+    fn keyframe(
+        &mut self,
+        ready: ReadyImage,
+        split: Split,
+        run_checks: bool,
+        default_depth_m: f64,
+    ) -> Result<Keyframe, Rejection> {
+        let pose = &ready.camera_pose.world_from_camera;
+        if !kinematics::transform::is_finite(pose) {
+            return Err(Rejection::PoseNotFinite);
+        }
+        if run_checks {
+            self.acceptance.check_motion(ready.stamp, pose)?;
+        }
+        let depth = self.depth_of(&ready);
+        if run_checks {
+            let depth_m = depth.as_ref().and_then(assemble::median_depth_m).unwrap_or(default_depth_m);
+            let exposure_secs = ready.image.exposure_secs.or(self.config.exposure_micros.map(|micros| micros * 1e-6));
+            self.acceptance.check_speed(&ready.camera_pose, self.color_undistorter.full(), exposure_secs, depth_m)?;
+        }
+        let rgb = assemble::rgb(&ready.image, &self.config.intrinsics).map_err(|e| self.undecodable(&e))?;
+        if run_checks {
+            self.acceptance.check_pixels(&rgb, self.config.intrinsics.size_px)?;
+            self.acceptance.accept(ready.stamp, pose);
+        }
+        let rgba_srgb = self.color_undistorter.rgba(&rgb).map_err(|e| self.undecodable(&e))?;
+        let truth = ready.truth.and_then(|truth| {
+            assemble::truth(&truth, &self.config.intrinsics, &self.color_undistorter)
+                .map_err(|e| self.undecodable(&e))
+                .ok()
+        });
+        let pinhole = self.color_undistorter.pinhole();
+        Ok(Keyframe {
+            camera: ready.image.camera,
+            stamp: ready.stamp,
+            size_px: pinhole.size_px,
+            focal_px: pinhole.focal_px,
+            principal_px: pinhole.principal_px,
+            rgba_srgb,
+            depth,
+            world_from_camera: ready.camera_pose.world_from_camera,
+            twist: ready.camera_pose.twist,
+            readout_secs: self.acceptance.readout_secs(),
+            joint_twists: ready.camera_pose.joint_twists,
+            base: ready.camera_pose.base,
+            split,
+            truth,
+        })
+    }
+
+    /// If depth does not decode, the keyframe is kept without depth.
+    fn depth_of(&mut self, ready: &ReadyImage) -> Option<keyframe::DepthMap> {
+        let (image, camera_pose) = ready.depth.as_ref()?;
+        let map =
+            assemble::depth_map(image, self.config.depth.as_ref()?, self.depth_undistorter.as_ref()?, camera_pose);
+        map.map_err(|e| self.undecodable(&e)).ok()
+    }
+
+    /// Logs the first decoding error of a camera; all of them are counted.
+    fn undecodable(&mut self, error: &crate::Error) -> Rejection {
+        if !std::mem::replace(&mut self.warned_undecodable, true) {
+            log::warn!("{}", chain(error));
+        }
+        Rejection::Undecodable
+    }
+}

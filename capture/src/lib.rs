@@ -1,0 +1,48 @@
+//! From a rig file to keyframes: opens the devices, joins images with poses, and corrects base poses.
+//!
+//! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and [`open::recording`] a
+//! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
+//! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
+//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a thread of its own.
+//! [`dataset`] loads datasets with known poses instead.
+//!
+//! ```
+//! use capture::{Join, Rig};
+//!
+//! let rig_file = r#"
+//! [arm]
+//! driver = "none"
+//! [camera.front]
+//! driver = "v4l2"
+//! size_px = [640, 480]
+//! rate_hz = 30
+//! parent = "base"
+//! intrinsics = { focal_px = [600, 600], principal_px = [320, 240] }
+//! "#;
+//! let urdf = r#"<robot name="none"><link name="base"/></robot>"#;
+//! let rig = Rig::parse("rig.toml", rig_file, urdf, &[])?;
+//! assert_eq!(&*rig.cameras[0].name, "front");
+//! let join = Join::new(&rig)?;
+//! assert_eq!(join.counts().to_string(), "0 keyframes of 0 images");
+//! # Ok::<(), capture::Error>(())
+//! ```
+
+pub mod config;
+pub mod dataset;
+pub mod downscale;
+mod error;
+mod feed;
+mod join;
+pub mod open;
+mod stations;
+mod stop;
+#[cfg(test)]
+#[path = "../../tests/common/test_data.rs"]
+mod test_data;
+
+pub use config::{ConfigError, Override, Rig};
+pub use error::{Error, Result};
+pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
+pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
+pub use stations::{StationReport, Stations};
+pub use stop::Stop;

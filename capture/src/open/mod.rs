@@ -1,0 +1,381 @@
+//! Opens the devices of a rig file, or a recording, as one source of samples.
+
+mod real;
+mod realsense;
+#[cfg(feature = "sim")]
+mod simulated;
+#[cfg(all(test, feature = "sim"))]
+mod simulated_tests;
+mod tags;
+
+#[cfg(target_os = "linux")]
+pub use real::franka_chain;
+pub use real::{check_motion, movable_arm, udp_arm_address};
+
+use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
+use crate::error::{Context, Error, bail};
+use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
+use drivers::{Live, Sample, Source};
+use kinematics::Chain;
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+use tags::TagBaseSource;
+
+/// Hint for missing devices.
+const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
+
+/// The port of a Franka controller.
+pub const FCI_PORT: u16 = 1337;
+
+/// Which devices to open for a rig file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Devices {
+    /// The devices in the rig file.
+    Real,
+    /// Simulated devices with the same names, sizes, rates, intrinsics and robot.
+    Sim,
+}
+
+/// An open rig or recording.
+pub struct Opened {
+    /// The rig with all settings resolved.
+    pub rig: Rig,
+    /// The samples of all devices, or of the recording.
+    pub source: Box<dyn Source>,
+    /// Set when the samples end early because the recording is damaged.
+    pub damage: Arc<OnceLock<String>>,
+}
+
+/// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that store it.
+///
+/// # Errors
+///
+/// If a device cannot be opened, a driver is not part of this build, or the rig file lacks a setting that a driver
+/// needs.
+pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
+    if devices == Devices::Sim {
+        rig.arm.driver = ArmDriver::Sim;
+        rig.base.driver = match rig.base.driver {
+            _ if base_moves(&rig.sim.scene) => BaseDriver::Sim,
+            BaseDriver::Tags => BaseDriver::Tags,
+            _ => BaseDriver::Fixed,
+        };
+        for scanner in &mut rig.scanners {
+            scanner.driver = ScannerDriver::Sim;
+        }
+        for camera in &mut rig.cameras {
+            camera.driver = CameraDriver::Sim;
+        }
+    }
+    if let Some(device) = unsupported_device(&rig) {
+        bail!("{device} cannot be opened by this version; {SIM_HINT}");
+    }
+    check_arm(&rig)?;
+    if devices == Devices::Sim {
+        check_intrinsics(&rig)?;
+    }
+    let real = real::open(&mut rig).map_err(|error| Error::Failed(format!("{error:#}; {SIM_HINT}")))?;
+    let source = if is_any_simulated(&rig) { simulate(&rig, real)? } else { Box::new(Live::new(real)?) };
+    let source = match rig.base.driver {
+        BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
+        _ => source,
+    };
+    Ok(Opened { rig, source, damage: Arc::default() })
+}
+
+/// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
+/// recording.
+///
+/// # Errors
+///
+/// If the file is not a recording, contains no valid rig, or does not match the given rig.
+pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate::Result<Opened> {
+    let recording = Recording::open(path)?;
+    let mut rig = match rig {
+        Some(rig) => rig,
+        None => stored_rig(path, &recording, overrides)?,
+    };
+    if let Some(recorded) = recording.joint_names() {
+        chain_of(&rig)?
+            .order_in(recorded)
+            .with_context(|| format!("the recording {path:?} does not match the robot"))?;
+        if !rig.arm.joint_offsets.is_empty() {
+            let of = |name: &String| rig.arm.joints.iter().position(|known| known == name);
+            let offset = |name: &String| of(name).map_or(0.0, |ix| rig.arm.joint_offsets[ix]);
+            rig.arm.joint_offsets = recorded.iter().map(offset).collect();
+        }
+        rig.arm.joints = recorded.to_vec();
+    }
+    check_intrinsics(&rig)?;
+    let damage = Arc::default();
+    let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
+    Ok(Opened { rig, source, damage })
+}
+
+/// Creates a recording of a rig, with the rig file and the URDF attached.
+///
+/// # Errors
+///
+/// If the file cannot be written.
+pub fn recorder(path: &Path, rig: &Rig) -> crate::Result<Recorder> {
+    let cameras: Vec<_> = rig.cameras.iter().map(|camera| (&*camera.name, &camera.intrinsics)).collect();
+    let resolved = rig.to_toml();
+    let description = RecordingMetadata {
+        files: &[(RIG_FILE, resolved.as_bytes()), (URDF_FILE, rig.arm.urdf_text.as_bytes())],
+        cameras: &cameras,
+        joint_names: &rig.arm.joints,
+    };
+    Ok(Recorder::create(path, &description)?)
+}
+
+/// The kinematic chain from the robot's base to its flange.
+///
+/// # Errors
+///
+/// If the URDF of the rig has no such chain.
+pub fn chain_of(rig: &Rig) -> crate::Result<Chain> {
+    let arm = &rig.arm;
+    Chain::from_urdf(&arm.urdf_text, &arm.base_link, &arm.flange_link).context("the arm's URDF")
+}
+
+fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> crate::Result<Rig> {
+    let text = |name| {
+        let bytes = recording.attachment(name).with_context(|| format!("the recording {path:?} contains no {name}"))?;
+        std::str::from_utf8(bytes).with_context(|| format!("the recording {path:?}: {name} is not text"))
+    };
+    Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
+}
+
+/// Cameras on the flange need joint readings.
+fn check_arm(rig: &Rig) -> crate::Result<()> {
+    let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
+    if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
+        bail!(
+            "camera {:?} has the parent flange, but arm.driver is none: the parent must be base or world",
+            camera.name
+        );
+    }
+    Ok(())
+}
+
+/// Intrinsics that are stored in the camera are unknown unless the camera is opened.
+fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
+    if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
+        bail!(
+            "camera.{}.intrinsics is missing: it is stored in the camera, which this command does not open",
+            camera.name
+        );
+    }
+    Ok(())
+}
+
+/// Whether any device of a rig is simulated.
+#[must_use]
+pub fn is_any_simulated(rig: &Rig) -> bool {
+    rig.arm.driver == ArmDriver::Sim
+        || rig.base.driver == BaseDriver::Sim
+        || rig.cameras.iter().any(|camera| camera.driver == CameraDriver::Sim)
+        || rig.scanners.iter().any(|scanner| scanner.driver == ScannerDriver::Sim)
+}
+
+/// The first device of a rig that has no driver yet.
+fn unsupported_device(rig: &Rig) -> Option<String> {
+    let has_none = rig.base.driver == BaseDriver::Rgbd;
+    has_none.then(|| format!("base driver {:?}", format!("{:?}", rig.base.driver).to_lowercase()))
+}
+
+#[cfg(feature = "sim")]
+fn simulate(rig: &Rig, real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
+    simulated::open(rig, real)
+}
+
+#[cfg(feature = "sim")]
+fn base_moves(scene: &str) -> bool {
+    sim::Scene::from_name(scene).is_some_and(sim::Scene::has_moving_base)
+}
+
+#[cfg(not(feature = "sim"))]
+fn base_moves(_scene: &str) -> bool {
+    false
+}
+
+#[cfg(not(feature = "sim"))]
+fn simulate(_rig: &Rig, _real: drivers::Devices) -> crate::Result<Box<dyn Source>> {
+    bail!("this program was built without the simulator: build it with `cargo build --release --features sim`")
+}
+
+/// A recording that reports damage when it ends.
+struct RecordingSource {
+    recording: Recording,
+    damage: Arc<OnceLock<String>>,
+}
+
+impl Source for RecordingSource {
+    fn next_sample(&mut self) -> Result<Option<Sample>, drivers::Error> {
+        let sample = self.recording.next_sample()?;
+        if sample.is_none()
+            && let Some(damage) = self.recording.damage()
+        {
+            // Reported once, at the end, with the other losses.
+            let _ = self.damage.set(damage.to_owned());
+        }
+        Ok(sample)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn load(name: &str, overrides: &[Override]) -> Rig {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
+        Rig::load(&path, overrides).expect("a bundled rig file")
+    }
+
+    #[test]
+    fn unsupported_driver_error_suggests_sim() {
+        let rig = load("static-arm.toml", &[Override::new("base.driver", "rgbd")]);
+        let message = format!("{:#}", super::rig(rig, Devices::Real).err().expect("no such driver"));
+        assert!(message.contains("rgbd") && message.contains("--sim"), "{message}");
+    }
+
+    #[test]
+    fn missing_or_unattached_v4l2_camera_is_an_error() {
+        let absent = [
+            Override::new("arm.driver", "none"),
+            Override::new("camera.wrist.driver", "v4l2"),
+            Override::new("camera.wrist.device", "no such serial"),
+            Override::new("camera.wrist.depth.device", "no such serial"),
+            Override::new("camera.wrist.depth.meters_per_count", 0.001),
+        ];
+        let error_of = |overrides: &[Override]| {
+            let opened = super::rig(load("static-arm.toml", overrides), Devices::Real);
+            format!("{:#}", opened.err().expect("nothing is connected"))
+        };
+        let message = error_of(&absent);
+        assert!(message.contains("\"wrist\" has the parent flange"), "{message}");
+        let on_base = [&absent[..], &[Override::new("camera.wrist.parent", "base")]].concat();
+        let message = error_of(&on_base);
+        assert!(message.contains("no V4L2 camera named \"no such serial\"") && message.contains("--sim"), "{message}");
+        let without_scale = [&on_base[..3], &on_base[5..]].concat();
+        let message = error_of(&without_scale);
+        assert!(message.contains("camera.wrist.depth.device"), "{message}");
+    }
+
+    #[cfg(feature = "nokhwa")]
+    #[test]
+    fn unsupported_nokhwa_settings_are_rejected() {
+        let of = |more: &[Override]| {
+            let driver = [("arm.driver", "none"), ("camera.wrist.driver", "nokhwa"), ("camera.wrist.parent", "base")];
+            let overrides =
+                driver.map(|(key, value)| Override::new(key, value)).into_iter().chain(more.iter().cloned());
+            let opened = super::rig(load("static-arm.toml", &overrides.collect::<Vec<_>>()), Devices::Real);
+            format!("{:#}", opened.err().expect("nothing is connected"))
+        };
+        assert!(of(&[]).contains("nokhwa does not support depth"), "{}", of(&[]));
+        let gain = of(&[Override::new("camera.wrist.v4l2.gain", 7_i64)]);
+        assert!(gain.contains("nokhwa does not support gain"), "{gain}");
+    }
+
+    #[test]
+    fn missing_realsense_camera_error_suggests_a_remedy() {
+        let overrides = [
+            Override::new("arm.driver", "none"),
+            Override::new("camera.wrist.parent", "base"),
+            Override::new("camera.wrist.driver", "realsense"),
+            Override::new("camera.wrist.device", "no such serial"),
+        ];
+        let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
+        let message = format!("{:#}", opened.err().expect("nothing is connected"));
+        let expected = if cfg!(feature = "realsense") { "\"no such serial\"" } else { "--features realsense" };
+        assert!(message.contains(expected) && message.contains("--sim"), "{message}");
+    }
+
+    #[test]
+    fn unreachable_network_arm_error_suggests_a_remedy() {
+        let error_of = |driver: &str, address: &str| {
+            let overrides = [Override::new("arm.driver", driver), Override::new("arm.address", address)];
+            let opened = super::rig(load("static-arm.toml", &overrides), Devices::Real);
+            format!("{:#}", opened.err().expect("no such arm"))
+        };
+        for (driver, address, expected) in
+            [("franka", "", "arm.address"), ("franka", "127.0.0.1:1", "FCI"), ("udp", "172.16.0.2", "arm.address")]
+        {
+            let message = error_of(driver, address);
+            assert!(message.contains(expected), "{driver} {address}: {message}");
+        }
+        let occupied = std::net::UdpSocket::bind("127.0.0.1:0").expect("a free port");
+        let address = occupied.local_addr().expect("bound").to_string();
+        assert!(error_of("udp", &address).contains(&address));
+    }
+
+    #[cfg(all(feature = "sim", target_os = "linux"))]
+    #[test]
+    fn franka_arm_is_read_with_simulated_cameras() {
+        use drivers::franka::FciVersion;
+        use drivers::franka::emulated::{EmulatedRobot, Joints, Limits, RobotConfig};
+        const REST_RAD: [f64; 7] = [0.1, -0.5, 0.2, -2.0, 0.3, 1.8, 0.7];
+        // A Franka reports poses relative to its own base link, also on a mobile base.
+        for name in ["static-arm.toml", "mobile-arm.toml"] {
+            let plain = load(name, &[]);
+            let chain = Chain::from_urdf(&plain.arm.urdf_text, "panda_link0", "panda_link8").expect("a Panda");
+            let config = RobotConfig {
+                address: "127.0.0.1:0".parse().expect("an address"),
+                version: FciVersion::V5,
+                chain,
+                flange_from_tool: kinematics::Transform::identity(),
+                limits: Limits::panda(),
+            };
+            let rest = Joints { position_rad: REST_RAD, ..Joints::default() };
+            let emulated = EmulatedRobot::start(config, Box::new(move |_, _| rest)).expect("a free port");
+            let address = emulated.address().to_string();
+            let overrides = [Override::new("arm.driver", "franka"), Override::new("arm.address", &*address)];
+            let mut opened =
+                super::rig(load(name, &overrides), Devices::Real).unwrap_or_else(|e| panic!("{}", format!("{e:#}")));
+            let joints = loop {
+                match opened.source.next_sample().expect("the rig works").expect("it does not end") {
+                    Sample::Joints(joints) => break joints,
+                    _ => continue,
+                }
+            };
+            assert_eq!(joints.position, REST_RAD, "{name}");
+        }
+    }
+
+    #[test]
+    fn missing_recording_is_an_error() {
+        let missing = recording(Path::new("no/such.mcap"), None, &[]).err().expect("no file");
+        assert!(format!("{missing:#}").contains("no/such.mcap"));
+    }
+
+    #[test]
+    fn recording_stores_its_rig() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let rig = load("two-cameras.toml", &[Override::new("sim.seed", 77)]);
+        let mut recorder = recorder(&path, &rig).expect("a new file");
+        let joints = kinematics::JointState {
+            stamp: kinematics::Stamp(5),
+            position: vec![0.0; 7],
+            velocity: vec![],
+            effort: vec![],
+        };
+        recorder.write(&Sample::Joints(joints.clone())).expect("disk space");
+        recorder.finish().expect("disk space");
+        let mut opened = recording(&path, None, &[]).expect("a recording");
+        assert_eq!(opened.rig, rig);
+        assert_eq!(opened.source.next_sample().expect("readable"), Some(Sample::Joints(joints)));
+        assert_eq!(opened.source.next_sample().expect("readable"), None);
+        assert_eq!(opened.damage.get(), None);
+        // A different joint order in the rig file has no effect; a different joint name is an error.
+        let mut reversed = rig.clone();
+        reversed.arm.joints.reverse();
+        assert_eq!(recording(&path, Some(reversed), &[]).expect("the same joints").rig, rig);
+        let mut renamed = rig;
+        renamed.arm.urdf_text = renamed.arm.urdf_text.replace("panda_joint3", "elbow");
+        let error_of = format!("{:#}", recording(&path, Some(renamed), &[]).err().expect("no joint of that name"));
+        assert!(error_of.contains("run.mcap") && error_of.contains("\"elbow\""), "{error_of}");
+        let overridden = recording(&path, None, &[Override::new("train.seed", 9)]).expect("a recording");
+        assert_eq!(overridden.rig.train.seed, 9);
+    }
+}

@@ -1,0 +1,308 @@
+//! Opens the devices of a rig that are not simulated.
+
+#[cfg(target_os = "linux")]
+use crate::config::Depth;
+use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
+use crate::error::{Context, bail};
+#[cfg(target_os = "linux")]
+use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
+#[cfg(target_os = "linux")]
+use drivers::franka::{self, FrankaArm, MovableFrankaArm};
+use drivers::motion::MovableArm;
+#[cfg(target_os = "linux")]
+use drivers::motion::{MotionConfig, MotionLimits};
+use drivers::udp::{UdpArm, UdpBase, UdpScanner};
+#[cfg(target_os = "linux")]
+use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
+#[cfg(target_os = "linux")]
+use drivers::wire::can::odrive::Endpoints;
+use drivers::{Arm, Base, Devices, RangeScanner};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::time::Duration;
+
+/// Default address for receiving joint states: this computer only.
+const DEFAULT_ARM_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 7011);
+
+/// Opens all real devices of a rig, possibly none. Fills in calibration that is stored in a camera.
+pub(super) fn open(rig: &mut Rig) -> crate::Result<Devices> {
+    let mut devices = Devices::default();
+    for camera in &mut rig.cameras {
+        match camera.driver {
+            CameraDriver::V4l2 => devices.cameras.extend(v4l2_cameras(camera)?),
+            CameraDriver::Nokhwa => devices.cameras.push(nokhwa_camera(camera)?),
+            CameraDriver::Realsense => devices.cameras.push(super::realsense::open(camera)?),
+            CameraDriver::Sim => {}
+        }
+    }
+    devices.arm = match rig.arm.driver {
+        ArmDriver::None | ArmDriver::Sim => None,
+        ArmDriver::Can => Some(can_arm(rig)?),
+        ArmDriver::Franka => Some(franka_arm(rig)?),
+        ArmDriver::Udp => Some(udp_arm(rig)?),
+    };
+    if rig.base.driver == BaseDriver::Udp {
+        let base = UdpBase::open(rig.base.address, [rig.base.max_sigma_m, rig.base.max_sigma_rad])?;
+        log::info!("base: listening on {}", base.address());
+        devices.base = Some(Box::new(base) as Box<dyn Base>);
+    }
+    for scanner in rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp) {
+        let open = UdpScanner::open(&scanner.name, scanner.address)?;
+        log::info!("range scanner {:?}: listening on {}", scanner.name, open.address());
+        devices.scanners.push(Box::new(open) as Box<dyn RangeScanner>);
+    }
+    Ok(devices)
+}
+
+/// Opens the arm for motion: enables it and holds its position. Joint positions are those of the device, without
+/// `arm.joint_offsets`.
+///
+/// # Errors
+///
+/// If the rig file has no table `[arm.motion]`, the driver cannot move arms or does not support the settings, or the
+/// arm cannot be reached.
+pub fn movable_arm(rig: &Rig) -> crate::Result<Box<dyn MovableArm>> {
+    let Some(motion) = &rig.arm.motion else {
+        bail!("the rig file has no table [arm.motion], so its arm is only read; see docs/guide/moving-arms.md");
+    };
+    match rig.arm.driver {
+        ArmDriver::Can => movable_can_arm(rig, motion),
+        ArmDriver::Franka => movable_franka_arm(rig, motion),
+        _ => bail!("arms with this driver can only be read"),
+    }
+}
+
+/// Checks the motion settings as far as possible without the arm.
+///
+/// # Errors
+///
+/// If the driver cannot move arms or does not support the settings.
+pub fn check_motion(rig: &Rig) -> crate::Result<()> {
+    let Some(motion) = &rig.arm.motion else { return Ok(()) };
+    match rig.arm.driver {
+        #[cfg(target_os = "linux")]
+        ArmDriver::Can => Ok(MovableCanArm::check(&movable_config(rig, motion)?)?),
+        #[cfg(target_os = "linux")]
+        ArmDriver::Franka => Ok(MovableFrankaArm::check(&motion_config(rig, motion)?).map_err(crate::Error::Failed)?),
+        _ => bail!("arms with this driver can only be read"),
+    }
+}
+
+/// Motion limits of each joint: positions from the URDF, speed from the rig file.
+#[cfg(target_os = "linux")]
+fn motion_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MotionConfig> {
+    let Rig { arm, .. } = rig;
+    let chain = super::chain_of(rig)?;
+    let mut limits = Vec::new();
+    for (ix, name) in arm.joints.iter().enumerate() {
+        let joint_ix = chain.joint_names().iter().position(|known| known == name);
+        let joint =
+            joint_ix.map(|joint_ix| chain.limits()[joint_ix]).context("a joint of the rig is not in its URDF")?;
+        let mut joint = MotionLimits::new(&joint, arm.max_speed_rad_s, motion.acceleration_secs, motion.jerk_secs);
+        // URDF positions are device positions plus the offset.
+        let offset = arm.joint_offsets.get(ix).copied().unwrap_or(0.0);
+        joint.position = joint.position.map(|bound| bound - offset);
+        limits.push(joint);
+    }
+    let timeout = Duration::from_secs_f64(motion.timeout_millis / 1000.0);
+    let ArmMotion { on_loss, accept_no_watchdog, .. } = *motion;
+    Ok(MotionConfig { limits, on_loss, timeout, accept_no_watchdog })
+}
+
+#[cfg(target_os = "linux")]
+fn movable_can_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+    Ok(Box::new(MovableCanArm::open(&movable_config(rig, motion)?)?))
+}
+
+#[cfg(target_os = "linux")]
+fn movable_config(rig: &Rig, motion: &ArmMotion) -> crate::Result<MovableArmConfig> {
+    let path = &motion.odrive_endpoints;
+    let endpoints = || Endpoints::parse(&std::fs::read_to_string(path)?).map_err(crate::Error::other);
+    let odrive_endpoints = match path.as_str() {
+        "" => None,
+        _ => Some(endpoints().with_context(|| format!("arm.motion.odrive_endpoints {path:?}"))?),
+    };
+    Ok(MovableArmConfig { arm: can_config(rig), motion: motion_config(rig, motion)?, odrive_endpoints })
+}
+
+#[cfg(not(target_os = "linux"))]
+fn movable_can_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+    bail!("arms on CAN buses can only be moved on Linux")
+}
+
+#[cfg(target_os = "linux")]
+fn can_config(rig: &Rig) -> can::ArmConfig {
+    let Rig { arm, .. } = rig;
+    can::ArmConfig { buses: arm.buses.clone(), motors: arm.motors.clone(), rate_hz: arm.rate_hz }
+}
+
+/// Opens an arm with motors on CAN buses.
+#[cfg(target_os = "linux")]
+fn can_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+    Ok(Box::new(CanArm::open(&can_config(rig))?))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn can_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+    bail!("arms on CAN buses can only be read on Linux")
+}
+
+/// Opens a Franka arm for reading over FCI.
+#[cfg(target_os = "linux")]
+fn franka_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+    Ok(Box::new(FrankaArm::open(&franka_config(rig)?)?))
+}
+
+/// Opens a Franka arm for motion over FCI.
+#[cfg(target_os = "linux")]
+fn movable_franka_arm(rig: &Rig, motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+    let defaults = franka::ContactConfig::default();
+    let contact = franka::ContactConfig {
+        torque_nm: motion.contact_torque_nm.unwrap_or(defaults.torque_nm),
+        force_n: motion.contact_force_n.unwrap_or(defaults.force_n),
+        moment_nm: motion.contact_moment_nm.unwrap_or(defaults.moment_nm),
+        stiffness_nm_rad: motion.stiffness_nm_rad,
+    };
+    let arm = MovableFrankaArm::open(&franka_config(rig)?, &motion_config(rig, motion)?, &contact)?;
+    Ok(Box::new(arm))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn movable_franka_arm(_rig: &Rig, _motion: &ArmMotion) -> crate::Result<Box<dyn MovableArm>> {
+    bail!("Franka arms can only be moved on Linux")
+}
+
+#[cfg(target_os = "linux")]
+fn franka_config(rig: &Rig) -> crate::Result<franka::ArmConfig> {
+    let Rig { arm, .. } = rig;
+    if arm.address.is_empty() {
+        bail!("arm.address is missing: set it to the address of the robot's controller, such as \"172.16.0.2\"");
+    }
+    Ok(franka::ArmConfig { address: arm.address.clone(), joint_names: arm.joints.clone(), chain: franka_chain(rig)? })
+}
+
+/// The chain from the link in which a Franka arm reports poses to its flange.
+///
+/// # Errors
+///
+/// If the URDF of the rig has no such chain.
+#[cfg(target_os = "linux")]
+pub fn franka_chain(rig: &Rig) -> crate::Result<kinematics::Chain> {
+    let Rig { arm, .. } = rig;
+    let robot = kinematics::urdf::Robot::parse(&arm.urdf_text).context("the arm's URDF")?;
+    let path = robot.path(&arm.base_link, &arm.flange_link).context("the arm's URDF")?;
+    // That link is the parent of the arm's first joint, wherever it is on the base.
+    let first = path.iter().find(|joint| arm.joints.contains(&joint.name));
+    let arm_base_link = first.map_or(&arm.base_link, |joint| &joint.parent);
+    kinematics::Chain::new(&robot, arm_base_link, &arm.flange_link).context("the arm's URDF")
+}
+
+#[cfg(not(target_os = "linux"))]
+fn franka_arm(_rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+    bail!("Franka arms can only be read on Linux")
+}
+
+/// Opens an arm whose joint states are sent by another program.
+fn udp_arm(rig: &Rig) -> crate::Result<Box<dyn Arm>> {
+    let open = UdpArm::open(&rig.arm.joints, udp_arm_address(rig)?)?;
+    log::info!("arm: listening on {}", open.address());
+    Ok(Box::new(open))
+}
+
+/// The address on which [`ArmDriver::Udp`] receives joint states.
+///
+/// # Errors
+///
+/// If `arm.address` is not an IP address with a port.
+pub fn udp_arm_address(rig: &Rig) -> crate::Result<SocketAddr> {
+    match &*rig.arm.address {
+        "" => Ok(DEFAULT_ARM_ADDRESS),
+        text => text.parse().with_context(|| {
+            format!("arm.address is {text:?}; the driver udp listens on an address such as {DEFAULT_ARM_ADDRESS}")
+        }),
+    }
+}
+
+/// Opens a V4L2 camera: its color images, and its depth images if it has depth.
+#[cfg(target_os = "linux")]
+fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
+    let depth = camera.depth.as_ref().map(|depth| v4l2_depth(camera, depth)).transpose()?;
+    let configs = std::iter::once(v4l2_color(camera)).chain(depth);
+    configs.map(|config| Ok(Box::new(V4l2Camera::open(config)?) as Box<dyn drivers::Camera>)).collect()
+}
+
+#[cfg(not(target_os = "linux"))]
+fn v4l2_cameras(camera: &Camera) -> crate::Result<Vec<Box<dyn drivers::Camera>>> {
+    bail!("camera {:?}: V4L2 is only available on Linux; use driver = \"nokhwa\" for webcams", camera.name)
+}
+
+/// Opens a camera with nokhwa, which sets only size, rate and format.
+#[cfg(feature = "nokhwa")]
+fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
+    let Camera { name, v4l2, .. } = camera;
+    if v4l2.gain.is_some() || v4l2.brightness.is_some() || v4l2.white_balance_kelvin.is_some() {
+        bail!("camera {name:?}: the driver nokhwa does not support gain, brightness or white balance: remove them");
+    }
+    if camera.depth.is_some() {
+        bail!("camera {name:?}: the driver nokhwa does not support depth");
+    }
+    let config = drivers::nokhwa::Config {
+        name: name.to_string(),
+        device: camera.device.clone(),
+        format: v4l2.format,
+        intrinsics: camera.intrinsics.clone(),
+        rate_hz: camera.rate_hz,
+        exposure_micros: camera.exposure_micros,
+        delivery: v4l2.delivery,
+        reconnect_for: Duration::from_secs_f64(v4l2.reconnect_secs),
+    };
+    Ok(Box::new(drivers::nokhwa::NokhwaCamera::open(config)?))
+}
+
+#[cfg(not(feature = "nokhwa"))]
+fn nokhwa_camera(camera: &Camera) -> crate::Result<Box<dyn drivers::Camera>> {
+    bail!(
+        "camera {:?}: this program was built without nokhwa: build it with `cargo build --release --features nokhwa`; \
+         on Linux, use driver = \"v4l2\" for webcams",
+        camera.name
+    )
+}
+
+/// Settings of the color images of a camera.
+#[cfg(target_os = "linux")]
+fn v4l2_color(camera: &Camera) -> Config {
+    Config {
+        name: camera.name.to_string(),
+        device: camera.device.clone(),
+        format: camera.v4l2.format,
+        intrinsics: camera.intrinsics.clone(),
+        rate_hz: camera.rate_hz,
+        meters_per_count: None,
+        settings: Settings {
+            exposure_micros: camera.exposure_micros,
+            gain: camera.v4l2.gain,
+            white_balance_kelvin: camera.v4l2.white_balance_kelvin,
+            brightness: camera.v4l2.brightness,
+        },
+        delivery: camera.v4l2.delivery,
+        reconnect_for: Duration::from_secs_f64(camera.v4l2.reconnect_secs),
+    }
+}
+
+/// Settings of the depth images of a camera, which come from a separate device with automatic exposure.
+#[cfg(target_os = "linux")]
+fn v4l2_depth(camera: &Camera, depth: &Depth) -> crate::Result<Config> {
+    let Some(meters_per_count) = depth.meters_per_count.filter(|_| !depth.device.is_empty()) else {
+        let name = &camera.name;
+        bail!(
+            "camera {name:?}: depth by V4L2 needs camera.{name}.depth.device and camera.{name}.depth.meters_per_count"
+        );
+    };
+    Ok(Config {
+        device: depth.device.clone(),
+        format: Some(V4l2Format::Z16),
+        intrinsics: depth.intrinsics.clone(),
+        meters_per_count: Some(meters_per_count),
+        settings: Settings::default(),
+        ..v4l2_color(camera)
+    })
+}

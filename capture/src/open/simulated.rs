@@ -1,0 +1,155 @@
+//! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
+
+use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
+use crate::error::bail;
+use drivers::{Devices, Error, Live, Sample, Source};
+use kinematics::{Stamp, Transform};
+use std::sync::Arc;
+
+/// Opens the simulated rig, in lockstep or in real time according to the rig file. In real time, `real` devices run in
+/// parallel.
+pub(super) fn open(rig: &Rig, real: Devices) -> crate::Result<Box<dyn Source>> {
+    let mut config = config_of(rig)?;
+    let any_real = real.arm.is_some() || real.base.is_some() || !real.scanners.is_empty() || !real.cameras.is_empty();
+    if rig.sim.lockstep {
+        if any_real {
+            bail!("sim.lockstep does not work with real devices, which cannot wait: set sim.lockstep = false");
+        }
+        return Ok(Box::new(sim::open(&config)?.into_lockstep()));
+    }
+    // Real devices use the clock of this computer. Without them, the simulation starts at 0.
+    let start = if any_real { drivers::clock::now() } else { Stamp::default() };
+    // In real time the limits are checked here, because devices that end would look like devices that fail.
+    (config.duration_secs, config.n_images) = (None, None);
+    let sim::LiveRig { mut devices, truth, .. } = sim::open(&config)?.into_live(start)?;
+    devices.arm = real.arm.or(devices.arm);
+    devices.base = devices.base.or(real.base);
+    devices.scanners.extend(real.scanners);
+    devices.cameras.extend(real.cameras);
+    Ok(Box::new(RealTime {
+        live: Live::new(devices)?,
+        truth,
+        first_camera: Arc::clone(&rig.cameras[0].name),
+        n_left: rig.sim.n_images,
+        end: rig.sim.duration_secs.map(|secs| start.plus_secs(secs)),
+    }))
+}
+
+/// Live simulated devices with their ground truth.
+struct RealTime {
+    live: Live,
+    truth: sim::LiveTruth,
+    first_camera: Arc<str>,
+    n_left: Option<u64>,
+    end: Option<Stamp>,
+}
+
+impl Source for RealTime {
+    fn next_sample(&mut self) -> Result<Option<Sample>, Error> {
+        if let Some(truth) = self.truth.take() {
+            return Ok(Some(truth));
+        }
+        if self.n_left == Some(0) {
+            return Ok(None);
+        }
+        let sample = self.live.next_sample()?;
+        if let Some(Sample::Image(image)) = &sample
+            && !image.is_depth()
+            && image.camera == self.first_camera
+            && let Some(n_left) = &mut self.n_left
+        {
+            *n_left -= 1;
+        }
+        let past_end = |sample: &Sample| self.end.is_some_and(|end| sample.stamp() >= end);
+        Ok(sample.filter(|sample| !past_end(sample)))
+    }
+
+    fn n_other_samples_dropped(&self) -> u64 {
+        self.live.n_other_samples_dropped()
+    }
+}
+
+/// The simulator configuration of a rig.
+fn config_of(rig: &Rig) -> crate::Result<sim::Config> {
+    let Some(scene) = sim::Scene::from_name(&rig.sim.scene) else {
+        let known: Vec<_> = sim::Scene::ALL.iter().map(|scene| scene.name()).collect();
+        bail!("sim.scene is {:?}; known scenes: {}", rig.sim.scene, known.join(", "));
+    };
+    if rig.base.world_from_base != Transform::identity() {
+        bail!("a simulated base is at the world origin: base.world_from_base must be the identity");
+    }
+    if scene.has_moving_base() != (rig.base.driver == BaseDriver::Sim) {
+        let driver = if scene.has_moving_base() { "sim" } else { "fixed" };
+        bail!("the scene {:?} needs base.driver = {driver:?}", scene.name());
+    }
+    Ok(sim::Config {
+        scene,
+        seed: rig.sim.seed,
+        ideal: rig.sim.ideal,
+        truth: rig.sim.truth,
+        truth_depth: rig.sim.truth_depth,
+        speed: rig.sim.speed,
+        azimuth_only: rig.sim.azimuth_only,
+        duration_secs: rig.sim.duration_secs,
+        n_images: rig.sim.n_images,
+        joint_names: super::chain_of(rig)?.joint_names().to_vec(),
+        reading_order: rig.arm.joints.clone(),
+        scanners: rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Sim).map(scanner_of).collect(),
+        base: sim::BaseConfig { rate_hz: rig.base.rate_hz, drift_m: rig.base.drift_m, drift_rad: rig.base.drift_rad },
+        light_inside_frac: rig.sim.light_inside_frac,
+        cameras: rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::Sim).map(camera_of).collect(),
+    })
+}
+
+fn scanner_of(scanner: &Scanner) -> sim::ScannerConfig {
+    sim::ScannerConfig {
+        name: scanner.name.to_string(),
+        rate_hz: scanner.rate_hz,
+        base_from_scanner: scanner.base_from_scanner,
+        n_rings: scanner.sim.rings,
+        elevation_rad: [scanner.sim.min_elevation_rad, scanner.sim.max_elevation_rad],
+        n_columns: scanner.sim.columns,
+        min_m: scanner.min_m,
+        max_m: scanner.max_m,
+        noise_sigma_m: scanner.sim.noise_sigma_m,
+        dropped_frac: scanner.sim.dropped_frac,
+    }
+}
+
+fn camera_of(camera: &Camera) -> sim::CameraConfig {
+    let default = sim::SensorConfig::default();
+    sim::CameraConfig {
+        name: camera.name.to_string(),
+        intrinsics: camera.intrinsics.clone(),
+        rate_hz: camera.rate_hz,
+        parent: match camera.parent {
+            Parent::Flange => sim::Parent::Flange,
+            Parent::Base => sim::Parent::Base,
+            Parent::World => sim::Parent::World,
+        },
+        parent_from_camera: camera.parent_from_camera,
+        sensor: sim::SensorConfig {
+            noise_sigma: camera.sim.noise_sigma,
+            shot_frac: camera.sim.shot_frac,
+            exposure_micros: camera.exposure_micros.unwrap_or(default.exposure_micros),
+            blur_samples: camera.sim.blur_samples,
+            readout_micros: camera.readout_micros.unwrap_or(0.0),
+            latency_millis: camera.sim.latency_millis,
+            dropped_frac: camera.sim.dropped_frac,
+            supersample: camera.sim.supersample,
+        },
+        depth: camera.depth.as_ref().map(|depth| sim::DepthConfig {
+            sensor: (depth.intrinsics != camera.intrinsics || depth.camera_from_depth != Transform::identity()).then(
+                || sim::DepthSensor {
+                    intrinsics: depth.intrinsics.clone(),
+                    camera_from_depth: depth.camera_from_depth,
+                },
+            ),
+            noise_sigma_m: camera.sim.depth_noise_sigma_m,
+            hole_frac: camera.sim.depth_hole_frac,
+            min_m: depth.min_m,
+            max_m: depth.max_m,
+            meters_per_count: camera.sim.meters_per_count,
+        }),
+    }
+}

@@ -1,0 +1,122 @@
+//! One posed photo of a dataset, and the decoding of its files.
+
+use crate::Error;
+use crate::decode::decode_complete;
+use image::{DynamicImage, ImageReader};
+use kinematics::{Intrinsics, Stamp, Transform};
+use std::path::{Path, PathBuf};
+
+/// One posed photo on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DatasetImage {
+    /// Name in the dataset, usually the path of the image inside the folder.
+    pub name: String,
+    /// Lens parameters of the color image at its original size.
+    pub intrinsics: Intrinsics,
+    /// Pose at `stamp`.
+    pub world_from_camera: Transform,
+    /// When the photo was taken. If the dataset has no times, images are 1 ms apart in the order of their names.
+    pub stamp: Stamp,
+    /// The color image.
+    pub image_path: PathBuf,
+    /// Its depth image, if any.
+    pub depth: Option<DepthFile>,
+    /// Image that is 0 at pixels that must not be used.
+    pub mask_path: Option<PathBuf>,
+}
+
+/// A 16-bit depth image on disk.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthFile {
+    /// The file.
+    pub path: PathBuf,
+    /// Meters per count; a count of 0 is unknown.
+    pub meters_per_count: f64,
+    /// Pose of the depth camera when the depth image was taken.
+    pub world_from_camera: Transform,
+}
+
+/// The decoded files of one image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LoadedImage {
+    /// `[height, width, 4]`, sRGB, still distorted. Alpha is 0 at pixels that the mask or the alpha of the photo
+    /// excludes, else 255.
+    pub rgba_srgb: Vec<u8>,
+    /// Depth, still distorted.
+    pub depth: Option<DepthImage>,
+    /// Why depth is missing although the image has a depth file.
+    pub depth_error: Option<String>,
+}
+
+/// Decoded depth at its own size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DepthImage {
+    /// Lens parameters of the photo, scaled to the size of the depth image.
+    pub intrinsics: Intrinsics,
+    /// `[height, width]`, meters along the camera's z axis; 0 if unknown.
+    pub depth_m: Vec<f32>,
+}
+
+impl DatasetImage {
+    /// Decodes the files of this image. If only the depth image fails to decode, the photo is still returned.
+    pub fn load(&self) -> Result<LoadedImage, Error> {
+        let mut rgba = decode_file(&self.image_path)?.into_rgba8();
+        self.require_size(&self.image_path, [rgba.width(), rgba.height()])?;
+        for pixel in rgba.pixels_mut() {
+            pixel.0[3] = if pixel.0[3] == 0 { 0 } else { 255 };
+        }
+        if let Some(mask_path) = &self.mask_path {
+            let mask = decode_file(mask_path)?.into_luma8();
+            self.require_size(mask_path, [mask.width(), mask.height()])?;
+            for (pixel, mask_pixel) in rgba.pixels_mut().zip(mask.pixels()) {
+                pixel.0[3] = if mask_pixel.0[0] == 0 { 0 } else { pixel.0[3] };
+            }
+        }
+        let (depth, depth_error) = match self.depth.as_ref().map(|file| self.load_depth(file)) {
+            Some(Err(error)) => (None, Some(error.to_string())),
+            Some(Ok(depth)) => (Some(depth), None),
+            None => (None, None),
+        };
+        Ok(LoadedImage { rgba_srgb: rgba.into_raw(), depth, depth_error })
+    }
+
+    fn load_depth(&self, file: &DepthFile) -> Result<DepthImage, Error> {
+        let DynamicImage::ImageLuma16(counts) = decode_file(&file.path)? else {
+            return Err(Error::NotDepth { path: file.path.clone() });
+        };
+        #[expect(clippy::cast_possible_truncation, reason = "f32 is more precise than sensors")]
+        let meters_from_count = |count: &u16| (f64::from(*count) * file.meters_per_count) as f32;
+        Ok(DepthImage {
+            intrinsics: self.intrinsics.resized([counts.width(), counts.height()]),
+            depth_m: counts.as_raw().iter().map(meters_from_count).collect(),
+        })
+    }
+
+    fn require_size(&self, path: &Path, got_px: [u32; 2]) -> Result<(), Error> {
+        let expected_px = self.intrinsics.size_px;
+        if got_px == expected_px {
+            return Ok(());
+        }
+        Err(Error::DatasetImageSize { path: path.to_owned(), got_px, expected_px })
+    }
+}
+
+/// Reads the width and height of an image from its header.
+pub(super) fn image_size_px(path: &Path) -> Result<[u32; 2], Error> {
+    let size = open_image(path)?.into_dimensions().map_err(|source| decode_error(path, source))?;
+    Ok(size.into())
+}
+
+fn decode_file(path: &Path) -> Result<DynamicImage, Error> {
+    let bytes = std::fs::read(path).map_err(|source| Error::Open { path: path.to_owned(), source })?;
+    decode_complete(&bytes, None).map_err(|source| decode_error(path, source))
+}
+
+fn open_image(path: &Path) -> Result<ImageReader<std::io::BufReader<std::fs::File>>, Error> {
+    let open = || ImageReader::open(path)?.with_guessed_format();
+    open().map_err(|source| Error::Open { path: path.to_owned(), source })
+}
+
+fn decode_error(path: &Path, source: image::ImageError) -> Error {
+    Error::DatasetImage { path: path.to_owned(), source }
+}

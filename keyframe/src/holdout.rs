@@ -1,0 +1,128 @@
+//! Selects which photos of a dataset are excluded from training, and for what.
+
+use crate::{Error, Split};
+use std::path::Path;
+
+/// How test photos are chosen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Holdout {
+    /// Every n-th photo, starting with the first; n is at least 1.
+    Every(usize),
+    /// The photos with these names.
+    Named(Vec<String>),
+}
+
+impl Default for Holdout {
+    fn default() -> Self {
+        Self::Every(8)
+    }
+}
+
+impl Holdout {
+    /// Parses the value of `--holdout`: a number, or a file with one name per line.
+    ///
+    /// # Errors
+    ///
+    /// If it is neither a number from 1 nor a readable file with at least one name.
+    pub fn from_argument(argument: &str) -> Result<Self, Error> {
+        let invalid = |reason: &str| Error::Holdout { request: argument.to_owned(), reason: reason.to_owned() };
+        if let Ok(every) = argument.parse::<i64>() {
+            return usize::try_from(every)
+                .ok()
+                .filter(|every| *every >= 1)
+                .map(Self::Every)
+                .ok_or_else(|| invalid("must be at least 1, or a file that lists photos"));
+        }
+        let text = std::fs::read_to_string(Path::new(argument))
+            .map_err(|error| invalid(&format!("neither a whole number nor a readable file ({error})")))?;
+        let names: Vec<_> = text.lines().map(str::trim).filter(|name| !name.is_empty()).map(str::to_owned).collect();
+        if names.is_empty() { Err(invalid("the file lists no photo")) } else { Ok(Self::Named(names)) }
+    }
+
+    /// The split of each photo, in the order of `names`.
+    ///
+    /// Validation photos lie halfway between test photos; with named test photos, they are every 8th of the others,
+    /// from the 5th. Names match with or without folder and extension.
+    ///
+    /// # Errors
+    ///
+    /// If a name matches no photo.
+    pub fn splits(&self, names: &[&str]) -> Result<Vec<Split>, Error> {
+        match self {
+            Self::Every(every) => Ok((0..names.len()).map(|ix| every_nth(ix, *every)).collect()),
+            Self::Named(test_names) => splits_by_name(test_names, names),
+        }
+    }
+}
+
+fn every_nth(ix: usize, every: usize) -> Split {
+    match ix % every {
+        0 => Split::Test,
+        offset if every >= 4 && offset == every / 2 => Split::Validation,
+        _ => Split::Train,
+    }
+}
+
+fn splits_by_name(test_names: &[String], names: &[&str]) -> Result<Vec<Split>, Error> {
+    for test_name in test_names {
+        if !names.iter().any(|name| matches_name(name, test_name)) {
+            return Err(Error::Holdout { request: format!("{test_name:?}"), reason: "no photo has this name".into() });
+        }
+    }
+    let mut n_remaining = 0;
+    let split = |name: &&str| {
+        if test_names.iter().any(|test_name| matches_name(name, test_name)) {
+            return Split::Test;
+        }
+        n_remaining += 1;
+        if n_remaining % 8 == 5 { Split::Validation } else { Split::Train }
+    };
+    Ok(names.iter().map(split).collect())
+}
+
+/// Whether `requested` matches a photo by its path in the folder, its file name, or its file name without extension.
+fn matches_name(name: &str, requested: &str) -> bool {
+    let path = Path::new(name);
+    let parts = [path.file_name(), path.file_stem()];
+    name == requested || parts.into_iter().flatten().any(|part| part == requested)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use Split::{Test, Train, Validation};
+
+    #[test]
+    fn default_holdout_matches_keyframe_splits() {
+        let names = vec!["photo"; 20];
+        let expected: Vec<_> = (0..20).map(Split::of).collect();
+        assert_eq!(Holdout::default().splits(&names).unwrap(), expected);
+        assert_eq!(Holdout::Every(2).splits(&names[..4]).unwrap(), [Test, Train, Test, Train]);
+        assert_eq!(Holdout::Every(4).splits(&names[..5]).unwrap(), [Test, Train, Validation, Train, Test]);
+    }
+
+    #[test]
+    fn photos_match_with_or_without_folder_and_extension() {
+        let names = ["images/a.jpg", "images/b.jpg", "images/c.jpg", "images/d.jpg"];
+        let splits_by_name =
+            |test: &[&str]| Holdout::Named(test.iter().map(|name| (*name).to_owned()).collect()).splits(&names);
+        assert_eq!(splits_by_name(&["images/a.jpg", "b.jpg", "c"]).unwrap(), [Test, Test, Test, Train]);
+        assert!(splits_by_name(&["e"]).unwrap_err().to_string().contains("\"e\": no photo has this name"));
+        assert_eq!(splits_by_name(&["a", "b", "c", "d"]).unwrap(), [Test; 4], "all photos may be scored");
+    }
+
+    #[test]
+    fn argument_is_a_number_or_a_file() {
+        assert_eq!(Holdout::from_argument("10").unwrap(), Holdout::Every(10));
+        assert_eq!(Holdout::from_argument("1").unwrap().splits(&["a", "b"]).unwrap(), [Test, Test]);
+        for invalid in ["0", "-3"] {
+            assert!(Holdout::from_argument(invalid).unwrap_err().to_string().contains("at least 1"), "{invalid}");
+        }
+        assert!(Holdout::from_argument("no/such/file").is_err());
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("test.txt");
+        std::fs::write(&file, "a.jpg\n\n b.jpg \n").unwrap();
+        let names = vec!["a.jpg".to_owned(), "b.jpg".to_owned()];
+        assert_eq!(Holdout::from_argument(file.to_str().unwrap()).unwrap(), Holdout::Named(names));
+    }
+}

@@ -1,0 +1,112 @@
+//! The list of camera poses of a run, `cameras.json` next to the model. Viewers draw the cameras and choose their first
+//! view from them.
+
+use crate::error::Context;
+use crate::{camera_path, run_folder};
+use kinematics::Transform;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use viz::KeyframePose;
+
+/// Name of the file in the run folder.
+pub const FILE: &str = "cameras.json";
+
+/// Pose and intrinsics of one keyframe.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PosedCamera {
+    pub camera: String,
+    pub stamp_nanos: i64,
+    pub split: String,
+    pub size_px: [u32; 2],
+    pub focal_px: [f64; 2],
+    pub principal_px: [f64; 2],
+    /// 4x4 matrix, row major.
+    pub world_from_camera: [f64; 16],
+}
+
+#[derive(Serialize, Deserialize)]
+struct File {
+    cameras: Vec<PosedCamera>,
+}
+
+/// Writes the list, one camera per line.
+pub fn write(folder: &Path, cameras: &[PosedCamera]) -> crate::Result<()> {
+    let lines: Vec<String> = cameras.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+    run_folder::write_atomic(&folder.join(FILE), &format!("{{\"cameras\": [\n{}\n]}}\n", lines.join(",\n")))
+}
+
+/// Reads the list; `None` if the folder has none.
+pub fn read(folder: &Path) -> crate::Result<Option<Vec<KeyframePose>>> {
+    let path = folder.join(FILE);
+    let text = match std::fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(error).with_context(|| format!("cannot read {}", path.display())),
+    };
+    let File { cameras } = serde_json::from_str(&text).with_context(|| format!("{} is damaged", path.display()))?;
+    let posed = cameras.into_iter().map(|camera| {
+        let world_from_camera = camera_path::rigid(&camera.world_from_camera).with_context(|| {
+            let (name, stamp) = (&camera.camera, camera.stamp_nanos);
+            format!("{}: the pose of {name} {stamp}", path.display())
+        })?;
+        Ok(KeyframePose {
+            camera: camera.camera.into(),
+            world_from_camera,
+            size_px: camera.size_px,
+            focal_px: camera.focal_px,
+            principal_px: camera.principal_px,
+        })
+    });
+    posed.collect::<crate::Result<_>>().map(Some)
+}
+
+/// The 4x4 matrix of a pose, row major.
+pub fn row_major(pose: &Transform) -> [f64; 16] {
+    let rows = pose.to_homogeneous().transpose();
+    std::array::from_fn(|ix| rows[ix])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Isometry3, Vector3};
+
+    fn camera() -> PosedCamera {
+        let pose = Isometry3::new(Vector3::new(0.5, -2.0, 1.25), Vector3::new(0.3, -1.1, 0.7));
+        PosedCamera {
+            camera: "wrist".into(),
+            stamp_nanos: -7,
+            split: "test".into(),
+            size_px: [64, 48],
+            focal_px: [50.0, 51.0],
+            principal_px: [32.0, 24.0],
+            world_from_camera: row_major(&pose),
+        }
+    }
+
+    #[test]
+    fn camera_list_round_trips() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert!(read(folder.path()).expect("no file is no error").is_none());
+        write(folder.path(), &[camera(), camera()]).expect("disk space");
+        let cameras = read(folder.path()).expect("a list").expect("a file");
+        assert_eq!((cameras.len(), cameras[0].camera.as_ref(), cameras[1].size_px), (2, "wrist", [64, 48]));
+        for (number, expected) in row_major(&cameras[1].world_from_camera).iter().zip(camera().world_from_camera) {
+            assert!((number - expected).abs() < 1e-12);
+        }
+        write(folder.path(), &[]).expect("disk space");
+        assert_eq!(read(folder.path()).expect("a list").map(|cameras| cameras.len()), Some(0));
+    }
+
+    #[test]
+    fn damaged_list_error_names_the_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut skewed = camera();
+        skewed.world_from_camera[0] = 3.0;
+        write(folder.path(), &[skewed]).expect("disk space");
+        let message = format!("{:#}", read(folder.path()).expect_err("not rigid"));
+        assert!(message.contains(FILE) && message.contains("wrist -7"), "{message}");
+        std::fs::write(folder.path().join(FILE), "{").expect("disk space");
+        assert!(format!("{:#}", read(folder.path()).expect_err("truncated")).contains("damaged"));
+    }
+}

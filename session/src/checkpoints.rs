@@ -1,0 +1,293 @@
+//! Checkpoints of a model in training: taken periodically and written on a separate thread.
+
+use crate::Error;
+use crate::error::Context;
+use crate::run_folder::{CHECKPOINT, expect_one_model};
+use crate::stored_keyframes::StoredKeyframes;
+use keyframe::Keyframe;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+use trainer::Method;
+use trainer::checkpoint::{Checkpoint, PendingCheckpoint};
+
+/// Default time between two checkpoints.
+const DEFAULT_PERIOD: Duration = Duration::from_secs(60);
+/// Time between two writes of new keyframes in a live run.
+const KEYFRAME_PERIOD: Duration = Duration::from_secs(2);
+/// Name of the flag as stored in checkpoints.
+const CHECKPOINT_SECS: &str = "checkpoint-secs";
+
+/// How often checkpoints are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CheckpointOptions {
+    /// Time between two checkpoints; zero: never; `None`: 60 s.
+    pub period: Option<Duration>,
+}
+
+impl CheckpointOptions {
+    /// The flag as it is stored in a checkpoint, if it was given.
+    pub fn flag(self) -> Option<(String, String)> {
+        Some((CHECKPOINT_SECS.to_owned(), self.period?.as_secs_f64().to_string()))
+    }
+
+    /// This flag, or the value of the earlier run if it was not given.
+    pub fn or_previous(self, flags: &BTreeMap<String, String>) -> Self {
+        let previous = || flags.get(CHECKPOINT_SECS).and_then(|text| parse_period(text).ok());
+        Self { period: self.period.or_else(previous) }
+    }
+}
+
+/// Parses a number of seconds that is at least 0.
+///
+/// # Errors
+///
+/// If it is no such number.
+pub fn parse_period(text: &str) -> Result<Duration, String> {
+    let secs = text.parse().ok().and_then(|secs| Duration::try_from_secs_f64(secs).ok());
+    secs.ok_or_else(|| "expected a number of at least 0".to_owned())
+}
+
+/// Reads the checkpoint in a run folder.
+pub fn read(folder: &Path) -> crate::Result<Checkpoint> {
+    expect_one_model(folder)?;
+    Checkpoint::read(&folder.join(CHECKPOINT))
+        .with_context(|| format!("no checkpoint to resume from in {}", folder.display()))
+}
+
+/// Rejects a limit in seconds that earlier training has already reached.
+pub fn check_limit_not_passed(seconds: Option<f64>, checkpoint: &Checkpoint, subject: &str) -> Result<(), Error> {
+    match seconds.filter(|seconds| *seconds <= checkpoint.seconds) {
+        Some(seconds) => Err(Error::BadInput(format!(
+            "--seconds {seconds}: {subject} has already been trained for {:.1} s, which count; give a larger limit",
+            checkpoint.seconds
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// What every checkpoint of a run contains in addition to the model state.
+#[derive(Clone, Debug, Default)]
+pub struct RunFlags {
+    /// SHA-256 of the model from which depth was rendered.
+    pub depth_from: Option<String>,
+    /// Flags of the run that affect its keyframes, and its limits.
+    pub flags: BTreeMap<String, String>,
+}
+
+/// The checkpoints of one run. Each one replaces the previous one.
+pub struct Checkpoints {
+    path: PathBuf,
+    run_flags: RunFlags,
+    period: Duration,
+    /// Time after `last` at which the next checkpoint is due.
+    due_after: Duration,
+    last: Instant,
+    /// Keyframes that exist nowhere else on disk.
+    stored_keyframes: Option<StoredKeyframes>,
+    last_keyframes: Instant,
+    writer: Option<WriterThread>,
+    /// Whether this run has written a checkpoint.
+    has_any: bool,
+}
+
+/// A writer thread.
+struct WriterThread {
+    thread: JoinHandle<crate::Result<()>>,
+    /// Whether it writes a checkpoint rather than only keyframes.
+    is_checkpoint: bool,
+}
+
+/// A model in training, and the other contents of its checkpoint.
+pub struct Snapshot<'a> {
+    pub method: &'a mut dyn Method,
+    /// All keyframes in the store, including test keyframes.
+    pub keyframes: &'a [Arc<Keyframe>],
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Whether training has reached its limit.
+    pub is_finished: bool,
+}
+
+impl Checkpoints {
+    /// Returns `None` if checkpoints are disabled. The first one is due after one period.
+    pub fn new(folder: &Path, options: CheckpointOptions) -> Option<Self> {
+        let (period, path) = (options.period.unwrap_or(DEFAULT_PERIOD), folder.join(CHECKPOINT));
+        (!period.is_zero()).then(|| Self {
+            path,
+            run_flags: RunFlags::default(),
+            period,
+            due_after: period,
+            last: Instant::now(),
+            stored_keyframes: None,
+            last_keyframes: Instant::now(),
+            writer: None,
+            has_any: false,
+        })
+    }
+
+    /// Stores these flags in each checkpoint.
+    pub fn with_flags(self, run_flags: RunFlags) -> Self {
+        Self { run_flags, ..self }
+    }
+
+    /// Also stores the keyframes, for a live run whose images exist nowhere else. The first checkpoint is due as soon
+    /// as the first keyframes are written, because resuming needs both.
+    pub fn with_keyframes(self, run: &Path) -> Self {
+        let due_after = self.period.min(KEYFRAME_PERIOD);
+        Self { stored_keyframes: Some(StoredKeyframes::of_run(run)), due_after, ..self }
+    }
+
+    /// Whether keyframes are stored too.
+    pub fn keeps_keyframes(&self) -> bool {
+        self.stored_keyframes.is_some()
+    }
+
+    /// Starts a checkpoint if one is due and the previous one is complete; returns whether it did. Write errors are
+    /// logged and do not stop training.
+    pub fn write_when_due(&mut self, now: Snapshot<'_>) -> Result<bool, trainer::Error> {
+        if self.writer.as_ref().is_some_and(|writer| !writer.thread.is_finished()) {
+            return Ok(false);
+        }
+        let is_resumable = self.stored_keyframes.is_none() || !now.keyframes.is_empty();
+        if self.last.elapsed() >= self.due_after && is_resumable {
+            self.begin(now)?;
+            return Ok(true);
+        }
+        if let Some(stored) = self.stored_keyframes.clone().filter(|_| self.last_keyframes.elapsed() >= KEYFRAME_PERIOD)
+        {
+            self.wait_and_warn();
+            let keyframes = now.keyframes.to_vec();
+            let thread = std::thread::spawn(move || stored.add(&keyframes));
+            self.writer = Some(WriterThread { thread, is_checkpoint: false });
+            self.last_keyframes = Instant::now();
+        }
+        Ok(false)
+    }
+
+    /// Starts a checkpoint of the current state once the one in progress is complete.
+    pub fn begin(&mut self, now: Snapshot<'_>) -> Result<(), trainer::Error> {
+        let job = self.take(now)?;
+        self.write(job);
+        Ok(())
+    }
+
+    /// Copies the current state for writing later.
+    pub fn take(&mut self, now: Snapshot<'_>) -> Result<CheckpointWrite, trainer::Error> {
+        self.wait_and_warn();
+        let started = Instant::now();
+        let pending = now.method.checkpoint()?;
+        log::debug!("taking a checkpoint paused training for {:?}", started.elapsed());
+        Ok(CheckpointWrite {
+            pending,
+            seconds: now.seconds,
+            is_finished: now.is_finished,
+            run_flags: self.run_flags.clone(),
+            path: self.path.clone(),
+            keyframes: self.stored_keyframes.clone().map(|stored| (stored, now.keyframes.to_vec())),
+        })
+    }
+
+    /// Writes a copy on a separate thread.
+    pub fn write(&mut self, job: CheckpointWrite) {
+        let thread = std::thread::spawn(move || job.write());
+        self.writer = Some(WriterThread { thread, is_checkpoint: true });
+        (self.last, self.last_keyframes) = (Instant::now(), Instant::now());
+        self.due_after = self.period;
+    }
+
+    fn wait_and_warn(&mut self) {
+        let is_checkpoint = self.writer.as_ref().is_some_and(|writer| writer.is_checkpoint);
+        match self.wait() {
+            Ok(()) => {}
+            Err(error) if is_checkpoint => {
+                let previous = if self.path.exists() { "; the previous one is kept" } else { "" };
+                log::warn!("cannot write a checkpoint{previous}: {error:#}");
+            }
+            // The next checkpoint stores them too, and warns if that fails.
+            Err(error) => log::debug!("cannot store keyframes: {error:#}"),
+        }
+    }
+
+    /// Path of the newest checkpoint of this run. If the one in progress fails, the previous one is used.
+    pub fn newest(&mut self) -> Option<&Path> {
+        if let Err(error) = self.wait() {
+            log::warn!("the checkpoint in progress failed: {error:#}");
+        }
+        self.has_any.then_some(&self.path)
+    }
+
+    /// Waits until the checkpoint in progress is on disk.
+    pub fn wait(&mut self) -> crate::Result<()> {
+        let Some(WriterThread { thread, is_checkpoint }) = self.writer.take() else { return Ok(()) };
+        match thread.join() {
+            Ok(written) => {
+                written?;
+                self.has_any |= is_checkpoint;
+                Ok(())
+            }
+            Err(panic) => std::panic::resume_unwind(panic),
+        }
+    }
+}
+
+/// A checkpoint that is ready to be written.
+pub struct CheckpointWrite {
+    pending: PendingCheckpoint,
+    seconds: f64,
+    is_finished: bool,
+    run_flags: RunFlags,
+    path: PathBuf,
+    keyframes: Option<(StoredKeyframes, Vec<Arc<Keyframe>>)>,
+}
+
+impl CheckpointWrite {
+    /// Writes new keyframes, then the checkpoint, then removes keyframes that only the previous checkpoint needed.
+    fn write(self) -> crate::Result<()> {
+        let started = Instant::now();
+        let RunFlags { depth_from, flags } = self.run_flags;
+        if let Some((stored, keyframes)) = &self.keyframes {
+            stored.add(keyframes)?;
+        }
+        let (seconds, is_finished) = (self.seconds, self.is_finished);
+        Checkpoint { seconds, is_finished, depth_from, flags, ..self.pending.finish()? }.write(&self.path)?;
+        if let Some((stored, keyframes)) = &self.keyframes {
+            stored.keep_only(keyframes)?;
+        }
+        log::debug!("wrote a checkpoint in {:?}", started.elapsed());
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn checkpoint_period_must_be_a_number() {
+        assert_eq!(parse_period("0"), Ok(Duration::ZERO));
+        assert_eq!(parse_period("0.5"), Ok(Duration::from_millis(500)));
+        for invalid in ["-1", "nan", "inf", "minute", ""] {
+            assert!(parse_period(invalid).is_err(), "{invalid}");
+        }
+    }
+
+    #[test]
+    fn resumed_run_keeps_the_checkpoint_period() {
+        let [none, one, two] =
+            [None, Some(1.0), Some(2.5)].map(|secs| CheckpointOptions { period: secs.map(Duration::from_secs_f64) });
+        let flags = |options: CheckpointOptions| options.flag().into_iter().collect();
+        assert_eq!(none.or_previous(&flags(two)).period, two.period);
+        assert_eq!(one.or_previous(&flags(two)).period, one.period);
+        assert_eq!(none.or_previous(&flags(none)).period, None);
+    }
+
+    #[test]
+    fn missing_checkpoint_error_names_the_folder() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let message = format!("{:#}", read(folder.path()).expect_err("none"));
+        assert!(message.contains(folder.path().to_str().expect("plain")) && message.contains(CHECKPOINT), "{message}");
+    }
+}

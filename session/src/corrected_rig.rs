@@ -1,0 +1,187 @@
+//! Writes the rig file with the calibration corrections that alignment found.
+
+use crate::Error;
+use crate::error::Context;
+use calibration::{Alignment, CameraCorrection, Estimate};
+use capture::config::{Camera, Rig, TimeOffset};
+use kinematics::{Chain, Intrinsics, Transform};
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
+use std::path::{Path, PathBuf};
+
+/// Value of `source` for a corrected time offset.
+const SOURCE: &str = "train --write-rig";
+
+/// The rig with all corrections applied. Per-image pose corrections have no key in a rig file and are left out.
+pub fn corrected(rig: &Rig, alignment: &Alignment) -> crate::Result<Rig> {
+    let mut rig = rig.clone();
+    for camera in &mut rig.cameras {
+        if let Some(correction) = alignment.corrections.get(&*camera.name) {
+            correct(camera, correction, alignment);
+        }
+    }
+    let joint_offsets =
+        alignment.corrections.values().map(|correction| &correction.joint_offsets).max_by_key(|offsets| offsets.len());
+    if let Some(by_chain) = joint_offsets.filter(|offsets| !offsets.is_empty()) {
+        let chain = Chain::from_urdf(&rig.arm.urdf_text, &rig.arm.base_link, &rig.arm.flange_link)?;
+        rig.arm.joint_offsets.resize(rig.arm.joints.len(), 0.0);
+        for (joint_ix, offset) in chain.order_in(&rig.arm.joints)?.into_iter().zip(by_chain) {
+            rig.arm.joint_offsets[joint_ix] += offset;
+        }
+    }
+    Ok(rig)
+}
+
+/// Checks that the rig file can be written there.
+pub fn check_target_file(rig: &Rig, file: &Path) -> Result<(), Error> {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if !folder.is_dir() || file.is_dir() {
+        return Err(Error::BadInput(format!("--write-rig {}: must be a file in an existing folder", file.display())));
+    }
+    match other_robot(rig, file) {
+        Some(urdf) => Err(Error::BadInput(format!(
+            "--write-rig {}: {} is the URDF of another robot; write the rig file to a separate folder",
+            file.display(),
+            urdf.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Path of the URDF next to a rig file, if it describes another robot.
+fn other_robot(rig: &Rig, file: &Path) -> Option<PathBuf> {
+    let urdf = file.with_file_name(drivers::recording::URDF_FILE);
+    let existing = std::fs::read_to_string(&urdf).ok()?;
+    (existing != rig.arm.urdf_text).then_some(urdf)
+}
+
+/// Writes a rig file and the robot's URDF next to it. Does not overwrite the URDF of another robot.
+pub fn write(rig: &Rig, file: &Path) -> crate::Result<()> {
+    check_target_file(rig, file)?;
+    let urdf = file.with_file_name(drivers::recording::URDF_FILE);
+    let in_file = || format!("cannot write {}", file.display());
+    std::fs::write(&urdf, &rig.arm.urdf_text).with_context(in_file)?;
+    std::fs::write(file, rig.to_toml()).with_context(in_file)
+}
+
+fn correct(camera: &mut Camera, correction: &CameraCorrection, alignment: &Alignment) {
+    let moved = |rotation_rad: [f64; 3], translation_m: [f64; 3]| {
+        Transform::from_parts(
+            Translation3::from(Vector3::from(translation_m)),
+            UnitQuaternion::from_scaled_axis(Vector3::from(rotation_rad)),
+        )
+    };
+    camera.parent_from_camera *= moved(correction.rotation_rad, correction.translation_m).inverse();
+    if correction.time_offset_secs != 0.0 {
+        let sigma = alignment.estimates.iter().find_map(|estimate| match estimate {
+            Estimate::TimeOffset(time_offset) if *time_offset.camera == *camera.name => Some(time_offset.sigma),
+            _ => None,
+        });
+        camera.stamp_to_mid_exposure = Some(TimeOffset {
+            value_millis: camera.stamp_to_mid_exposure.as_ref().map_or(0.0, |known| known.value_millis)
+                + 1e3 * correction.time_offset_secs,
+            sigma_millis: 1e3 * sigma.unwrap_or(0.0),
+            source: SOURCE.to_owned(),
+        });
+    }
+    if correction.readout_secs != 0.0 {
+        let readout_micros = camera.readout_micros.unwrap_or(0.0) + 1e6 * correction.readout_secs;
+        camera.readout_micros = Some(readout_micros.clamp(0.0, 1e6 / camera.rate_hz));
+    }
+    let correct_lens = |intrinsics: &mut Intrinsics| {
+        for axis in 0..2 {
+            intrinsics.principal_px[axis] += correction.principal_offset_focals[axis] * intrinsics.focal_px[axis];
+            intrinsics.focal_px[axis] *= correction.log_focal[axis].exp();
+        }
+    };
+    if let Some(depth) = &mut camera.depth {
+        let shares_lens = depth.intrinsics == camera.intrinsics.resized(depth.intrinsics.size_px)
+            || depth.intrinsics == camera.intrinsics;
+        if shares_lens {
+            correct_lens(&mut depth.intrinsics);
+        }
+        depth.camera_from_depth =
+            moved(correction.depth_rotation_rad, correction.depth_translation_m) * depth.camera_from_depth;
+        depth.factor *= correction.log_depth_scale.exp();
+    }
+    correct_lens(&mut camera.intrinsics);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use calibration::ScalarEstimate;
+    use std::collections::BTreeMap;
+
+    const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
+
+    fn bundled_rig() -> Rig {
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        Rig::load(&file, &[]).unwrap()
+    }
+
+    #[test]
+    fn every_correction_is_written_to_its_key() {
+        let mut rig = bundled_rig();
+        rig.arm.joints.reverse(); // The device orders joints differently from the chain.
+        let correction = CameraCorrection {
+            rotation_rad: [0.01, -0.02, 0.03],
+            translation_m: [0.001, 0.002, -0.003],
+            time_offset_secs: 0.004,
+            log_focal: [0.01, 0.02],
+            principal_offset_focals: [0.001, -0.002],
+            joint_offsets: (0..7).map(f64::from).map(|joint| 0.001 * joint).collect(),
+            depth_translation_m: [0.0, 0.0, 0.005],
+            log_depth_scale: 0.01,
+            readout_secs: -0.003,
+            ..CameraCorrection::default()
+        };
+        let alignment = Alignment {
+            corrections: BTreeMap::from([("wrist".to_owned(), correction.clone())]),
+            estimates: vec![Estimate::TimeOffset(ScalarEstimate {
+                camera: "wrist".to_owned(),
+                value: 0.004,
+                sigma: 1e-4,
+            })],
+            ..Alignment::default()
+        };
+        let calibrated_rig = corrected(&rig, &alignment).unwrap();
+        let (before, after) = (&rig.cameras[0], &calibrated_rig.cameras[0]);
+        // The correction is applied after camera_from_parent.
+        let moved = Transform::new(Vector3::from(correction.translation_m), Vector3::from(correction.rotation_rad));
+        let expected = moved * before.parent_from_camera.inverse();
+        let max_error = (after.parent_from_camera.inverse().to_homogeneous() - expected.to_homogeneous()).abs().max();
+        assert!(max_error < TOLERANCE, "{max_error}");
+        let time_offset = after.stamp_to_mid_exposure.as_ref().unwrap();
+        assert!(
+            (time_offset.value_millis - 4.0).abs() < TOLERANCE && (time_offset.sigma_millis - 0.1).abs() < TOLERANCE
+        );
+        assert_eq!(time_offset.source, SOURCE);
+        assert!((after.readout_micros.unwrap() - 12_000.0).abs() < 1e-6);
+        assert!((after.intrinsics.focal_px[0] / before.intrinsics.focal_px[0] - 0.01f64.exp()).abs() < TOLERANCE);
+        let [fx, fy] = before.intrinsics.focal_px;
+        let moved = [0, 1].map(|axis| after.intrinsics.principal_px[axis] - before.intrinsics.principal_px[axis]);
+        assert!((moved[0] - 0.001 * fx).abs() < 1e-9 && (moved[1] + 0.002 * fy).abs() < 1e-9, "{moved:?}");
+        let depth = after.depth.as_ref().unwrap();
+        assert_eq!(depth.intrinsics.focal_px, after.intrinsics.focal_px, "depth uses the same lens");
+        assert!((depth.factor - 0.01f64.exp()).abs() < TOLERANCE);
+        assert!((depth.camera_from_depth.translation.vector - Vector3::new(0.0, 0.0, 0.005)).norm() < TOLERANCE);
+        let expected: Vec<f64> = (0..7).rev().map(|joint| 0.001 * f64::from(joint)).collect();
+        assert_eq!(calibrated_rig.arm.joint_offsets, expected);
+        // The written file can be read back, and the URDF of another robot is not overwritten.
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rig.toml");
+        write(&calibrated_rig, &file).unwrap();
+        assert_eq!(Rig::load(&file, &[]).unwrap(), calibrated_rig);
+        assert!(
+            Rig::load(&file, &[]).unwrap().has_same_calibration(&calibrated_rig)
+                && !rig.has_same_calibration(&calibrated_rig)
+        );
+        std::fs::write(folder.path().join(drivers::recording::URDF_FILE), "<robot/>").unwrap();
+        assert!(write(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"));
+        assert!(check_target_file(&calibrated_rig, &folder.path().join("none/rig.toml")).is_err());
+        assert!(
+            check_target_file(&calibrated_rig, &file).unwrap_err().to_string().contains("another robot"),
+            "the check before training rejects it, too"
+        );
+    }
+}

@@ -1,0 +1,395 @@
+//! Input of `train` and `eval`: a dataset folder or a recording, as keyframes in host memory.
+
+use crate::Error;
+use crate::depth_from::{DepthSource, RenderedDepth};
+use crate::error::ensure;
+use crate::methods::methods_of;
+use crate::read_progress::{OnReadProgress, ReadProgress};
+use crate::run_folder::is_recording;
+use capture::config::{Override, Rig};
+use capture::open::{self, Opened};
+use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
+use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::ModelKind;
+use trainer::gpu::Gpu;
+
+/// Which images are used, and for what.
+#[derive(Clone, Debug, Default)]
+pub struct DataOptions {
+    /// Use every n-th image for testing, or the images listed in this file; every 8th if `None`.
+    pub holdout: Option<String>,
+    /// Use exactly the keyframes of this list.
+    pub keyframes: Option<PathBuf>,
+    /// Read a recording with this rig file instead of the one stored in it.
+    pub rig: Option<PathBuf>,
+    /// Scale the images (not their depth) to this fraction of their width and height.
+    pub scale: Option<f64>,
+}
+
+impl DataOptions {
+    /// The test images selected by `--holdout`, if it is given.
+    pub fn holdout(&self) -> Result<Option<Holdout>, Error> {
+        Ok(self.holdout.as_deref().map(Holdout::from_argument).transpose()?)
+    }
+
+    /// The given flags that affect keyframes: names and values, with absolute paths for files.
+    pub fn flags(&self) -> BTreeMap<String, String> {
+        let canonical = |file: &Path| file.canonicalize().unwrap_or_else(|_| file.to_owned()).display().to_string();
+        let holdout = |text: &String| if is_number(text) { text.clone() } else { canonical(Path::new(text)) };
+        let given = [
+            ("holdout", self.holdout.as_ref().map(holdout)),
+            ("keyframes", self.keyframes.as_deref().map(canonical)),
+            ("rig", self.rig.as_deref().map(canonical)),
+            ("scale", self.scale.map(|scale| scale.to_string())),
+        ];
+        given.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
+    }
+
+    /// The flags that affect the pixels of listed keyframes, as command-line arguments.
+    pub fn flags_of_images(&self) -> Vec<String> {
+        let rig = self.rig.as_ref().map(|file| ["--rig".to_owned(), file.display().to_string()]);
+        let scale = self.scale.map(|scale| ["--scale".to_owned(), scale.to_string()]);
+        rig.into_iter().chain(scale).flatten().collect()
+    }
+
+    /// Completes these flags with those of an earlier run, `before`. A different number is an error. A different file
+    /// is accepted, because it may have moved; its contents are compared later.
+    ///
+    /// `subject`: name of the earlier result for messages.
+    pub fn completed_with(&self, subject: &str, before: &BTreeMap<String, String>) -> Result<Self, Error> {
+        let now = self.flags();
+        for (name, value) in before {
+            let is_other = |now: &String| now != value && is_number(now) && is_number(value);
+            if let Some(now) = now.get(name).filter(|now| is_other(now)) {
+                return Err(Error::BadInput(format!("--{name} {now}: {subject} was trained with --{name} {value}")));
+            }
+        }
+        let unset_flag = |name: &str| before.get(name).filter(|_| !now.contains_key(name));
+        // Both flags select images, so either one replaces both.
+        let image_flag = |name: &str| unset_flag(name).filter(|_| self.holdout.is_none() && self.keyframes.is_none());
+        let scale = unset_flag("scale").map(|scale| scale.parse());
+        let scale = scale.transpose().map_err(|_| Error::BadInput(format!("{subject}: its scale is not a number")))?;
+        let restored = Self {
+            holdout: self.holdout.clone().or(image_flag("holdout").cloned()),
+            keyframes: self.keyframes.clone().or(image_flag("keyframes").map(PathBuf::from)),
+            rig: self.rig.clone().or(unset_flag("rig").map(PathBuf::from)),
+            scale: self.scale.or(scale),
+        };
+        let restored_flags: Vec<String> = restored
+            .flags()
+            .iter()
+            .filter(|(name, _)| !now.contains_key(*name))
+            .map(|(name, value)| format!("--{name} {value}"))
+            .collect();
+        if !restored_flags.is_empty() {
+            log::info!("using {}, as {subject} was trained with", restored_flags.join(" "));
+        }
+        Ok(restored)
+    }
+}
+
+fn is_number(text: &str) -> bool {
+    text.parse::<f64>().is_ok()
+}
+
+/// Loaded keyframes and their metadata.
+pub struct Data {
+    /// In the order of the data.
+    pub keyframes: Vec<Arc<Keyframe>>,
+    /// Names of the images, in the same order.
+    pub names: Vec<String>,
+    /// The rig of the recording; `None` for a folder.
+    pub rig: Option<Rig>,
+    /// Whether the stamps are times rather than image indices.
+    pub has_times: bool,
+    /// Data that could not be read. If there are any, the exit code is 3.
+    pub data_losses: Vec<String>,
+    /// The correction of the base pose at each station after the first.
+    pub stations: Vec<StationReport>,
+    /// Depth that was rendered from a model for images without depth.
+    pub rendered_depth: Option<RenderedDepth>,
+    /// Time spent on station registration and depth rendering, which precede training but count as training time.
+    pub preparation_time: Duration,
+}
+
+/// What the data are used for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Needs at least one training image.
+    Training,
+    /// Needs at least one test image.
+    Scoring,
+}
+
+/// Which images are used.
+struct DataSelection {
+    list: Option<KeyframeList>,
+    holdout: Option<Holdout>,
+    scale: Option<f64>,
+    /// Replaces the rig stored in a recording.
+    rig: Option<PathBuf>,
+    /// Uses base poses as reported, without corrections at stations.
+    use_reported_poses: bool,
+}
+
+impl Data {
+    /// Reads a folder, or a recording through the join.
+    pub fn load(
+        path: &Path,
+        args: &DataOptions,
+        purpose: Purpose,
+        overrides: &[Override],
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let list = args.keyframes.as_deref().map(KeyframeList::load).transpose()?;
+        let holdout = args.holdout()?;
+        Self::load_selected(
+            path,
+            DataSelection { list, holdout, scale: args.scale, rig: args.rig.clone(), use_reported_poses: false },
+            purpose,
+            overrides,
+            progress,
+        )
+    }
+
+    /// Reads the keyframes of a list, with images scaled to this fraction of their size and base poses as reported.
+    pub fn of_list(
+        path: &Path,
+        list: KeyframeList,
+        rig: Option<PathBuf>,
+        scale: f64,
+        overrides: &[Override],
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let selection =
+            DataSelection { list: Some(list), holdout: None, scale: Some(scale), rig, use_reported_poses: true };
+        Self::load_selected(path, selection, Purpose::Training, overrides, progress)
+    }
+
+    fn load_selected(
+        path: &Path,
+        selection: DataSelection,
+        purpose: Purpose,
+        overrides: &[Override],
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let DataSelection { list, holdout, scale, rig, use_reported_poses } = selection;
+        expect(path)?;
+        let is_recording = is_recording(path);
+        let mut data = if is_recording {
+            let scale = scale.map(|scale| Override::new("train.scale", scale));
+            let overrides: Vec<Override> = overrides.iter().cloned().chain(scale).collect();
+            let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
+            Self::from_recording(path, rig, list, overrides, progress)?
+        } else if let Some(rig) = rig {
+            return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())).into());
+        } else {
+            Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, progress)?
+        };
+        if let (true, Some(holdout)) = (is_recording, &holdout) {
+            data.assign_splits(holdout)?;
+        }
+        if !use_reported_poses {
+            data.realign();
+        }
+        let (required_split, message) = match purpose {
+            Purpose::Training => (Split::Train, "no training image"),
+            Purpose::Scoring => (Split::Test, "no test image"),
+        };
+        if data.of_split(required_split).is_empty() {
+            let n_images = counted(data.keyframes.len() as u64, "image");
+            return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
+        }
+        Ok(data)
+    }
+
+    /// The rig with which a recording is read, before flags override it.
+    pub fn rig_as_given(path: &Path, args: &DataOptions) -> crate::Result<Rig> {
+        let rig = args.rig.as_deref().map(|file| Rig::load(file, &[])).transpose()?;
+        Ok(open::recording(path, rig, &[])?.rig)
+    }
+
+    /// The methods to train if no flag names any: those in the rig file of a recording, read before everything else.
+    pub fn default_methods(path: &Path, args: &DataOptions) -> crate::Result<Vec<ModelKind>> {
+        expect(path)?;
+        if is_recording(path) { methods_of(&Self::rig_as_given(path, args)?) } else { Ok(vec![ModelKind::default()]) }
+    }
+
+    /// Keyframes of one split.
+    pub fn of_split(&self, split: Split) -> Vec<Arc<Keyframe>> {
+        self.keyframes.iter().filter(|keyframe| keyframe.split == split).cloned().collect()
+    }
+
+    /// Names of the images by camera and stamp.
+    pub fn image_names(&self) -> BTreeMap<(String, i64), String> {
+        let key = |keyframe: &Arc<Keyframe>| (keyframe.camera.to_string(), keyframe.stamp.0);
+        self.keyframes.iter().map(key).zip(self.names.iter().cloned()).collect()
+    }
+
+    /// Whether any keyframe has depth.
+    pub fn has_depth(&self) -> bool {
+        self.keyframes.iter().any(|keyframe| keyframe.depth.is_some())
+    }
+
+    /// Renders depth for images without depth from a model.
+    pub fn render_depth(
+        &mut self,
+        gpu: Arc<Gpu>,
+        source: &DepthSource,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<()> {
+        let started = Instant::now();
+        self.rendered_depth = Some(source.draw(gpu, &mut self.keyframes, progress)?);
+        self.preparation_time += started.elapsed();
+        Ok(())
+    }
+
+    fn from_folder(
+        path: &Path,
+        holdout: &Holdout,
+        scale: f64,
+        list: Option<KeyframeList>,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let folder = drivers::dataset::read(path)?;
+        let n_all = Some(folder.images.len());
+        let on_image = |n_done| progress(ReadProgress { noun: "images", n_done, n_all });
+        let loaded = dataset::load(&folder, holdout, scale, &on_image)?;
+        for note in &loaded.notes {
+            log::warn!("{note}");
+        }
+        let mut data = Self {
+            keyframes: loaded.keyframes,
+            names: loaded.names,
+            rig: None,
+            has_times: folder.has_times(),
+            data_losses: loaded.data_losses,
+            stations: Vec::new(),
+            rendered_depth: None,
+            preparation_time: Duration::ZERO,
+        };
+        if let Some(list) = list {
+            data.take_only(&list)?;
+        }
+        Ok(data)
+    }
+
+    fn from_recording(
+        path: &Path,
+        rig: Option<Rig>,
+        list: Option<KeyframeList>,
+        overrides: Vec<Override>,
+        progress: OnReadProgress<'_>,
+    ) -> crate::Result<Self> {
+        let Opened { rig, mut source, damage } = open::recording(path, rig, &overrides)?;
+        let mut join = Join::new(&rig)?;
+        if let Some(list) = list {
+            join = join.taking_only(list);
+        }
+        let mut keyframes: Vec<Arc<Keyframe>> = Vec::new();
+        let mut apply = |events: Vec<JoinEvent>| {
+            for event in events {
+                match event {
+                    JoinEvent::Accepted(keyframe) => keyframes.push(keyframe),
+                    JoinEvent::Evicted { camera, stamp } => {
+                        keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                    }
+                    JoinEvent::PosedImage(_) | JoinEvent::Rejected { .. } => {}
+                }
+            }
+            progress(ReadProgress { noun: "keyframes", n_done: keyframes.len(), n_all: None });
+        };
+        while let Some(sample) = source.next_sample()? {
+            apply(join.push(sample));
+        }
+        apply(join.finish());
+        log::info!("{}", join.counts());
+        let mut data_losses = join.counts().data_losses(SampleUse::ProcessedOnly);
+        data_losses.extend(damage.get().cloned());
+        data_losses.extend(join.check_list()?);
+        let names = keyframes.iter().map(|keyframe| name(keyframe)).collect();
+        Ok(Self {
+            keyframes,
+            names,
+            rig: Some(rig),
+            has_times: true,
+            data_losses,
+            stations: Vec::new(),
+            rendered_depth: None,
+            preparation_time: Duration::ZERO,
+        })
+    }
+
+    /// Corrects the base poses at stations, as a live run does.
+    fn realign(&mut self) {
+        let Some(mut stations) = self.rig.as_ref().and_then(Stations::new) else { return };
+        self.keyframes = stations.corrected(std::mem::take(&mut self.keyframes));
+        (self.stations, self.preparation_time) = (stations.reports().to_vec(), stations.spent());
+    }
+
+    /// Assigns splits anew, separately for each camera.
+    fn assign_splits(&mut self, holdout: &Holdout) -> crate::Result<()> {
+        let mut by_camera: BTreeMap<Arc<str>, Vec<usize>> = BTreeMap::new();
+        for (ix, keyframe) in self.keyframes.iter().enumerate() {
+            by_camera.entry(keyframe.camera.clone()).or_default().push(ix);
+        }
+        for ixs in by_camera.values() {
+            let names: Vec<&str> = ixs.iter().map(|ix| self.names[*ix].as_str()).collect();
+            for (ix, split) in ixs.iter().zip(holdout.splits(&names)?) {
+                Arc::make_mut(&mut self.keyframes[*ix]).split = split;
+            }
+        }
+        Ok(())
+    }
+
+    /// Keeps only the listed keyframes, with the splits in the list.
+    fn take_only(&mut self, list: &KeyframeList) -> Result<(), Error> {
+        let images = || self.keyframes.iter().map(|keyframe| (&*keyframe.camera, keyframe.stamp));
+        self.data_losses.extend(list.check_found(images(), images().next())?);
+        let all = std::mem::take(&mut self.keyframes).into_iter().zip(std::mem::take(&mut self.names));
+        for (mut keyframe, name) in all {
+            if let Some(split) = list.split_of(&keyframe.camera, keyframe.stamp) {
+                Arc::make_mut(&mut keyframe).split = split;
+                self.keyframes.push(keyframe);
+                self.names.push(name);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns an error if the path does not exist.
+pub fn expect(path: &Path) -> crate::Result<()> {
+    ensure!(path.exists(), "{} does not exist", path.display());
+    Ok(())
+}
+
+/// Name of a recorded image: camera and stamp.
+fn name(keyframe: &Keyframe) -> String {
+    format!("{}/{}", keyframe.camera, keyframe.stamp.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn missing_flags_are_restored() {
+        let none = DataOptions { holdout: None, keyframes: None, rig: None, scale: None };
+        let first = DataOptions { holdout: Some("5".into()), scale: Some(0.25), ..none.clone() };
+        let again = |args: &DataOptions| args.completed_with("the checkpoint", &first.flags());
+        assert_eq!(again(&none).expect("no flag is given").flags(), first.flags());
+        let listed = DataOptions { keyframes: Some("other.txt".into()), ..none.clone() };
+        let names: Vec<String> = again(&listed).expect("lists are compared later").flags().into_keys().collect();
+        assert_eq!(names, ["keyframes", "scale"]);
+        let same = DataOptions { scale: Some(0.25), ..none.clone() };
+        assert_eq!(again(&same).expect("the same").flags(), first.flags());
+        let other = again(&DataOptions { scale: Some(0.5), ..none.clone() }).expect_err("another").to_string();
+        assert_eq!(other, "--scale 0.5: the checkpoint was trained with --scale 0.25");
+        assert!(again(&DataOptions { holdout: Some("2".into()), ..none }).is_err());
+    }
+}

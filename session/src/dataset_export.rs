@@ -1,0 +1,261 @@
+//! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
+
+use crate::error::{Context, bail, ensure};
+use crate::partial::Partial;
+use drivers::dataset::nerfstudio;
+use image::ExtendedColorType;
+use keyframe::{DepthMap, Keyframe, Split};
+use kinematics::{Transform, transform};
+use serde_json::{Map, Value, json};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Depth unit that readers assume if the file does not specify one: millimeters.
+const METERS_PER_COUNT: f64 = 0.001;
+/// Maximum difference between the lenses of depth and photo, in pixels of the depth image. Above it, depth cannot be
+/// stored with the photo.
+const MAX_LENS_DIFFERENCE_PX: f64 = 0.5;
+/// The test photos, one per line, in the format of `--holdout`.
+const TEST_LIST: &str = "test.txt";
+/// The split lists of nerfstudio.
+const LISTS: [(&str, Split); 3] =
+    [("train_filenames", Split::Train), ("val_filenames", Split::Validation), ("test_filenames", Split::Test)];
+
+/// The entries of a dataset folder.
+const ENTRIES: [&str; 5] = [IMAGES, MASKS, DEPTH, TEST_LIST, nerfstudio::FILE_NAME];
+const IMAGES: &str = "images";
+const MASKS: &str = "masks";
+const DEPTH: &str = "depth";
+
+/// Counts of what was written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Written {
+    pub n_images: usize,
+    pub n_depth: usize,
+    /// Depth images that were left out because their intrinsics differ from those of the photo, which the format cannot
+    /// express.
+    pub n_depth_skipped: usize,
+}
+
+/// Writes a folder, which must not contain a dataset yet. `transforms.json` is written last, so a folder that has it is
+/// complete.
+///
+/// Depth is rounded to millimeters and limited to 65 m. Velocities, readout times and ground truth of simulators are
+/// not exported.
+pub fn write_nerfstudio(out: &Path, keyframes: impl Iterator<Item = Arc<Keyframe>>) -> crate::Result<Written> {
+    let transforms = out.join(nerfstudio::FILE_NAME);
+    if let Some(existing) = ENTRIES.iter().map(|entry| out.join(entry)).find(|entry| entry.exists()) {
+        bail!("{} already exists: give another folder", existing.display());
+    }
+    let partial = Partial::folder(out, &ENTRIES);
+    let mut written = Written::default();
+    let (mut cameras, mut frames, mut splits) = (Vec::new(), Vec::new(), Vec::new());
+    for keyframe in keyframes {
+        frames.push(write_frame(out, &keyframe, &mut written)?);
+        cameras.push(camera_keys(&keyframe));
+        splits.push(keyframe.split);
+    }
+    ensure!(!frames.is_empty(), "no keyframe to export");
+
+    let names = |wanted_split: Split| {
+        let of_split = frames.iter().zip(&splits).filter(move |(_, split)| **split == wanted_split);
+        of_split.filter_map(|(frame, _)| frame["file_path"].as_str().map(str::to_owned)).collect::<Vec<_>>()
+    };
+    write_text(&out.join(TEST_LIST), &(names(Split::Test).join("\n") + "\n"))?;
+    let mut document = Map::new();
+    document.insert("camera_model".to_owned(), json!("PINHOLE"));
+    document.insert("depth_unit_scale_factor".to_owned(), json!(METERS_PER_COUNT));
+    document.extend(LISTS.map(|(key, split)| (key.to_owned(), json!(names(split)))));
+    // A single camera is written once at the top level, which every reader supports; several cameras are written per
+    // frame.
+    if cameras.iter().all(|camera| *camera == cameras[0]) {
+        document.append(&mut cameras[0]);
+    } else {
+        frames.iter_mut().zip(&mut cameras).for_each(|(frame, camera)| frame.append(camera));
+    }
+    document.insert("frames".to_owned(), json!(frames));
+    write_text(&transforms, &serde_json::to_string_pretty(&document)?)?;
+    partial.keep();
+    Ok(written)
+}
+
+/// Writes the images of one keyframe and returns its entry.
+fn write_frame(out: &Path, keyframe: &Keyframe, written: &mut Written) -> crate::Result<Map<String, Value>> {
+    let name = format!("{}_{:020}.png", keyframe.camera, keyframe.stamp.0);
+    let mut frame = Map::new();
+    let mut insert = |key: &str, value: Value| frame.insert(key.to_owned(), value);
+    insert("file_path", json!(format!("{IMAGES}/{name}")));
+    insert("transform_matrix", opengl_rows(&keyframe.world_from_camera));
+
+    let pixels = keyframe.rgba_srgb.as_chunks::<4>().0;
+    let rgb: Vec<u8> = pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect();
+    write_png(&out.join(IMAGES).join(&name), keyframe.size_px, &rgb, ExtendedColorType::Rgb8)?;
+    written.n_images += 1;
+    if pixels.iter().any(|pixel| pixel[3] == 0) {
+        let mask: Vec<u8> = pixels.iter().map(|pixel| pixel[3]).collect();
+        write_png(&out.join(MASKS).join(&name), keyframe.size_px, &mask, ExtendedColorType::L8)?;
+        insert("mask_path", json!(format!("{MASKS}/{name}")));
+    }
+    match &keyframe.depth {
+        Some(depth) if has_lens_of(depth, keyframe) => {
+            write_png(&out.join(DEPTH).join(&name), depth.size_px, &depth_counts(depth), ExtendedColorType::L16)?;
+            insert("depth_file_path", json!(format!("{DEPTH}/{name}")));
+            if depth.world_from_camera != keyframe.world_from_camera {
+                insert("depth_transform_matrix", opengl_rows(&depth.world_from_camera));
+            }
+            written.n_depth += 1;
+        }
+        Some(_) => written.n_depth_skipped += 1,
+        None => {}
+    }
+    Ok(frame)
+}
+
+/// Size and intrinsics of a keyframe under nerfstudio's keys.
+fn camera_keys(keyframe: &Keyframe) -> Map<String, Value> {
+    let [[fl_x, fl_y], [cx, cy]] = [keyframe.focal_px, keyframe.principal_px];
+    let keys =
+        [("fl_x", fl_x), ("fl_y", fl_y), ("cx", cx), ("cy", cy)].map(|(key, value)| (key.to_owned(), json!(value)));
+    let [width, height] = keyframe.size_px;
+    let size = [("w", width), ("h", height)].map(|(key, value)| (key.to_owned(), json!(value)));
+    keys.into_iter().chain(size).collect()
+}
+
+/// The pose as four rows, for a camera that looks along -z with y up.
+fn opengl_rows(world_from_camera: &Transform) -> Value {
+    // A rotation by half a turn is its own inverse.
+    let rows = transform::to_rows(&(world_from_camera * nerfstudio::opengl_from_camera()));
+    json!(rows.as_chunks::<4>().0)
+}
+
+/// Whether the depth image has the photo's lens, scaled to its size.
+fn has_lens_of(depth: &DepthMap, keyframe: &Keyframe) -> bool {
+    (0..2).all(|axis| {
+        let ratio = f64::from(depth.size_px[axis]) / f64::from(keyframe.size_px[axis]);
+        let focal_difference = depth.focal_px[axis] - ratio * keyframe.focal_px[axis];
+        let principal_difference = depth.principal_px[axis] - ratio * keyframe.principal_px[axis];
+        focal_difference.abs() < MAX_LENS_DIFFERENCE_PX && principal_difference.abs() < MAX_LENS_DIFFERENCE_PX
+    })
+}
+
+/// Depth in millimeters, in native byte order as the encoder expects; 0 where unknown or too far.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "the range is checked first")]
+fn depth_counts(depth: &DepthMap) -> Vec<u8> {
+    let count = |depth_m: &f32| {
+        let count = (f64::from(*depth_m) / METERS_PER_COUNT).round();
+        if (0.0..=f64::from(u16::MAX)).contains(&count) { count as u16 } else { 0 }
+    };
+    depth.depth_m.iter().flat_map(|depth_m| count(depth_m).to_ne_bytes()).collect()
+}
+
+fn write_png(path: &Path, size_px: [u32; 2], bytes: &[u8], color: ExtendedColorType) -> crate::Result<()> {
+    let write = || {
+        path.parent().map_or(Ok(()), std::fs::create_dir_all)?;
+        image::save_buffer(path, bytes, size_px[0], size_px[1], color)
+    };
+    write().with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn write_text(path: &Path, text: &str) -> crate::Result<()> {
+    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use capture::dataset;
+    use keyframe::Holdout;
+    use kinematics::Stamp;
+    use nalgebra::{UnitQuaternion, Vector3};
+
+    /// A keyframe of 32 x 24 pixels with depth.
+    fn keyframe(ix: usize) -> Keyframe {
+        let rotation = UnitQuaternion::from_euler_angles(0.1 * ix as f64, 0.2, -1.0);
+        let world_from_camera = Transform::from_parts(Vector3::new(ix as f64, 2.0, 3.0).into(), rotation);
+        let pixels = (0..24).flat_map(|y: u8| (0..32).flat_map(move |x: u8| [3 * x, y, 9, 255]));
+        let depth = DepthMap {
+            size_px: [16, 12],
+            focal_px: [15.0, 15.5],
+            principal_px: [8.0, 6.5],
+            depth_m: (0..16 * 12).map(|pixel_ix| pixel_ix as f32 * 0.011).collect(),
+            world_from_camera,
+        };
+        Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(1_000_000_000 * (ix as i64 + 1)),
+            size_px: [32, 24],
+            focal_px: [30.0, 31.0],
+            principal_px: [16.0, 13.0],
+            rgba_srgb: pixels.collect(),
+            depth: Some(depth),
+            world_from_camera,
+            twist: None,
+            readout_secs: 0.0,
+            joint_twists: [].into(),
+            base: None,
+            split: Split::of(ix),
+            truth: None,
+        }
+    }
+
+    fn read_back(out: &Path) -> Vec<Arc<Keyframe>> {
+        let dataset = drivers::dataset::read(out).unwrap();
+        assert!(dataset.notes.is_empty(), "{:?}", dataset.notes);
+        let holdout = Holdout::from_argument(out.join(TEST_LIST).to_str().unwrap()).unwrap();
+        dataset::load(&dataset, &holdout, 1.0, &|_| ()).unwrap().keyframes
+    }
+
+    #[test]
+    fn keyframes_survive_a_round_trip() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("out");
+        let mut keyframes: Vec<_> = (0..10).map(keyframe).collect();
+        let mut masked = keyframes[3].rgba_srgb.to_vec();
+        masked[7] = 0;
+        keyframes[3].rgba_srgb = masked.into();
+        let moved_pose = Transform::translation(0.001, 0.0, 0.0) * keyframes[5].world_from_camera;
+        keyframes[5].depth.as_mut().unwrap().world_from_camera = moved_pose;
+        let written = write_nerfstudio(&out, keyframes.iter().cloned().map(Arc::new)).unwrap();
+        assert_eq!(written, Written { n_images: 10, n_depth: 10, n_depth_skipped: 0 });
+        for (got, expected) in read_back(&out).iter().zip(&keyframes) {
+            assert_eq!(
+                (got.size_px, got.focal_px, got.principal_px),
+                (expected.size_px, expected.focal_px, expected.principal_px)
+            );
+            assert!(got.rgba_srgb == expected.rgba_srgb, "colors differ");
+            assert_eq!(got.split == Split::Test, expected.split == Split::Test);
+            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
+            let (got, expected) = (got.depth.as_ref().unwrap(), expected.depth.as_ref().unwrap());
+            assert_eq!((got.size_px, got.focal_px), (expected.size_px, expected.focal_px));
+            assert!(got.depth_m.iter().zip(expected.depth_m.iter()).all(|(a, b)| (a - b).abs() < 1e-6));
+            assert!((got.world_from_camera.inverse() * expected.world_from_camera).to_homogeneous().is_identity(1e-12));
+        }
+    }
+
+    #[test]
+    fn different_cameras_are_written_per_frame() {
+        let folder = tempfile::tempdir().unwrap();
+        let (first, mut second) = (keyframe(1), keyframe(2));
+        second.camera = "overview".into();
+        second.size_px = [24, 32];
+        second.depth.as_mut().unwrap().focal_px = [40.0, 40.0];
+        let written = write_nerfstudio(folder.path(), [first, second].map(Arc::new).into_iter()).unwrap();
+        assert_eq!(written, Written { n_images: 2, n_depth: 1, n_depth_skipped: 1 });
+        let sizes: Vec<_> = drivers::dataset::read(folder.path())
+            .unwrap()
+            .images
+            .iter()
+            .map(|image| image.intrinsics.size_px)
+            .collect();
+        assert_eq!(sizes, [[24, 32], [32, 24]]);
+    }
+
+    #[test]
+    fn existing_dataset_is_not_overwritten_and_empty_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(write_nerfstudio(folder.path(), std::iter::empty()).unwrap_err().to_string().contains("no keyframe"));
+        write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap();
+        let again = write_nerfstudio(folder.path(), std::iter::once(Arc::new(keyframe(0)))).unwrap_err();
+        assert!(again.to_string().contains("already exists"), "{again}");
+    }
+}

@@ -1,0 +1,266 @@
+//! Errors of this crate.
+
+use keyframe::ErrorClass;
+use std::error::Error as StdError;
+use std::fmt::{Display, Formatter};
+
+/// The result of a fallible operation of this crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Why a session cannot train, evaluate, save or resume.
+///
+/// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its outermost
+/// context; `{:#}` gives the message with all causes.
+#[derive(Debug)]
+#[non_exhaustive]
+pub enum Error {
+    /// The arguments, or a file they name, are invalid.
+    BadInput(String),
+    /// The input is not sufficient for a result.
+    InsufficientData(String),
+    /// Something failed.
+    Failed(String),
+    /// The rig file is invalid, or a device or recording failed.
+    Capture(capture::Error),
+    /// A model cannot be created, trained, saved or loaded.
+    Trainer(trainer::Error),
+    /// A list of keyframes, a selection of test images, or a keyframe is invalid.
+    Keyframe(keyframe::Error),
+    /// A device, recording or dataset failed.
+    Driver(drivers::Error),
+    /// A lens, pose or robot description is invalid.
+    Kinematics(kinematics::Error),
+    /// A file cannot be read or written.
+    Io(std::io::Error),
+    /// An error of another library.
+    Other(Box<dyn StdError + Send + Sync>),
+    /// The GPU failed and the run could not continue on another device. The message names what is saved on disk.
+    GpuUnrecoverable(String),
+    /// The operation that failed, with the cause.
+    Context {
+        /// What was being done, or the file, device or image concerned.
+        context: String,
+        /// Why it failed.
+        source: Box<Self>,
+    },
+}
+
+impl From<capture::ConfigError> for Error {
+    fn from(error: capture::ConfigError) -> Self {
+        Self::Capture(error.into())
+    }
+}
+
+impl Error {
+    /// What the error means for the caller.
+    #[must_use]
+    pub fn class(&self) -> ErrorClass {
+        match self {
+            Self::BadInput(_) | Self::Trainer(trainer::Error::BudgetTooSmall { .. }) => ErrorClass::BadInput,
+            Self::InsufficientData(_) => ErrorClass::InsufficientData,
+            Self::Capture(error) => error.class(),
+            Self::Keyframe(error) => error.class(),
+            Self::Context { source, .. } => source.class(),
+            Self::Failed(_)
+            | Self::GpuUnrecoverable(_)
+            | Self::Trainer(_)
+            | Self::Driver(_)
+            | Self::Kinematics(_)
+            | Self::Io(_)
+            | Self::Other(_) => ErrorClass::Failed,
+        }
+    }
+
+    /// The error without the operations that failed.
+    fn root(&self) -> &Self {
+        match self {
+            Self::Context { source, .. } => source.root(),
+            _ => self,
+        }
+    }
+
+    /// Whether the GPU caused the error: it was lost or out of memory.
+    #[must_use]
+    pub fn is_gpu_error(&self) -> bool {
+        matches!(self.root(), Self::Trainer(error) if error.is_gpu_error())
+    }
+
+    /// Whether the GPU failed and could not be reopened.
+    #[must_use]
+    pub fn is_gpu_unrecoverable(&self) -> bool {
+        matches!(self.root(), Self::GpuUnrecoverable(_))
+    }
+
+    /// Whether reading or writing a file failed, for example on a full disk.
+    #[must_use]
+    pub fn is_io(&self) -> bool {
+        let mut cause: Option<&(dyn StdError + 'static)> = Some(self.root());
+        while let Some(error) = cause {
+            let is_io = match error.downcast_ref() {
+                Some(Self::Io(_)) => true,
+                Some(Self::Trainer(error)) => error.source().is_some_and(|source| source.is::<std::io::Error>()),
+                _ => error.is::<std::io::Error>(),
+            };
+            if is_io {
+                return true;
+            }
+            cause = error.source();
+        }
+        false
+    }
+
+    /// Adds the operation that failed.
+    #[must_use]
+    pub fn with_context(self, context: impl Into<String>) -> Self {
+        Self::Context { context: context.into(), source: Box::new(self) }
+    }
+
+    /// An error of a library that is not part of this interface.
+    pub(crate) fn other(error: impl StdError + Send + Sync + 'static) -> Self {
+        Self::Other(Box::new(error))
+    }
+}
+
+/// Writes the message; in the alternate form `{:#}`, followed by those of all causes.
+impl Display for Error {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::BadInput(text) | Self::InsufficientData(text) | Self::Failed(text) | Self::GpuUnrecoverable(text) => {
+                f.write_str(text)
+            }
+            Self::Capture(error) => write_chain(f, error),
+            Self::Trainer(error) => write_chain(f, error),
+            Self::Keyframe(error) => write_chain(f, error),
+            Self::Driver(error) => write_chain(f, error),
+            Self::Kinematics(error) => write_chain(f, error),
+            Self::Io(error) => write_chain(f, error),
+            Self::Other(error) => write_chain(f, error.as_ref()),
+            Self::Context { context, source } if f.alternate() => write!(f, "{context}: {source:#}"),
+            Self::Context { context, .. } => f.write_str(context),
+        }
+    }
+}
+
+fn write_chain(f: &mut Formatter<'_>, error: &(dyn StdError + 'static)) -> std::fmt::Result {
+    write!(f, "{error}")?;
+    let mut cause = error.source().filter(|_| f.alternate());
+    while let Some(error) = cause {
+        write!(f, ": {error}")?;
+        cause = error.source();
+    }
+    Ok(())
+}
+
+impl StdError for Error {
+    fn source(&self) -> Option<&(dyn StdError + 'static)> {
+        match self {
+            Self::BadInput(_) | Self::InsufficientData(_) | Self::Failed(_) | Self::GpuUnrecoverable(_) => None,
+            Self::Capture(error) => error.source(),
+            Self::Trainer(error) => error.source(),
+            Self::Keyframe(error) => error.source(),
+            Self::Driver(error) => error.source(),
+            Self::Kinematics(error) => error.source(),
+            Self::Io(error) => error.source(),
+            Self::Other(error) => error.source(),
+            Self::Context { source, .. } => Some(source.as_ref()),
+        }
+    }
+}
+
+impl From<capture::Error> for Error {
+    fn from(error: capture::Error) -> Self {
+        Self::Capture(error)
+    }
+}
+
+impl From<trainer::Error> for Error {
+    fn from(error: trainer::Error) -> Self {
+        Self::Trainer(error)
+    }
+}
+
+impl From<keyframe::Error> for Error {
+    fn from(error: keyframe::Error) -> Self {
+        Self::Keyframe(error)
+    }
+}
+
+impl From<drivers::Error> for Error {
+    fn from(error: drivers::Error) -> Self {
+        Self::Driver(error)
+    }
+}
+
+impl From<kinematics::Error> for Error {
+    fn from(error: kinematics::Error) -> Self {
+        Self::Kinematics(error)
+    }
+}
+
+impl From<std::io::Error> for Error {
+    fn from(error: std::io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+macro_rules! from_other {
+    ($($error:ty),*) => { $(impl From<$error> for Error {
+        fn from(error: $error) -> Self {
+            Self::other(error)
+        }
+    })* };
+}
+from_other!(image::ImageError, resvg::usvg::Error, serde_json::Error);
+
+/// Adds the operation that failed to an error.
+pub(crate) trait Context<T> {
+    fn context(self, context: impl Into<String>) -> Result<T>;
+    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T>;
+}
+
+impl<T, E: Into<Error>> Context<T> for std::result::Result<T, E> {
+    fn context(self, context: impl Into<String>) -> Result<T> {
+        self.with_context(|| context)
+    }
+
+    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T> {
+        self.map_err(|error| Error::Context { context: context().into(), source: Box::new(error.into()) })
+    }
+}
+
+impl<T> Context<T> for Option<T> {
+    fn context(self, context: impl Into<String>) -> Result<T> {
+        self.ok_or_else(|| Error::Failed(context.into()))
+    }
+
+    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T> {
+        self.ok_or_else(|| Error::Failed(context().into()))
+    }
+}
+
+/// Returns an [`Error::Failed`] with a formatted message.
+macro_rules! bail {
+    ($($message:tt)*) => { return Err($crate::Error::Failed(format!($($message)*))) };
+}
+pub(crate) use bail;
+
+/// Returns an [`Error::Failed`] with a formatted message unless the condition holds.
+macro_rules! ensure {
+    ($condition:expr, $($message:tt)*) => { if !$condition { $crate::error::bail!($($message)*) } };
+}
+pub(crate) use ensure;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn context_keeps_the_class_and_the_causes() {
+        let error = Err::<(), _>(Error::BadInput("scale is 2".into())).context("rig.toml").expect_err("an error");
+        assert_eq!(error.class(), ErrorClass::BadInput);
+        assert_eq!(format!("{error:#}"), "rig.toml: scale is 2");
+        let missing = std::fs::read("no/such/file").with_context(|| "the list").expect_err("no file");
+        assert_eq!(missing.class(), ErrorClass::Failed);
+        assert!(format!("{missing:#}").starts_with("the list: "));
+    }
+}

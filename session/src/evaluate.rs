@@ -1,0 +1,366 @@
+//! Evaluates a model: renders every test keyframe from its pose at its size, and scores the result.
+//!
+//! The only evaluation in the program: `train`, `run` and `eval` report the same scores for the same model.
+
+use crate::error::Context;
+use calibration::CalibratedCamera;
+use keyframe::{DepthMap, Keyframe, counted};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fmt::{Display, Formatter};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::eval::{Lpips, PixelPair, SurfaceError, depth_rmse_m, psnr, ssim, surface_error};
+use trainer::{Method, Picture, Projection, RenderRequest};
+
+/// Environment variable with the path of the LPIPS weights, used if no flag gives one.
+const LPIPS_WEIGHTS: &str = "FIELDRIG_LPIPS_WEIGHTS";
+/// Near plane of renders, meters.
+const NEAR_M: f64 = 0.01;
+/// Far plane of renders, meters.
+const FAR_M: f64 = 1000.0;
+
+/// Minimum alpha of a pixel that counts as covered by the model.
+pub const MIN_ALPHA: u8 = 128;
+/// Minimum covered fraction; below it, the model probably does not show the scene of the images.
+pub const MIN_COVERED_FRAC: f64 = 0.05;
+/// Hint for that case.
+pub const CHECK_SAME_SCENE: &str = "do both show the same scene in the same world frame?";
+
+/// Loads LPIPS if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights. A program built without LPIPS logs a warning.
+pub fn load_lpips(flag: Option<&Path>) -> Result<Option<Lpips>, trainer::Error> {
+    let named = std::env::var_os(LPIPS_WEIGHTS).map(PathBuf::from);
+    let Some(weights) = flag.or(named.as_deref()) else { return Ok(None) };
+    match Lpips::load(weights) {
+        Err(error @ trainer::Error::LpipsNotBuilt) => {
+            log::warn!("no LPIPS: {error}");
+            Ok(None)
+        }
+        lpips => lpips.map(Some),
+    }
+}
+
+/// Computes scores of test images.
+#[derive(Clone)]
+pub struct Evaluator {
+    /// Whether to compute all available scores rather than PSNR only.
+    is_full: bool,
+    /// `None` without weights.
+    lpips: Option<Arc<Lpips>>,
+}
+
+/// Scores of one test image. `None` means unknown, never zero.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ImageScores {
+    pub camera: String,
+    pub stamp_nanos: i64,
+    /// PSNR against the image as the camera delivered it, dB.
+    pub psnr: f64,
+    pub ssim: Option<f64>,
+    pub lpips: Option<f64>,
+    /// Root mean square error along z over pixels where both have depth, meters.
+    pub depth_rmse_m: Option<f64>,
+    /// Accuracy: mean distance of the rendered surface from the measured one along its normal, meters.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface_error_m: Option<f64>,
+    /// Completeness: fraction of the measured surface that is rendered within 5 mm.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface_within_5_mm: Option<f64>,
+    /// PSNR against the noise-free image, rendered at the true pose, dB; in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_truth: Option<f64>,
+    /// PSNR of the delivered image against the noise-free one, dB; in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_ceiling: Option<f64>,
+    /// Fraction of pixels that the model covers; `None` if the picture stayed on the GPU.
+    #[serde(skip)]
+    pub covered_frac: Option<f64>,
+}
+
+/// Mean scores over the test images. `None` means unknown, never zero.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Scores {
+    pub psnr: Option<f64>,
+    pub ssim: Option<f64>,
+    pub lpips: Option<f64>,
+    pub depth_rmse_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface_error_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub surface_within_5_mm: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_truth: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_ceiling: Option<f64>,
+    /// PSNR per camera; empty if there is only one.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub psnr_per_camera: BTreeMap<String, f64>,
+}
+
+impl Evaluator {
+    /// Computes PSNR, SSIM, depth scores and, if the flag or `FIELDRIG_LPIPS_WEIGHTS` gives weights, LPIPS.
+    pub fn thorough(lpips_weights: Option<&Path>) -> crate::Result<Self> {
+        Ok(Self { is_full: true, lpips: load_lpips(lpips_weights)?.map(Arc::new) })
+    }
+
+    /// Computes PSNR only, with one render per image.
+    pub fn psnr_only() -> Self {
+        Self { is_full: false, lpips: None }
+    }
+
+    /// Scores one test keyframe.
+    pub fn score(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
+        if !self.is_full
+            && self.lpips.is_none()
+            && let Some(psnr) = psnr_on_gpu(method, keyframe)?
+        {
+            return Ok(ImageScores {
+                camera: keyframe.camera.to_string(),
+                stamp_nanos: keyframe.stamp.0,
+                psnr,
+                ssim: None,
+                lpips: None,
+                depth_rmse_m: None,
+                surface_error_m: None,
+                surface_within_5_mm: None,
+                psnr_truth: None,
+                psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
+                covered_frac: None,
+            });
+        }
+        let drawn = draw(method, keyframe, false)?;
+        let pair = PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &keyframe.rgba_srgb)?;
+        let depth = if self.is_full { depth_error(method, keyframe)? } else { DepthError::default() };
+        Ok(ImageScores {
+            camera: keyframe.camera.to_string(),
+            stamp_nanos: keyframe.stamp.0,
+            psnr: psnr(&pair)?,
+            ssim: self.is_full.then(|| ssim(&pair)).transpose()?,
+            lpips: self.lpips.as_ref().map(|lpips| lpips.distance(&pair)).transpose()?,
+            depth_rmse_m: depth.rmse_m,
+            surface_error_m: depth.surface.and_then(|surface| surface.mean_m),
+            surface_within_5_mm: depth.surface.map(|surface| surface.near_frac),
+            psnr_truth: if self.is_full { truth_score(method, keyframe)? } else { None },
+            psnr_ceiling: keyframe.truth.as_ref().and_then(|truth| truth.psnr_ceiling),
+            covered_frac: Some(covered_frac(&drawn)),
+        })
+    }
+
+    /// Scores one test keyframe. Errors name the keyframe.
+    pub fn score_named(&self, method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<ImageScores> {
+        self.score(method, keyframe)
+            .with_context(|| format!("test image of {:?} at {} ns", keyframe.camera, keyframe.stamp.0))
+    }
+
+    /// Scores test keyframes one after the other.
+    pub fn score_all<'a>(
+        &self,
+        method: &mut dyn Method,
+        tests: impl Iterator<Item = &'a Arc<Keyframe>>,
+    ) -> crate::Result<Vec<ImageScores>> {
+        tests.map(|keyframe| self.score_named(method, keyframe)).collect()
+    }
+}
+
+impl Scores {
+    /// The means over `images`.
+    pub fn mean(images: &[ImageScores]) -> Self {
+        let mut psnr_per_camera = BTreeMap::new();
+        for image in images {
+            psnr_per_camera.entry(image.camera.clone()).or_insert_with(Vec::new).push(image.psnr);
+        }
+        if psnr_per_camera.len() < 2 {
+            psnr_per_camera.clear();
+        }
+        Self {
+            psnr: mean(images.iter().map(|image| Some(image.psnr))),
+            ssim: mean(images.iter().map(|image| image.ssim)),
+            lpips: mean(images.iter().map(|image| image.lpips)),
+            depth_rmse_m: mean(images.iter().map(|image| image.depth_rmse_m)),
+            surface_error_m: mean(images.iter().map(|image| image.surface_error_m)),
+            surface_within_5_mm: mean(images.iter().map(|image| image.surface_within_5_mm)),
+            psnr_truth: mean(images.iter().map(|image| image.psnr_truth)),
+            psnr_ceiling: mean(images.iter().map(|image| image.psnr_ceiling)),
+            psnr_per_camera: psnr_per_camera
+                .into_iter()
+                .filter_map(|(camera, values)| Some((camera, mean(values.into_iter().map(Some))?)))
+                .collect(),
+        }
+    }
+}
+
+impl Display for Scores {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        let decibels = |what: &str, value: Option<f64>| value.map(|value| format!("{what} {value:.2} dB"));
+        let mut words: Vec<String> = decibels("PSNR", self.psnr).into_iter().collect();
+        words.extend(self.psnr_per_camera.iter().filter_map(|(camera, psnr)| decibels(camera, Some(*psnr))));
+        words.extend(decibels("against truth", self.psnr_truth));
+        words.extend(decibels("ceiling", self.psnr_ceiling));
+        words.extend(self.ssim.map(|ssim| format!("SSIM {ssim:.4}")));
+        words.extend(self.lpips.map(|lpips| format!("LPIPS {lpips:.4}")));
+        words.extend(self.depth_rmse_m.map(|depth| format!("depth {:.1} mm", depth * 1e3)));
+        words.extend(self.surface_error_m.map(|error| format!("surface {:.1} mm", error * 1e3)));
+        words.extend(self.surface_within_5_mm.map(|share| format!("{:.1} % within 5 mm", share * 1e2)));
+        if words.is_empty() { f.write_str("no test image yet") } else { f.write_str(&words.join(", ")) }
+    }
+}
+
+/// Fraction of a picture's pixels that the model covers.
+pub fn covered_frac(picture: &Picture) -> f64 {
+    let pixels = picture.rgba_srgb.as_chunks::<4>().0;
+    let n_covered = pixels.iter().filter(|[.., alpha]| *alpha >= MIN_ALPHA).count();
+    n_covered as f64 / pixels.len().max(1) as f64
+}
+
+/// Warns if a model covers almost nothing of these pictures, given the covered fraction of each.
+pub fn warn_if_hardly_covered(covered_fracs: &[f64]) {
+    let covered_frac = covered_fracs.iter().sum::<f64>() / covered_fracs.len().max(1) as f64;
+    if covered_frac < MIN_COVERED_FRAC {
+        let views = counted(covered_fracs.len() as u64, "view");
+        log::warn!("the model covers {:.1} % of {views}; {CHECK_SAME_SCENE}", 100.0 * covered_frac);
+    }
+}
+
+/// Mean of the known values.
+fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    let (mut sum, mut n) = (0.0, 0.0);
+    for value in values.flatten() {
+        sum += value;
+        n += 1.0;
+    }
+    (n > 0.0).then(|| sum / n)
+}
+
+/// Renders a model from the pose of a keyframe, with the same rolling shutter and the camera's gains.
+pub fn draw(method: &mut dyn Method, keyframe: &Keyframe, depth: bool) -> Result<Picture, trainer::Error> {
+    let lens = method.calibrated_camera(keyframe)?;
+    let mut picture = method.render(&RenderRequest { depth, ..request(keyframe, &lens) })?;
+    if lens.gains != [1.0; 3] {
+        let by_byte = lens.gains.map(gain_table);
+        for [red, green, blue, _] in picture.rgba_srgb.as_chunks_mut::<4>().0 {
+            for (color, table) in [red, green, blue].into_iter().zip(&by_byte) {
+                *color = table[usize::from(*color)];
+            }
+        }
+    }
+    Ok(picture)
+}
+
+/// PSNR of the picture that [`draw`] returns against the image of the keyframe, bit-identical, without reading the
+/// picture back. `None` if the method does not support it, or if gains are applied after rendering.
+fn psnr_on_gpu(method: &mut dyn Method, keyframe: &Keyframe) -> Result<Option<f64>, trainer::Error> {
+    let lens = method.calibrated_camera(keyframe)?;
+    if lens.gains == [1.0; 3] { method.psnr(&request(keyframe, &lens), keyframe) } else { Ok(None) }
+}
+
+/// Renders a model from the pose of a keyframe's depth image, with the size and intrinsics of `depth`: the full depth
+/// map or a subsampled one. `None` for a keyframe without depth.
+pub fn render_depth(
+    method: &mut dyn Method,
+    keyframe: &Keyframe,
+    depth: &DepthMap,
+) -> Result<Option<Picture>, trainer::Error> {
+    let lens = method.calibrated_camera(keyframe)?;
+    let Some(color_from_depth) = lens.color_from_depth else { return Ok(None) };
+    let drawn = method.render(&RenderRequest {
+        world_from_camera: lens.world_from_camera * color_from_depth,
+        size_px: depth.size_px,
+        projection: Projection::Pinhole { focal_px: depth.focal_px, principal_px: depth.principal_px },
+        shutter: None,
+        depth: true,
+        ..request(keyframe, &lens)
+    })?;
+    Ok(Some(drawn))
+}
+
+/// Lookup table for multiplying a color value by `gain`.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to a byte")]
+fn gain_table(gain: f64) -> [u8; 256] {
+    std::array::from_fn(|value| (gain * value as f64).round().clamp(0.0, 255.0) as u8)
+}
+
+fn request(keyframe: &Keyframe, lens: &CalibratedCamera) -> RenderRequest {
+    RenderRequest {
+        world_from_camera: lens.world_from_camera,
+        size_px: keyframe.size_px,
+        projection: Projection::Pinhole { focal_px: lens.focal_px, principal_px: lens.principal_px },
+        shutter: lens.shutter,
+        near_m: NEAR_M,
+        far_m: FAR_M,
+        crop: None,
+        background_srgb: [0.0; 3],
+        appearance_of: Some((keyframe.camera.clone(), keyframe.stamp)),
+        depth: false,
+    }
+}
+
+/// Error of rendered depth relative to measured depth.
+#[derive(Default)]
+struct DepthError {
+    rmse_m: Option<f64>,
+    surface: Option<SurfaceError>,
+}
+
+fn depth_error(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<DepthError> {
+    let Some(full) = &keyframe.depth else { return Ok(DepthError::default()) };
+    let stride = method.depth_stride();
+    let subsampled = (stride > 1).then(|| full.subsampled(stride));
+    let depth = subsampled.as_ref().unwrap_or(full);
+    let Some(drawn) = render_depth(method, keyframe, depth)? else { return Ok(DepthError::default()) };
+    Ok(DepthError {
+        rmse_m: depth_rmse_m(&drawn.depth_m, &depth.depth_m)?,
+        surface: surface_error(&drawn.depth_m, depth)?,
+    })
+}
+
+/// PSNR against the noise-free image, which has no rolling shutter and was taken from the true pose.
+fn truth_score(method: &mut dyn Method, keyframe: &Keyframe) -> crate::Result<Option<f64>> {
+    let Some(truth) = &keyframe.truth else { return Ok(None) };
+    let lens = CalibratedCamera { world_from_camera: truth.world_from_camera, ..method.calibrated_camera(keyframe)? };
+    let at_truth = RenderRequest { shutter: None, ..request(keyframe, &lens) };
+    let drawn = method.render(&at_truth)?;
+    Ok(Some(psnr(&PixelPair::new(keyframe.size_px, &drawn.rgba_srgb, &truth.rgba_srgb)?)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(camera: &str, psnr: f64, lpips: Option<f64>) -> ImageScores {
+        ImageScores {
+            camera: camera.into(),
+            stamp_nanos: 0,
+            psnr,
+            ssim: None,
+            lpips,
+            depth_rmse_m: None,
+            surface_error_m: None,
+            surface_within_5_mm: None,
+            psnr_truth: None,
+            psnr_ceiling: None,
+            covered_frac: Some(1.0),
+        }
+    }
+
+    #[test]
+    fn pixels_count_as_covered_from_half_alpha() {
+        let rgba_srgb = [0, MIN_ALPHA - 1, MIN_ALPHA, 255].into_iter().flat_map(|alpha| [9, 9, 9, alpha]).collect();
+        assert_eq!(covered_frac(&Picture { size_px: [2, 2], rgba_srgb, depth_m: vec![0.0; 4] }), 0.5);
+    }
+
+    #[test]
+    fn means_skip_unknown_scores() {
+        let scores = Scores::mean(&[image("wrist", 20.0, Some(0.5)), image("wrist", 30.0, None)]);
+        assert_eq!((scores.psnr, scores.lpips, scores.ssim), (Some(25.0), Some(0.5), None));
+        assert!(scores.psnr_per_camera.is_empty(), "a single camera is not reported separately");
+        assert_eq!(Scores::mean(&[]), Scores::default());
+    }
+
+    #[test]
+    fn psnr_is_reported_per_camera() {
+        let scores =
+            Scores::mean(&[image("wrist", 20.0, None), image("front", 30.0, None), image("wrist", 22.0, None)]);
+        assert_eq!(scores.psnr, Some(24.0));
+        assert_eq!(scores.psnr_per_camera, BTreeMap::from([("front".into(), 30.0), ("wrist".into(), 21.0)]));
+    }
+}

@@ -1,0 +1,20 @@
+//! Loss of the GPU on purpose, for tests of the recovery.
+
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
+use trainer::gpu::Gpu;
+
+static AT_STEP: OnceLock<u64> = OnceLock::new();
+
+/// Loses the device once, when a model of this process reaches the step. For tests.
+pub fn lose_gpu_at_step(step: u64) {
+    let _ = AT_STEP.set(step); // The first step is kept.
+}
+
+/// Loses the device if that was requested and is due.
+pub(crate) fn lose_when_due(gpu: &Gpu, step: u64) {
+    static IS_LOST: AtomicBool = AtomicBool::new(false);
+    if AT_STEP.get().is_some_and(|at_step| step >= *at_step) && !IS_LOST.swap(true, Ordering::Relaxed) {
+        gpu.lose();
+    }
+}

@@ -1,0 +1,80 @@
+//! Training sessions: one or several models that learn from keyframes, are evaluated on a schedule, and survive failures.
+//!
+//! A [`Session`] is one model in training with its clock, evaluations, checkpoints and reports. [`train`] and [`drive`]
+//! train on keyframes from disk, which [`Data`] reads; [`Live`] is the loop of a live run, which takes keyframes from a
+//! [`capture::Feed`] and draws pictures for viewers. [`finish`] saves and scores the models. Timing-dependent decisions
+//! are logged ([`DecisionLog`]) and can be repeated ([`Replay`]). Reports go to an [`Observer`].
+//!
+//! ```
+//! use keyframe::{Keyframe, Split};
+//! use session::{DataOptions, Limits, limits};
+//!
+//! // Train for ten seconds unless a limit is given.
+//! assert_eq!(limits(None, None, 10.0)?.describe(), "10 s");
+//! assert_eq!(limits(None, Some(500), 10.0)?.describe(), "500 steps");
+//! assert!(limits(Some(-1.0), None, 10.0).is_err());
+//! // Every 10th image is a test image.
+//! let options = DataOptions { holdout: Some("10".into()), ..DataOptions::default() };
+//! assert!(options.holdout()?.is_some());
+//! # Ok::<(), session::Error>(())
+//! ```
+
+pub mod camera_list;
+pub mod camera_path;
+pub mod chart;
+pub mod checkpoints;
+mod clock;
+pub mod corrected_rig;
+mod data;
+mod dataset_export;
+mod decisions;
+pub mod depth_from;
+mod error;
+pub mod evaluate;
+pub mod evaluation_schedule;
+mod gpu_loss;
+mod live;
+pub mod methods;
+pub mod next_commands;
+mod observer;
+pub mod partial;
+mod pending_evaluation;
+mod read_progress;
+pub mod recoveries;
+pub mod recovery;
+mod render_budget;
+mod replay;
+mod report;
+pub mod run_folder;
+pub mod scene_hint;
+mod session;
+mod stored_keyframes;
+mod table;
+mod time_slices;
+mod training;
+mod training_options;
+mod viewer;
+mod viewers;
+
+pub use checkpoints::{CheckpointOptions, Checkpoints, RunFlags, parse_period};
+pub use clock::Clock;
+pub use data::{Data, DataOptions, Purpose, expect};
+pub use dataset_export::{Written, write_nerfstudio};
+pub use decisions::{DecisionLog, RunDescription, Settings};
+pub use error::{Error, Result};
+pub use evaluate::Evaluator;
+pub use gpu_loss::lose_gpu_at_step;
+pub use live::{Live, LiveOptions, Pace};
+pub use methods::methods_of;
+pub use observer::{DoneEvent, Evaluation, FinishedReport, Observer, ProfileEvent, SessionEvent, SessionProgress};
+pub use read_progress::{OnReadProgress, ReadProgress, ignore_progress};
+pub use recoveries::OpenGpu;
+pub use recovery::Recovery;
+pub use replay::Replay;
+pub use session::{EndingSession, Evaluators, FinishedModel, Limits, Session, TrainingOutcome, finish};
+pub use stored_keyframes::StoredKeyframes;
+pub use table::Table;
+pub use training::{TrainingPlan, check_before_data, drive, limits, model_specs, train};
+pub use training_options::{AvailableData, REALIGN, Refine, RefineSettings, TrainingOptions};
+pub use viewer::{ModelViewer, ServedModel};
+pub use viewers::Viewers;

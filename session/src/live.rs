@@ -1,0 +1,437 @@
+//! The loop of a live run: takes keyframes, trains models, and draws pictures for viewers.
+
+use crate::recoveries::{self, OpenGpu, Recoveries};
+use crate::render_budget::RenderBudget;
+use crate::session::Session;
+use crate::{scene_hint, time_slices};
+use capture::{Change, Feed, InputResult};
+use keyframe::{Keyframe, Split};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use viz::{Hub, KeyframePose, ModelStatus, Status};
+
+/// Period of status messages.
+const PUBLISH_PERIOD: Duration = Duration::from_millis(250);
+/// Maximum wait for a keyframe when there is nothing to do.
+const IDLE: Duration = Duration::from_millis(10);
+/// Fraction of the time spent on scores between scheduled evaluations.
+const SCORE_FRAC: f64 = 0.03;
+/// How often to check for keyframes while waiting for a keyframe or a picture request.
+const POLL_PERIOD: Duration = Duration::from_millis(2);
+/// Pictures are drawn for at most this long before other work continues.
+const MAX_RENDER_TIME: Duration = Duration::from_millis(100);
+
+/// What determines when keyframes are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// Real time: keyframes are taken as they arrive.
+    RealTime,
+    /// Lockstep with the trainer: a keyframe is taken every given number of steps, so that a seed gives one result.
+    Lockstep {
+        /// Steps between two keyframes.
+        steps_per_keyframe: u64,
+    },
+}
+
+/// The parts of a live run.
+pub struct Live {
+    /// The first one is drawn for viewers that name no method.
+    sessions: Vec<Session>,
+    feed: Feed,
+    hub: Hub,
+    pace: Pace,
+    start_keyframes: usize,
+    keyframes: Vec<Arc<Keyframe>>,
+    n_evicted: u64,
+    /// Step of each session at which the next keyframe is due in lockstep.
+    next_keyframe_at: Vec<u64>,
+    budget: RenderBudget,
+    /// Session whose latest score is refreshed next.
+    next_refreshed: usize,
+    published: Option<Instant>,
+    scoring_time: Duration,
+    notes: Vec<String>,
+    recoveries: Recoveries,
+}
+
+impl Live {
+    /// Combines the parts; does not start anything yet.
+    pub fn new(sessions: Vec<Session>, feed: Feed, hub: Hub, options: LiveOptions) -> Self {
+        Self {
+            next_keyframe_at: vec![0; sessions.len()],
+            sessions,
+            feed,
+            hub,
+            pace: options.pace,
+            start_keyframes: options.start_keyframes,
+            keyframes: Vec::new(),
+            n_evicted: 0,
+            budget: RenderBudget::default(),
+            next_refreshed: 0,
+            published: None,
+            scoring_time: Duration::ZERO,
+            notes: options.notes,
+            recoveries: Recoveries::new(options.open_gpu),
+        }
+    }
+
+    /// Continues with the keyframes of an earlier run, which the sessions already hold.
+    pub fn resume_from(mut self, keyframes: Vec<Arc<Keyframe>>) -> Self {
+        self.keyframes = keyframes;
+        self.publish_keyframes();
+        if let Some(hint) = scene_hint::from_keyframes(&self.keyframes) {
+            self.hub.set_scene_hint(hint);
+        }
+        self
+    }
+
+    fn publish_keyframes(&self) {
+        self.hub.set_keyframes(self.keyframes.iter().map(|keyframe| frustum(keyframe)).collect());
+    }
+
+    /// Whether the run is over: a limit was reached or cannot be reached, the devices failed, or the input ended
+    /// without training data.
+    pub fn is_over(&self) -> bool {
+        if self.is_scoring() {
+            return false; // Scores at the limit are still reported.
+        }
+        // If one session has reached its limit, the run waits for the others as long as they can reach theirs.
+        let is_done = |session: &Session| session.is_over() || (self.feed.ended() && session.is_idle());
+        let reached = self.sessions.iter().any(Session::is_over) && self.sessions.iter().all(is_done);
+        reached || self.has_exhausted_input() || self.feed.source_failed() || (self.feed.ended() && !self.can_train())
+    }
+
+    /// Whether the input ended and a step limit was set that no model can reach without more keyframes. Without a step
+    /// limit the run does not end; the result stays visible.
+    pub fn has_exhausted_input(&self) -> bool {
+        self.is_finished() && self.sessions.iter().any(|session| session.n_steps_remaining().is_some_and(|n| n > 0))
+    }
+
+    /// The hub that clients are connected to.
+    pub fn hub(&self) -> Hub {
+        self.hub.clone()
+    }
+
+    /// Keyframes in the store, in order of acceptance.
+    pub fn keyframes(&self) -> &[Arc<Keyframe>] {
+        &self.keyframes
+    }
+
+    /// Number of keyframes evicted so far.
+    pub fn n_evicted(&self) -> u64 {
+        self.n_evicted
+    }
+
+    /// The models in training.
+    pub fn sessions(&self) -> &[Session] {
+        &self.sessions
+    }
+
+    /// Takes keyframes, trains, draws and publishes in turn. If the GPU fails, it is reopened.
+    pub fn advance(&mut self) -> crate::Result<()> {
+        let advanced =
+            self.take_keyframes().and_then(|()| self.step()).and_then(|()| self.render()).and_then(|()| self.publish());
+        advanced.or_else(|error| self.recoveries.recover(&mut self.sessions, error))
+    }
+
+    /// Waits for queued work. If the GPU failed, it is reopened; returns whether that was necessary.
+    pub fn wait(&mut self) -> crate::Result<bool> {
+        match self.sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => Ok(false),
+            Err(error) => self.recoveries.recover(&mut self.sessions, error).map(|()| true),
+        }
+    }
+
+    /// What is saved on disk if the run fails now.
+    pub fn describe_recoverable(&mut self) -> String {
+        recoveries::describe_recoverable(&mut self.sessions)
+    }
+
+    /// Pushes new keyframes to the models: all that wait in real time, the one that is due in lockstep. Does nothing
+    /// during an evaluation.
+    fn take_keyframes(&mut self) -> crate::Result<()> {
+        if self.is_scoring() {
+            return Ok(());
+        }
+        if let Some(first_image) = self.feed.first_image() {
+            self.sessions.iter_mut().for_each(|session| session.start_clock(first_image));
+        }
+        let n_before = self.keyframes.len();
+        match self.pace {
+            Pace::RealTime => {
+                if !self.is_training() || self.is_idle() {
+                    let first = self.wait_for_change();
+                    first.map_or(Ok(()), |change| self.apply(change))?;
+                }
+                while let Some(change) = self.feed.next(Duration::ZERO) {
+                    self.apply(change)?;
+                }
+            }
+            Pace::Lockstep { steps_per_keyframe } => {
+                while !self.feed.ended() && self.is_keyframe_due() {
+                    let Some(change) = self.wait_for_change() else { break };
+                    let is_new = matches!(change, Change::Accepted(_));
+                    self.apply(change)?;
+                    if is_new && self.is_training() {
+                        for (at, session) in self.next_keyframe_at.iter_mut().zip(&self.sessions) {
+                            *at = session.progress().step + steps_per_keyframe;
+                        }
+                    }
+                }
+            }
+        }
+        if self.keyframes.len() != n_before {
+            self.publish_keyframes();
+            if self.keyframes.len() <= self.start_keyframes
+                && let Some(hint) = scene_hint::from_keyframes(&self.keyframes)
+            {
+                self.hub.set_scene_hint(hint);
+            }
+        }
+        Ok(())
+    }
+
+    /// The next keyframe that was added or removed; `None` if a requested picture may be drawn now, or nothing happens
+    /// for [`IDLE`].
+    fn wait_for_change(&mut self) -> Option<Change> {
+        if self.hub.n_clients() == 0 {
+            return self.feed.next(IDLE);
+        }
+        let started = Instant::now();
+        loop {
+            let before = Instant::now();
+            let timeout = if self.budget.may_render() { Duration::ZERO } else { POLL_PERIOD };
+            if let Some(change) = self.feed.next(timeout) {
+                return Some(change);
+            }
+            let is_requested = self.budget.may_render() && self.hub.wait_for_request(POLL_PERIOD);
+            self.budget.add_training(before.elapsed()); // Training had nothing to do in this time.
+            if started.elapsed() >= IDLE || is_requested {
+                return None;
+            }
+        }
+    }
+
+    /// Trains a slice once there are enough keyframes; during an evaluation, scores one test image instead. Does
+    /// nothing if a requested picture may be drawn at once.
+    fn step(&mut self) -> crate::Result<()> {
+        self.sessions.iter().try_for_each(Session::check_gpu)?;
+        if !self.is_training() {
+            return Ok(());
+        }
+        if let Some(session) = self.sessions.iter_mut().find(|session| session.is_scoring()) {
+            let before = Instant::now();
+            session.score_next()?;
+            self.budget.add_training(before.elapsed());
+            return Ok(());
+        }
+        if self.is_finished() {
+            self.hub.wait_for_request(IDLE);
+            return Ok(());
+        }
+        if self.is_render_pending() {
+            return Ok(());
+        }
+        let is_watched = self.hub.n_clients() > 0;
+        self.sessions.iter_mut().for_each(|session| session.set_watched(is_watched));
+        let is_paced = self.pace != Pace::RealTime && !self.feed.ended();
+        let due = &self.next_keyframe_at;
+        let max_steps = |ix: usize, session: &Session| match is_paced {
+            true => due[ix].saturating_sub(session.progress().step),
+            false => u64::MAX,
+        };
+        let before = Instant::now();
+        let (hub, budget) = (&self.hub, self.budget);
+        time_slices::train_next(&mut self.sessions, max_steps, || {
+            budget.may_render() && hub.wait_for_request(Duration::ZERO)
+        })?;
+        self.budget.add_training(before.elapsed());
+        Ok(())
+    }
+
+    /// Whether a picture is requested and may be drawn now.
+    fn is_render_pending(&self) -> bool {
+        self.budget.may_render() && self.hub.wait_for_request(Duration::ZERO)
+    }
+
+    /// Draws requested pictures as long as training keeps its share of the time.
+    fn render(&mut self) -> crate::Result<()> {
+        let started = Instant::now();
+        if !self.is_training() || self.is_idle() {
+            self.budget = RenderBudget::default(); // Training does not need the time.
+        }
+        while started.elapsed() < MAX_RENDER_TIME && self.budget.may_render() {
+            let Some(pending) = self.hub.next_request() else { break };
+            if self.keyframes.is_empty() {
+                pending.fail("no keyframe yet");
+                continue;
+            }
+            let Some(session) = session_for_method(&mut self.sessions, pending.method()) else {
+                let available_methods =
+                    self.sessions.iter().map(|session| session.kind().name()).collect::<Vec<_>>().join(", ");
+                let requested = pending.method().unwrap_or_default().to_owned();
+                pending.fail(&format!("no model with the method {requested:?}, only {available_methods}"));
+                continue;
+            };
+            // Work queued before the picture counts as training time.
+            let before = Instant::now();
+            session.n_total_steps()?;
+            self.budget.add_training(before.elapsed());
+            let before = Instant::now();
+            match session.render(&pending.request) {
+                Ok(picture) => pending.deliver(picture),
+                Err(error) => pending.fail(&error.to_string()),
+            }
+            self.budget.add_render(before.elapsed());
+        }
+        Ok(())
+    }
+
+    /// Publishes the status of the run to viewers, a few times per second.
+    fn publish(&mut self) -> crate::Result<()> {
+        if self.published.is_some_and(|published| published.elapsed() < PUBLISH_PERIOD) {
+            return Ok(());
+        }
+        self.published = Some(Instant::now());
+        let clock_secs = self.sessions[0].secs();
+        if self.scoring_time.as_secs_f64() < SCORE_FRAC * clock_secs && !self.is_scoring() {
+            let before = Instant::now();
+            // Only one image at a time, because viewers are waiting.
+            self.next_refreshed = (self.next_refreshed + 1) % self.sessions.len();
+            let session = &mut self.sessions[self.next_refreshed];
+            if session.progress().step > 0 {
+                session.n_total_steps()?;
+                session.refresh_psnr()?;
+            }
+            self.scoring_time += before.elapsed();
+            self.budget.add_training(before.elapsed());
+        }
+        let mut models = self.sessions.iter().map(model_status);
+        self.hub.set_status(Status {
+            state: self.state().to_owned(),
+            seconds: clock_secs,
+            keyframes: self.keyframes.len() as u64,
+            rejected: self.feed.rejected(),
+            model: models.next().unwrap_or_default(),
+            others: models.collect(),
+            notes: self.notes.clone(),
+            result: None,
+        });
+        Ok(())
+    }
+
+    /// Ends the input; returns the sessions and the remaining input.
+    pub fn finish(self) -> (Vec<Session>, crate::Result<InputResult>) {
+        // The status stays visible, because viewers wait for the scores.
+        self.hub.set_state("saving");
+        (self.sessions, self.feed.finish().map_err(Into::into))
+    }
+
+    fn is_scoring(&self) -> bool {
+        self.sessions.iter().any(Session::is_scoring)
+    }
+
+    fn is_training(&self) -> bool {
+        self.can_train() && (self.keyframes.len() >= self.start_keyframes || self.feed.ended())
+    }
+
+    /// Counting keyframes is not enough: with several cameras, each camera starts with a test keyframe.
+    fn can_train(&self) -> bool {
+        self.keyframes.iter().any(|keyframe| keyframe.split == Split::Train)
+    }
+
+    /// Whether no model can train before the next keyframe arrives.
+    fn is_idle(&self) -> bool {
+        self.sessions.iter().all(|session| session.is_idle() || session.has_finished_steps())
+    }
+
+    /// Whether each model has reached the step at which the next keyframe is due, or cannot train without it.
+    fn is_keyframe_due(&self) -> bool {
+        let is_due = |(session, at): (&Session, &u64)| {
+            session.progress().step >= *at || session.is_idle() || session.has_finished_steps()
+        };
+        self.sessions.iter().zip(&self.next_keyframe_at).all(is_due)
+    }
+
+    /// Whether the input ended and all training is done; the models stay visible until the user ends the run.
+    fn is_finished(&self) -> bool {
+        self.feed.ended() && self.is_idle()
+    }
+
+    fn state(&self) -> &'static str {
+        if self.is_finished() {
+            "finished"
+        } else if self.is_training() {
+            "training"
+        } else if self.feed.first_image().is_some() {
+            "collecting keyframes"
+        } else {
+            "waiting for images"
+        }
+    }
+
+    fn apply(&mut self, change: Change) -> crate::Result<()> {
+        match change {
+            Change::Accepted(keyframe) => {
+                // A model that has made all its steps gets no more keyframes, so that it equals a model trained alone.
+                self.keyframes.push(keyframe.clone());
+                let mut pushed = Ok(());
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
+                    // Every session holds the keyframe, even after a GPU failure, so that a restored model gets it.
+                    pushed = pushed.and(session.push(&keyframe));
+                }
+                pushed
+            }
+            Change::Evicted { camera, stamp } => {
+                self.n_evicted += 1;
+                self.keyframes.retain(|keyframe| keyframe.camera != camera || keyframe.stamp != stamp);
+                let mut removed = Ok(());
+                for session in self.sessions.iter_mut().filter(|session| !session.has_finished_steps()) {
+                    removed = removed.and(session.remove(&camera, stamp));
+                }
+                removed
+            }
+        }
+    }
+}
+
+/// Options of a live run.
+pub struct LiveOptions {
+    /// What determines when keyframes are taken.
+    pub pace: Pace,
+    /// Number of keyframes with which training starts.
+    pub start_keyframes: usize,
+    /// Notes shown on the page.
+    pub notes: Vec<String>,
+    /// Opens the GPU again after a failure.
+    pub open_gpu: OpenGpu,
+}
+
+/// The session of a method; the first one if no method is given.
+fn session_for_method<'a>(sessions: &'a mut [Session], method: Option<&str>) -> Option<&'a mut Session> {
+    sessions.iter_mut().find(|session| method.is_none_or(|name| session.kind().name() == name))
+}
+
+fn model_status(session: &Session) -> ModelStatus {
+    let progress = session.progress();
+    ModelStatus {
+        method: session.kind().name().to_owned(),
+        step: progress.step,
+        step_millis: (progress.step > 0).then_some(progress.step_millis),
+        primitives: progress.primitives,
+        primitives_label: session.kind().entry().primitives_label.to_owned(),
+        bytes: progress.bytes,
+        psnr: session.psnr(),
+        psnr_history: session.psnr_history().to_vec(),
+    }
+}
+
+fn frustum(keyframe: &Keyframe) -> KeyframePose {
+    KeyframePose {
+        camera: keyframe.camera.clone(),
+        world_from_camera: keyframe.world_from_camera,
+        size_px: keyframe.size_px,
+        focal_px: keyframe.focal_px,
+        principal_px: keyframe.principal_px,
+    }
+}

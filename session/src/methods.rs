@@ -1,0 +1,89 @@
+//! Options and names of models on the command line and in rig files.
+
+use crate::Error;
+use crate::run_folder::{expect_model, expect_one_model};
+use capture::Rig;
+use capture::config::Train;
+use keyframe::listed;
+use serde_json::Value;
+use std::path::Path;
+use std::sync::Arc;
+use trainer::gpu::Gpu;
+use trainer::{CommonOptions, LoadedModel, ModelKind, ModelSpec};
+
+/// Values of options that only some methods have, by name.
+pub type Settings = Vec<(&'static str, Value)>;
+
+/// Maximum number of splats.
+pub const MAX_SPLATS: &str = "max_splats";
+/// How the number of splats is chosen.
+pub const COUNT: &str = "count";
+/// Degree of the spherical harmonics.
+pub const SH_DEGREE: &str = "sh_degree";
+
+/// Names of kinds as prose: `splat`, `tsdf and splat`, `tsdf, nerf and splat`.
+pub fn describe(kinds: &[ModelKind]) -> String {
+    listed(&kinds.iter().map(|kind| kind.name()).collect::<Vec<_>>(), "and")
+}
+
+/// The kind of model at a path; `None` if it is not a model.
+///
+/// # Errors If the folder contains several models, or its `model.json` is invalid.
+pub fn kind_of(path: &Path) -> crate::Result<Option<ModelKind>> {
+    expect_one_model(path)?;
+    Ok(ModelKind::of_saved(path)?)
+}
+
+/// Loads a saved model of any kind from its folder, or splats from a file.
+pub fn load(gpu: Arc<Gpu>, model: &Path) -> crate::Result<LoadedModel> {
+    expect_model(model)?;
+    Ok(trainer::load(gpu, model)?)
+}
+
+/// The methods that a rig file names.
+///
+/// # Errors
+///
+/// If it names an unknown one.
+pub fn methods_of(rig: &Rig) -> crate::Result<Vec<ModelKind>> {
+    let known: Vec<_> = ModelKind::ALL.iter().map(|kind| (kind.name(), *kind)).collect();
+    Ok(rig.train.methods.resolve(&known)?)
+}
+
+/// Options from a rig file. `steps` is the number of steps if it is fixed in advance.
+pub fn options(train: &Train, steps: Option<u64>) -> (CommonOptions, Settings) {
+    let defaults = CommonOptions::default();
+    let common = CommonOptions {
+        seed: train.seed,
+        max_bytes: train.max_bytes,
+        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
+        ..defaults
+    };
+    let max_splats = train.max_splats.map(|n| (MAX_SPLATS, n.into()));
+    (common, max_splats.into_iter().chain([(SH_DEGREE, train.sh_degree.into())]).collect())
+}
+
+/// Models of these kinds with common options, and with the settings that each of them has.
+pub fn specs(kinds: &[ModelKind], common: &CommonOptions, settings: &Settings) -> Result<Vec<ModelSpec>, Error> {
+    let spec = |kind: &ModelKind| ModelSpec::new(*kind, common.clone(), settings);
+    kinds.iter().map(spec).collect::<Result<_, _>>().map_err(|error| Error::BadInput(error.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_setting_belongs_to_a_method() {
+        for name in [MAX_SPLATS, COUNT, SH_DEGREE] {
+            assert!(ModelKind::ALL.iter().any(|kind| kind.has_option(name)), "{name}");
+        }
+        assert!(!ModelKind::ALL.iter().any(|kind| kind.has_option("max-splats")));
+    }
+
+    #[test]
+    fn names_are_listed_in_prose() {
+        assert_eq!(describe(&ModelKind::ALL[..1]), "splat");
+        assert_eq!(describe(ModelKind::ALL), "splat, tsdf and nerf");
+    }
+}

@@ -1,0 +1,177 @@
+//! Commands to run after training. They work as printed, in the folder in which training was started.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use trainer::ModelKind;
+use trainer::method_entry::Export;
+
+/// The images that a model was trained on, for commands that need them.
+#[derive(Clone, Debug, Default)]
+pub struct DataSource {
+    /// Dataset folder or recording; `None` if a live run was not recorded.
+    pub path: Option<PathBuf>,
+    /// Flags with which `eval` loads the same images.
+    pub flags: Vec<String>,
+    /// Names of the images, by camera and stamp.
+    pub image_names: BTreeMap<(String, i64), String>,
+}
+
+impl DataSource {
+    /// The file name of an image, or without one its camera and stamp.
+    pub fn image_name(&self, camera: &str, stamp_nanos: i64) -> String {
+        let known = self.image_names.get(&(camera.to_owned(), stamp_nanos));
+        known.cloned().unwrap_or_else(|| format!("{camera}/{stamp_nanos}"))
+    }
+}
+
+/// What the commands need to know about a saved model.
+#[derive(Clone, Copy, Debug)]
+pub struct SavedModel<'a> {
+    pub kind: ModelKind,
+    pub folder: &'a Path,
+    pub data: &'a DataSource,
+    pub n_tests: usize,
+}
+
+/// A command and its purpose.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NextCommand {
+    pub purpose: String,
+    pub command: String,
+}
+
+/// The commands for models that were trained together.
+pub fn for_models(models: &[SavedModel<'_>]) -> Vec<NextCommand> {
+    let program = std::env::args_os().next().map_or("fieldrig".into(), |word| word.to_string_lossy().into_owned());
+    let mut commands = Vec::new();
+    let mut add = |purpose: &str, words: &[&str]| {
+        let words: Vec<String> = std::iter::once(&*program).chain(words.iter().copied()).map(quoted).collect();
+        commands.push(NextCommand { purpose: purpose.to_owned(), command: words.join(" ") });
+    };
+    if let Some(folder) = common_folder(models) {
+        add("view the model", &["view", &argument(folder)]);
+    }
+    for model in models {
+        let folder = argument(model.folder);
+        if let (Some(data), 1..) = (&model.data.path, model.n_tests) {
+            let list = argument(&model.folder.join("keyframes.txt"));
+            let mut words = vec!["eval", &*folder];
+            let data = argument(data);
+            words.extend([&*data, "--keyframes", &list]);
+            words.extend(model.data.flags.iter().map(String::as_str));
+            add("score it again", &words);
+        }
+        if let Some(Export { format, contents, .. }) = model.kind.entry().exports.first() {
+            let out = argument(&unused_file(&model_name(model.folder), format));
+            add(&format!("export the {contents}"), &["export", &folder, "--to", format, "--out", &out]);
+        }
+    }
+    commands
+}
+
+/// The command line of this process.
+pub fn this_command() -> String {
+    std::env::args_os().map(|word| quoted(&word.to_string_lossy())).collect::<Vec<_>>().join(" ")
+}
+
+/// Purposes and commands in two columns.
+pub fn lines(commands: &[NextCommand]) -> Vec<String> {
+    let width = commands.iter().map(|next| next.purpose.len()).max().unwrap_or_default() + 1;
+    let line = |next: &NextCommand| format!("{:width$}  {}", format!("{}:", next.purpose), next.command);
+    commands.iter().map(line).collect()
+}
+
+/// The folder to view: that of a single model, or the parent folder of several models.
+fn common_folder<'a>(models: &[SavedModel<'a>]) -> Option<&'a Path> {
+    match models {
+        [] => None,
+        [model] => Some(model.folder),
+        [model, ..] => model.folder.parent(),
+    }
+}
+
+/// Base name of files exported from a model: that of its folder, which is the method name in a run of several methods.
+fn model_name(folder: &Path) -> String {
+    folder.file_name().map_or_else(|| "model".to_owned(), |name| name.to_string_lossy().into_owned())
+}
+
+/// A file name in the current folder that does not exist yet, because `export` does not overwrite files.
+fn unused_file(name: &str, extension: &str) -> PathBuf {
+    let numbered =
+        |n: u32| PathBuf::from(if n == 1 { format!("{name}.{extension}") } else { format!("{name}-{n}.{extension}") });
+    (1..100).map(numbered).find(|file| !file.exists()).unwrap_or_else(|| numbered(100))
+}
+
+/// A path as a positional argument: a leading hyphen would make it a flag.
+fn argument(path: &Path) -> String {
+    let text = path.to_string_lossy();
+    if text.starts_with('-') { format!("./{text}") } else { text.into_owned() }
+}
+
+/// A word, quoted for a shell.
+pub fn quoted(word: &str) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "_-./:=@%+,".contains(letter);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shell_reads_quoted_words_back() {
+        for word in ["plain/path-1.spz", "two words", "it's", "$HOME `x` \"y\" \\ *", "", "naïve", "a\nb"] {
+            let output = std::process::Command::new("sh").args(["-c", &format!("printf %s {}", quoted(word))]).output();
+            assert_eq!(String::from_utf8_lossy(&output.expect("sh starts").stdout), word);
+        }
+        assert_eq!(quoted("runs/20261123-170000"), "runs/20261123-170000");
+    }
+
+    #[test]
+    fn commands_depend_on_the_kind_of_model() {
+        let data = DataSource {
+            path: Some("my data".into()),
+            flags: vec!["--scale".into(), "0.5".into()],
+            ..DataSource::default()
+        };
+        let kind = |name| ModelKind::from_name(name).expect("registered");
+        let model = |name, folder| SavedModel { kind: kind(name), folder: Path::new(folder), data: &data, n_tests: 3 };
+        let commands = |models: &[SavedModel<'_>]| -> Vec<String> {
+            let program = quoted(&std::env::args().next().expect("a program"));
+            let strip = |next: NextCommand| next.command.trim_start_matches(&format!("{program} ")).to_owned();
+            for_models(models).into_iter().map(strip).collect()
+        };
+        assert_eq!(
+            commands(&[model("splat", "runs/a b")]),
+            [
+                "view 'runs/a b'",
+                "eval 'runs/a b' 'my data' --keyframes 'runs/a b/keyframes.txt' --scale 0.5",
+                "export 'runs/a b' --to spz --out 'a b.spz'",
+            ]
+        );
+        assert_eq!(
+            commands(&[model("nerf", "both/nerf"), model("tsdf", "both/tsdf")]),
+            [
+                "view both",
+                "eval both/nerf 'my data' --keyframes both/nerf/keyframes.txt --scale 0.5",
+                "eval both/tsdf 'my data' --keyframes both/tsdf/keyframes.txt --scale 0.5",
+                "export both/tsdf --to glb --out tsdf.glb",
+            ]
+        );
+        let live = DataSource::default();
+        let unscored = SavedModel { data: &live, ..model("nerf", "-out") };
+        assert_eq!(commands(&[unscored]), ["view ./-out"]);
+        assert_eq!(commands(&[]), Vec::<String>::new());
+    }
+
+    #[test]
+    fn unnamed_images_use_camera_and_stamp() {
+        let mut data = DataSource::default();
+        data.image_names.insert(("camera".into(), 8), "images/0008.jpg".into());
+        assert_eq!(data.image_name("camera", 8), "images/0008.jpg");
+        assert_eq!(data.image_name("camera", 9), "camera/9");
+    }
+}

@@ -1,0 +1,117 @@
+//! Reports of a session to the program that runs it.
+
+use crate::evaluate::Scores;
+use serde::Serialize;
+use std::path::Path;
+use trainer::Progress;
+
+/// Receives the events of a session, for example to print them.
+pub trait Observer {
+    /// Takes an event.
+    fn on_event(&mut self, event: &SessionEvent<'_>);
+}
+
+/// Ignores all events.
+impl Observer for () {
+    fn on_event(&mut self, _event: &SessionEvent<'_>) {}
+}
+
+/// An event of a session.
+#[derive(Clone, Copy, Debug)]
+pub enum SessionEvent<'a> {
+    /// The state of training, several times per second.
+    Progress(&'a SessionProgress),
+    /// A scheduled evaluation.
+    Evaluated(&'a Evaluation),
+    /// Training ended; saving and scoring follow.
+    TrainingEnded,
+    /// The model was saved and scored.
+    Finished(&'a FinishedReport<'a>),
+}
+
+/// The state of training.
+#[derive(Clone, Debug)]
+pub struct SessionProgress {
+    /// Name of the model's primitive, in the singular.
+    pub primitive: &'static str,
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Steps, primitives and memory.
+    pub progress: Progress,
+    /// Mean of the latest PSNR of all test images, dB.
+    pub psnr: Option<f64>,
+}
+
+/// Result of a scheduled evaluation. Serialized, it is the event `eval`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Evaluation {
+    pub(crate) event: &'static str,
+    pub(crate) method: &'static str,
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Number of optimizer steps.
+    pub step: u64,
+    /// Mean scores of the test images.
+    #[serde(flatten)]
+    pub scores: Scores,
+    /// Number of test images in the mean scores.
+    pub(crate) n_images: usize,
+    /// Number of splats, blocks or samples, depending on the method.
+    pub primitives: u64,
+    /// Size of the model, bytes.
+    pub bytes: u64,
+    /// Time of a step, milliseconds.
+    pub(crate) step_millis: Option<f64>,
+    /// Name of the model's primitive, in the singular.
+    #[serde(skip)]
+    pub primitive: &'static str,
+    /// Smoothed time of a step, milliseconds; 0 before the first.
+    #[serde(skip)]
+    pub smoothed_step_millis: f64,
+}
+
+/// Result of training. Serialized, it is the event `done`.
+#[derive(Clone, Debug, Serialize)]
+pub struct DoneEvent<'a> {
+    pub(crate) event: &'static str,
+    /// Name of the method.
+    pub method: &'static str,
+    /// Training time, seconds.
+    pub seconds: f64,
+    /// Number of optimizer steps.
+    pub steps: u64,
+    /// Mean scores of the test images.
+    #[serde(flatten)]
+    pub scores: Scores,
+    /// Number of splats, blocks or samples, depending on the method.
+    pub primitives: u64,
+    /// Size of the model, bytes.
+    pub bytes: u64,
+    /// Folder of the model.
+    pub out: &'a Path,
+    /// Hash of the saved model.
+    pub checkpoint_sha256: &'a str,
+}
+
+/// GPU time of each kernel in a step. Serialized, it is the event `profile`.
+#[derive(Clone, Debug, Serialize)]
+pub struct ProfileEvent<'a> {
+    pub(crate) event: &'static str,
+    /// Name of the method.
+    pub method: &'static str,
+    /// Names and milliseconds.
+    pub passes: &'a [(&'static str, f64)],
+}
+
+/// What is known about a model after it was saved and scored.
+#[derive(Clone, Debug)]
+pub struct FinishedReport<'a> {
+    /// The result.
+    pub done: &'a DoneEvent<'a>,
+    /// GPU time of each kernel, if profiling was requested.
+    pub profile: Option<ProfileEvent<'a>>,
+    /// Name of the model's primitive, in the singular.
+    pub primitive: &'static str,
+    /// Whether the page `report.html` was written.
+    pub has_page: bool,
+}

@@ -1,0 +1,82 @@
+//! Recovery from a GPU failure during a run: every model continues on a reopened device from its newest checkpoint.
+
+use crate::Error;
+use crate::error::Context;
+use crate::session::Session;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
+
+/// How many times a run tries to reopen the GPU.
+const MAX_RECOVERIES: u32 = 3;
+/// After this time without a failure the count restarts: a run of several days may fail occasionally.
+const RESET_COUNT_AFTER: Duration = Duration::from_secs(600);
+/// Pause between attempts: a driver reset takes a moment.
+const RETRY_DELAY: Duration = Duration::from_secs(1);
+
+/// What is saved of these sessions if they fail now: a sentence without a period, or empty if nothing is known.
+pub fn describe_recoverable(sessions: &mut [Session]) -> String {
+    let recoverable = sessions.iter_mut().filter_map(|session| {
+        let has_checkpoint = session.has_checkpoint();
+        Some(session.recovery()?.describe_recoverable(has_checkpoint))
+    });
+    recoverable.collect::<Vec<_>>().join("; ")
+}
+
+/// Opens the GPU again after a failure.
+pub type OpenGpu = fn() -> crate::Result<Arc<Gpu>>;
+
+/// Counts the attempts of a run to reopen the GPU.
+#[derive(Debug)]
+pub struct Recoveries {
+    open_gpu: OpenGpu,
+    n: u32,
+    last: Option<Instant>,
+}
+
+impl Recoveries {
+    /// No attempts so far.
+    #[must_use]
+    pub fn new(open_gpu: OpenGpu) -> Self {
+        Self { open_gpu, n: 0, last: None }
+    }
+
+    /// Continues all sessions on a reopened device if the GPU caused the error. Otherwise, and if all attempts fail,
+    /// returns the error.
+    pub fn recover(&mut self, sessions: &mut [Session], error: crate::Error) -> crate::Result<()> {
+        if !error.is_gpu_error() || sessions.iter().any(|session| session.recovery().is_none()) {
+            return Err(error);
+        }
+        let began = Instant::now();
+        if self.last.is_some_and(|last| last.elapsed() > RESET_COUNT_AFTER) {
+            self.n = 0;
+        }
+        let mut error = error;
+        while self.n < MAX_RECOVERIES {
+            if self.n > 0 {
+                std::thread::sleep(RETRY_DELAY);
+            }
+            self.n += 1;
+            log::warn!("{error:#}: reopening the GPU, attempt {} of {MAX_RECOVERIES}", self.n);
+            match restart_all(sessions, self.open_gpu) {
+                Ok(()) => {
+                    // Several sessions share one clock.
+                    sessions.iter().take(1).for_each(|session| session.exclude(began.elapsed()));
+                    self.last = Some(Instant::now());
+                    return Ok(());
+                }
+                Err(again) => error = again,
+            }
+        }
+        let recoverable = describe_recoverable(sessions);
+        Err(Error::GpuUnrecoverable(format!(
+            "{error:#}; giving up after {MAX_RECOVERIES} attempts to reopen the GPU; {recoverable}"
+        )))
+    }
+}
+
+fn restart_all(sessions: &mut [Session], open_gpu: OpenGpu) -> crate::Result<()> {
+    sessions.iter_mut().for_each(Session::drop_model); // The new model may need its memory.
+    let gpu = open_gpu().context("cannot reopen the GPU")?;
+    sessions.iter_mut().try_for_each(|session| session.restart_on(&gpu))
+}

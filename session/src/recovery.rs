@@ -1,0 +1,52 @@
+//! What a model needs to recover from a GPU failure, and the errors of one.
+
+use crate::decisions::Settings;
+use crate::run_folder::CHECKPOINT;
+use keyframe::Keyframe;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::ModelSpec;
+
+/// What a session needs to continue on another device.
+pub struct Recovery {
+    pub model_spec: ModelSpec,
+    /// Folder of the run.
+    pub folder: PathBuf,
+    /// Folder of the checkpoint that the run was resumed from, if it was.
+    pub resumed: Option<PathBuf>,
+    /// Keyframes that the resumed model was trained on.
+    pub known: Vec<Arc<Keyframe>>,
+    /// Settings for the decision log.
+    pub settings: Settings,
+    /// The command that continues from the newest checkpoint.
+    pub resume_command: String,
+}
+
+impl Recovery {
+    /// What can be continued if the model cannot be saved, as a sentence without a period.
+    pub fn describe_recoverable(&self, has_checkpoint: bool) -> String {
+        let Self { folder, resume_command, .. } = self;
+        match (has_checkpoint, &self.resumed) {
+            (true, _) => {
+                format!("the newest checkpoint is {}: `{resume_command}` continues from it", in_folder(folder))
+            }
+            (false, Some(resumed)) => {
+                format!("no newer checkpoint was written: resume again from the one in {}", resumed.display())
+            }
+            (false, None) => "no checkpoint was written yet: start the run again".to_owned(),
+        }
+    }
+}
+
+fn in_folder(folder: &Path) -> String {
+    folder.join(CHECKPOINT).display().to_string()
+}
+
+/// Adds what is saved on disk to an error of the GPU.
+pub fn with_recoverable(error: crate::Error, recoverable: &str) -> crate::Error {
+    if error.is_gpu_error() && !recoverable.is_empty() {
+        error.with_context(format!("the GPU failed at the end of the run; {recoverable}"))
+    } else {
+        error
+    }
+}

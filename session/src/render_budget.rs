@@ -1,0 +1,93 @@
+//! Limits the share of time that pictures take from training.
+//!
+//! Time spent on training is credited to pictures one for one. A picture is drawn at once while credit is left, so
+//! training keeps at least half of the time however many pictures are requested.
+
+use std::time::Duration;
+
+/// Maximum credit, seconds; more if the last slice of training took longer. It allows a burst of pictures of this
+/// length.
+const MAX_CREDIT_SECS: f64 = 0.1;
+/// Maximum debt, seconds: after a picture that takes longer, training catches up on this much only.
+const MAX_DEBT_SECS: f64 = 1.0;
+
+/// The time available for pictures.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RenderBudget {
+    /// Credit if positive, debt if negative.
+    balance_secs: f64,
+}
+
+impl Default for RenderBudget {
+    fn default() -> Self {
+        Self { balance_secs: MAX_CREDIT_SECS }
+    }
+}
+
+impl RenderBudget {
+    /// Whether a picture may be drawn now.
+    pub fn may_render(self) -> bool {
+        self.balance_secs >= 0.0
+    }
+
+    /// Adds time spent on training.
+    pub fn add_training(&mut self, spent: Duration) {
+        let spent_secs = spent.as_secs_f64();
+        self.balance_secs = (self.balance_secs + spent_secs).min(MAX_CREDIT_SECS.max(spent_secs));
+    }
+
+    /// Subtracts time spent on a picture.
+    pub fn add_render(&mut self, spent: Duration) {
+        self.balance_secs = (self.balance_secs - spent.as_secs_f64()).max(-MAX_DEBT_SECS);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STEP: Duration = Duration::from_millis(4);
+
+    /// Fraction of the time that pictures get if they are requested back to back.
+    fn render_frac(picture: Duration, step: Duration) -> f64 {
+        let (mut budget, mut rendered, mut trained) = (RenderBudget::default(), Duration::ZERO, Duration::ZERO);
+        for _ in 0..10_000 {
+            while budget.may_render() {
+                budget.add_render(picture);
+                rendered += picture;
+            }
+            budget.add_training(step);
+            trained += step;
+        }
+        rendered.as_secs_f64() / (rendered + trained).as_secs_f64()
+    }
+
+    #[test]
+    fn training_keeps_half_of_the_time() {
+        for millis in [1, 3, 40, 400] {
+            let frac = render_frac(Duration::from_millis(millis), STEP);
+            assert!((0.49..0.51).contains(&frac), "{millis} ms per picture: {frac}");
+        }
+        // On a CPU a picture may take so long that its debt is capped.
+        assert!(render_frac(Duration::from_secs(10), STEP) > 0.8);
+    }
+
+    #[test]
+    fn bursts_of_pictures_are_bounded() {
+        let mut budget = RenderBudget::default();
+        let mut n_drawn = 0;
+        while budget.may_render() {
+            budget.add_render(Duration::from_millis(3));
+            n_drawn += 1;
+        }
+        assert_eq!(n_drawn, 34);
+        budget.add_training(STEP);
+        assert!(budget.may_render());
+        // On a CPU a step takes seconds, so all stages of a picture are drawn between two steps.
+        budget.add_training(Duration::from_secs(2));
+        for stage_millis in [100, 500, 1300] {
+            assert!(budget.may_render());
+            budget.add_render(Duration::from_millis(stage_millis));
+        }
+    }
+}

@@ -1,0 +1,179 @@
+//! `train --replay-decisions`: trains with the decisions of a log.
+
+use crate::data::Data;
+use crate::decisions::{Decision, Decisions, Pushed};
+use crate::methods::{MAX_SPLATS, SH_DEGREE};
+use crate::read_progress::OnReadProgress;
+use crate::session::Session;
+use crate::{Error, depth_from};
+use capture::Stop;
+use capture::config::Override;
+use keyframe::{Keyframe, KeyframeList};
+use kinematics::Stamp;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use trainer::{ModelKind, ModelSpec};
+
+/// A decision log to replay.
+pub struct Replay {
+    path: PathBuf,
+    pub decisions: Decisions,
+    model_spec: ModelSpec,
+}
+
+impl Replay {
+    /// Reads a log.
+    pub fn load(path: &Path) -> crate::Result<Self> {
+        let decisions = Decisions::load(path)?;
+        let kind = ModelKind::from_name(&decisions.settings.method).ok_or_else(|| {
+            Error::BadInput(format!("{}: unknown method {:?}", path.display(), decisions.settings.method))
+        })?;
+        let model_spec = ModelSpec { kind, options: decisions.settings.options.clone() };
+        model_spec.check().map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
+        let replay = Self { path: path.to_owned(), decisions, model_spec };
+        if replay.decisions.pushed().next().is_none() {
+            return Err(
+                Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into()
+            );
+        }
+        Ok(replay)
+    }
+
+    /// Loads exactly the keyframes in the log; [`Self::check_data`] checks that they are the same.
+    pub fn load_data(&self, path: &Path, rig: Option<PathBuf>, progress: OnReadProgress<'_>) -> crate::Result<Data> {
+        let pushed = || self.decisions.pushed();
+        let list: KeyframeList = pushed()
+            .filter_map(|pushed| Some((pushed.camera.clone(), Stamp(pushed.stamp_nanos), pushed.split()?)))
+            .collect();
+        let mut data = Data::of_list(path, list, rig, self.decisions.settings.scale, &self.overrides(), progress)?;
+        let as_pushed: HashMap<(&str, i64), &Pushed> =
+            pushed().map(|pushed| ((&*pushed.camera, pushed.stamp_nanos), pushed)).collect();
+        for keyframe in &mut data.keyframes {
+            if let Some(pushed) = as_pushed.get(&(&*keyframe.camera, keyframe.stamp.0)) {
+                *keyframe = pushed.corrected(keyframe);
+            }
+        }
+        if !self.decisions.is_complete() {
+            let last = self.decisions.entries.last().map_or(0, |entry| entry.step);
+            let name = self.name();
+            data.data_losses.push(format!("{name} is truncated: replaying up to step {last}, its last one"));
+        }
+        Ok(data)
+    }
+
+    /// Returns an error if a keyframe of the log is missing from the data or differs.
+    pub fn check_data(&self, path: &Path, data: &Data) -> Result<(), Error> {
+        let by_key = by_name(&data.keyframes);
+        let (name, shown) = (self.name(), path.display());
+        for pushed in self.decisions.pushed() {
+            let (camera, stamp) = (&*pushed.camera, pushed.stamp_nanos);
+            let Some(keyframe) = by_key.get(&(camera, stamp)) else {
+                return Err(Error::InsufficientData(format!(
+                    "{name} contains image {stamp} of camera {camera:?}, which is not in {shown}"
+                )));
+            };
+            if !pushed.matches(keyframe) {
+                return Err(Error::InsufficientData(format!(
+                    "image {stamp} of camera {camera:?} has other pixels, depth, intrinsics or pose in {shown} than in \
+                     {name}"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that depth was rendered from the same model as in the logged run, identified by its SHA-256.
+    pub fn check_depth_from(&self, sha256: Option<&str>) -> Result<(), Error> {
+        depth_from::check_same(&self.name(), self.decisions.settings.depth_from.as_deref(), sha256)
+    }
+
+    /// Checks that training starts where the log does. `from_step`: the step of the checkpoint that training continues
+    /// from.
+    pub fn check_start(&self, from_step: Option<u64>) -> Result<(), Error> {
+        let name = self.name();
+        match (self.decisions.settings.from_step, from_step) {
+            (log, here) if log == here => Ok(()),
+            (None, _) => Err(Error::BadInput(format!("{name} starts at the first step: remove --resume"))),
+            (Some(log), None) => Err(Error::BadInput(format!(
+                "{name} continues from step {log}: give the folder of that checkpoint with --resume"
+            ))),
+            (Some(log), Some(here)) => {
+                Err(Error::BadInput(format!("{name} continues from step {log}, but the checkpoint is at step {here}")))
+            }
+        }
+    }
+
+    /// The method and options of the logged run.
+    pub fn model_spec(&self) -> ModelSpec {
+        self.model_spec.clone()
+    }
+
+    /// Warns if the GPU adapter differs from that of the log.
+    pub fn check_adapter(&self, adapter: &str) {
+        let logged_adapter = &self.decisions.settings.adapter;
+        if logged_adapter != adapter {
+            log::warn!("{} was written on {logged_adapter:?}: this adapter rounds differently", self.name());
+        }
+    }
+
+    /// Replays the decisions, each at its step.
+    pub fn drive(&self, session: &mut Session, keyframes: &[Arc<Keyframe>], stop: &Stop) -> crate::Result<()> {
+        let by_key = by_name(keyframes);
+        session.start_clock(Instant::now());
+        for entry in &self.decisions.entries {
+            while !stop.requested() {
+                let n_total_steps = session.n_total_steps()?;
+                if n_total_steps >= entry.step {
+                    break;
+                }
+                if session.step(entry.step - n_total_steps)? == 0 {
+                    return Err(Error::InsufficientData(format!(
+                        "{} requires step {}, but there is nothing to train on",
+                        self.name(),
+                        entry.step
+                    ))
+                    .into());
+                }
+            }
+            if stop.requested() {
+                break;
+            }
+            match &entry.decision {
+                Decision::Push(pushed) => {
+                    if let Some(keyframe) = by_key.get(&(&*pushed.camera, pushed.stamp_nanos)) {
+                        session.push(keyframe)?;
+                    }
+                }
+                Decision::Remove(removed) => session.remove(&removed.camera, Stamp(removed.stamp_nanos))?,
+                Decision::Seed(_) => session.seed()?,
+                Decision::Begin(_) => drop(session.step(0)?),
+                Decision::Restored(_) | Decision::Checkpoint(_) | Decision::End(_) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// The settings as keys of a rig file, so that the resolved rig file that is written is correct.
+    fn overrides(&self) -> Vec<Override> {
+        let ModelSpec { kind, options } = &self.model_spec;
+        let specific = |key, name: &str| Some(Override::new(key, options.specific.get(name)?.as_i64()?));
+        let mut overrides = vec![
+            Override::new("train.method", kind.name()),
+            Override::new("train.seed", options.common.seed.cast_signed()),
+        ];
+        overrides.extend(specific("train.max_splats", MAX_SPLATS));
+        overrides.extend(specific("train.sh_degree", SH_DEGREE));
+        overrides.extend(options.common.max_bytes.map(|bytes| Override::new("train.max_bytes", bytes.cast_signed())));
+        overrides
+    }
+
+    fn name(&self) -> String {
+        format!("the log {}", self.path.display())
+    }
+}
+
+fn by_name(keyframes: &[Arc<Keyframe>]) -> HashMap<(&str, i64), &Arc<Keyframe>> {
+    keyframes.iter().map(|keyframe| ((&*keyframe.camera, keyframe.stamp.0), keyframe)).collect()
+}

@@ -1,0 +1,497 @@
+//! `report.html`: the result of training in one file that works offline: test images next to renders, scores, settings.
+//!
+//! The page is made from `report.json`, from pictures drawn for it, and from the commands to run next.
+
+mod pictures;
+
+pub use pictures::{Comparison, Scored, compare};
+
+use crate::chart::drawing::escaped;
+use crate::chart::{Axis, Chart, Line, Point, Scale};
+use crate::next_commands::NextCommand;
+use crate::table::Table;
+use crate::{evaluation_schedule, run_folder};
+use serde_json::{Map, Value};
+use std::fmt::Write;
+use std::path::Path;
+
+/// Name of the page in the folder of a run.
+pub const FILE: &str = "report.html";
+/// Tables with more rows than this are collapsed.
+const MAX_OPEN_ROWS: usize = 16;
+
+/// The content of the page.
+pub struct Page<'a> {
+    pub folder: &'a Path,
+    /// The content of `report.json`.
+    pub report: &'a Value,
+    /// Name of the model's primitive, in the singular.
+    pub primitive: &'a str,
+    pub comparisons: &'a [Comparison],
+    pub next: &'a [NextCommand],
+    /// Settings of the model from the decision log; `Null` if there is no log.
+    pub settings: Value,
+    /// The command line of the training.
+    pub command: String,
+}
+
+impl Page<'_> {
+    /// Writes the page into the folder.
+    pub fn write(&self) -> crate::Result<()> {
+        run_folder::write_atomic(&self.folder.join(FILE), &self.html())
+    }
+
+    fn html(&self) -> String {
+        let (done, report) = (&self.report["done"], self.report);
+        let method = done["method"].as_str().unwrap_or("model");
+        let name = self.folder.display().to_string();
+        let title = escaped(&format!("{name}: {method}"));
+        let mut page = format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+             <title>{title}</title>\n<style>\n{}</style></head>\n<body><main>\n<h1>{title}</h1>\n<p class=\"sub\">{}</p>\n",
+            include_str!("style.css"),
+            escaped(&self.subtitle())
+        );
+        page.push_str(&figures(done, self.primitive));
+        page.push_str(&data_losses(&report["data_losses"]));
+        page.push_str(&commands(self.next));
+        page.push_str(&comparison_section(self.comparisons, array(&report["per_image"]).len()));
+        page.push_str(&curve(report, method));
+        page.push_str(&collapsible(&scores_of_images(report), "Scores of all test images"));
+        page.push_str(&collapsible(&evaluations_table(report, self.primitive), "Scores during training"));
+        page.push_str(&trials(&report["trials"]));
+        page.push_str(&self.settings_tables());
+        page.push_str("</main></body></html>\n");
+        page
+    }
+
+    /// Program version, data and device in one line.
+    fn subtitle(&self) -> String {
+        let text = |key: &str| self.report[key].as_str().map(str::to_owned);
+        let words = [Some(format!("fieldrig {}", env!("CARGO_PKG_VERSION"))), text("data"), text("adapter")];
+        words.into_iter().flatten().collect::<Vec<_>>().join(" · ")
+    }
+
+    fn settings_tables(&self) -> String {
+        let excluded_keys = ["done", "data_losses", "evaluations", "trials", "passes", "per_image"];
+        let extra = self.report.as_object().into_iter().flatten();
+        let extra = extra.filter(|(key, _)| !excluded_keys.contains(&key.as_str()));
+        let mut run: Vec<Vec<String>> = vec![vec!["command".to_owned(), self.command.clone()]];
+        run.extend(extra.flat_map(|(key, value)| rows_of(key, value)));
+        run.extend(rows_of("model sha256", &self.report["done"]["checkpoint_sha256"]));
+        let passes = array(&self.report["passes"]).iter().filter_map(|pass| {
+            Some(vec![format!("GPU time of {}", pass[0].as_str()?), format!("{:.3} ms", pass[1].as_f64()?)])
+        });
+        run.extend(passes);
+        let mut html = settings_table("This run", run, false);
+        if let Value::Object(settings) = &self.settings {
+            let rows = settings.iter().flat_map(|(key, value)| rows_of(key, value)).collect();
+            html.push_str(&settings_table("All settings of the model", rows, true));
+        }
+        html
+    }
+}
+
+/// The main scores and sizes.
+fn figures(done: &Value, primitive: &str) -> String {
+    let number = |key: &str| done[key].as_f64();
+    let scaled =
+        |key: &str, factor: f64, digits: usize| number(key).map(|value| format!("{:.digits$}", factor * value));
+    let primitives = format!("{primitive}s");
+    let entries = [
+        ("test PSNR", scaled("psnr", 1.0, 2).or(Some("–".to_owned())), "dB"),
+        ("SSIM", scaled("ssim", 1.0, 4), ""),
+        ("LPIPS", scaled("lpips", 1.0, 4), ""),
+        ("depth RMSE", scaled("depth_rmse_m", 1e3, 1), "mm"),
+        ("surface error", scaled("surface_error_m", 1e3, 1), "mm"),
+        ("surface within 5 mm", scaled("surface_within_5_mm", 1e2, 1), "%"),
+        ("PSNR to the true scene", scaled("psnr_truth", 1.0, 2), "dB"),
+        ("training time", scaled("seconds", 1.0, 1), "s"),
+        ("steps", number("steps").map(grouped), ""),
+        (primitives.as_str(), number("primitives").map(grouped), ""),
+        ("GPU memory", scaled("bytes", 1e-6, 1), "MB"),
+    ];
+    let mut html = String::from("<dl class=\"figures\">\n");
+    for (name, value, unit) in entries {
+        let Some(value) = value else { continue };
+        let unit = if unit.is_empty() { String::new() } else { format!("<small>{unit}</small>") };
+        writeln!(html, "<div><dd>{value}{unit}</dd><dt>{}</dt></div>", escaped(name)).expect("a String never fails");
+    }
+    for (camera, psnr) in done["psnr_per_camera"].as_object().into_iter().flatten() {
+        let (camera, psnr) = (escaped(camera), psnr.as_f64().unwrap_or_default());
+        writeln!(html, "<div><dd>{psnr:.2}<small>dB</small></dd><dt>PSNR of {camera}</dt></div>")
+            .expect("a String never fails");
+    }
+    html.push_str("</dl>\n");
+    html
+}
+
+fn data_losses(data_losses: &Value) -> String {
+    let items: String =
+        array(data_losses).iter().filter_map(Value::as_str).map(|loss| format!("<li>{}</li>", escaped(loss))).collect();
+    match items.is_empty() {
+        true => String::new(),
+        false => format!("<div class=\"warn\"><strong>Lost data</strong><ul>{items}</ul></div>\n"),
+    }
+}
+
+fn commands(next: &[NextCommand]) -> String {
+    let entry = |next: &NextCommand| {
+        format!("<dt>{}</dt><dd><code>{}</code></dd>\n", escaped(&next.purpose), escaped(&next.command))
+    };
+    let entries: String = next.iter().map(entry).collect();
+    if entries.is_empty() {
+        return String::new();
+    }
+    format!("<h2>Next commands</h2>\n<dl class=\"commands card\">\n{entries}</dl>\n")
+}
+
+/// Test images next to renders.
+fn comparison_section(comparisons: &[Comparison], n_tests: usize) -> String {
+    if comparisons.is_empty() {
+        let reason = if n_tests == 0 { "there are no test images" } else { "no test image could be drawn" };
+        return format!("<h2>Test images</h2>\n<p class=\"legend\">No comparison: {reason}.</p>\n");
+    }
+    let count_note = match comparisons.len() == n_tests {
+        true => String::new(),
+        false => format!("{} of {n_tests} test images, with the best and the worst among them. ", comparisons.len()),
+    };
+    let mut html = format!(
+        "<h2>Test images</h2>\n<p class=\"legend\">{count_note}Left to right: the camera image and the model's render from \
+         the same pose. None of these images was used for training.</p>\n<div class=\"comparisons\">\n"
+    );
+    let by_psnr = |a: &&Comparison, b: &&Comparison| a.psnr.total_cmp(&b.psnr);
+    let (worst, best) = (comparisons.iter().min_by(by_psnr), comparisons.iter().max_by(by_psnr));
+    for comparison in comparisons {
+        let is = |other: Option<&Comparison>| other.is_some_and(|other| std::ptr::eq(other, comparison));
+        let tag = match comparisons.len() {
+            ..3 => "",
+            _ if is(worst) => "<span class=\"tag\">worst</span>",
+            _ if is(best) => "<span class=\"tag\">best</span>",
+            _ => "",
+        };
+        html.push_str(&comparison_card(comparison, tag));
+    }
+    html.push_str("</div>\n");
+    html
+}
+
+fn comparison_card(comparison: &Comparison, tag: &str) -> String {
+    let Comparison { name, psnr, ssim, size_px: [width, height], image, render, error, depth } = comparison;
+    let name = escaped(name);
+    let ssim = ssim.map_or(String::new(), |ssim| format!("<span>SSIM {ssim:.4}</span>"));
+    let figure = |source: &str, caption: &str| {
+        format!(
+            "<figure><img loading=\"lazy\" width=\"{width}\" height=\"{height}\" alt=\"{caption}, {name}\" src=\"{source}\">\
+             <figcaption>{caption}</figcaption></figure>\n"
+        )
+    };
+    let depth = depth.as_ref().map_or(String::new(), |depth| {
+        let [near, far] = depth.range_m;
+        figure(&depth.picture, &format!("depth, {near:.2} m (red) to {far:.2} m (blue)"))
+    });
+    let shape = if height > width { " tall" } else { "" };
+    format!(
+        "<article class=\"comparison card{shape}\"><h3>{name}<span>{psnr:.2} dB</span>{ssim}{tag}</h3>\n<div class=\"pair\">\n{}{}\
+         <div class=\"stack\">{}{depth}</div></div></article>\n",
+        figure(image, "test image"),
+        figure(render, "render"),
+        figure(error, "error, bright from 25 %")
+    )
+}
+
+/// Accuracy over time.
+fn curve(report: &Value, method: &str) -> String {
+    let point = |evaluation: &Value| {
+        Some((evaluation["seconds"].as_f64().filter(|secs| *secs > 0.0)?, evaluation["psnr"].as_f64()?))
+    };
+    let mut points: Vec<(f64, f64)> = array(&report["evaluations"]).iter().filter_map(point).collect();
+    let last_secs = points.last().map_or(0.0, |(secs, _)| *secs);
+    points.extend(point(&report["done"]).filter(|(secs, _)| *secs > 1.01 * last_secs));
+    if points.len() < 2 {
+        return String::new();
+    }
+    let chart = Chart {
+        title: "PSNR of test images over time".into(),
+        subtitle: "the last point is the saved model".into(),
+        x: Axis {
+            label: "seconds of training (log)".into(),
+            scale: Scale::Log,
+            ticks: evaluation_schedule::up_to(1.1 * last_secs.max(points.last().map_or(0.0, |(secs, _)| *secs)))
+                .collect(),
+        },
+        y: Axis { label: "test PSNR, dB".into(), scale: Scale::Linear, ticks: Vec::new() },
+        lines: vec![Line {
+            label: method.to_owned(),
+            points: points.iter().map(|(x, y)| Point { x: *x, y: *y, low: *y, high: *y }).collect(),
+            is_peer: false,
+        }],
+        thresholds: Vec::new(),
+        markers: Vec::new(),
+    };
+    format!("<h2>Training curve</h2>\n<div class=\"chart card\">{}</div>\n", chart.draw().svg())
+}
+
+fn scores_of_images(report: &Value) -> Table {
+    let columns = [
+        ("psnr", "PSNR, dB", 1.0, 2),
+        ("ssim", "SSIM", 1.0, 4),
+        ("lpips", "LPIPS", 1.0, 4),
+        ("depth_rmse_m", "depth RMSE, mm", 1e3, 1),
+        ("surface_error_m", "surface, mm", 1e3, 1),
+        ("psnr_truth", "to truth, dB", 1.0, 2),
+    ];
+    table("Scores of all test images", &report["per_image"], ("name", "image"), &columns)
+}
+
+fn evaluations_table(report: &Value, primitive: &str) -> Table {
+    let primitives = format!("{primitive}s");
+    let columns = [
+        ("step", "step", 1.0, 0),
+        ("psnr", "PSNR, dB", 1.0, 2),
+        ("ssim", "SSIM", 1.0, 4),
+        ("lpips", "LPIPS", 1.0, 4),
+        ("depth_rmse_m", "depth RMSE, mm", 1e3, 1),
+        ("n_images", "test images", 1.0, 0),
+        ("primitives", primitives.as_str(), 1.0, 0),
+        ("bytes", "MB", 1e-6, 1),
+        ("step_millis", "ms per step", 1.0, 2),
+    ];
+    table("Scores during training", &report["evaluations"], ("seconds", "seconds"), &columns)
+}
+
+/// A column: key, head, factor, digits after the point.
+type Column<'a> = (&'a str, &'a str, f64, usize);
+
+/// A table of objects, one row each; columns without any value are left out.
+fn table(title: &str, objects: &Value, (key, head): (&str, &str), columns: &[Column<'_>]) -> Table {
+    let objects = array(objects);
+    let is_known = |column: &&Column<'_>| objects.iter().any(|object| object[column.0].is_number());
+    let columns: Vec<&Column<'_>> = columns.iter().filter(is_known).collect();
+    let cell = |object: &Value, (key, _, factor, digits): &Column<'_>| match object[*key].as_f64() {
+        Some(value) if *digits == 0 => grouped(factor * value),
+        Some(value) => format!("{:.*}", *digits, factor * value),
+        None => "–".to_owned(),
+    };
+    let first = |object: &Value| match &object[key] {
+        Value::Number(number) => format!("{:.2}", number.as_f64().unwrap_or_default()),
+        other => text_of(other),
+    };
+    let row = |object: &Value| -> Vec<String> {
+        std::iter::once(first(object)).chain(columns.iter().map(|column| cell(object, column))).collect()
+    };
+    Table {
+        title: title.to_owned(),
+        head: std::iter::once(head).chain(columns.iter().map(|column| column.1)).map(str::to_owned).collect(),
+        rows: objects.iter().map(row).collect(),
+    }
+}
+
+/// A table: collapsed if it is long, left out if it is empty.
+fn collapsible(table: &Table, title: &str) -> String {
+    match table.rows.len() {
+        0 => String::new(),
+        1..=MAX_OPEN_ROWS => table.html(),
+        n => format!("<details><summary>{}: {n} rows</summary>\n{}</details>\n", escaped(title), table.html()),
+    }
+}
+
+/// The results of A/B trials.
+fn trials(trials: &Value) -> String {
+    let rows: Vec<Vec<String>> = array(trials)
+        .iter()
+        .map(|trial| {
+            let number = |key: &str| trial[key].as_f64().unwrap_or_default();
+            let kept = if trial["kept"] == Value::Bool(true) { "kept" } else { "dropped" };
+            let gain = format!("{:+.2} ± {:.2}", number("gain_db"), number("standard_error_db"));
+            vec![text_of(&trial["candidate"]), gain, text_of(&trial["n_images"]), kept.to_owned()]
+        })
+        .collect();
+    if rows.is_empty() {
+        return String::new();
+    }
+    let head = ["tried", "gain, dB", "images", "result"].map(str::to_owned).to_vec();
+    Table { title: "Trials during training".into(), head, rows }.html()
+}
+
+fn settings_table(title: &str, rows: Vec<Vec<String>>, is_collapsed: bool) -> String {
+    let row = |row: &Vec<String>| {
+        let cells: String = row.iter().map(|cell| format!("<td>{}</td>", escaped(cell))).collect();
+        format!("<tr>{cells}</tr>\n")
+    };
+    let rows: String = rows.iter().map(row).collect();
+    let table = format!("<div class=\"wide settings\"><table><tbody>\n{rows}</tbody></table></div>\n");
+    match is_collapsed {
+        true => format!("<details><summary>{title}</summary>\n{table}</details>\n"),
+        false => format!("<h2>{title}</h2>\n{table}"),
+    }
+}
+
+/// A value as rows of a table: one row per key for objects, none for empty values.
+fn rows_of(key: &str, value: &Value) -> Vec<Vec<String>> {
+    let key = match key {
+        "n_train" => "training images".to_owned(),
+        "n_validation" => "validation images".to_owned(),
+        "n_test" => "test images".to_owned(),
+        "startup_secs" => "seconds before training".to_owned(),
+        other => other.replace('_', " "),
+    };
+    match value {
+        Value::Null => Vec::new(),
+        Value::Array(items) if items.is_empty() => Vec::new(),
+        Value::Object(map) => {
+            map.iter().flat_map(|(inner, value)| rows_of(&format!("{key}: {inner}"), value)).collect()
+        }
+        Value::Array(items) if items.iter().any(Value::is_object) => {
+            let numbered = items.iter().enumerate();
+            numbered.map(|(ix, item)| vec![format!("{key} {}", ix + 1), text_of(item)]).collect()
+        }
+        other => vec![vec![key, text_of(other)]],
+    }
+}
+
+/// A value in one line.
+fn text_of(value: &Value) -> String {
+    let of_map = |map: &Map<String, Value>| {
+        let known = map.iter().filter(|(_, value)| !value.is_null());
+        known.map(|(key, value)| format!("{} {}", key.replace('_', " "), text_of(value))).collect::<Vec<_>>()
+    };
+    match value {
+        Value::Null => "–".to_owned(),
+        Value::Bool(is_true) => String::from(if *is_true { "yes" } else { "no" }),
+        Value::String(text) => text.clone(),
+        Value::Number(number) => match number.as_f64() {
+            Some(float) if !number.is_i64() && !number.is_u64() => short_float(float),
+            _ => number.to_string(),
+        },
+        Value::Array(items) => items.iter().map(text_of).collect::<Vec<_>>().join(", "),
+        Value::Object(map) => of_map(map).join(", "),
+    }
+}
+
+/// A number with four digits after the point, without trailing zeros.
+fn short_float(value: f64) -> String {
+    if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
+        let text = format!("{value:.4}");
+        return text.trim_end_matches('0').trim_end_matches('.').to_owned();
+    }
+    format!("{value:.3e}")
+}
+
+/// A whole number with its digits in groups of three.
+fn grouped(value: f64) -> String {
+    let digits = format!("{:.0}", value.abs());
+    let mut text = String::from(if value < 0.0 { "-" } else { "" });
+    for (ix, digit) in digits.chars().enumerate() {
+        if ix > 0 && (digits.len() - ix).is_multiple_of(3) {
+            text.push('\u{202f}');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+fn array(value: &Value) -> &[Value] {
+    value.as_array().map_or(&[], Vec::as_slice)
+}
+
+/// The settings in the decision log of a folder, which are its first line; `Null` if there is no log.
+pub fn settings_in(folder: &Path) -> Value {
+    let step_of = |name: &str| name.strip_prefix("decisions-from-")?.strip_suffix(".jsonl")?.parse::<u64>().ok();
+    let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let newest = names.filter_map(|entry| Some((step_of(entry.file_name().to_str()?)?, entry.path()))).max();
+    let path = newest.map_or_else(|| folder.join("decisions.jsonl"), |(_, path)| path);
+    let first_line = || -> Option<Value> {
+        let text = std::fs::read_to_string(&path).ok()?;
+        serde_json::from_str(text.lines().next()?).ok()
+    };
+    first_line().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn page(report: &Value) -> String {
+        let next = NextCommand { purpose: "view the model".into(), command: "fieldrig view 'a <b>'".into() };
+        let page = Page {
+            folder: Path::new("runs/a <b>"),
+            report,
+            primitive: "splat",
+            comparisons: &[],
+            next: &[next],
+            settings: json!({ "options": { "seed": 7, "caps": null } }),
+            command: "fieldrig train data".into(),
+        };
+        page.html()
+    }
+
+    #[test]
+    fn page_shows_scores_commands_and_settings_escaped() {
+        let html = page(&json!({
+            "done": { "method": "splat", "psnr": 23.456, "ssim": 0.9, "seconds": 8.0, "steps": 12345, "primitives": 4000000,
+                      "bytes": 8000000, "psnr_per_camera": { "wrist": 22.0 } },
+            "data": "my data", "adapter": "a GPU",
+            "data_losses": ["1 image <broken>"],
+            "evaluations": [{ "seconds": 0.5, "psnr": 20.0, "step": 10, "step_millis": 1.5 }, { "seconds": 4.0, "psnr": 22.0 }],
+            "per_image": [{ "name": "images/1.jpg", "psnr": 23.456, "ssim": null }],
+            "trials": [{ "candidate": "joints", "gain_db": 0.5, "standard_error_db": 0.1, "n_images": 9, "kept": true }],
+            "rejected": { "blurred": 3 }, "alignment": null,
+        }));
+        for words in [
+            "<title>runs/a &lt;b&gt;: splat</title>",
+            "23.46<small>dB</small>",
+            "12\u{202f}345",
+            "4\u{202f}000\u{202f}000",
+            "PSNR of wrist",
+            "1 image &lt;broken&gt;",
+            "<code>fieldrig view 'a &lt;b&gt;'</code>",
+            "<svg ",
+            "images/1.jpg",
+            "+0.50 ± 0.10",
+            "<td>rejected: blurred</td><td>3</td>",
+            "<td>options: seed</td><td>7</td>",
+            "prefers-color-scheme: dark",
+        ] {
+            assert!(html.contains(words), "{words} is missing: {html}");
+        }
+        assert!(!html.contains("<b>") && !html.contains("alignment") && !html.contains("NaN"));
+        assert!(
+            !html.contains("http://") || html.matches("http://").count() == html.matches("http://www.w3.org").count()
+        );
+    }
+
+    #[test]
+    fn page_without_scores_is_valid() {
+        let html = page(&json!({ "done": { "method": "tsdf", "psnr": null }, "evaluations": [], "per_image": [] }));
+        assert!(html.contains("there are no test images") && !html.contains("<svg "), "{html}");
+    }
+
+    #[test]
+    fn values_are_formatted_compactly() {
+        let texts =
+            [json!(0.000_012_34), json!(0.5), json!(7), json!([1.25, 2]), json!(true), json!({ "a_b": 1, "c": null })];
+        assert_eq!(texts.each_ref().map(text_of), ["1.234e-5", "0.5", "7", "1.25, 2", "yes", "a b 1"]);
+        assert_eq!(
+            [0.0, 999.0, 1000.0, -1_234_567.0].map(grouped),
+            ["0", "999", "1\u{202f}000", "-1\u{202f}234\u{202f}567"]
+        );
+    }
+
+    #[test]
+    fn settings_come_from_the_newest_log() {
+        let folder = tempfile::tempdir().expect("a folder");
+        assert_eq!(settings_in(folder.path()), Value::Null);
+        let write = |name: &str, step: u64| {
+            let lines = format!("{}\n{}\n", json!({ "from_step": step }), json!({ "end": true }));
+            std::fs::write(folder.path().join(name), lines).expect("disk space");
+        };
+        write("decisions.jsonl", 0);
+        assert_eq!(settings_in(folder.path())["from_step"], 0);
+        write("decisions-from-9.jsonl", 9);
+        write("decisions-from-100.jsonl", 100);
+        assert_eq!(settings_in(folder.path())["from_step"], 100);
+    }
+}

@@ -1,0 +1,492 @@
+//! The folder of a run, and the files in it.
+
+use crate::Error;
+use crate::error::{Context, bail, ensure};
+use capture::config::Rig;
+use keyframe::{Keyframe, listed};
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use trainer::{Method, ModelKind};
+
+/// File extension of recordings.
+const RECORDING_EXTENSION: &str = "mcap";
+/// Parent folder of runs without `--out`.
+const RUNS: &str = "runs";
+/// Folder in which a model is saved until it is complete.
+const PARTIAL_MODEL: &str = "model.part";
+/// The checkpoint in the folder of a run.
+pub const CHECKPOINT: &str = "training.ckpt";
+/// Lock file, held while a run writes into a folder.
+const LOCK: &str = ".lock";
+const SECS_PER_DAY: u64 = 86_400;
+
+/// Returns an error if a folder contains one or several models, so that results are never mixed or overwritten.
+pub fn check_no_model(folder: &Path) -> Result<(), Error> {
+    let subfolders = [PathBuf::new()].into_iter().chain(ModelKind::ALL.iter().map(|kind| PathBuf::from(kind.name())));
+    let mut files =
+        subfolders.flat_map(|path| ModelKind::model_files().map(|name| path.join(name)).collect::<Vec<_>>());
+    match files.find(|file| folder.join(file).exists()) {
+        Some(file) => Err(Error::BadInput(format!(
+            "--out {}: the folder already contains a model ({}); give another folder",
+            folder.display(),
+            file.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Returns an error if a folder contains one or several interrupted runs, because a new run would replace their
+/// checkpoints.
+pub fn check_no_unfinished_run(out: &Path) -> Result<(), Error> {
+    let folders = std::iter::once(out.to_owned()).chain(ModelKind::ALL.iter().map(|kind| out.join(kind.name())));
+    match folders.into_iter().find(|folder| folder.join(CHECKPOINT).exists()) {
+        Some(folder) => Err(Error::BadInput(format!(
+            "--out {}: {} contains an interrupted run: continue it with --resume, or give another folder",
+            out.display(),
+            folder.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// Returns an error if results would be written into the folder of the data.
+pub fn check_not_data_folder(out: &Path, data: &Path) -> Result<(), Error> {
+    let canonical = |path: &Path| path.canonicalize().ok();
+    match (canonical(out), canonical(data)) {
+        (Some(folder), Some(data)) if folder == data => Err(Error::BadInput(format!(
+            "--out {}: this is the folder of the data; give another folder",
+            out.display()
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// Returns an error that names the subfolders if a folder contains models of several methods where one model is needed.
+pub fn expect_one_model(folder: &Path) -> Result<(), Error> {
+    let holds_one = |folder: &Path| holds_model(folder) || folder.join(CHECKPOINT).exists();
+    let inside: Vec<String> = ModelKind::ALL
+        .iter()
+        .map(|kind| folder.join(kind.name()))
+        .filter(|folder| holds_one(folder))
+        .map(|folder| folder.display().to_string())
+        .collect();
+    if inside.is_empty() || holds_one(folder) {
+        return Ok(());
+    }
+    Err(Error::BadInput(format!(
+        "{}: the folder contains several methods; give {}",
+        folder.display(),
+        inside.join(" or ")
+    )))
+}
+
+/// Returns an error unless the path is a model: an existing folder with exactly one model, or a file of splats.
+pub fn expect_model(model: &Path) -> crate::Result<()> {
+    let shown = model.display();
+    ensure!(model.exists(), "{shown} does not exist");
+    if model.is_dir() {
+        expect_one_model(model)?;
+        if holds_model(model) {
+            return Ok(());
+        }
+        let has_checkpoint = model.join(CHECKPOINT).exists();
+        let hint = if has_checkpoint { " but has a checkpoint: train --resume continues from it" } else { "" };
+        bail!("{shown} contains no model{hint}");
+    }
+    // A part of a model may have the extension of a complete one.
+    let is_part = |kind: &ModelKind| {
+        let is_complete = |file: &str| kind.entry().single_file.is_some() && kind.entry().files.last() == Some(&file);
+        kind.entry().files.iter().any(|file| model.ends_with(file) && !is_complete(file))
+    };
+    if ModelKind::ALL.iter().any(is_part) || ModelKind::of_single_file(model).is_none() {
+        let single_files = ModelKind::ALL.iter().filter_map(|kind| kind.entry().single_file);
+        let described: Vec<String> =
+            single_files.map(|file| format!("{} (.{})", file.description, file.extensions.join(", ."))).collect();
+        let described = listed(&described.iter().map(String::as_str).collect::<Vec<_>>(), "or");
+        let message = format!("{shown} is not {described}; for a saved model, give its folder");
+        return Err(Error::BadInput(message).into());
+    }
+    Ok(())
+}
+
+/// Whether a folder contains any file of a saved model.
+fn holds_model(folder: &Path) -> bool {
+    ModelKind::model_files().any(|name| folder.join(name).exists())
+}
+
+/// The models at a path: the path itself, or the models in the folder of a run of several methods. Returns the same
+/// errors as [`expect_model`]. Methods without a model are left out, unless none has one.
+pub fn models_at(path: &Path) -> crate::Result<Vec<PathBuf>> {
+    let inside = ModelKind::ALL.iter().map(|kind| path.join(kind.name())).filter(|folder| holds_model(folder));
+    let inside: Vec<PathBuf> = inside.collect();
+    if path.is_dir() && !holds_model(path) && !inside.is_empty() {
+        return Ok(inside);
+    }
+    expect_model(path)?;
+    Ok(vec![path.to_owned()])
+}
+
+/// Folders created by this run. They are removed if the run is rejected.
+#[derive(Debug, Default)]
+pub struct CreatedFolders {
+    /// Folders of the run, each before its parent.
+    leaves: Vec<PathBuf>,
+    /// Their parents, each before its own parent.
+    parents: Vec<PathBuf>,
+}
+
+impl CreatedFolders {
+    /// Creates the folder of each model of a run: the requested folder for a single model, else a subfolder per method.
+    /// Writes the resolved rig file, if any, into each of them, with only the method of that model.
+    pub fn make_each(
+        &mut self,
+        requested: Option<&Path>,
+        kinds: &[ModelKind],
+        rig: Option<&Rig>,
+    ) -> crate::Result<Vec<PathBuf>> {
+        let write = |rig: &Rig, folder: &Path| {
+            rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))
+        };
+        let out = self.make(requested)?;
+        let folders: Vec<PathBuf> = match kinds {
+            [_] => vec![out.clone()],
+            several => {
+                several.iter().map(|kind| self.make(Some(&out.join(kind.name())))).collect::<crate::Result<_>>()?
+            }
+        };
+        if let Some(rig) = rig {
+            write(rig, &out)?;
+            for (kind, folder) in kinds.iter().zip(&folders) {
+                write(&rig.with_method(kind.name()), folder)?;
+            }
+        }
+        Ok(folders)
+    }
+
+    /// Creates the requested folder, or `runs/<UTC time>`. A folder that already contains a model is an error.
+    pub fn make(&mut self, requested: Option<&Path>) -> crate::Result<PathBuf> {
+        let is_missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+        let missing = |folder: &Path| folder.ancestors().take_while(is_missing).map(Path::to_owned).collect::<Vec<_>>();
+        let runs = missing(Path::new(RUNS));
+        let missing_parents = requested.map_or(Vec::new(), missing);
+        let created = make(requested)?;
+        match (requested, missing_parents.split_first()) {
+            (None, _) => {
+                self.leaves.insert(0, created.clone());
+                self.parents.splice(0..0, runs);
+            }
+            (Some(_), Some((leaf, parents))) => {
+                self.leaves.insert(0, leaf.clone());
+                self.parents.splice(0..0, parents.iter().cloned());
+            }
+            (Some(_), None) => {} // It existed before.
+        }
+        Ok(created)
+    }
+
+    /// Removes the created folders with their contents, unless they contain a model, a checkpoint or a recording.
+    pub fn remove_created(self) {
+        let holds_recording = |folder: &PathBuf| {
+            let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+            entries.map(|entry| entry.path()).any(|path| is_recording(&path))
+        };
+        let must_keep =
+            |folder: &PathBuf| holds_recording(folder) || holds_model(folder) || folder.join(CHECKPOINT).exists();
+        if self.leaves.iter().any(must_keep) {
+            return;
+        }
+        let removed = self.leaves.iter().try_for_each(std::fs::remove_dir_all);
+        // A folder into which another program wrote meanwhile is not empty, so it is kept.
+        let removed = removed.and_then(|()| self.parents.iter().try_for_each(std::fs::remove_dir));
+        if let Err(error) = removed {
+            log::debug!("cannot remove a folder of the rejected run: {error}");
+        }
+    }
+
+    /// Removes the created folders if the command was rejected, because of bad input or insufficient data.
+    pub fn keep_unless(self, is_rejected: bool) {
+        if is_rejected {
+            self.remove_created();
+        }
+    }
+}
+
+fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
+    if let Some(folder) = requested {
+        if folder.to_str().is_none() {
+            return Err(Error::BadInput(format!("--out {}: the name must be valid UTF-8", folder.display())).into());
+        }
+        check_no_model(folder)?;
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
+        lock(folder)?;
+        return Ok(folder.to_owned());
+    }
+    make_in(Path::new(RUNS), "")
+}
+
+/// Creates a folder in the system's temporary folder, for a model that cannot be saved in the folder of its run.
+pub fn make_fallback_folder() -> crate::Result<PathBuf> {
+    make_in(&std::env::temp_dir(), "fieldrig-")
+}
+
+/// Creates a new folder named after the current time.
+fn make_in(parent: &Path, prefix: &str) -> crate::Result<PathBuf> {
+    #[expect(clippy::disallowed_methods, reason = "only a readable name; no time is measured")]
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    std::fs::create_dir_all(parent).with_context(|| format!("cannot create the folder {}", parent.display()))?;
+    let name = format!("{prefix}{}", name_from_time(since_epoch));
+    for attempt in 1..100 {
+        let folder = match attempt {
+            1 => parent.join(&name),
+            _ => parent.join(format!("{name}-{attempt}")),
+        };
+        match std::fs::create_dir(&folder) {
+            Ok(()) => {
+                lock(&folder)?;
+                return Ok(folder);
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(error).with_context(|| format!("cannot create the folder {}", folder.display())),
+        }
+    }
+    bail!("{} and 98 numbered variants already exist: give a folder with --out", parent.join(name).display())
+}
+
+/// Locks a folder against other runs for the lifetime of this process.
+fn lock(folder: &Path) -> crate::Result<()> {
+    let path = folder.join(LOCK);
+    let file = std::fs::File::create(&path).with_context(|| format!("cannot write {}", path.display()))?;
+    match file.try_lock() {
+        Ok(()) => std::mem::forget(file), // The system releases it when the process ends in any way.
+        Err(std::fs::TryLockError::WouldBlock) => {
+            let message = format!("--out {}: another run uses this folder; give another one", folder.display());
+            return Err(Error::BadInput(message).into());
+        }
+        Err(std::fs::TryLockError::Error(error)) => log::debug!("cannot lock {}: {error}", path.display()),
+    }
+    Ok(())
+}
+
+/// Saves a model in a temporary subfolder and moves its files into place once it is complete.
+pub fn save_model(method: &mut dyn Method, folder: &Path) -> crate::Result<()> {
+    let partial_folder = folder.join(PARTIAL_MODEL);
+    if partial_folder.exists() {
+        // Left by a run that was killed while saving.
+        std::fs::remove_dir_all(&partial_folder)
+            .with_context(|| format!("cannot remove {}", partial_folder.display()))?;
+    }
+    if let Err(error) = method.save(&partial_folder) {
+        let _ = std::fs::remove_dir_all(&partial_folder); // Incomplete, and wastes space.
+        return Err(error.into());
+    }
+    // The last file of a method completes its model.
+    for name in ModelKind::model_files().filter(|name| partial_folder.join(name).exists()) {
+        let path = folder.join(name);
+        std::fs::rename(partial_folder.join(name), &path)
+            .with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    // Fails if the folder is not empty, so that a file missing from the list above is not lost.
+    std::fs::remove_dir(&partial_folder).with_context(|| format!("cannot remove {}", partial_folder.display()))
+}
+
+/// Writes a report as indented JSON.
+pub fn write_json(path: &Path, report: &impl Serialize) -> crate::Result<()> {
+    let mut text = serde_json::to_string_pretty(report).context("cannot write the report as JSON")?;
+    text.push('\n');
+    write_atomic(path, &text)
+}
+
+/// Writes a file that is either complete or absent.
+pub fn write_atomic(path: &Path, text: &str) -> crate::Result<()> {
+    Ok(trainer::atomic_file::write(path, |file| file.write_all(text.as_bytes()))?)
+}
+
+/// Writes the keyframes of a run and their splits, for `--keyframes`.
+pub fn write_keyframe_list(path: &Path, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+    write_atomic(path, &keyframe::list_text(keyframes.iter()))
+}
+
+/// SHA-256 over the model files of a folder, each preceded by its name and length.
+pub fn checkpoint_sha256(folder: &Path) -> crate::Result<String> {
+    let mut hash = Sha256::new();
+    let mut n_files = 0;
+    for name in ModelKind::model_files() {
+        let path = folder.join(name);
+        if !path.exists() {
+            continue;
+        }
+        let bytes = std::fs::read(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        hash.update(format!("{name} {}\n", bytes.len()));
+        hash.update(&bytes);
+        n_files += 1;
+    }
+    ensure!(n_files > 0, "{} contains no model", folder.display());
+    Ok(hex(&hash.finalize()))
+}
+
+/// Lower-case hexadecimal digits.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// `20261121-093000` for a time since 1970, UTC.
+fn name_from_time(since_epoch: Duration) -> String {
+    let secs = since_epoch.as_secs();
+    let (year, month, day) = date_from_days(secs / SECS_PER_DAY);
+    let secs_of_day = secs % SECS_PER_DAY;
+    format!("{year:04}{month:02}{day:02}-{:02}{:02}{:02}", secs_of_day / 3600, secs_of_day / 60 % 60, secs_of_day % 60)
+}
+
+/// Year, month and day of a day counted from 1 January 1970.
+fn date_from_days(mut days: u64) -> (u64, usize, u64) {
+    let is_leap = |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+    let mut year = 1970;
+    while days >= 365 + u64::from(is_leap(year)) {
+        days -= 365 + u64::from(is_leap(year));
+        year += 1;
+    }
+    let lengths = [31, 28 + u64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30, 31];
+    let mut month_ix = 0;
+    while days >= lengths[month_ix] {
+        days -= lengths[month_ix];
+        month_ix += 1;
+    }
+    (year, month_ix + 1, days + 1)
+}
+
+/// Whether the file name is that of a recording.
+pub fn is_recording(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == RECORDING_EXTENSION)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tsdf_and_splat() -> [ModelKind; 2] {
+        ["tsdf", "splat"].map(|name| ModelKind::from_name(name).expect("registered"))
+    }
+
+    #[test]
+    fn folders_are_named_by_utc() {
+        assert_eq!(name_from_time(Duration::ZERO), "19700101-000000");
+        assert_eq!(name_from_time(Duration::from_secs(951_782_400)), "20000229-000000");
+        assert_eq!(name_from_time(Duration::from_secs(1_795_253_400)), "20261121-093000");
+        assert_eq!(name_from_time(Duration::from_secs(4_102_444_799)), "20991231-235959");
+    }
+
+    #[test]
+    fn folder_with_a_model_is_rejected() {
+        let folder = tempfile::tempdir().expect("folder");
+        assert_eq!(make(Some(folder.path())).expect("an empty folder"), folder.path());
+        std::fs::write(folder.path().join("model.json"), b"{}").expect("file");
+        let message = make(Some(folder.path())).expect_err("a model").to_string();
+        assert!(
+            message.contains(folder.path().to_str().expect("plain")) && message.contains("model.json"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn models_of_several_methods_are_found_in_subfolders() {
+        let folder = tempfile::tempdir().expect("folder");
+        let requested = folder.path().join("out");
+        let created =
+            CreatedFolders::default().make_each(Some(&requested), &tsdf_and_splat(), None).expect("it is free");
+        assert_eq!(created, [requested.join("tsdf"), requested.join("splat")]);
+        expect_one_model(&requested).expect("there is none yet");
+        std::fs::write(created[0].join(CHECKPOINT), b"{}").expect("file");
+        assert!(models_at(&requested).is_err(), "a checkpoint is not a model");
+        std::fs::write(created[1].join("splats.ply"), b"{}").expect("file");
+        assert_eq!(models_at(&requested).expect("one of them"), [requested.join("splat")]);
+        std::fs::write(created[0].join("model.json"), b"{}").expect("file");
+        assert_eq!(models_at(&requested).expect("both"), [requested.join("splat"), requested.join("tsdf")]);
+        assert_eq!(models_at(&created[0]).expect("itself"), [requested.join("tsdf")]);
+        std::fs::remove_file(created[0].join("model.json")).expect("file");
+        let message = expect_one_model(&requested).expect_err("two").to_string();
+        assert!(message.contains("out/splat or ") && message.ends_with("out/tsdf"), "{message}");
+        expect_one_model(&created[1]).expect("one");
+        let message = check_no_model(&requested).expect_err("one inside").to_string();
+        assert!(message.contains("splat/splats.ply"), "{message}");
+    }
+
+    #[test]
+    fn unfinished_run_is_not_overwritten() {
+        let out = tempfile::tempdir().expect("a folder");
+        check_no_unfinished_run(&out.path().join("new")).expect("nothing is there");
+        let run = out.path().join(ModelKind::default().name());
+        std::fs::create_dir(&run).expect("disk space");
+        check_no_unfinished_run(out.path()).expect("no checkpoint");
+        std::fs::write(run.join(CHECKPOINT), b"x").expect("disk space");
+        assert!(
+            check_no_unfinished_run(out.path())
+                .is_err_and(|error| error.to_string().contains("splat contains an interrupted run"))
+        );
+        assert!(check_no_unfinished_run(&run).is_err());
+    }
+
+    #[test]
+    fn rejected_run_removes_only_its_own_folders() {
+        let folder = tempfile::tempdir().expect("folder");
+        let (own_folder, foreign_folder) = (folder.path().join("a/b"), folder.path().join("theirs"));
+        std::fs::create_dir(&foreign_folder).expect("disk space");
+        for (requested, is_left) in [(&own_folder, false), (&foreign_folder, true)] {
+            let mut created = CreatedFolders::default();
+            created.make_each(Some(requested), &tsdf_and_splat(), None).expect("it is free");
+            created.keep_unless(true);
+            assert_eq!((requested.exists(), requested.join("tsdf").exists()), (is_left, false), "{requested:?}");
+        }
+        assert!(!folder.path().join("a").exists());
+        for (is_rejected, file) in [(true, CHECKPOINT), (true, "scan.mcap"), (false, "keyframes.txt")] {
+            let mut created = CreatedFolders::default();
+            let out = folder.path().join(file);
+            created.make(Some(&out)).expect("it is free");
+            std::fs::write(out.join(file), b"x").expect("file");
+            created.keep_unless(is_rejected);
+            assert!(out.exists(), "{file}");
+        }
+    }
+
+    #[test]
+    fn missing_model_error_suggests_a_path() {
+        let folder = tempfile::tempdir().expect("folder");
+        let at = |name: &str| folder.path().join(name);
+        let message = |name: &str| expect_model(&at(name)).expect_err("no model").to_string();
+        assert!(message("absent").ends_with("absent does not exist"));
+        assert!(message("").ends_with("contains no model"));
+        for name in [CHECKPOINT, "report.json", "scan.mcap", "mesh.ply"] {
+            std::fs::write(at(name), b"x").expect("file");
+            assert!(message(name).contains("give its folder"), "{name}");
+            if name == CHECKPOINT {
+                assert!(message("").contains("--resume"));
+            }
+        }
+        std::fs::write(at("splats.ply"), b"x").expect("file");
+        expect_model(&at("splats.ply")).expect("a file of splats");
+        expect_model(folder.path()).expect("a folder with splats");
+    }
+
+    #[test]
+    fn folder_is_locked_by_one_run() {
+        let folder = tempfile::tempdir().expect("folder");
+        make(Some(folder.path())).expect("the first");
+        let message = make(Some(folder.path())).expect_err("the second").to_string();
+        assert!(message.contains("another run uses this folder"), "{message}");
+    }
+
+    #[test]
+    fn checksum_covers_contents_and_names() {
+        let folder = tempfile::tempdir().expect("folder");
+        assert!(checkpoint_sha256(folder.path()).is_err(), "no model, no checksum");
+        std::fs::write(folder.path().join("splats.ply"), b"abc").expect("file");
+        let first = checkpoint_sha256(folder.path()).expect("a model");
+        std::fs::write(folder.path().join("report.json"), b"other").expect("file");
+        assert_eq!(checkpoint_sha256(folder.path()).expect("a model"), first);
+        std::fs::write(folder.path().join("splats.ply"), b"abd").expect("file");
+        assert_ne!(checkpoint_sha256(folder.path()).expect("a model"), first);
+    }
+}

@@ -1,0 +1,167 @@
+//! Scoring image by image gives the same result as scoring all at once.
+
+use super::*;
+use calibration::CalibratedCamera;
+use kinematics::{Stamp, Transform};
+use trainer::Error;
+use trainer::checkpoint::PendingCheckpoint;
+use trainer::gpu::GpuOptions;
+
+const SIZE_PX: [u32; 2] = [4, 2];
+const N_TESTS: u8 = 5;
+const MAX_IMAGES_DURING_TRAINING: usize = 3;
+
+/// A model that draws pictures of one gray level and counts them.
+#[derive(Default)]
+struct Gray {
+    level: u8,
+    n_drawn: std::rc::Rc<std::cell::Cell<u32>>,
+}
+
+impl Method for Gray {
+    fn push(&mut self, _keyframe: Arc<Keyframe>) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn remove(&mut self, _camera: &str, _stamp: Stamp) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn step(&mut self, n: u64) -> Result<u64, Error> {
+        self.level += 1;
+        Ok(n.min(1))
+    }
+
+    fn is_idle(&self) -> bool {
+        false
+    }
+
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
+        Ok(self.level.into())
+    }
+
+    fn seed(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn prepare(&mut self) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn set_watched(&mut self, _watched: bool) {}
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Picture, Error> {
+        self.n_drawn.set(self.n_drawn.get() + 1);
+        assert!(!request.depth, "PSNR needs no depth");
+        let n = request.size_px[0] as usize * request.size_px[1] as usize;
+        Ok(Picture { size_px: request.size_px, rgba_srgb: vec![self.level; 4 * n], depth_m: Vec::new() })
+    }
+
+    fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
+        Ok(CalibratedCamera::of(keyframe))
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        Ok(Vec::new())
+    }
+
+    fn alignment(&self) -> Option<&Alignment> {
+        None
+    }
+
+    fn progress(&self) -> Progress {
+        Progress { step: self.level.into(), ..Progress::default() }
+    }
+
+    fn report(&self) -> Vec<TrialReport> {
+        Vec::new()
+    }
+
+    fn save(&mut self, _folder: &Path) -> Result<(), Error> {
+        Ok(())
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        Err(Error::AllPixelsMasked)
+    }
+}
+
+fn test_keyframe(ix: u8) -> Arc<Keyframe> {
+    Arc::new(Keyframe {
+        camera: "wrist".into(),
+        stamp: Stamp(ix.into()),
+        size_px: SIZE_PX,
+        focal_px: [4.0; 2],
+        principal_px: [2.0, 1.0],
+        rgba_srgb: [100 + 10 * ix, 50, 50, 255].repeat(8).into(),
+        depth: None,
+        world_from_camera: Transform::identity(),
+        twist: None,
+        readout_secs: 0.0,
+        joint_twists: [].into(),
+        base: None,
+        split: Split::Test,
+        truth: None,
+    })
+}
+
+/// A session of one second with an evaluation due, and the counter of its pictures.
+fn session_with_evaluation_due(stop: &Stop) -> (Session, std::rc::Rc<std::cell::Cell<u32>>) {
+    let method = Gray::default();
+    let n_drawn = method.n_drawn.clone();
+    let quick = Evaluator::psnr_only;
+    let evaluators = Evaluators {
+        during_training: quick(),
+        max_images_during_training: MAX_IMAGES_DURING_TRAINING,
+        at_end: quick(),
+    };
+    let gpu = Gpu::open(&GpuOptions::default()).expect("an adapter");
+    let mut session =
+        Session::new(gpu, (ModelKind::default(), Box::new(method)), evaluators, Limits::default(), Box::new(()))
+            .with_stop(stop);
+    for ix in 0..N_TESTS {
+        session.push(&test_keyframe(ix)).expect("held");
+    }
+    session.start_clock(Instant::now().checked_sub(Duration::from_secs(1)).expect("the machine has run for a second"));
+    session.train_steps(1).expect("a step");
+    (session, n_drawn)
+}
+
+#[test]
+fn stepwise_scoring_equals_scoring_at_once() {
+    let stop = Stop::default();
+    let (mut at_once, n_at_once) = session_with_evaluation_due(&stop);
+    at_once.evaluate_when_due().expect("scored");
+    assert!(!at_once.is_scoring() && n_at_once.get() == 3);
+
+    let (session, n_drawn) = session_with_evaluation_due(&stop);
+    let mut stepwise = session.with_stepwise_scoring();
+    stepwise.evaluate_when_due().expect("opened");
+    assert!(stepwise.is_scoring() && stepwise.reported.is_empty() && n_drawn.get() == 0, "the caller scores");
+    for n in 1..=3 {
+        assert!(stepwise.is_scoring());
+        stepwise.score_next().expect("scored");
+        assert_eq!(n_drawn.get(), n, "one image at a time");
+    }
+    assert!(!stepwise.is_scoring());
+    let [one, other] = [&at_once, &stepwise].map(|session| &session.reported[0]);
+    assert_eq!((one.n_images, one.step), (3, 1));
+    assert_eq!((other.n_images, other.step), (3, 1));
+    assert!(one.scores == other.scores && one.scores.psnr.is_some());
+    assert!((other.seconds - 1.0).abs() < 0.9, "{} s: when the evaluation was due", other.seconds);
+    assert!(stepwise.psnr() == at_once.psnr());
+    stepwise.score_next().expect("nothing to do");
+    assert_eq!((stepwise.reported.len(), n_drawn.get()), (1, 3));
+}
+
+#[test]
+fn evaluation_is_dropped_when_stopping() {
+    let stop = Stop::default();
+    let (session, n_drawn) = session_with_evaluation_due(&stop);
+    let mut session = session.with_stepwise_scoring();
+    session.evaluate_when_due().expect("opened");
+    session.score_next().expect("scored");
+    stop.request();
+    session.score_next().expect("dropped");
+    assert!(!session.is_scoring() && session.reported.is_empty() && n_drawn.get() == 1);
+}

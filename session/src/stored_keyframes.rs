@@ -1,0 +1,305 @@
+//! Stores the keyframes of a live run on disk, next to its checkpoint, for `run --resume`.
+//!
+//! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
+//! as PNG. Ground truth from a simulator is left out.
+
+use crate::error::{Context, ensure};
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
+use kinematics::{Stamp, Transform, Twist};
+use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use trainer::checkpoint::{Array, Checkpoint};
+
+/// Name of the folder in the folder of a run.
+pub const FOLDER: &str = "keyframes";
+const EXTENSION: &str = "keyframe";
+const METHOD: &str = "keyframe";
+const COLOR: &str = "rgba_srgb.png";
+const DEPTH: &str = "depth_m.png";
+
+/// A folder of keyframes.
+#[derive(Clone, Debug)]
+pub struct StoredKeyframes {
+    folder: PathBuf,
+}
+
+/// All of a keyframe except its pixels.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Description {
+    camera: String,
+    stamp_nanos: i64,
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    world_from_camera: [f64; 7],
+    twist: Option<[f64; 6]>,
+    readout_secs: f64,
+    joint_twists: Vec<[f64; 6]>,
+    split: String,
+    depth: Option<DepthDescription>,
+    base: Option<BaseDescription>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct DepthDescription {
+    size_px: [u32; 2],
+    focal_px: [f64; 2],
+    principal_px: [f64; 2],
+    world_from_camera: [f64; 7],
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct BaseDescription {
+    station: Option<usize>,
+    world_from_base: [f64; 7],
+    map_from_odom: [f64; 7],
+}
+
+impl StoredKeyframes {
+    /// The stored keyframes of the run in this folder; nothing is read or written yet.
+    pub fn of_run(run: &Path) -> Self {
+        Self { folder: run.join(FOLDER) }
+    }
+
+    /// Writes the keyframes that are not stored yet.
+    pub fn add(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+        std::fs::create_dir_all(&self.folder).with_context(|| format!("cannot create {}", self.folder.display()))?;
+        let existing = self.names()?;
+        for keyframe in keyframes {
+            let name = name_of(keyframe);
+            if !existing.contains(&name) {
+                to_checkpoint(keyframe)?.write(&self.folder.join(name))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Removes all files except those of these keyframes.
+    pub fn keep_only(&self, keyframes: &[Arc<Keyframe>]) -> crate::Result<()> {
+        let stored: BTreeSet<String> = keyframes.iter().map(|keyframe| name_of(keyframe)).collect();
+        for name in self.names()?.difference(&stored) {
+            let path = self.folder.join(name);
+            std::fs::remove_file(&path).with_context(|| format!("cannot remove {}", path.display()))?;
+        }
+        Ok(())
+    }
+
+    /// Reads all keyframes, ordered by stamp.
+    pub fn read(&self) -> crate::Result<Vec<Arc<Keyframe>>> {
+        let mut keyframes = Vec::new();
+        for name in self.names()? {
+            let path = self.folder.join(name);
+            let read = || keyframe_of(&Checkpoint::read(&path)?);
+            keyframes.push(Arc::new(read().with_context(|| format!("cannot read the keyframe {}", path.display()))?));
+        }
+        keyframes.sort_by(|one, other| (one.stamp, &one.camera).cmp(&(other.stamp, &other.camera)));
+        Ok(keyframes)
+    }
+
+    fn names(&self) -> crate::Result<BTreeSet<String>> {
+        let list = || {
+            let names = std::fs::read_dir(&self.folder)?.map(|entry| entry.map(|entry| entry.file_name()));
+            names.collect::<std::io::Result<Vec<_>>>()
+        };
+        let names = list().with_context(|| format!("cannot list {}", self.folder.display()))?;
+        let names = names.into_iter().filter_map(|name| name.into_string().ok());
+        Ok(names.filter(|name| Path::new(name).extension().is_some_and(|extension| extension == EXTENSION)).collect())
+    }
+}
+
+fn name_of(keyframe: &Keyframe) -> String {
+    format!("{}_{:020}.{EXTENSION}", keyframe.camera, keyframe.stamp.0)
+}
+
+fn to_checkpoint(keyframe: &Keyframe) -> crate::Result<Checkpoint> {
+    let description = Description {
+        camera: keyframe.camera.to_string(),
+        stamp_nanos: keyframe.stamp.0,
+        size_px: keyframe.size_px,
+        focal_px: keyframe.focal_px,
+        principal_px: keyframe.principal_px,
+        world_from_camera: numbers(&keyframe.world_from_camera),
+        twist: keyframe.twist.as_ref().map(twist_numbers),
+        readout_secs: keyframe.readout_secs,
+        joint_twists: keyframe.joint_twists.iter().map(twist_numbers).collect(),
+        split: split_name(keyframe.split).to_owned(),
+        depth: keyframe.depth.as_ref().map(|depth| DepthDescription {
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            world_from_camera: numbers(&depth.world_from_camera),
+        }),
+        base: keyframe.base.as_ref().map(|base| BaseDescription {
+            station: base.station,
+            world_from_base: numbers(&base.world_from_base),
+            map_from_odom: numbers(&base.map_from_odom),
+        }),
+    };
+    let mut arrays = vec![Array { name: COLOR.to_owned(), bytes: png(keyframe.size_px, &keyframe.rgba_srgb)? }];
+    if let Some(depth) = &keyframe.depth {
+        let bytes: Vec<u8> = depth.depth_m.iter().flat_map(|depth_m| depth_m.to_le_bytes()).collect();
+        arrays.push(Array { name: DEPTH.to_owned(), bytes: png(depth.size_px, &bytes)? });
+    }
+    Ok(Checkpoint {
+        method: METHOD.to_owned(),
+        seconds: 0.0,
+        depth_from: None,
+        flags: BTreeMap::new(),
+        is_finished: false,
+        state: serde_json::to_value(description)?,
+        arrays,
+    })
+}
+
+fn keyframe_of(checkpoint: &Checkpoint) -> crate::Result<Keyframe> {
+    ensure!(checkpoint.method == METHOD, "it contains a {}, expected a {METHOD}", checkpoint.method);
+    let metadata: Description = serde_json::from_value(checkpoint.state.clone())?;
+    let pixels = |name: &str, size_px: [u32; 2]| {
+        let array = checkpoint.arrays.iter().find(|array| array.name == name);
+        let png = &array.with_context(|| format!("array {name:?} is missing"))?.bytes;
+        let image = image::load_from_memory_with_format(png, image::ImageFormat::Png)?;
+        ensure!([image.width(), image.height()] == size_px, "array {name:?} has the wrong size, expected {size_px:?}");
+        Ok(image.into_rgba8().into_raw())
+    };
+    let depth = metadata.depth.map(|depth| {
+        let bytes = pixels(DEPTH, depth.size_px)?;
+        let depth_m = bytes.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
+        Ok::<_, crate::Error>(DepthMap {
+            size_px: depth.size_px,
+            focal_px: depth.focal_px,
+            principal_px: depth.principal_px,
+            depth_m: depth_m.collect(),
+            world_from_camera: transform(depth.world_from_camera),
+        })
+    });
+    Ok(Keyframe {
+        camera: metadata.camera.into(),
+        stamp: Stamp(metadata.stamp_nanos),
+        size_px: metadata.size_px,
+        focal_px: metadata.focal_px,
+        principal_px: metadata.principal_px,
+        rgba_srgb: pixels(COLOR, metadata.size_px)?.into(),
+        depth: depth.transpose()?,
+        world_from_camera: transform(metadata.world_from_camera),
+        twist: metadata.twist.map(twist),
+        readout_secs: metadata.readout_secs,
+        joint_twists: metadata.joint_twists.into_iter().map(twist).collect(),
+        base: metadata.base.map(|base| BaseState {
+            station: base.station,
+            world_from_base: transform(base.world_from_base),
+            map_from_odom: transform(base.map_from_odom),
+            truth: None,
+        }),
+        split: split_from_name(&metadata.split).with_context(|| format!("unknown split {:?}", metadata.split))?,
+        truth: None,
+    })
+}
+
+/// Encodes four bytes per pixel without loss. Depth is stored the same way: the bytes of an f32 differ little between
+/// neighbors.
+fn png([width, height]: [u32; 2], bytes: &[u8]) -> crate::Result<Vec<u8>> {
+    let mut png = Vec::new();
+    let encoder = PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::Sub);
+    encoder.write_image(bytes, width, height, ExtendedColorType::Rgba8)?;
+    Ok(png)
+}
+
+/// Three numbers of the translation, then the quaternion with its real part last.
+fn numbers(pose: &Transform) -> [f64; 7] {
+    let [x, y, z] = pose.translation.vector.into();
+    let [i, j, k, w] = pose.rotation.coords.into();
+    [x, y, z, i, j, k, w]
+}
+
+/// The bit-exact inverse of [`numbers`].
+fn transform([x, y, z, i, j, k, w]: [f64; 7]) -> Transform {
+    Transform::from_parts(Translation3::new(x, y, z), UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k)))
+}
+
+fn twist_numbers(twist: &Twist) -> [f64; 6] {
+    let ([x, y, z], [a, b, c]) = (twist.linear_m_s.into(), twist.angular_rad_s.into());
+    [x, y, z, a, b, c]
+}
+
+fn twist([x, y, z, a, b, c]: [f64; 6]) -> Twist {
+    Twist { linear_m_s: Vector3::new(x, y, z), angular_rad_s: Vector3::new(a, b, c) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use keyframe::Split;
+
+    fn keyframe(stamp_nanos: i64, depth: bool) -> Arc<Keyframe> {
+        let pose = Transform::new(Vector3::new(0.1, 1.0 / 3.0, -2.0), Vector3::new(0.3, -0.2, 0.1));
+        Arc::new(Keyframe {
+            camera: "wrist".into(),
+            stamp: Stamp(stamp_nanos),
+            size_px: [5, 3],
+            focal_px: [4.0, 4.1],
+            principal_px: [2.5, 1.5],
+            rgba_srgb: (0..60).map(|ix| ix * 4).collect(),
+            depth: depth.then(|| DepthMap {
+                size_px: [2, 2],
+                focal_px: [1.5; 2],
+                principal_px: [1.0; 2],
+                depth_m: vec![0.0, 1.0 / 3.0, f32::MIN_POSITIVE, 7.25].into(),
+                world_from_camera: pose.inverse(),
+            }),
+            world_from_camera: pose,
+            twist: depth.then(|| twist([0.1, 0.2, 0.3, 0.4, 0.5, 0.7])),
+            readout_secs: 0.015,
+            joint_twists: vec![twist([1.0, 2.0, 3.0, 4.0, 5.0, 1.0 / 7.0])].into(),
+            base: depth.then(|| BaseState {
+                station: Some(3),
+                world_from_base: pose,
+                map_from_odom: pose * pose,
+                truth: None,
+            }),
+            split: Split::Validation,
+            truth: None,
+        })
+    }
+
+    #[test]
+    fn keyframes_round_trip_bit_for_bit_in_order() {
+        let run = tempfile::tempdir().expect("a folder");
+        let stored = StoredKeyframes::of_run(run.path());
+        let all = [keyframe(9_000_000_000, true), keyframe(20, false), keyframe(10_000_000_000, true)];
+        stored.add(&all[..2]).expect("disk space");
+        stored.add(&all).expect("disk space");
+        let read = stored.read().expect("complete files");
+        let in_order = [&all[1], &all[0], &all[2]];
+        assert_eq!(read.len(), 3);
+        for (read, expected) in read.iter().zip(in_order) {
+            assert_eq!((read.stamp, &read.camera, read.split), (expected.stamp, &expected.camera, expected.split));
+            assert_eq!(keyframe::fingerprint(read), keyframe::fingerprint(expected));
+            assert_eq!(read.base, expected.base);
+        }
+        stored.keep_only(&all[1..]).expect("they are there");
+        assert_eq!(stored.read().expect("complete files").len(), 2);
+    }
+
+    #[test]
+    fn damaged_file_is_named_in_the_error() {
+        let run = tempfile::tempdir().expect("a folder");
+        let stored = StoredKeyframes::of_run(run.path());
+        assert!(stored.read().is_err(), "no folder yet");
+        stored.add(&[keyframe(1, true)]).expect("disk space");
+        let path = run.path().join(FOLDER).join("wrist_00000000000000000001.keyframe");
+        let mut bytes = std::fs::read(&path).expect("a file");
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 1;
+        std::fs::write(&path, bytes).expect("disk space");
+        let message = format!("{:#}", stored.read().expect_err("damaged"));
+        assert!(message.contains("wrist_00000000000000000001.keyframe") && message.contains("damaged"), "{message}");
+    }
+}

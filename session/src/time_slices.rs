@@ -1,0 +1,65 @@
+//! Time slices for several models on one device.
+//!
+//! The next slice goes to the model with the least device time so far. Results do not depend on the slices: a model is
+//! a function of its steps and keyframes alone.
+
+use crate::session::Session;
+use std::time::Duration;
+
+/// Trains the model that has used the device least, among those that can train, and then evaluates all sessions that
+/// are due.
+///
+/// `max_steps`: maximum number of steps of a session in this slice, given its index. `is_render_pending`: whether a
+/// picture waits; the slice then ends after the current submit.
+pub fn train_next(
+    sessions: &mut [Session],
+    max_steps: impl Fn(usize, &Session) -> u64,
+    is_render_pending: impl Fn() -> bool,
+) -> crate::Result<()> {
+    let can_train =
+        |ix: usize, session: &Session| !session.is_over() && !session.is_idle() && max_steps(ix, session) > 0;
+    let device_time: Vec<Option<Duration>> = sessions
+        .iter()
+        .enumerate()
+        .map(|(ix, session)| can_train(ix, session).then(|| session.device_time()))
+        .collect();
+    if let Some((ix, min_time)) = next(&device_time) {
+        if sessions.len() == 1 {
+            sessions[ix].train_steps(max_steps(ix, &sessions[ix]))?;
+        } else {
+            // A session that had nothing to train on for a while does not catch up.
+            sessions.iter_mut().for_each(|session| session.raise_device_time(min_time));
+            sessions[ix].run_time_slice(|session| max_steps(ix, session), is_render_pending)?;
+        }
+    }
+    sessions.iter_mut().try_for_each(Session::evaluate_when_due)
+}
+
+/// Index and device time of the session with the least device time, the first of several; `None` if no session can
+/// train.
+fn next(device_time: &[Option<Duration>]) -> Option<(usize, Duration)> {
+    device_time
+        .iter()
+        .enumerate()
+        .filter_map(|(ix, device_time)| Some((ix, (*device_time)?)))
+        .min_by_key(|(_, device_time)| *device_time)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_slices_share_the_time_evenly() {
+        const MILLIS: [u64; 3] = [40, 90, 55];
+        let mut device_time = [Duration::ZERO; 3];
+        for _ in 0..1000 {
+            let (ix, _) = next(&device_time.map(Some)).expect("all can train");
+            device_time[ix] += Duration::from_millis(MILLIS[ix]);
+        }
+        let (max_time, min_time) = (device_time.iter().max().expect("three"), device_time.iter().min().expect("three"));
+        assert!(*max_time - *min_time <= Duration::from_millis(90), "{device_time:?}");
+        assert_eq!(next(&[None, Some(device_time[1]), None]), Some((1, device_time[1])));
+        assert_eq!(next(&[None, None]), None);
+    }
+}

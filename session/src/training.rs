@@ -1,0 +1,147 @@
+//! Trains models from keyframes on disk: once in `train`, many times in `bench`.
+
+use crate::data::{Data, DataOptions};
+use crate::methods::{self, COUNT, MAX_SPLATS, Settings, methods_of};
+use crate::observer::Observer;
+use crate::recoveries::{OpenGpu, Recoveries};
+use crate::session::{Evaluators, Limits, Session};
+use crate::training_options::{AvailableData, Refine, RefineSettings, TrainingOptions};
+use crate::{Error, run_folder, time_slices};
+use capture::Stop;
+use capture::config::{DEFAULT_SEED, Rig};
+use keyframe::{Keyframe, listed};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use trainer::gpu::Gpu;
+use trainer::splat::CountPolicy;
+use trainer::{self, CommonOptions, ModelKind, ModelSpec};
+
+/// Everything that determines a training besides its keyframes.
+pub struct TrainingPlan {
+    pub model_spec: ModelSpec,
+    pub evaluators: Evaluators,
+    pub limits: Limits,
+    /// Receives the reports.
+    pub observer: Box<dyn Observer>,
+}
+
+/// Trains a new model until a limit or until `stop` is requested.
+///
+/// The clock starts once all pipelines are compiled; seeding counts.
+pub fn train(
+    gpu: Arc<Gpu>,
+    plan: TrainingPlan,
+    keyframes: &[Arc<Keyframe>],
+    preparation_time: Duration,
+    stop: &Stop,
+    open_gpu: OpenGpu,
+) -> crate::Result<Session> {
+    let kind = plan.model_spec.kind;
+    let mut method = plan.model_spec.start(gpu.clone())?;
+    method.prepare()?;
+    let mut session = Session::new(gpu, (kind, method), plan.evaluators, plan.limits, plan.observer).with_stop(stop);
+    drive(std::slice::from_mut(&mut session), keyframes, preparation_time, stop, open_gpu)?;
+    Ok(session)
+}
+
+/// Starts the clock, pushes the keyframes to all models, and trains each until a limit or until `stop` is requested.
+///
+/// `preparation_time`: time already spent on preparing the keyframes, which counts as training time.
+pub fn drive(
+    sessions: &mut [Session],
+    keyframes: &[Arc<Keyframe>],
+    preparation_time: Duration,
+    stop: &Stop,
+    open_gpu: OpenGpu,
+) -> crate::Result<()> {
+    let now = Instant::now();
+    let began = now.checked_sub(preparation_time).unwrap_or(now);
+    for session in &mut *sessions {
+        session.start_clock(began);
+        for keyframe in keyframes {
+            session.push(keyframe)?;
+        }
+        if session.is_idle() && session.progress().step == 0 {
+            let others: Vec<&str> =
+                ModelKind::ALL.iter().filter(|kind| !kind.entry().needs_depth).map(|kind| kind.name()).collect();
+            return Err(Error::InsufficientData(format!(
+                "the method {} needs depth, but no training image has depth: \
+                 use --depth-from to render it from another model of the scene, or the method {}",
+                session.kind().name(),
+                listed(&others, "or")
+            )));
+        }
+    }
+    let is_done = |session: &Session| session.is_over() || session.is_idle();
+    let mut recoveries = Recoveries::new(open_gpu);
+    loop {
+        while !stop.requested() && !sessions.iter().all(is_done) {
+            if let Err(error) = time_slices::train_next(sessions, |_, _| u64::MAX, || false) {
+                recoveries.recover(sessions, error)?;
+            }
+            sessions.iter_mut().filter(|session| session.is_idle()).for_each(Session::mark_finished);
+        }
+        match sessions.iter().try_for_each(Session::wait) {
+            Ok(()) => return Ok(()),
+            Err(error) => recoveries.recover(sessions, error)?,
+        }
+    }
+}
+
+/// The methods and their options. For a recording, its rig file sets them and flags override it; for a folder, only
+/// flags set them.
+pub fn model_specs(
+    options: &TrainingOptions,
+    data: &Data,
+    steps: Option<u64>,
+    software: bool,
+) -> Result<Vec<ModelSpec>, Error> {
+    let rig_methods = data.rig.as_ref().map(methods_of).transpose()?;
+    let kinds = rig_methods.or(options.methods.clone()).unwrap_or_else(|| vec![ModelKind::default()]);
+    options.check_for(&kinds)?;
+    // A trial takes hundreds of additional steps, which take minutes on a CPU.
+    let available = AvailableData {
+        joints: data.rig.is_some(),
+        drifts: data.rig.as_ref().is_none_or(Rig::has_moving_base),
+        // Depth rendered from reported camera poses contains no information about the true poses.
+        depth: data.has_depth() && data.rendered_depth.as_ref().is_none_or(|rendered| rendered.n_images == 0),
+    };
+    let RefineSettings { align, with_scene: cameras } =
+        options.refining(available, if software { Refine::None } else { Refine::Auto })?;
+    options.check_learned(&kinds, available)?;
+    let count = options.count.unwrap_or(if software { CountPolicy::ToCap } else { CountPolicy::Tested });
+    let (common, mut settings) = match &data.rig {
+        Some(rig) => methods::options(&rig.train, steps),
+        None => options_without_rig(options, steps),
+    };
+    settings.push((COUNT, serde_json::json!(count)));
+    methods::specs(&kinds, &CommonOptions { cameras, align, ..common }, &settings)
+}
+
+/// Options from flags alone.
+fn options_without_rig(options: &TrainingOptions, steps: Option<u64>) -> (CommonOptions, Settings) {
+    let defaults = CommonOptions::default();
+    let common = CommonOptions {
+        seed: options.seed.unwrap_or(DEFAULT_SEED),
+        max_bytes: options.max_bytes,
+        n_planned_steps: steps.unwrap_or(defaults.n_planned_steps),
+        ..defaults
+    };
+    (common, options.max_splats.map(|n| (MAX_SPLATS, n.into())).into_iter().collect())
+}
+
+/// Checks flags that do not depend on the contents of the data, before all data are read.
+pub fn check_before_data(options: &TrainingOptions, path: &Path, images: &DataOptions) -> crate::Result<()> {
+    let defaults = || Data::default_methods(path, images);
+    let kinds = options.methods.clone().map_or_else(defaults, Ok)?;
+    options.check_before_data(&kinds, run_folder::is_recording(path))
+}
+
+/// When to stop, from `--seconds` and `--steps`; `default_secs` if neither is given.
+pub fn limits(seconds: Option<f64>, steps: Option<u64>, default_secs: f64) -> Result<Limits, Error> {
+    if seconds.is_some_and(|seconds| seconds.is_nan() || seconds < 0.0) {
+        return Err(Error::BadInput("--seconds: must be a number of at least 0".into()));
+    }
+    Ok(Limits { seconds: seconds.or(steps.is_none().then_some(default_secs)), steps })
+}

@@ -1,0 +1,327 @@
+//! Options shared by everything that trains. They override the keys of the same name in a rig file.
+
+use crate::Error;
+use crate::methods::{COUNT, MAX_SPLATS, describe};
+use calibration::{CameraRefinement, ParamSet, candidates};
+use capture::Override;
+use keyframe::listed;
+use trainer::ModelKind;
+use trainer::splat::CountPolicy;
+
+/// The rig file key that `--refine` sets.
+pub const REALIGN: &str = "base.realign";
+
+/// Which models to train, and their limits; `None` leaves the choice to the rig file or the default.
+#[derive(Clone, Debug, Default)]
+pub struct TrainingOptions {
+    /// Scene models, without duplicates.
+    pub methods: Option<Vec<ModelKind>>,
+    /// Random seed.
+    pub seed: Option<u64>,
+    /// Maximum GPU memory of each model, bytes.
+    pub max_bytes: Option<u64>,
+    /// Maximum number of splats.
+    pub max_splats: Option<u64>,
+    /// Calibration parameters to estimate; empty: the default.
+    pub refine: Vec<Refine>,
+    /// How the number of splats is chosen.
+    pub count: Option<CountPolicy>,
+}
+
+/// Calibration parameters that can be requested, and how to choose them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refine {
+    Auto,
+    None,
+    /// The rig file's `base.realign`; not a camera parameter.
+    Base,
+    Extrinsics,
+    TimeOffset,
+    Joints,
+    DepthPose,
+    Lens,
+    DepthScale,
+    Readout,
+    ImagePoses,
+    ImageGains,
+}
+
+impl Refine {
+    /// All values with their names on the command line.
+    pub const ALL: [(&str, Self); 12] = [
+        ("auto", Self::Auto),
+        ("none", Self::None),
+        ("base", Self::Base),
+        ("extrinsics", Self::Extrinsics),
+        ("time-offset", Self::TimeOffset),
+        ("joints", Self::Joints),
+        ("depth-pose", Self::DepthPose),
+        ("lens", Self::Lens),
+        ("depth-scale", Self::DepthScale),
+        ("readout", Self::Readout),
+        ("image-poses", Self::ImagePoses),
+        ("image-gains", Self::ImageGains),
+    ];
+
+    /// The name on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        Self::ALL.iter().find(|(_, refine)| *refine == self).map_or("", |(name, _)| name)
+    }
+}
+
+/// Which calibration parameters are estimated, and how.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RefineSettings {
+    /// By registering keyframes with depth.
+    pub align: CameraRefinement,
+    /// Jointly with the scene.
+    pub with_scene: CameraRefinement,
+}
+
+/// Properties of the data that limit which calibration parameters can be estimated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AvailableData {
+    /// Poses come from the joints of a recording, so their errors are systematic and shared by all images.
+    pub joints: bool,
+    /// Poses come from a SLAM system or a base that uses one, so they drift from image to image.
+    pub drifts: bool,
+    /// The keyframes are known before training and have depth.
+    pub depth: bool,
+}
+
+impl TrainingOptions {
+    /// The requested scene models; `None` if the flag is not given.
+    pub fn methods(&self) -> Option<&[ModelKind]> {
+        self.methods.as_deref()
+    }
+
+    /// Rejects flags that set an option which none of the methods has.
+    pub fn check_for(&self, kinds: &[ModelKind]) -> Result<(), Error> {
+        let flags = [(self.max_splats.is_some(), "--max-splats", MAX_SPLATS), (self.count.is_some(), "--count", COUNT)];
+        let is_unused = |option: &str| !kinds.iter().any(|kind| kind.has_option(option));
+        match flags.into_iter().find(|(is_given, _, option)| *is_given && is_unused(option)) {
+            Some((_, flag, option)) => {
+                let having = ModelKind::ALL.iter().filter(|kind| kind.has_option(option)).map(|kind| kind.name());
+                Err(Error::BadInput(format!(
+                    "{flag}: needs the method {}, but the method is {}",
+                    listed(&having.collect::<Vec<_>>(), "or"),
+                    describe(kinds)
+                )))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// Rejects flags that are invalid for any data, before the data is read.
+    pub fn check_before_data(&self, kinds: &[ModelKind], joints: bool) -> Result<(), Error> {
+        let all_available = AvailableData { joints, drifts: true, depth: true };
+        self.check_for(kinds)?;
+        self.refining(all_available, Refine::None)?;
+        self.check_learned(kinds, all_available)
+    }
+
+    /// Rejects requested parameters that no scene model can estimate; the error lists the valid ones.
+    pub fn check_learned(&self, kinds: &[ModelKind], available: AvailableData) -> Result<(), Error> {
+        let can_align = |param: &Refine| available.depth && *param != Refine::ImageGains;
+        let can_learn = |param: &Refine| {
+            let set = param_set(std::slice::from_ref(param));
+            !set.is_empty() && kinds.iter().any(|kind| kind.entry().learnable.contains(set))
+        };
+        let is_other = |param: &Refine| matches!(param, Refine::Auto | Refine::None | Refine::Base);
+        let is_known = |param: &Refine| is_other(param) || can_align(param) || can_learn(param);
+        let Some(unknown) = self.refine.iter().find(|param| !is_known(param)) else { return Ok(()) };
+        let known: Vec<&str> = Refine::ALL.iter().filter(|(_, param)| is_known(param)).map(|(name, _)| *name).collect();
+        let without = if available.depth { "" } else { " without depth at the start" };
+        Err(Error::BadInput(format!(
+            "--refine {}: the method {} cannot estimate this{without}; it supports {}",
+            unknown.name(),
+            describe(kinds),
+            known.join(", ")
+        )))
+    }
+
+    /// Which calibration parameters to estimate; `default_value` applies if the flag is not given.
+    pub fn refining(&self, available: AvailableData, default_value: Refine) -> Result<RefineSettings, Error> {
+        let requested = if self.refine.is_empty() { std::slice::from_ref(&default_value) } else { &self.refine };
+        let has = |param| requested.contains(&param);
+        if (has(Refine::Auto) || has(Refine::None)) && requested.len() > 1 {
+            return Err(Error::BadInput("--refine: auto and none cannot be combined with other values".into()));
+        }
+        if has(Refine::Auto) {
+            return Ok(available.auto_settings());
+        }
+        let needs_depth = [Refine::Joints, Refine::DepthPose, Refine::DepthScale, Refine::Readout];
+        if let (Some(param), false) = (needs_depth.into_iter().find(|param| has(*param)), available.depth) {
+            let message = "needs depth images that are all available before training";
+            return Err(Error::BadInput(format!("--refine {}: {message}", param.name())));
+        }
+        if has(Refine::Joints) && !available.joints {
+            return Err(Error::BadInput("--refine joints: needs a recording of an arm".into()));
+        }
+        let set = param_set(requested);
+        if !available.depth {
+            return Ok(RefineSettings {
+                align: CameraRefinement::default(),
+                with_scene: CameraRefinement::Always(set),
+            });
+        }
+        Ok(RefineSettings {
+            align: CameraRefinement::Always(set - ParamSet::IMAGE_GAINS),
+            with_scene: CameraRefinement::Always(set & (ParamSet::IMAGE_POSES | ParamSet::IMAGE_GAINS)),
+        })
+    }
+
+    /// The rig file keys that the flags override.
+    pub fn overrides(&self) -> Vec<Override> {
+        let mut overrides = Vec::new();
+        if let Some(kinds) = self.methods() {
+            overrides.push(Override::new("train.method", method_names(kinds)));
+        }
+        if let Some(seed) = self.seed {
+            overrides.push(Override::new("train.seed", seed.cast_signed()));
+        }
+        if let Some(bytes) = self.max_bytes {
+            overrides.push(Override::new("train.max_bytes", bytes.cast_signed()));
+        }
+        if let Some(n) = self.max_splats {
+            overrides.push(Override::new("train.max_splats", n.cast_signed()));
+        }
+        overrides.extend(self.realign().map(|is_on| Override::new(REALIGN, is_on)));
+        overrides
+    }
+
+    /// Whether the pose of a mobile base is re-estimated at each station; `None` if `--refine` is not given.
+    pub fn realign(&self) -> Option<bool> {
+        let is_on = || self.refine.iter().any(|param| matches!(param, Refine::Auto | Refine::Base));
+        (!self.refine.is_empty()).then(is_on)
+    }
+}
+
+/// The value of `train.method`: a word, or a list of words if there are several.
+fn method_names(kinds: &[ModelKind]) -> toml::Value {
+    match kinds {
+        [one] => one.name().into(),
+        several => several.iter().map(|kind| kind.name()).collect::<Vec<_>>().into(),
+    }
+}
+
+/// The requested camera parameters.
+fn param_set(requested: &[Refine]) -> ParamSet {
+    let has = |param| requested.contains(&param);
+    let params = [
+        (Refine::Extrinsics, ParamSet::EXTRINSICS),
+        (Refine::TimeOffset, ParamSet::TIME_OFFSET),
+        (Refine::Lens, ParamSet::LENS),
+        (Refine::ImagePoses, ParamSet::IMAGE_POSES),
+        (Refine::ImageGains, ParamSet::IMAGE_GAINS),
+        (Refine::Joints, ParamSet::JOINTS),
+        (Refine::DepthPose, ParamSet::DEPTH_POSE),
+        (Refine::DepthScale, ParamSet::DEPTH_SCALE),
+        (Refine::Readout, ParamSet::READOUT),
+    ];
+    params.into_iter().filter(|(param, _)| has(*param)).map(|(_, param)| param).collect()
+}
+
+impl AvailableData {
+    /// The candidates to try, most promising first: by registration where possible, otherwise jointly with the scene.
+    fn auto_settings(self) -> RefineSettings {
+        let gains = ParamSet::IMAGE_GAINS;
+        let poses = ParamSet::IMAGE_POSES;
+        let with_scene = match self {
+            Self { drifts: true, .. } => vec![gains, poses],
+            Self { depth: true, .. } => vec![gains],
+            Self { depth: false, .. } => {
+                vec![gains, ParamSet::EXTRINSICS | ParamSet::TIME_OFFSET]
+            }
+        };
+        RefineSettings {
+            align: CameraRefinement::Try(if self.depth { candidates() } else { Vec::new() }),
+            with_scene: CameraRefinement::Try(with_scene),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn kind(name: &str) -> ModelKind {
+        ModelKind::from_name(name).expect("registered")
+    }
+
+    fn refining(requested: &[Refine], joints: bool, depth: bool) -> Result<RefineSettings, String> {
+        let options = TrainingOptions { refine: requested.to_vec(), ..TrainingOptions::default() };
+        options
+            .refining(AvailableData { joints, drifts: !joints, depth }, Refine::None)
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn params_visible_in_depth_are_not_learned_with_scene() {
+        let extrinsics = ParamSet::EXTRINSICS;
+        let by_depth = refining(&[Refine::Extrinsics, Refine::ImageGains], true, true).unwrap();
+        assert_eq!(by_depth.align, CameraRefinement::Always(extrinsics));
+        assert_eq!(by_depth.with_scene, CameraRefinement::Always(ParamSet::IMAGE_GAINS));
+        let without = refining(&[Refine::Extrinsics], true, false).unwrap();
+        assert_eq!(
+            without,
+            RefineSettings { align: CameraRefinement::default(), with_scene: CameraRefinement::Always(extrinsics) }
+        );
+
+        let candidates = |choice: CameraRefinement| match choice {
+            CameraRefinement::Try(candidates) => candidates.len(),
+            CameraRefinement::Always(_) => panic!("auto tries"),
+        };
+        for (joints, depth, aligned, learned) in
+            [(true, true, 8, 1), (true, false, 0, 2), (false, true, 8, 2), (false, false, 0, 2)]
+        {
+            let RefineSettings { align, with_scene } = refining(&[Refine::Auto], joints, depth).unwrap();
+            assert_eq!(
+                (candidates(align), candidates(with_scene)),
+                (aligned, learned),
+                "joints {joints}, depth {depth}"
+            );
+        }
+        assert_eq!(refining(&[], true, true), Ok(RefineSettings::default()));
+    }
+
+    #[test]
+    fn flags_of_splats_need_splats() {
+        let options =
+            TrainingOptions { max_splats: Some(5), refine: vec![Refine::ImageGains], ..TrainingOptions::default() };
+        let available = AvailableData { joints: true, drifts: false, depth: true };
+        let both = [kind("tsdf"), kind("splat")];
+        assert!(options.check_for(&both).is_ok() && options.check_learned(&both, available).is_ok());
+        let message = options.check_for(&[kind("tsdf"), kind("nerf")]).unwrap_err().to_string();
+        assert!(message.contains("--max-splats") && message.contains("tsdf and nerf"), "{message}");
+        let message = options.check_learned(&[kind("tsdf")], available).unwrap_err().to_string();
+        assert!(
+            message.starts_with(
+                "--refine image-gains: the method tsdf cannot estimate this; it supports auto, none, base, extrinsics,"
+            ),
+            "{message}"
+        );
+        assert!(message.ends_with("readout, image-poses"), "{message}");
+        assert!(options.check_learned(&[kind("nerf")], available).is_ok());
+        let options = TrainingOptions { refine: vec![Refine::Extrinsics], ..TrainingOptions::default() };
+        assert!(options.check_before_data(&[kind("nerf")], false).is_ok());
+        let message = options
+            .check_learned(&[kind("nerf")], AvailableData { depth: false, ..available })
+            .unwrap_err()
+            .to_string();
+        assert!(message.ends_with("supports auto, none, base, image-poses, image-gains"), "{message}");
+        let options = TrainingOptions { refine: vec![Refine::Joints], ..TrainingOptions::default() };
+        assert!(options.check_before_data(&[kind("splat")], true).is_ok());
+        assert!(options.check_before_data(&[kind("splat")], false).is_err());
+    }
+
+    #[test]
+    fn unsupported_refine_params_are_rejected() {
+        let message = |requested: &[Refine], joints, depth| refining(requested, joints, depth).unwrap_err();
+        assert!(message(&[Refine::DepthPose], true, false).contains("depth-pose: needs depth images"));
+        assert!(message(&[Refine::Readout], false, false).contains("readout: needs"));
+        assert!(message(&[Refine::Joints], false, true).contains("needs a recording of an arm"));
+        assert!(message(&[Refine::Auto, Refine::Extrinsics], true, true).contains("cannot be combined"));
+    }
+}

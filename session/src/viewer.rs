@@ -1,0 +1,70 @@
+//! Draws models that no longer change for the page: the loop of `view`, and of a run that has ended.
+
+use capture::Stop;
+use kinematics::Transform;
+use std::time::Duration;
+use trainer::{Aabb, Method, ModelKind, RenderRequest};
+use viz::{Hub, PendingRender};
+
+/// Longest time until Ctrl-C is noticed while no client requests a picture.
+const POLL_PERIOD: Duration = Duration::from_millis(100);
+
+/// A model that clients can view.
+pub struct ServedModel {
+    pub kind: ModelKind,
+    pub method: Box<dyn Method>,
+}
+
+/// Models that no longer change, and the hub of clients that view them.
+pub struct ModelViewer {
+    /// The first is drawn for clients that name no method.
+    models: Vec<ServedModel>,
+    hub: Hub,
+    /// The page is z up; a model may not be.
+    model_from_page: Transform,
+}
+
+impl ModelViewer {
+    /// A viewer of models whose z axis points up.
+    pub fn new(models: Vec<ServedModel>, hub: Hub) -> Self {
+        Self { models, hub, model_from_page: Transform::identity() }
+    }
+
+    /// Rotates the models so that they are upright in the page's world, which is z up.
+    pub fn with_model_from_page(self, model_from_page: Transform) -> Self {
+        Self { model_from_page, ..self }
+    }
+
+    /// Draws requested pictures until a signal requests a stop.
+    pub fn serve(&mut self, stop: &Stop) {
+        while !stop.signaled() {
+            if self.hub.wait_for_request(POLL_PERIOD)
+                && let Some(pending) = self.hub.next_request()
+            {
+                self.answer(pending);
+            }
+        }
+    }
+
+    fn answer(&mut self, pending: PendingRender) {
+        let request = in_model(&pending.request, &self.model_from_page);
+        let requested_method = pending.method().map(str::to_owned);
+        let is_requested =
+            |model: &&mut ServedModel| requested_method.as_deref().is_none_or(|name| model.kind.name() == name);
+        let Some(model) = self.models.iter_mut().find(is_requested) else {
+            let names: Vec<&str> = self.models.iter().map(|model| model.kind.name()).collect();
+            let requested_method = requested_method.unwrap_or_default();
+            return pending.fail(&format!("no model with the method {requested_method:?}, only {}", names.join(", ")));
+        };
+        match model.method.render(&request) {
+            Ok(picture) => pending.deliver(picture),
+            Err(error) => pending.fail(&error.to_string()),
+        }
+    }
+}
+
+/// The page's request in the model's world frame.
+fn in_model(request: &RenderRequest, model_from_page: &Transform) -> RenderRequest {
+    let crop = request.crop.map(|crop| Aabb { world_from_box: model_from_page * crop.world_from_box, ..crop });
+    RenderRequest { world_from_camera: model_from_page * request.world_from_camera, crop, ..request.clone() }
+}

@@ -1,0 +1,158 @@
+//! Prints the reports of training sessions, and progress bars.
+
+use crate::print;
+use indicatif::ProgressBar;
+use keyframe::counted;
+use parking_lot::Mutex;
+use serde::Serialize;
+use session::next_commands::{self, SavedModel};
+use session::{FinishedModel, Limits, Observer, ReadProgress, SessionEvent};
+
+/// What is printed about a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum OutputMode {
+    /// A line per evaluation, and a progress bar if stderr is a terminal.
+    Lines,
+    /// A JSON object per evaluation.
+    Json,
+    /// Only the progress bar; the caller reports the result.
+    Bar,
+    /// Nothing at all.
+    Nothing,
+}
+
+impl OutputMode {
+    /// The output mode of a command with one session.
+    pub(crate) fn of_command(json: bool) -> Self {
+        if json { Self::Json } else { Self::Lines }
+    }
+}
+
+/// Prints the reports of a session.
+pub(crate) struct Console {
+    output: OutputMode,
+    limits: Limits,
+    bar: ProgressBar,
+}
+
+impl Console {
+    /// A console for a session with these limits. Several sessions at once have no progress bar, because their bars
+    /// would overwrite each other.
+    pub(crate) fn new(output: OutputMode, limits: Limits, n_sessions: usize) -> Self {
+        let length = limits.steps.or(limits.seconds.map(whole_secs));
+        let template = if length.is_some() { "{bar:30} {elapsed} {msg}" } else { "{spinner} {elapsed} {msg}" };
+        let is_hidden = n_sessions > 1 || matches!(output, OutputMode::Json | OutputMode::Nothing);
+        Self { output, limits, bar: print::bar(length, template, is_hidden) }
+    }
+}
+
+impl Observer for Console {
+    fn on_event(&mut self, event: &SessionEvent<'_>) {
+        match (event, self.output) {
+            (SessionEvent::Progress(session), _) => {
+                let progress = &session.progress;
+                let has_steps = self.limits.steps.is_some();
+                self.bar.set_position(if has_steps { progress.step } else { whole_secs(session.seconds) });
+                let psnr = session.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
+                let primitives = counted(progress.primitives, session.primitive);
+                self.bar.set_message(format!("step {}, {primitives}{psnr}", progress.step));
+            }
+            (SessionEvent::TrainingEnded, _) => self.bar.finish_and_clear(),
+            (SessionEvent::Evaluated(evaluation), OutputMode::Json) => print_json(evaluation),
+            (SessionEvent::Evaluated(evaluation), OutputMode::Lines) => print::report(format_args!(
+                "{:7.2} s  step {:6}  {:>15}  {:7.2} ms/step  {}",
+                evaluation.seconds,
+                evaluation.step,
+                counted(evaluation.primitives, evaluation.primitive),
+                evaluation.smoothed_step_millis,
+                evaluation.scores
+            )),
+            (SessionEvent::Finished(finished), OutputMode::Json) => {
+                finished.profile.iter().for_each(print_json);
+                print_json(finished.done);
+            }
+            (SessionEvent::Finished(finished), OutputMode::Lines) => {
+                for (name, millis) in finished.profile.iter().flat_map(|profile| profile.passes) {
+                    print::report(format_args!("{millis:9.3} ms  {name}"));
+                }
+                let done = finished.done;
+                print::report(format_args!(
+                    "{:.1} s, {}, {}, {:.1} MB: {}",
+                    done.seconds,
+                    counted(done.steps, "step"),
+                    counted(done.primitives, finished.primitive),
+                    done.bytes as f64 / 1e6,
+                    done.scores
+                ));
+                let with_page = if finished.has_page { ", with pictures and scores in report.html" } else { "" };
+                print::report(format_args!("saved in {}{with_page}", done.out.display()));
+            }
+            (SessionEvent::Evaluated(_) | SessionEvent::Finished(_), OutputMode::Bar | OutputMode::Nothing) => {}
+        }
+    }
+}
+
+/// Prints a JSON object as [`print::report_json`] does; an error is logged.
+pub(crate) fn print_json(value: &impl Serialize) {
+    if let Err(error) = print::report_json(value) {
+        log::error!("{error:#}");
+    }
+}
+
+/// Prints the commands that use these models.
+pub(crate) fn print_next_commands(models: &[FinishedModel]) {
+    let models: Vec<SavedModel<'_>> = models.iter().map(FinishedModel::saved).collect();
+    for line in next_commands::lines(&next_commands::for_models(&models)) {
+        print::report(line);
+    }
+}
+
+/// Whole seconds for the progress bar.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float casts saturate")]
+fn whole_secs(secs: f64) -> u64 {
+    secs as u64
+}
+
+/// A progress bar for reading images; cleared when it is dropped.
+pub(crate) struct ReadBar {
+    is_hidden: bool,
+    /// What is counted, and its bar.
+    bar: Mutex<Option<(&'static str, ProgressBar)>>,
+}
+
+impl ReadBar {
+    /// A bar that appears with the first progress, unless it is hidden.
+    pub(crate) fn new(is_hidden: bool) -> Self {
+        Self { is_hidden, bar: Mutex::default() }
+    }
+
+    /// Shows the progress.
+    pub(crate) fn show(&self, progress: ReadProgress) {
+        let mut current = self.bar.lock();
+        if current.as_ref().is_none_or(|(noun, _)| *noun != progress.noun) {
+            clear(&mut current);
+            let template = match progress.noun {
+                "images" => "{bar:30} {pos} of {len} images",
+                "depth images" => "{bar:30} {pos} of {len} depth images",
+                _ => "{spinner} {pos} keyframes",
+            };
+            let bar = print::bar(progress.n_all.map(|n| n as u64), template, self.is_hidden);
+            *current = Some((progress.noun, bar));
+        }
+        if let Some((_, bar)) = &*current {
+            bar.set_position(progress.n_done as u64);
+        }
+    }
+}
+
+fn clear(bar: &mut Option<(&'static str, ProgressBar)>) {
+    if let Some((_, bar)) = bar.take() {
+        bar.finish_and_clear();
+    }
+}
+
+impl Drop for ReadBar {
+    fn drop(&mut self) {
+        clear(&mut self.bar.lock());
+    }
+}

@@ -1,0 +1,83 @@
+//! Signals that end a command: it stops, saves, and exits.
+//!
+//! SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed) request an orderly stop. A second Ctrl-C ends the
+//! process at once. SIGHUP never does, because a closing terminal sends it more than once: the kernel to the foreground
+//! group, the shell to its jobs. If SIGHUP is ignored, as under `nohup`, it stays ignored.
+
+use anyhow::Context;
+use capture::Stop;
+use session::partial;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::flag;
+use signal_hook::iterator::Signals;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// Shells report this plus the signal number for a process ended by a signal.
+const SIGNAL_EXIT_BASE: i32 = 128;
+
+/// Handles SIGINT, SIGTERM and SIGHUP of a command that saves its results; at most once per process.
+pub(crate) fn stop_on_signals() -> anyhow::Result<Stop> {
+    stop_on_signals_logging("stopping and saving; Ctrl-C again exits at once")
+}
+
+/// As [`stop_on_signals`], for a command that saves nothing.
+pub(crate) fn stop_on_signals_logging(message: &'static str) -> anyhow::Result<Stop> {
+    let (stop, signaled) = Stop::with_signal_flag(message);
+    let interrupted = Arc::new(AtomicBool::new(false));
+    let register = || -> std::io::Result<()> {
+        // A signal's actions run in the order of registration: the first Ctrl-C only sets the flags.
+        flag::register_conditional_shutdown(SIGINT, SIGNAL_EXIT_BASE + SIGINT, interrupted.clone())?;
+        flag::register(SIGINT, interrupted)?;
+        termination_signals().try_for_each(|signal| flag::register(signal, signaled.clone()).map(drop))
+    };
+    register().context("cannot install signal handlers")?;
+    Ok(stop)
+}
+
+/// Makes the signals that end a process remove partial files first.
+///
+/// For commands that have nothing to save when they are cancelled; others use [`stop_on_signals`].
+pub(crate) fn remove_partial_files_on_signals() -> anyhow::Result<()> {
+    let mut signals = Signals::new(termination_signals()).context("cannot install signal handlers")?;
+    let remove_all = move || {
+        if let Some(signal) = signals.forever().next() {
+            let _no_new_files = partial::remove_all();
+            std::process::exit(SIGNAL_EXIT_BASE + signal);
+        }
+    };
+    std::thread::Builder::new().name("signals".into()).spawn(remove_all).context("cannot start a thread")?;
+    Ok(())
+}
+
+/// The signals that request a stop; without SIGHUP if it is ignored.
+fn termination_signals() -> impl Iterator<Item = i32> {
+    [SIGINT, SIGTERM].into_iter().chain((!is_ignored(SIGHUP)).then_some(SIGHUP))
+}
+
+/// Whether this process was started with the signal ignored, which Linux reports in `/proc`.
+fn is_ignored(signal: i32) -> bool {
+    let Ok(status) = std::fs::read_to_string("/proc/self/status") else { return false };
+    is_in_ignore_mask(&status, signal)
+}
+
+/// Reads the mask `SigIgn` of `/proc/self/status`: bit n - 1 is set if signal n is ignored.
+fn is_in_ignore_mask(status: &str, signal: i32) -> bool {
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ignored_signals_are_parsed_from_the_mask() {
+        let status = |mask: &str| format!("Name:\tfieldrig\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\nSigCgt:\tff\n");
+        assert!(is_in_ignore_mask(&status("0000000000001001"), SIGHUP));
+        assert!(!is_in_ignore_mask(&status("0000000000001000"), SIGHUP));
+        assert!(is_in_ignore_mask(&status("0000000000001000"), 13));
+        assert!(!is_in_ignore_mask("Name:\tfieldrig\n", SIGHUP));
+    }
+}

@@ -1,0 +1,78 @@
+//! Placeholder for a model whose GPU failed.
+
+use crate::checkpoint::PendingCheckpoint;
+use crate::gpu::PassTiming;
+use crate::{Error, Method, Picture, Progress, RenderRequest};
+use calibration::{Alignment, CalibratedCamera, TrialReport};
+use keyframe::Keyframe;
+use kinematics::Stamp;
+use std::path::Path;
+use std::sync::Arc;
+
+/// A model whose GPU failed: every operation returns [`Error::DeviceLost`].
+#[derive(Clone, Copy, Debug)]
+pub struct FailedModel;
+
+impl Method for FailedModel {
+    fn push(&mut self, _: Arc<Keyframe>) -> Result<(), Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn remove(&mut self, _: &str, _: Stamp) -> Result<(), Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn step(&mut self, _: u64) -> Result<u64, Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn is_idle(&self) -> bool {
+        true
+    }
+
+    fn set_watched(&mut self, _: bool) {}
+
+    fn n_total_steps(&mut self) -> Result<u64, Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn seed(&mut self) -> Result<(), Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn prepare(&mut self) -> Result<(), Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn render(&mut self, _: &RenderRequest) -> Result<Picture, Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn calibrated_camera(&mut self, _: &Keyframe) -> Result<CalibratedCamera, Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn profile_step(&mut self) -> Result<Vec<PassTiming>, Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn alignment(&self) -> Option<&Alignment> {
+        None
+    }
+
+    fn progress(&self) -> Progress {
+        Progress::default()
+    }
+
+    fn report(&self) -> Vec<TrialReport> {
+        Vec::new()
+    }
+
+    fn save(&mut self, _: &Path) -> Result<(), Error> {
+        Err(Error::DeviceLost)
+    }
+
+    fn checkpoint(&mut self) -> Result<PendingCheckpoint, Error> {
+        Err(Error::DeviceLost)
+    }
+}

@@ -1,0 +1,25 @@
+//! A rendered image and its gradient, on the CPU in f64.
+
+/// Output of a render, row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RenderedImage {
+    /// Color of the splats without background, premultiplied.
+    pub rgb: Vec<[f64; 3]>,
+    /// Fraction of the background that is visible, 0 to 1.
+    pub transmittance: Vec<f64>,
+    /// Depths along z with the weights of the colors, meters; divide by `1 - transmittance` for a mean depth.
+    pub depth: Vec<f64>,
+    /// Index of the last splat that contributed to the pixel.
+    pub last_contributor: Vec<Option<usize>>,
+}
+
+/// Gradient of a loss with respect to a [`RenderedImage`], row by row.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Upstream {
+    /// With respect to the color.
+    pub rgb: Vec<[f64; 3]>,
+    /// With respect to the transmittance.
+    pub transmittance: Vec<f64>,
+    /// With respect to the depth.
+    pub depth: Vec<f64>,
+}

@@ -1,0 +1,125 @@
+//! Options of a model: those that all methods share, and those of its method.
+
+use crate::Error;
+use calibration::CameraRefinement;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+/// Options of one method.
+pub trait MethodOptions: Serialize + DeserializeOwned + Default {
+    /// Name of the method in files and on the command line.
+    const METHOD: &'static str;
+}
+
+/// Options that all methods share. A method ignores those that do not apply to it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CommonOptions {
+    /// Seeds every random choice.
+    pub seed: u64,
+    /// Maximum GPU memory of the model, bytes.
+    pub max_bytes: Option<u64>,
+    /// Steps over which learning rates decay and the model grows.
+    pub n_planned_steps: u64,
+    /// Camera parameters that are optimized with the scene.
+    pub cameras: CameraRefinement,
+    /// Camera parameters that are estimated by registering keyframes with depth, before the model is trained on them.
+    pub align: CameraRefinement,
+}
+
+/// Options of a model. `S` are those of its method, by default as JSON, because the type depends on the method.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModelOptions<S = Value> {
+    /// Options that all methods share.
+    pub common: CommonOptions,
+    /// Options of the method.
+    pub specific: S,
+}
+
+impl Default for CommonOptions {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            max_bytes: None,
+            n_planned_steps: 7000,
+            cameras: CameraRefinement::default(),
+            align: CameraRefinement::default(),
+        }
+    }
+}
+
+impl<S> ModelOptions<S> {
+    /// These options with a change.
+    #[must_use]
+    pub fn with(mut self, change: impl FnOnce(&mut Self)) -> Self {
+        change(&mut self);
+        self
+    }
+}
+
+impl<S> From<S> for ModelOptions<S> {
+    /// Options of a method with the default common options.
+    fn from(specific: S) -> Self {
+        Self { common: CommonOptions::default(), specific }
+    }
+}
+
+impl ModelOptions {
+    /// The options with those of the method in their own type.
+    ///
+    /// # Errors
+    ///
+    /// Fails if an option of the method is missing, unknown or has an invalid value.
+    pub fn typed<S: MethodOptions>(&self) -> Result<ModelOptions<S>, Error> {
+        let specific = S::deserialize(&self.specific)
+            .map_err(|error| Error::InvalidOptions { method: S::METHOD, reason: error.to_string() })?;
+        Ok(ModelOptions { common: self.common.clone(), specific })
+    }
+}
+
+impl<S: MethodOptions> ModelOptions<S> {
+    /// The options with those of the method as JSON.
+    pub fn to_json(&self) -> ModelOptions {
+        ModelOptions { common: self.common.clone(), specific: json(&self.specific) }
+    }
+}
+
+/// Default options of a method, as JSON.
+pub(crate) fn default_options<S: MethodOptions>() -> Value {
+    json(&S::default())
+}
+
+fn json(options: &impl MethodOptions) -> Value {
+    serde_json::to_value(options).expect("options are plain data")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mean_color::MeanColorOptions;
+
+    #[test]
+    fn options_survive_json_bit_by_bit() {
+        let options = ModelOptions::<MeanColorOptions>::default().with(|options| {
+            options.common.seed = u64::MAX;
+            options.specific.rate = 0.1 + 0.2;
+        });
+        let text = serde_json::to_string(&options.to_json()).unwrap();
+        let read: ModelOptions = serde_json::from_str(&text).unwrap();
+        assert_eq!(read.typed::<MeanColorOptions>().unwrap(), options);
+    }
+
+    #[test]
+    fn invalid_options_are_rejected_with_the_method() {
+        let mut options = ModelOptions::<MeanColorOptions>::default().to_json();
+        options.specific["rate"] = "fast".into();
+        let message = options.typed::<MeanColorOptions>().unwrap_err().to_string();
+        assert!(message.contains("mean-color") && message.contains("fast"), "{message}");
+        options.specific = serde_json::json!({ "rate": 0.5, "seed": 1 });
+        assert!(options.typed::<MeanColorOptions>().is_err(), "a common option among those of the method");
+        options.specific = serde_json::json!({});
+        assert!(options.typed::<MeanColorOptions>().is_err(), "no option may be missing");
+    }
+}

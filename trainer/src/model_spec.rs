@@ -1,0 +1,119 @@
+//! Creates, resumes and loads models of any method.
+
+use crate::checkpoint::Checkpoint;
+use crate::gpu::Gpu;
+use crate::model_options::{CommonOptions, MethodOptions, ModelOptions};
+use crate::registry::ModelKind;
+use crate::{Error, Method};
+use keyframe::Keyframe;
+use serde::Deserialize;
+use serde_json::Value;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Method and options of a model to create.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ModelSpec {
+    /// The method.
+    pub kind: ModelKind,
+    /// Options of the model.
+    pub options: ModelOptions,
+}
+
+/// A model restored from a checkpoint.
+pub struct Resumed {
+    /// Method and options of the original training.
+    pub model_spec: ModelSpec,
+    /// The model.
+    pub method: Box<dyn Method>,
+    /// Keyframes it was not trained on: test keyframes and new ones.
+    pub untrained: Vec<Arc<Keyframe>>,
+}
+
+/// A saved model in GPU memory.
+pub struct LoadedModel {
+    /// The method.
+    pub kind: ModelKind,
+    /// The model.
+    pub method: Box<dyn Method>,
+}
+
+impl ModelSpec {
+    /// A model with the default options of its method, except for the `settings`: names and values of options. Settings
+    /// that the method does not have are ignored, so that the same settings can be given to several methods.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a value is invalid.
+    pub fn new(kind: ModelKind, common: CommonOptions, settings: &[(&str, Value)]) -> Result<Self, Error> {
+        let mut specific = (kind.entry().default_options)();
+        for (name, value) in settings {
+            if let Some(option) = specific.get_mut(name) {
+                *option = value.clone();
+            }
+        }
+        let model_spec = Self { kind, options: ModelOptions { common, specific } };
+        model_spec.check()?;
+        Ok(model_spec)
+    }
+
+    /// A model of the method that these options belong to.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the method is not registered.
+    pub fn of<S: MethodOptions>(options: &ModelOptions<S>) -> Result<Self, Error> {
+        Ok(Self { kind: registered(S::METHOD)?, options: options.to_json() })
+    }
+
+    /// The options in the type of their method; `None` if the method is another one.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the options are invalid.
+    pub fn options_of<S: MethodOptions>(&self) -> Result<Option<ModelOptions<S>>, Error> {
+        (self.kind.name() == S::METHOD).then(|| self.options.typed()).transpose()
+    }
+
+    /// Fails if the options do not belong to the method or are invalid.
+    pub fn check(&self) -> Result<(), Error> {
+        (self.kind.entry().check_options)(&self.options)
+    }
+
+    /// Creates an untrained model.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the options are invalid, or on an error of the GPU.
+    pub fn start(&self, gpu: Arc<Gpu>) -> Result<Box<dyn Method>, Error> {
+        (self.kind.entry().start)(gpu, &self.options)
+    }
+}
+
+/// Restores a model from a checkpoint. `keyframes` must contain those it was trained on.
+///
+/// # Errors
+///
+/// Fails if the checkpoint is invalid, if keyframes are missing or differ, or on an error of the GPU.
+pub fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<Resumed, Error> {
+    let kind = registered(&checkpoint.method)?;
+    let options = checkpoint.state.get("options").unwrap_or(&Value::Null);
+    let options = ModelOptions::deserialize(options)
+        .map_err(|error| Error::CheckpointState { reason: format!("options: {error}") })?;
+    let (method, untrained) = (kind.entry().resume)(gpu, checkpoint, keyframes)?;
+    Ok(Resumed { model_spec: ModelSpec { kind, options }, method, untrained })
+}
+
+/// Loads a saved model from its folder, or from a single file.
+///
+/// # Errors
+///
+/// Fails if the method of the model is unknown, if a file is invalid, or on an error of the GPU.
+pub fn load(gpu: Arc<Gpu>, model: &Path) -> Result<LoadedModel, Error> {
+    let kind = ModelKind::of_saved(model)?.ok_or_else(|| Error::UnknownModel { path: model.to_owned() })?;
+    Ok(LoadedModel { kind, method: (kind.entry().load)(gpu, model)? })
+}
+
+fn registered(name: &str) -> Result<ModelKind, Error> {
+    ModelKind::from_name(name).ok_or_else(|| Error::UnknownMethod { name: name.to_owned() })
+}

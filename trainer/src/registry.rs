@@ -1,0 +1,102 @@
+//! The methods that models can be trained with. This is the only file that knows all of them.
+
+use crate::method_entry::MethodEntry;
+use crate::model_metadata::METADATA_FILE;
+use crate::{Error, nerf, splat, tsdf};
+use std::fmt::{Debug, Formatter};
+use std::path::Path;
+
+/// A registered method.
+#[derive(Clone, Copy)]
+pub struct ModelKind(&'static MethodEntry);
+
+impl ModelKind {
+    /// All methods. The first one is the default.
+    pub const ALL: &'static [Self] = &[
+        Self(&splat::ENTRY),
+        Self(&tsdf::ENTRY),
+        Self(&nerf::ENTRY),
+        #[cfg(test)]
+        Self(&crate::mean_color::ENTRY),
+    ];
+
+    /// The method with this name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.iter().copied().find(|kind| kind.name() == name)
+    }
+
+    /// The name in files and on the command line.
+    pub fn name(self) -> &'static str {
+        self.0.name
+    }
+
+    /// Everything that the method registers.
+    pub fn entry(self) -> &'static MethodEntry {
+        self.0
+    }
+
+    /// Whether the options of the method include one of this name.
+    pub fn has_option(self, name: &str) -> bool {
+        (self.0.default_options)().get(name).is_some()
+    }
+
+    /// The method of a saved model. In a folder, from the method in `model.json` or else from the files; otherwise from
+    /// the extension of the file. `None` if neither identifies one.
+    ///
+    /// # Errors
+    ///
+    /// Fails if `model.json` is invalid.
+    pub fn of_saved(model: &Path) -> Result<Option<Self>, Error> {
+        #[derive(serde::Deserialize)]
+        struct Metadata {
+            method: Option<String>,
+        }
+        if model.is_file() {
+            return Ok(Self::of_single_file(model));
+        }
+        let is_complete = |kind: &Self| kind.0.files.last().is_some_and(|file| model.join(file).is_file());
+        let by_files = || Self::ALL.iter().copied().find(is_complete);
+        let path = model.join(METADATA_FILE);
+        let Ok(bytes) = std::fs::read(&path) else { return Ok(by_files()) };
+        let metadata: Metadata =
+            serde_json::from_slice(&bytes).map_err(|source| Error::ModelMetadata { path, source })?;
+        Ok(metadata.method.as_deref().and_then(Self::from_name).or_else(by_files))
+    }
+
+    /// The method whose models can be single files with the extension of this one.
+    pub fn of_single_file(file: &Path) -> Option<Self> {
+        let extension = file.extension()?.to_str()?.to_ascii_lowercase();
+        let has_extension =
+            |kind: &Self| kind.0.single_file.is_some_and(|single| single.extensions.contains(&extension.as_str()));
+        Self::ALL.iter().copied().find(has_extension)
+    }
+
+    /// Names of the files of saved models of all methods, in the order in which they are put in place and hashed.
+    pub fn model_files() -> impl Iterator<Item = &'static str> {
+        std::iter::once(METADATA_FILE).chain(Self::ALL.iter().flat_map(|kind| kind.0.files).copied())
+    }
+}
+
+impl Default for ModelKind {
+    /// The first method.
+    fn default() -> Self {
+        Self::ALL[0]
+    }
+}
+
+impl PartialEq for ModelKind {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.name == other.0.name
+    }
+}
+
+impl Eq for ModelKind {}
+
+impl Debug for ModelKind {
+    fn fmt(&self, formatter: &mut Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str(self.0.name)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,58 @@
+//! Rules that every registered method must follow.
+
+use super::*;
+use crate::gpu::{Gpu, GpuOptions};
+use crate::{CommonOptions, ModelSpec, load, resume};
+use std::collections::BTreeSet;
+
+#[test]
+fn names_files_and_extensions_are_unique() {
+    let is_unique = |words: Vec<&str>| words.iter().collect::<BTreeSet<_>>().len() == words.len();
+    assert!(is_unique(ModelKind::ALL.iter().map(|kind| kind.name()).collect()));
+    assert!(is_unique(ModelKind::model_files().collect()));
+    let single_files = ModelKind::ALL.iter().filter_map(|kind| kind.entry().single_file);
+    assert!(is_unique(single_files.flat_map(|single| single.extensions).copied().collect()));
+    for kind in ModelKind::ALL {
+        assert!(!kind.entry().files.is_empty(), "{kind:?}: a folder cannot be recognized");
+        assert_eq!(ModelKind::from_name(kind.name()), Some(*kind));
+    }
+    assert_eq!(ModelKind::from_name("mesh"), None);
+}
+
+#[test]
+fn untrained_model_of_every_method_is_resumed_saved_and_recognized() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    for kind in ModelKind::ALL {
+        let common = CommonOptions { seed: 5, n_planned_steps: 90, ..CommonOptions::default() };
+        let mut model = ModelSpec::new(*kind, common.clone(), &[]).unwrap().start(gpu.clone()).unwrap();
+        let checkpoint = model.checkpoint().unwrap().finish().unwrap();
+        assert_eq!(checkpoint.method, kind.name());
+        let resumed = resume(gpu.clone(), &checkpoint, &[]).unwrap();
+        assert_eq!((resumed.model_spec.kind, &resumed.model_spec.options.common), (*kind, &common));
+        resumed.model_spec.check().unwrap();
+
+        let folder = tempfile::tempdir().unwrap();
+        model.save(folder.path()).unwrap();
+        let written = std::fs::read_dir(folder.path()).unwrap();
+        let written: BTreeSet<_> = written.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        let registered = kind.entry().files.iter().chain([&METADATA_FILE]).map(|file| (*file).to_owned());
+        assert_eq!(written, registered.collect(), "{kind:?}");
+        assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), Some(*kind));
+        std::fs::remove_file(folder.path().join(METADATA_FILE)).unwrap();
+        assert_eq!(ModelKind::of_saved(folder.path()).unwrap(), Some(*kind));
+        assert_eq!(load(gpu.clone(), folder.path()).unwrap().method.bounds().unwrap(), None);
+    }
+}
+
+#[test]
+fn checkpoint_of_an_unknown_method_is_rejected() {
+    let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+    let checkpoint = crate::checkpoint::Checkpoint::new("mesh", serde_json::json!({}), Vec::new());
+    assert!(matches!(resume(gpu, &checkpoint, &[]), Err(Error::UnknownMethod { name }) if name == "mesh"));
+}
+
+#[test]
+fn method_of_a_file_follows_from_its_extension() {
+    let of = |name: &str| ModelKind::of_single_file(Path::new(name)).map(ModelKind::name);
+    assert_eq!([of("a.PLY"), of("a/b.spz"), of("a.glb"), of("ply")], [Some("splat"), Some("splat"), None, None]);
+}

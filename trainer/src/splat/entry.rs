@@ -1,0 +1,95 @@
+//! Registers splats as a method.
+
+use super::file::{self, Format, IN_FOLDER};
+use super::{SplatOptions, SplatTrainer};
+use crate::checkpoint::Checkpoint;
+use crate::gpu::Gpu;
+use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
+use crate::model_options::{MethodOptions, default_options};
+use crate::{Error, Method, ResumedModel};
+use calibration::ParamSet;
+use keyframe::Keyframe;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Splats as a method.
+pub(crate) static ENTRY: MethodEntry = MethodEntry {
+    name: SplatOptions::METHOD,
+    description: "Gaussian splats",
+    model: "a splat model",
+    primitive: "splat",
+    primitives_label: "Splats",
+    files: &[IN_FOLDER],
+    single_file: Some(SingleFile { description: "a file of splats", extensions: &["ply", "spz"] }),
+    needs_depth: false,
+    learnable: ParamSet::EXTRINSICS
+        .union(ParamSet::TIME_OFFSET)
+        .union(ParamSet::LENS)
+        .union(ParamSet::IMAGE_POSES)
+        .union(ParamSet::IMAGE_GAINS),
+    exports: &[
+        Export { format: "spz", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_spz) },
+        Export { format: "ply", contents: "splats", has_cells: false, write: ExportWriter::Cpu(write_ply) },
+    ],
+    default_options: default_options::<SplatOptions>,
+    check_options: |options| options.typed::<SplatOptions>().map(drop),
+    start: |gpu, options| Ok(Box::new(SplatTrainer::new(gpu, options.typed()?)?)),
+    resume,
+    load,
+};
+
+fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<ResumedModel, Error> {
+    let (model, untrained) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
+    Ok((Box::new(model), untrained))
+}
+
+fn load(gpu: Arc<Gpu>, model: &Path) -> Result<Box<dyn Method>, Error> {
+    let splats = file::read(model)?;
+    // The limit is for training; a saved model is shown completely.
+    let max_splats = u32::try_from(splats.n_splats()).unwrap_or(u32::MAX);
+    let options = SplatOptions { max_splats, ..SplatOptions::default() };
+    let trainer = SplatTrainer::from_arrays(gpu, options.into(), &splats)?;
+    Ok(Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer }))
+}
+
+fn write_ply(request: &ExportRequest<'_>) -> Result<Exported, Error> {
+    write(request, Format::Ply)
+}
+
+fn write_spz(request: &ExportRequest<'_>) -> Result<Exported, Error> {
+    write(request, Format::Spz)
+}
+
+/// Writes the splats after validating them.
+fn write(request: &ExportRequest<'_>, format: Format) -> Result<Exported, Error> {
+    let splats = file::read(request.model)?;
+    file::write(request.out, format, &splats)?;
+    let detail = format!("of color degree {}", splats.sh_degree);
+    Ok(Exported { n_items: splats.n_splats() as u64, item: "splat", detail })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::GpuOptions;
+    use crate::splat::arrays::SplatArrays;
+    use crate::splat::ply;
+
+    #[test]
+    fn saved_model_above_the_training_limit_is_loaded_completely() {
+        let n_splats = SplatOptions::default().max_splats as usize + 1;
+        let splats = SplatArrays {
+            means: vec![[0.0, 0.0, 1.0]; n_splats],
+            log_scales: vec![[-5.0; 3]; n_splats],
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n_splats],
+            opacity_logits: vec![1.0; n_splats],
+            sh: vec![[0.1; 3]; n_splats],
+            sh_degree: 0,
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("large.ply");
+        ply::write(&path, &splats).unwrap();
+        let model = load(Gpu::open(&GpuOptions::default()).unwrap(), &path).unwrap();
+        assert_eq!(model.progress().primitives, n_splats as u64);
+    }
+}

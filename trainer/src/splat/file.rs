@@ -1,0 +1,50 @@
+//! Files of splats: a `.ply`, a `.spz`, or the folder of a saved model.
+
+use super::arrays::SplatArrays;
+use super::{ply, spz};
+use crate::Error;
+use std::path::{Path, PathBuf};
+
+/// The file of splats in the folder of a model.
+pub(super) const IN_FOLDER: &str = "splats.ply";
+
+/// Format of a file of splats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Format {
+    /// All values at full precision.
+    Ply,
+    /// Values quantized and compressed.
+    Spz,
+}
+
+impl Format {
+    /// The format for a file name extension.
+    fn of(path: &Path) -> Option<Self> {
+        let extension = path.extension()?.to_str()?.to_ascii_lowercase();
+        match extension.as_str() {
+            "ply" => Some(Self::Ply),
+            "spz" => Some(Self::Spz),
+            _ => None,
+        }
+    }
+}
+
+/// Reads splats from the folder of a model or from a file.
+pub(super) fn read(model: &Path) -> Result<SplatArrays, Error> {
+    let is_file = model.is_file();
+    let path: PathBuf = if is_file { model.to_owned() } else { model.join(IN_FOLDER) };
+    let splats = match Format::of(&path) {
+        Some(Format::Spz) => spz::read(&path),
+        Some(Format::Ply) | None => ply::read(&path),
+    };
+    let hint = if is_file { "; for a saved model, give its folder" } else { "" };
+    splats.map_err(|source| Error::NoSplats { path: model.to_owned(), hint, source: Box::new(source) })
+}
+
+/// Writes splats to a file.
+pub(super) fn write(path: &Path, format: Format, splats: &SplatArrays) -> Result<(), Error> {
+    match format {
+        Format::Ply => ply::write(path, splats),
+        Format::Spz => spz::write(path, splats),
+    }
+}

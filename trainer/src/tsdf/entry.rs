@@ -1,0 +1,80 @@
+//! Registers distance fields as a method.
+
+use super::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
+use super::mesh::{Mesh, write_glb, write_ply};
+use super::{TsdfModel, TsdfOptions};
+use crate::checkpoint::Checkpoint;
+use crate::gpu::Gpu;
+use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry};
+use crate::model_options::{MethodOptions, ModelOptions, default_options};
+use crate::{Aligned, Error, Method, ResumedModel};
+use calibration::ParamSet;
+use keyframe::Keyframe;
+use std::path::Path;
+use std::sync::Arc;
+
+/// Distance fields as a method.
+pub(crate) static ENTRY: MethodEntry = MethodEntry {
+    name: TsdfOptions::METHOD,
+    description: "signed distance field with a mesh",
+    model: "a distance field",
+    primitive: "block",
+    primitives_label: "Voxel blocks",
+    files: &[MESH_PLY, MESH_GLB, BLOCKS_FILE],
+    single_file: None,
+    needs_depth: true,
+    learnable: ParamSet::empty(),
+    exports: &[
+        Export {
+            format: "glb",
+            contents: "mesh",
+            has_cells: true,
+            write: ExportWriter::Gpu(|gpu, request| export(gpu, request, write_glb)),
+        },
+        Export {
+            format: "ply",
+            contents: "mesh",
+            has_cells: true,
+            write: ExportWriter::Gpu(|gpu, request| export(gpu, request, write_ply)),
+        },
+    ],
+    default_options: default_options::<TsdfOptions>,
+    check_options: |options| options.typed::<TsdfOptions>().map(drop),
+    start,
+    resume,
+    load,
+};
+
+fn start(gpu: Arc<Gpu>, options: &ModelOptions) -> Result<Box<dyn Method>, Error> {
+    let model = TsdfModel::new(gpu.clone(), options.typed()?)?;
+    Ok(Aligned::if_requested(model, &options.common, &gpu))
+}
+
+fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Keyframe>]) -> Result<ResumedModel, Error> {
+    Aligned::resume(checkpoint, keyframes, |own_checkpoint, keyframes| {
+        TsdfModel::resume(gpu, own_checkpoint, keyframes)
+    })
+}
+
+fn load(gpu: Arc<Gpu>, folder: &Path) -> Result<Box<dyn Method>, Error> {
+    Ok(Box::new(Aligned::load(TsdfModel::load(gpu, folder)?, folder)?))
+}
+
+/// Writes the mesh, extracted from the voxels.
+fn export(
+    gpu: Arc<Gpu>,
+    request: &ExportRequest<'_>,
+    write: fn(&Path, &Mesh) -> Result<(), Error>,
+) -> Result<Exported, Error> {
+    let mesh = TsdfModel::load(gpu, request.model)?.mesh()?;
+    let simplified = request.cell_m.map(|cell_m| (cell_m, mesh.clustered(cell_m)));
+    if let Some((cell_m, simplified)) = &simplified
+        && simplified.triangles.is_empty()
+    {
+        return Err(Error::EmptyMesh { cell_m: *cell_m });
+    }
+    let written = simplified.as_ref().map_or(&mesh, |(_, simplified)| simplified);
+    write(request.out, written)?;
+    let detail = if simplified.is_some() { format!("instead of {}", mesh.triangles.len()) } else { String::new() };
+    Ok(Exported { n_items: written.triangles.len() as u64, item: "triangle", detail })
+}
