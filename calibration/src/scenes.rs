@@ -134,7 +134,7 @@ impl Miscalibration {
 }
 
 /// Normally distributed noise, the same for the same key.
-pub fn noise(key: u64) -> f64 {
+fn noise(key: u64) -> f64 {
     Random::new(key).normal()
 }
 

@@ -1,5 +1,7 @@
 //! Bounds of most of a model, for the first view of a model without a list of cameras.
 
+use kinematics::quantile::{Rank, quantile};
+
 /// Fraction of the points inside the radius, so that stray points and distant backgrounds stay outside.
 const INSIDE_FRAC: f64 = 0.8;
 /// Minimum radius, meters: even a model of one point needs some size.
@@ -17,22 +19,14 @@ pub struct Bounds {
 impl Bounds {
     /// The median along each axis, and the radius that contains most of the points; `None` without points.
     pub(crate) fn of_points(points_m: &[[f64; 3]]) -> Option<Self> {
-        if points_m.is_empty() {
-            return None;
-        }
-        let center_m = [0, 1, 2].map(|axis| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5));
+        let quantile = |mut values: Vec<f64>, frac| quantile(&mut values, frac, Rank::Nearest);
+        let middle = |axis: usize| quantile(points_m.iter().map(|point| point[axis]).collect(), 0.5);
+        let center_m = [middle(0)?, middle(1)?, middle(2)?];
         let distance_m = |point: &[f64; 3]| {
             let squared = point.iter().zip(center_m).map(|(coordinate, center)| (coordinate - center).powi(2));
             squared.sum::<f64>().sqrt()
         };
-        let radius_m = quantile(points_m.iter().map(distance_m).collect(), INSIDE_FRAC);
+        let radius_m = quantile(points_m.iter().map(distance_m).collect(), INSIDE_FRAC)?;
         Some(Self { center_m, radius_m: radius_m.max(MIN_RADIUS_M) })
     }
-}
-
-/// The value that the fraction `frac` of all values does not exceed; `values` must not be empty.
-fn quantile(mut values: Vec<f64>, frac: f64) -> f64 {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction of a length")]
-    let rank = (frac * (values.len() - 1) as f64).round() as usize;
-    *values.select_nth_unstable_by(rank, f64::total_cmp).1
 }

@@ -69,12 +69,3 @@ fn corrupted_seeds_never_panic() {
         }
     }
 }
-
-/// If this fails after a change of a format, run the example `write_seeds` of the folder `fuzz`.
-#[test]
-fn generated_seeds_are_current() {
-    for Seed { target, name, bytes } in generated_seeds() {
-        let path = seed_folder(target).join(name);
-        assert!(std::fs::read(&path).is_ok_and(|stored| stored == bytes), "{path:?} differs from what the code writes");
-    }
-}
