@@ -186,7 +186,7 @@ impl Data {
             let rig = rig.as_deref().map(|file| Rig::load(file, &overrides)).transpose()?;
             Self::from_recording(path, rig, list, overrides, progress)?
         } else if let Some(rig) = rig {
-            return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())).into());
+            return Err(Error::BadInput(format!("--rig {}: only recordings take a rig file", rig.display())));
         } else {
             Self::from_folder(path, &holdout.clone().unwrap_or_default(), scale.unwrap_or(1.0), list, progress)?
         };
@@ -202,7 +202,7 @@ impl Data {
         };
         if data.of_split(required_split).is_empty() {
             let n_images = counted(data.keyframes.len() as u64, "image");
-            return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())).into());
+            return Err(Error::InsufficientData(format!("{}: {message} among {n_images}", path.display())));
         }
         Ok(data)
     }

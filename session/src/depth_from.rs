@@ -71,9 +71,7 @@ impl DepthSource {
         }
         if totals.n_missing > 0 && totals.n_rendered == 0 {
             let message = "the model is not visible in any image that lacks depth";
-            return Err(
-                Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")).into()
-            );
+            return Err(Error::InsufficientData(format!("--depth-from {model_name}: {message}; {CHECK_SAME_SCENE}")));
         }
         let rendered_frac = totals.n_rendered as f64 / totals.n_missing.max(1) as f64;
         let images = counted(n_images as u64, "image");

@@ -246,7 +246,12 @@ pub(crate) use bail;
 
 /// Returns an [`Error::Failed`] with a formatted message unless the condition holds.
 macro_rules! ensure {
-    ($condition:expr, $($message:tt)*) => { if !$condition { $crate::error::bail!($($message)*) } };
+    ($condition:expr, $($message:tt)*) => {
+        if $condition {
+        } else {
+            $crate::error::bail!($($message)*)
+        }
+    };
 }
 pub(crate) use ensure;
 

@@ -35,9 +35,7 @@ impl Replay {
         model_spec.check().map_err(|error| Error::BadInput(format!("{}: line 1: {error}", path.display())))?;
         let replay = Self { path: path.to_owned(), decisions, model_spec };
         if replay.decisions.pushed().next().is_none() {
-            return Err(
-                Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())).into()
-            );
+            return Err(Error::InsufficientData(format!("{} contains no keyframe, nothing to replay", replay.name())));
         }
         Ok(replay)
     }
@@ -134,8 +132,7 @@ impl Replay {
                         "{} requires step {}, but there is nothing to train on",
                         self.name(),
                         entry.step
-                    ))
-                    .into());
+                    )));
                 }
             }
             if stop.requested() {

@@ -108,7 +108,7 @@ pub fn expect_model(model: &Path) -> crate::Result<()> {
             single_files.map(|file| format!("{} (.{})", file.description, file.extensions.join(", ."))).collect();
         let described = listed(&described.iter().map(String::as_str).collect::<Vec<_>>(), "or");
         let message = format!("{shown} is not {described}; for a saved model, give its folder");
-        return Err(Error::BadInput(message).into());
+        return Err(Error::BadInput(message));
     }
     Ok(())
 }
@@ -218,7 +218,7 @@ impl CreatedFolders {
 fn make(requested: Option<&Path>) -> crate::Result<PathBuf> {
     if let Some(folder) = requested {
         if folder.to_str().is_none() {
-            return Err(Error::BadInput(format!("--out {}: the name must be valid UTF-8", folder.display())).into());
+            return Err(Error::BadInput(format!("--out {}: the name must be valid UTF-8", folder.display())));
         }
         check_no_model(folder)?;
         std::fs::create_dir_all(folder).with_context(|| format!("cannot create the folder {}", folder.display()))?;
@@ -264,7 +264,7 @@ fn lock(folder: &Path) -> crate::Result<()> {
         Ok(()) => std::mem::forget(file), // The system releases it when the process ends in any way.
         Err(std::fs::TryLockError::WouldBlock) => {
             let message = format!("--out {}: another run uses this folder; give another one", folder.display());
-            return Err(Error::BadInput(message).into());
+            return Err(Error::BadInput(message));
         }
         Err(std::fs::TryLockError::Error(error)) => log::debug!("cannot lock {}: {error}", path.display()),
     }

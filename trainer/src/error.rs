@@ -226,7 +226,7 @@ pub enum Error {
         /// What to do instead, as the end of the sentence.
         hint: &'static str,
         /// Cause.
-        source: Box<Error>,
+        source: Box<Self>,
     },
     /// A mesh has no triangles left after simplification.
     #[error("no triangles are left at a cell width of {cell_m} m")]

@@ -10,6 +10,13 @@ use serde_json::Value;
 use std::path::Path;
 use std::sync::Arc;
 
+/// Creates an untrained model.
+pub type StartModel = fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>;
+/// Restores a model from a checkpoint; the keyframes must contain those it was trained on.
+pub type ResumeModel = fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>;
+/// Loads a saved model from a folder or a single file.
+pub type LoadModel = fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>;
+
 /// A method that models can be trained with.
 pub struct MethodEntry {
     /// Name in files and on the command line.
@@ -38,12 +45,12 @@ pub struct MethodEntry {
     /// Fails if options are invalid.
     pub check_options: fn(&ModelOptions) -> Result<(), Error>,
     /// Creates an untrained model.
-    pub start: fn(Arc<Gpu>, &ModelOptions) -> Result<Box<dyn Method>, Error>,
+    pub start: StartModel,
     /// Restores a model from a checkpoint, whose `state.options` are [`ModelOptions`]. The keyframes must contain all
     /// that the model was trained on.
-    pub resume: fn(Arc<Gpu>, &Checkpoint, &[Arc<Keyframe>]) -> Result<ResumedModel, Error>,
+    pub resume: ResumeModel,
     /// Loads a saved model from its folder, or from a single file.
-    pub load: fn(Arc<Gpu>, &Path) -> Result<Box<dyn Method>, Error>,
+    pub load: LoadModel,
 }
 
 /// Files that are models by themselves.

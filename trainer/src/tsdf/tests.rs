@@ -1,5 +1,4 @@
 //! Tests of the whole model: rendering, carving, memory limits, saving and resuming.
-#![expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "fractions of small counts")]
 
 use super::{TsdfModel, TsdfOptions};
 use crate::checkpoint::Checkpoint;
