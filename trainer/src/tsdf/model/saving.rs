@@ -5,6 +5,7 @@ use super::checkpoint::{METHOD, invalid_state};
 use crate::checkpoint::{Array, Checkpoint};
 use crate::gpu::Gpu;
 use crate::model_metadata::METADATA_FILE;
+use crate::model_options::CommonOptions;
 use crate::tsdf::files::{BLOCKS_FILE, MESH_GLB, MESH_PLY};
 use crate::tsdf::mesh::{write_glb, write_ply};
 use crate::{Error, Method};
@@ -41,7 +42,10 @@ impl TsdfModel {
         write_ply(&folder.join(MESH_PLY), &mesh)?;
         write_glb(&folder.join(MESH_GLB), &mesh)?;
         let blocks = folder.join(BLOCKS_FILE);
-        let (state, arrays) = self.state()?;
+        let (mut state, arrays) = self.state()?;
+        // The other common options do not affect a field: equal fields give equal files, whatever the planned steps.
+        let common = CommonOptions { max_bytes: self.options.common.max_bytes, ..CommonOptions::default() };
+        state["options"]["common"] = serde_json::to_value(common).map_err(|error| invalid_state(error.to_string()))?;
         let arrays = arrays.into_iter().map(deflated).collect::<std::io::Result<Vec<Array>>>();
         let arrays = arrays.map_err(|source| write_error(&blocks, source))?;
         Checkpoint::new(METHOD, state, arrays).write(&blocks)?;
