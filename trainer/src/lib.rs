@@ -29,6 +29,7 @@ pub mod request;
 pub mod sort;
 pub mod splat;
 pub mod spz;
+mod submits;
 #[cfg(test)]
 #[path = "../../tests/common/test_data.rs"]
 mod test_data;

@@ -20,6 +20,7 @@ mod options;
 mod params;
 mod passes;
 pub mod reference;
+mod schedule;
 mod seed;
 mod snapshot;
 mod trainer;

@@ -3,31 +3,31 @@
 
 use super::SplatTrainer;
 use crate::Error;
-use crate::splat::buffers::SplatBuffers;
-use crate::splat::camera_params::CameraParams;
 use crate::splat::params::status;
-use crate::splat::seed::Seeder;
-use crate::splat::views::TrainView;
+use crate::splat::schedule::Schedule;
 use calibration::{Alignment, ParamSet, alignment_step};
+use keyframe::Keyframe;
+use std::sync::Arc;
 
 impl SplatTrainer {
     /// Number of steps until alignment is due.
     pub(super) fn steps_to_alignment(&self) -> u64 {
-        if self.alignment_task.is_done() { u64::MAX } else { self.alignment_step().saturating_sub(self.step).max(1) }
+        let is_done = self.alignment_task.is_done();
+        if is_done { u64::MAX } else { self.alignment_step().saturating_sub(self.schedule.step).max(1) }
     }
 
     fn alignment_step(&self) -> u64 {
-        alignment_step(self.gpu.is_software(), self.options.n_planned_steps)
+        alignment_step(self.recorder.gpu.is_software(), self.options.n_planned_steps)
     }
 
     /// Starts alignment, or applies its result when due.
     pub(super) fn align_when_due(&mut self) -> Result<(), Error> {
         if self.alignment_task.is_requested() {
-            let views = self.views.iter().map(|view| view.keyframe.clone());
-            let validation = self.trials.validation.iter().map(|validation| validation.keyframe.clone());
-            self.alignment_task.begin(views.chain(validation).collect(), &self.options.align);
+            let validation = self.trials.validation.iter().map(|validation| &validation.keyframe);
+            let keyframes = self.views.keyframes().chain(validation).cloned().collect();
+            self.alignment_task.begin(keyframes, &self.options.align);
         }
-        if self.step < self.alignment_step() || self.alignment_task.is_done() {
+        if self.schedule.step < self.alignment_step() || self.alignment_task.is_done() {
             return Ok(());
         }
         if self.alignment_task.finish()? {
@@ -42,23 +42,21 @@ impl SplatTrainer {
         log::info!("restarting training with corrected cameras");
         let poses = ParamSet { image_poses: true, ..ParamSet::default() };
         if self.alignment_task.result().is_some_and(Alignment::has_image_poses) && self.trials.remove_candidate(poses) {
-            self.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
+            self.model.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
         }
-        self.step_millis = 0.0;
-        self.passes.clear_bindings();
-        self.splats = SplatBuffers::new(&self.gpu, 1, self.options.sh_degree)?;
-        self.write_n_splats();
-        self.gpu.write(&self.learn_status, 4 * status::STEP as u64, &[0; 4]);
-        self.cameras = CameraParams::new(&self.gpu, self.cameras.set)?;
-        self.seeder = Seeder::default();
-        self.unseeded.clear();
+        self.optimizer.submits.reset_time();
+        self.recorder.passes.clear_bindings();
+        self.model.reset(&self.recorder.gpu, self.options.sh_degree)?;
+        self.optimizer.write_counter(&self.recorder.gpu, status::STEP, 0);
         for validation in &mut self.trials.validation {
             validation.keyframe = self.alignment_task.corrected(&validation.keyframe);
         }
-        self.pending = self.views.iter().map(|view| self.alignment_task.corrected(&view.keyframe)).collect();
-        self.views = self.pending.iter().cloned().map(TrainView::new).collect();
-        self.n_reverted_steps = self.n_reverted_steps.wrapping_add(self.step);
-        (self.step, self.schedule_start, self.last_growth_step) = (0, 0, 0);
+        let corrected: Vec<Arc<Keyframe>> =
+            self.views.keyframes().map(|keyframe| self.alignment_task.corrected(keyframe)).collect();
+        self.views.replace(corrected.iter().cloned());
+        self.seeding.restart(corrected);
+        self.trials.n_reverted_steps = self.trials.n_reverted_steps.wrapping_add(self.schedule.step);
+        self.schedule = Schedule::new(self.options.n_planned_steps);
         self.prepare_training()
     }
 }
