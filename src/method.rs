@@ -46,7 +46,7 @@ impl ModelSpec {
     pub(crate) fn start(self, gpu: Arc<Gpu>) -> anyhow::Result<Box<dyn Method>> {
         let Self { kind, options } = self;
         Ok(match kind {
-            ModelKind::Splat => Box::new(SplatTrainer::new(gpu, options)?),
+            ModelKind::Splat => aligned(SplatTrainer::new(gpu.clone(), options.clone())?, &gpu, options),
             ModelKind::Tsdf => aligned(TsdfModel::new(gpu.clone(), tsdf_options(&options))?, &gpu, options),
             ModelKind::Nerf => aligned(NerfModel::new(gpu.clone(), nerf_options(&options))?, &gpu, options),
         })
@@ -95,9 +95,10 @@ pub(crate) fn resume(gpu: Arc<Gpu>, checkpoint: &Checkpoint, keyframes: &[Arc<Ke
         let (method, untrained) = Aligned::resume(checkpoint, keyframes, resume)?;
         return Ok(Resumed { model_spec: ModelSpec { kind: ModelKind::Nerf, options }, method, untrained });
     }
-    let (model, untrained) = SplatTrainer::resume(gpu, checkpoint, keyframes)?;
-    let model_spec = ModelSpec { kind: ModelKind::Splat, options: model.options().clone() };
-    Ok(Resumed { model_spec, method: Box::new(model), untrained })
+    let model_spec = ModelSpec { kind: ModelKind::Splat, options: saved_options(checkpoint)? };
+    let resume = |own: &Checkpoint, keyframes: &[_]| SplatTrainer::resume(gpu, own, keyframes);
+    let (method, untrained) = Aligned::resume(checkpoint, keyframes, resume)?;
+    Ok(Resumed { model_spec, method, untrained })
 }
 
 /// The options of the model in a checkpoint.
@@ -163,8 +164,10 @@ pub(crate) fn load_with_bounds(gpu: Arc<Gpu>, model: &Path, needs_bounds: bool) 
     let splats = splat_file::read(model)?;
     let bounds = if needs_bounds { Bounds::of_splats(&splats) } else { None };
     let trainer = SplatTrainer::from_arrays(gpu, SplatOptions::default(), &splats)?;
-    let method: Box<dyn Method> =
-        Box::new(if model.is_dir() { trainer.with_saved_corrections(model)? } else { trainer });
+    let method: Box<dyn Method> = match model.is_dir() {
+        true => Box::new(Aligned::load(trainer.with_saved_corrections(model)?, model)?),
+        false => Box::new(trainer),
+    };
     Ok(LoadedModel { kind: ModelKind::Splat, method, bounds })
 }
 

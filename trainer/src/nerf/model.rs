@@ -244,7 +244,7 @@ impl NerfModel {
 }
 
 impl Restartable for NerfModel {
-    fn restart(&mut self) -> Result<(), Error> {
+    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let compiled = self.compiled.take();
         let is_watched = self.submits.is_watched();

@@ -41,8 +41,8 @@ pub struct SplatOptions {
     pub coarse_steps: Option<[u64; 2]>,
     /// Camera parameters that are optimized with the splats.
     pub cameras: CameraRefinement,
-    /// Camera parameters that are estimated by registering keyframes with depth, before the splats are trained on
-    /// them.
+    /// Camera parameters that are estimated by registering keyframes with depth, before the model is trained on them;
+    /// see [`crate::Aligned`].
     #[serde(default)]
     pub align: CameraRefinement,
     /// Maximum number of splats added for one depth image; `None` selects fewer on a CPU.

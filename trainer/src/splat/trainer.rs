@@ -1,6 +1,5 @@
 //! The splat model as a [`Method`]: composes the parts of training and drawing.
 
-mod alignment_task;
 mod checkpoint;
 mod lazy_pipelines;
 mod learning_rates;
@@ -30,9 +29,9 @@ use crate::checkpoint::PendingCheckpoint;
 use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::read_metadata;
 use crate::view::projections;
-use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, ply};
+use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, Restartable, ply};
 use calibration::{
-    Alignment, AlignmentTask, CalibratedCamera, CameraCorrection, CameraRefinement, ParamSet, Trial, TrialReport,
+    Alignment, CalibratedCamera, CameraCorrection, ParamSet, Trial, TrialReport,
 };
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
@@ -59,7 +58,6 @@ pub struct SplatTrainer {
     views: ViewSet,
     seeding: Seeding,
     trials: SplatTrials,
-    alignment_task: AlignmentTask,
     /// Corrections of the saved model that this one was loaded from.
     saved_corrections: BTreeMap<String, CameraCorrection>,
 }
@@ -72,20 +70,15 @@ impl SplatTrainer {
     }
 
     fn with_pipelines(gpu: Arc<Gpu>, options: SplatOptions, pipelines: LazyPipelines) -> Result<Self, Error> {
-        let params = match &options.cameras {
-            CameraRefinement::Always(params) => *params,
-            CameraRefinement::Try(_) => ParamSet::default(),
-        };
         let is_software = gpu.is_software();
         Ok(Self {
             renderer: Renderer::new(&gpu)?,
-            model: TrainedModel::new(&gpu, options.sh_degree, options.cap(), params)?,
+            model: TrainedModel::new(&gpu, &options)?,
             optimizer: Optimizer::new(&gpu, &options, pipelines)?,
             schedule: Schedule::new(options.n_planned_steps),
             views: ViewSet::new(&options, is_software),
             seeding: Seeding::new(&options, is_software),
             trials: SplatTrials::new(&options.cameras, options.count),
-            alignment_task: AlignmentTask::new(&options.align),
             saved_corrections: BTreeMap::new(),
             recorder: Recorder::new(gpu),
             options,
@@ -103,9 +96,7 @@ impl SplatTrainer {
 
     /// Loads the camera corrections of a saved model from its `model.json`.
     pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
-        let metadata = read_metadata(&folder.join("model.json"))?;
-        self.saved_corrections = metadata.cameras;
-        self.alignment_task = AlignmentTask::Done(metadata.alignment);
+        self.saved_corrections = read_metadata(&folder.join("model.json"))?.cameras;
         Ok(self)
     }
 
@@ -200,6 +191,30 @@ impl SplatTrainer {
     }
 }
 
+impl Restartable for SplatTrainer {
+    fn restart(&mut self, alignment: &Alignment) -> Result<(), Error> {
+        self.finish_in_flight()?;
+        let Self { options, recorder, .. } = self;
+        recorder.passes.clear_bindings();
+        let (gpu, is_software) = (&recorder.gpu, recorder.gpu.is_software());
+        self.model = TrainedModel::new(gpu, options)?;
+        self.optimizer.restart(gpu);
+        self.schedule = Schedule::new(options.n_planned_steps);
+        self.views = ViewSet::new(options, is_software);
+        self.seeding = Seeding::new(options, is_software);
+        self.trials = SplatTrials::new(&options.cameras, options.count);
+        let poses = ParamSet { image_poses: true, ..ParamSet::default() };
+        if alignment.has_image_poses() && self.trials.remove_candidate(poses) {
+            self.model.cameras.enable(poses); // Depth gives image poses to a few millimeters; the splats refine them.
+        }
+        Ok(())
+    }
+
+    fn learned_correction(&mut self, camera: &str) -> Result<Option<CameraCorrection>, Error> {
+        Ok(self.camera_corrections()?.remove(camera))
+    }
+}
+
 impl Method for SplatTrainer {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
         self.finish_in_flight()?; // Makes the step of its arrival exact.
@@ -214,7 +229,6 @@ impl Method for SplatTrainer {
             );
             return Ok(());
         }
-        let keyframe = self.alignment_task.corrected(&keyframe);
         if keyframe.split == Split::Validation && self.trials.holds_validation() {
             self.trials.validation.push(ValidationImage { keyframe, image: None });
             return Ok(());
@@ -281,12 +295,13 @@ impl Method for SplatTrainer {
     }
 
     fn calibrated_camera(&mut self, keyframe: &Keyframe) -> Result<CalibratedCamera, Error> {
-        let learned = self.camera_corrections()?;
-        Ok(self.alignment_task.calibrated_camera(keyframe, learned.get(keyframe.camera.as_ref())))
+        let corrections = self.camera_corrections()?;
+        let correction = corrections.get(keyframe.camera.as_ref());
+        Ok(correction.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe)))
     }
 
     fn alignment(&self) -> Option<&Alignment> {
-        self.alignment_task.result()
+        None
     }
 
     fn progress(&self) -> Progress {
@@ -316,7 +331,6 @@ impl Method for SplatTrainer {
             "sh_degree": arrays.sh_degree,
             "seed": self.options.seed,
             "trials": self.report(),
-            "alignment": self.alignment_task.result(),
             "cameras": self.camera_corrections()?,
         });
         let path = folder.join("model.json");

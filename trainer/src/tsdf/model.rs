@@ -242,7 +242,7 @@ impl TsdfModel {
 }
 
 impl Restartable for TsdfModel {
-    fn restart(&mut self) -> Result<(), Error> {
+    fn restart(&mut self, _alignment: &Alignment) -> Result<(), Error> {
         self.finish_in_flight()?;
         let is_watched = self.fusion.submits.is_watched();
         *self = Self::new(self.gpu.clone(), self.options.clone())?;

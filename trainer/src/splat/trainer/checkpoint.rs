@@ -6,13 +6,14 @@ use crate::Error;
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::Gpu;
 use crate::keyframe_signature::{self, KeyframeSignature};
+use crate::splat::buffers::SplatBuffers;
 use crate::splat::camera_params::CameraSlots;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
 use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial, Scores};
-use calibration::{Alignment, AlignmentTask, Candidate, ParamSet, Trial};
+use calibration::{Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
@@ -29,9 +30,27 @@ struct SavedState {
     /// Options with the values chosen for the adapter.
     options: SplatOptions,
     step: u64,
+    model: ModelState,
+    n_non_finite: u32,
+    /// Training views in order, which determines the order of training.
+    views: Vec<KeyframeSignature>,
+    /// Indices of the views that wait for their splats.
+    unseeded: Vec<usize>,
+    /// Slots of the parameters of cameras and images.
+    slots: CameraSlots,
+    remaining_trials: RemainingTrials,
+    finished_trials: Vec<Trial>,
+    /// A trial in progress.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    trial: Option<TrialState>,
+}
+
+/// What a trial restores, except for the arrays and the step.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ModelState {
     schedule_start: u64,
     last_growth_step: u64,
-    n_non_finite: u32,
     n_splats: u32,
     capacity: u32,
     sh_degree: u32,
@@ -39,22 +58,8 @@ struct SavedState {
     scene_size_m: f64,
     has_depth: bool,
     n_seeds: u64,
-    /// Training views in order, which determines the order of training.
-    views: Vec<KeyframeSignature>,
-    /// Indices of the views that wait for their splats.
-    unseeded: Vec<usize>,
-    /// Slots of the parameters of cameras and images.
-    slots: CameraSlots,
-    /// Camera parameters being optimized, and the trials that remain.
+    /// Camera parameters being optimized.
     params: ParamSet,
-    remaining_trials: RemainingTrials,
-    finished_trials: Vec<Trial>,
-    /// Whether alignment is finished, and its result. The signatures of the views are those of corrected keyframes.
-    is_aligned: bool,
-    alignment: Option<Alignment>,
-    /// A trial in progress.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    trial: Option<TrialState>,
 }
 
 /// A trial in progress. The half in training is the state above; the arrays of the other state have a prefix.
@@ -67,7 +72,9 @@ struct TrialState {
     /// Scores of the first half, once it is finished.
     baseline_scores: Option<Vec<(ImageKey, f64)>>,
     arrivals: Vec<ArrivalState>,
-    other: OtherHalf,
+    other_step: u64,
+    other: ModelState,
+    n_other_param_bytes: u64,
 }
 
 /// Camera name and stamp in nanoseconds.
@@ -81,29 +88,43 @@ struct ArrivalState {
     image: KeyframeSignature,
 }
 
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct OtherHalf {
-    step: u64,
-    schedule_start: u64,
-    last_growth_step: u64,
-    n_splats: u32,
-    capacity: u32,
-    sh_degree: u32,
-    active_degree: u32,
-    scene_size_m: f64,
-    has_depth: bool,
-    n_seeds: u64,
-    params: ParamSet,
-    n_param_bytes: u64,
-}
-
 fn image((camera, stamp): &(Arc<str>, Stamp)) -> ImageKey {
     (camera.to_string(), stamp.0)
 }
 
 fn id((camera, nanos): ImageKey) -> (Arc<str>, Stamp) {
     (camera.into(), Stamp(nanos))
+}
+
+impl ModelState {
+    fn of(splats: &SplatBuffers, params: ParamSet, schedule: &Schedule, scene: &ObservedScene) -> Self {
+        Self {
+            schedule_start: schedule.start,
+            last_growth_step: schedule.last_growth_step,
+            n_splats: splats.n_splats,
+            capacity: splats.capacity,
+            sh_degree: splats.sh_degree,
+            active_degree: splats.active_degree(),
+            scene_size_m: scene.size_m,
+            has_depth: scene.has_depth,
+            n_seeds: scene.seeder.n_seeds() as u64,
+            params,
+        }
+    }
+
+    fn splats(&self, gpu: &Gpu, checkpoint: &Checkpoint, prefix: &str) -> Result<SplatBuffers, Error> {
+        read_splats(gpu, checkpoint, prefix, [self.n_splats, self.capacity, self.sh_degree, self.active_degree])
+    }
+
+    fn schedule(&self, step: u64, n_planned_steps: u64) -> Schedule {
+        let (start, last_growth_step) = (self.schedule_start, self.last_growth_step);
+        Schedule { step, start, last_growth_step, ..Schedule::new(n_planned_steps) }
+    }
+
+    fn scene(&self, checkpoint: &Checkpoint, prefix: &str) -> Result<ObservedScene, Error> {
+        let seeder = read_seeds(checkpoint, prefix, self.n_seeds)?;
+        Ok(ObservedScene { seeder, size_m: self.scene_size_m, has_depth: self.has_depth })
+    }
 }
 
 impl TrialState {
@@ -119,20 +140,9 @@ impl TrialState {
                 .iter()
                 .map(|Arrival { step, keyframe }| ArrivalState { step: *step, image: KeyframeSignature::of(keyframe) })
                 .collect(),
-            other: OtherHalf {
-                step: schedule.step,
-                schedule_start: schedule.start,
-                last_growth_step: schedule.last_growth_step,
-                n_splats: splats.n_splats,
-                capacity: splats.capacity,
-                sh_degree: splats.sh_degree,
-                active_degree: splats.active_degree(),
-                scene_size_m: scene.size_m,
-                has_depth: scene.has_depth,
-                n_seeds: scene.seeder.n_seeds() as u64,
-                params: *params,
-                n_param_bytes: param_buffer.bytes(),
-            },
+            other_step: schedule.step,
+            other: ModelState::of(splats, *params, schedule, scene),
+            n_other_param_bytes: param_buffer.bytes(),
         }
     }
 
@@ -141,31 +151,15 @@ impl TrialState {
         self,
         gpu: &Gpu,
         checkpoint: &Checkpoint,
-        schedule: Schedule,
+        n_planned_steps: u64,
         keyframes: &[Arc<Keyframe>],
     ) -> Result<(RunningTrial, Option<Scores>), Error> {
-        let other = self.other;
-        let size = [other.n_splats, other.capacity, other.sh_degree, other.active_degree];
+        let params = checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), self.n_other_param_bytes)?;
         let state = Snapshot {
-            splats: read_splats(gpu, checkpoint, OTHER, size)?,
-            cameras: (
-                other.params,
-                gpu.storage_with(
-                    "splat.camera_params",
-                    checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), other.n_param_bytes)?,
-                )?,
-            ),
-            schedule: Schedule {
-                step: other.step,
-                start: other.schedule_start,
-                last_growth_step: other.last_growth_step,
-                ..schedule
-            },
-            scene: ObservedScene {
-                seeder: read_seeds(checkpoint, OTHER, other.n_seeds)?,
-                size_m: other.scene_size_m,
-                has_depth: other.has_depth,
-            },
+            splats: self.other.splats(gpu, checkpoint, OTHER)?,
+            cameras: (self.other.params, gpu.storage_with("splat.camera_params", params)?),
+            schedule: self.other.schedule(self.other_step, n_planned_steps),
+            scene: self.other.scene(checkpoint, OTHER)?,
         };
         let arrivals = self.arrivals.iter().zip(keyframes);
         let trial = RunningTrial {
@@ -197,24 +191,13 @@ impl SplatTrainer {
                 ..self.options.clone()
             },
             step: schedule.step,
-            schedule_start: schedule.start,
-            last_growth_step: schedule.last_growth_step,
+            model: ModelState::of(splats, cameras.set, schedule, scene),
             n_non_finite: u32::try_from(self.optimizer.n_non_finite).unwrap_or(u32::MAX),
-            n_splats: splats.n_splats,
-            capacity: splats.capacity,
-            sh_degree: splats.sh_degree,
-            active_degree: splats.active_degree(),
-            scene_size_m: scene.size_m,
-            has_depth: scene.has_depth,
-            n_seeds: scene.seeder.n_seeds() as u64,
             views: self.views.keyframes().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
             unseeded: self.seeding.unseeded().iter().filter_map(position_of).collect(),
             slots: cameras.slots(),
-            params: cameras.set,
             remaining_trials: self.trials.remaining_trials(),
             finished_trials: self.trials.finished.clone(),
-            is_aligned: self.alignment_task.is_done(),
-            alignment: self.alignment_task.result().cloned(),
             trial: self.trials.running_trial().map(|(trial, baseline_db)| TrialState::of(trial, baseline_db)),
         };
         let state =
@@ -252,18 +235,12 @@ impl SplatTrainer {
         }
         let state: SavedState =
             serde_json::from_value(checkpoint.state.clone()).map_err(|error| invalid_state(error.to_string()))?;
-        let alignment_task = if state.is_aligned {
-            AlignmentTask::Done(state.alignment.clone())
-        } else {
-            AlignmentTask::new(&state.options.align)
-        };
         // In the second half of a trial, some keyframes have yet to arrive again; in the first half, they are views.
         let arrivals = || state.trial.iter().flat_map(|trial| &trial.arrivals).map(|arrival| &arrival.image);
         let is_second_half = state.trial.as_ref().is_some_and(|trial| trial.baseline_scores.is_some());
         let yet_to_arrive = arrivals().filter(|_| is_second_half);
         let known: Vec<KeyframeSignature> = state.views.iter().chain(yet_to_arrive).cloned().collect();
-        let (mut views, untrained) =
-            keyframe_signature::match_keyframes(&known, keyframes, |keyframe| alignment_task.corrected(keyframe))?;
+        let (mut views, untrained) = keyframe_signature::match_keyframes(&known, keyframes)?;
         let yet_to_arrive = views.split_off(state.views.len());
         let arrived =
             arrivals().filter(|_| !is_second_half).map(|image| state.views.iter().position(|view| view == image));
@@ -279,25 +256,19 @@ impl SplatTrainer {
 
         let mut trainer = Self::new(gpu, state.options)?;
         let gpu = &trainer.recorder.gpu;
-        let size = [state.n_splats, state.capacity, state.sh_degree, state.active_degree];
-        trainer.model.splats = read_splats(gpu, checkpoint, "", size)?;
+        trainer.model.splats = state.model.splats(gpu, checkpoint, "")?;
         trainer.optimizer.write_counter(gpu, status::STEP, step);
         trainer.optimizer.write_counter(gpu, status::N_NON_FINITE, state.n_non_finite);
         trainer.optimizer.n_non_finite = state.n_non_finite.into();
-        trainer.model.cameras.restore(gpu, &state.slots, state.params, checkpoint)?;
+        trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
         trainer.trials.restore(state.remaining_trials, state.finished_trials);
         if let Some(trial) = state.trial {
-            let (trial, baseline_db) = trial.restored(gpu, checkpoint, trainer.schedule, &arrivals)?;
+            let (trial, baseline_db) = trial.restored(gpu, checkpoint, trainer.options.n_planned_steps, &arrivals)?;
             trainer.trials.restore_trial(trial, baseline_db);
         }
         trainer.views.replace(views);
-        trainer.alignment_task = alignment_task;
-        let seeder = read_seeds(checkpoint, "", state.n_seeds)?;
-        let scene = ObservedScene { seeder, size_m: state.scene_size_m, has_depth: state.has_depth };
-        trainer.seeding.restore(scene, unseeded);
-        trainer.schedule.step = state.step;
-        trainer.schedule.start = state.schedule_start;
-        trainer.schedule.last_growth_step = state.last_growth_step;
+        trainer.seeding.restore(state.model.scene(checkpoint, "")?, unseeded);
+        trainer.schedule = state.model.schedule(state.step, trainer.options.n_planned_steps);
         Ok((trainer, untrained))
     }
 }

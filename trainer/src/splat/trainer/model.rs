@@ -8,9 +8,10 @@ use crate::splat::arrays::SplatArrays;
 use crate::splat::buffers::{SplatBuffers, n_sh_rest};
 use crate::splat::camera_params::CameraParams;
 use crate::splat::kernels::LearnPipelines;
+use crate::splat::options::SplatOptions;
 use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
-use calibration::ParamSet;
+use calibration::{CameraRefinement, ParamSet};
 
 /// Standard deviation of a child's position within its parent, in standard deviations of the parent.
 const CHILD_SPREAD: f32 = 0.5;
@@ -29,20 +30,17 @@ pub(super) struct TrainedModel {
 
 impl TrainedModel {
     /// A model without splats.
-    pub(super) fn new(gpu: &Gpu, sh_degree: u32, max_splats: u32, params: ParamSet) -> Result<Self, Error> {
+    pub(super) fn new(gpu: &Gpu, options: &SplatOptions) -> Result<Self, Error> {
+        let params = match &options.cameras {
+            CameraRefinement::Always(params) => *params,
+            CameraRefinement::Try(_) => ParamSet::default(),
+        };
         Ok(Self {
-            splats: SplatBuffers::new(gpu, 1, sh_degree)?,
+            splats: SplatBuffers::new(gpu, 1, options.sh_degree)?,
             cameras: CameraParams::new(gpu, params)?,
-            max_splats,
+            max_splats: options.cap(),
             is_full: false,
         })
-    }
-
-    /// Removes all splats and resets the camera parameters.
-    pub(super) fn reset(&mut self, gpu: &Gpu, sh_degree: u32) -> Result<(), Error> {
-        self.splats = SplatBuffers::new(gpu, 1, sh_degree)?;
-        self.cameras = CameraParams::new(gpu, self.cameras.set)?;
-        Ok(())
     }
 
     /// Adds splats, up to the limit.

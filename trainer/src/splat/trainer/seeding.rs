@@ -3,7 +3,7 @@
 use super::view_set::ViewSet;
 use crate::splat::arrays::SplatArrays;
 use crate::splat::options::SplatOptions;
-use crate::splat::seed::{Density, Seeder};
+use crate::splat::seed::Density;
 use crate::splat::snapshot::ObservedScene;
 use keyframe::Keyframe;
 use std::sync::Arc;
@@ -55,13 +55,6 @@ impl Seeding {
     pub(super) fn remove(&mut self, is_removed: impl Fn(&Keyframe) -> bool) {
         self.pending.retain(|keyframe| !is_removed(keyframe));
         self.unseeded.retain(|keyframe| !is_removed(keyframe));
-    }
-
-    /// Forgets all seeds; `keyframes` get new ones.
-    pub(super) fn restart(&mut self, keyframes: Vec<Arc<Keyframe>>) {
-        self.scene.seeder = Seeder::default();
-        self.unseeded.clear();
-        self.pending = keyframes;
     }
 
     /// Discs at new depth readings of the keyframes that arrived since the last call; `None` if none arrived. `views`

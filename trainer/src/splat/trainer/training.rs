@@ -27,7 +27,6 @@ impl SplatTrainer {
             return Ok(0);
         }
         let learn = self.learn()?;
-        self.align_when_due()?;
         self.try_when_due()?;
         self.grow_when_due(&learn)?;
         let n_steps = self.n_steps_of_submit(n);
@@ -85,7 +84,6 @@ impl SplatTrainer {
             .min(by_time.clamp(1, MAX_STEPS_PER_SUBMIT))
             .min(self.schedule.steps_to_next_change())
             .min(self.trials.steps_left(self.schedule.step))
-            .min(self.steps_to_alignment())
     }
 
     /// Uploads the settings of the next steps.

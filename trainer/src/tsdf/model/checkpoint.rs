@@ -65,7 +65,7 @@ impl TsdfModel {
         let mut model = Self::of_state(gpu, checkpoint)?;
         let KeyframeQueue { pending, fused, unmatched, .. } = &mut model.queue;
         let known: Vec<KeyframeSignature> = fused.iter().chain(&*unmatched).cloned().collect();
-        let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes, Arc::clone)?;
+        let (mut found, rest) = keyframe_signature::match_keyframes(&known, keyframes)?;
         *pending = found.split_off(fused.len()).into();
         unmatched.clear();
         Ok((model, rest))
