@@ -103,8 +103,15 @@ impl<M: Restartable + 'static> Aligned<M> {
             return Ok((Box::new(model), untrained));
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
-        let AlignedState { choice, is_aligned, alignment, alignment_step, n_steps_before_restart, keyframes: ids, n_begun } =
-            serde_json::from_value(state).map_err(invalid_state)?;
+        let AlignedState {
+            choice,
+            is_aligned,
+            alignment,
+            alignment_step,
+            n_steps_before_restart,
+            keyframes: ids,
+            n_begun,
+        } = serde_json::from_value(state).map_err(invalid_state)?;
         let alignment_task = if is_aligned { AlignmentTask::Done(alignment) } else { AlignmentTask::new(&choice) };
         let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
@@ -113,15 +120,8 @@ impl<M: Restartable + 'static> Aligned<M> {
         let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
         // These are corrected when they are pushed again.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
-        let aligned = Self {
-            model,
-            choice,
-            alignment_task,
-            original_keyframes,
-            n_begun,
-            alignment_step,
-            n_steps_before_restart,
-        };
+        let aligned =
+            Self { model, choice, alignment_task, original_keyframes, n_begun, alignment_step, n_steps_before_restart };
         Ok((Box::new(aligned), untrained))
     }
 
@@ -265,7 +265,11 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             alignment: self.alignment_task.result().cloned(),
             alignment_step: self.alignment_step,
             n_steps_before_restart: self.n_steps_before_restart,
-            keyframes: self.original_keyframes.iter().map(|keyframe| (keyframe.camera.to_string(), keyframe.stamp.0)).collect(),
+            keyframes: self
+                .original_keyframes
+                .iter()
+                .map(|keyframe| (keyframe.camera.to_string(), keyframe.stamp.0))
+                .collect(),
             n_begun: self.n_begun,
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };

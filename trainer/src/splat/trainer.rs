@@ -30,9 +30,7 @@ use crate::gpu::{Gpu, PassTiming};
 use crate::model_metadata::read_metadata;
 use crate::view::projections;
 use crate::{Error, Method, Picture, Progress, Projection, RenderRequest, Restartable, ply};
-use calibration::{
-    Alignment, CalibratedCamera, CameraCorrection, ParamSet, Trial, TrialReport,
-};
+use calibration::{Alignment, CalibratedCamera, CameraCorrection, ParamSet, Trial, TrialReport};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use lazy_pipelines::LazyPipelines;
