@@ -1,5 +1,6 @@
 //! Errors in rig files.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 /// Why a rig file was rejected. The message names the file, the line and the key.
@@ -17,7 +18,7 @@ pub(crate) enum ConfigError {
     UnknownKey { at: SourceLocation, key: String, nearest: Option<String> },
     /// A required key.
     #[error("{file}: the key {key:?} is missing: {meaning}")]
-    Missing { file: String, key: String, meaning: &'static str },
+    Missing { file: String, key: String, meaning: Cow<'static, str> },
     /// A value outside the allowed ones.
     #[error("{at}: {key} is {got}, allowed: {allowed}")]
     InvalidValue { at: SourceLocation, key: String, got: String, allowed: String },

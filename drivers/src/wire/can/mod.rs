@@ -1,18 +1,14 @@
-//! Motors on a CAN bus: frames as plain data, and the protocols of several motor families.
+//! CAN frames as plain data, and the encodings that several motor families share. The codec of a family is in its
+//! folder of [`can`](crate::can).
 //!
 //! Every codec is pure: it converts between a [`Frame`] and SI values. Values outside the range of a field are
 //! clamped where the manufacturers' own examples clamp (MIT packing, Robstride, ODrive's feedforward), and are errors
 //! everywhere else. NaN is always an error.
 
 pub mod canopen;
-pub mod cia402;
-pub mod damiao;
 pub mod frame;
 pub mod mit;
-pub mod odrive;
-pub mod robstride;
 pub mod scale;
-pub mod tmotor;
 
 pub use frame::{Frame, Id};
 
@@ -109,12 +105,17 @@ pub enum CanError {
 }
 
 /// Finds the variant in `all` whose number is `raw`.
-fn decode_enum<T: Copy>(field: &'static str, raw: u32, all: &[T], number: impl Fn(T) -> u32) -> Result<T, CanError> {
+pub(crate) fn decode_enum<T: Copy>(
+    field: &'static str,
+    raw: u32,
+    all: &[T],
+    number: impl Fn(T) -> u32,
+) -> Result<T, CanError> {
     all.iter().copied().find(|known| number(*known) == raw).ok_or(CanError::Undefined { field, raw })
 }
 
 /// Returns the eight bytes of a data frame with an 11-bit or 29-bit identifier; any other frame is an error.
-fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
+pub(crate) fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[u8; 8], CanError> {
     let id = frame.id();
     if frame.is_remote() || id.is_extended() != extended {
         return Err(CanError::UnexpectedFrame { message, id: id.value() });
@@ -124,26 +125,26 @@ fn eight_bytes(frame: &Frame, message: &'static str, extended: bool) -> Result<[
 }
 
 #[cfg(test)]
-mod testing {
+pub(crate) mod testing {
     use super::{Frame, Id};
 
     /// Random numbers from a seed: the upper half of Knuth's linear congruential generator.
-    pub(super) struct Random(pub(super) u64);
+    pub(crate) struct Random(pub(crate) u64);
 
     impl Random {
-        pub(super) fn next(&mut self) -> u32 {
+        pub(crate) fn next(&mut self) -> u32 {
             self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (self.0 >> 32) as u32
         }
 
         /// A number from 0 to 1.
-        pub(super) fn unit_interval(&mut self) -> f64 {
+        pub(crate) fn unit_interval(&mut self) -> f64 {
             f64::from(self.next()) / f64::from(u32::MAX)
         }
     }
 
     /// Frames of random format, identifier, length and bytes; every fourth has the identifier `id`.
-    pub(super) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
+    pub(crate) fn random_frames(seed: u64, id: Id) -> impl Iterator<Item = Frame> {
         let mut random = Random(seed);
         (0..20_000).map(move |round| {
             let identifier = match random.next() % 2 {
@@ -164,7 +165,7 @@ mod testing {
     }
 
     /// The frame truncated to every shorter length, and twice as long as an FD frame. All of these must be rejected.
-    pub(super) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
+    pub(crate) fn truncated_and_doubled(frame: &Frame) -> Vec<Frame> {
         let bytes = [frame.data(), frame.data()].concat();
         let n_bytes = frame.data().len();
         let cut = (0..n_bytes).map(|len| Frame::classic(frame.id(), &bytes[..len]));
