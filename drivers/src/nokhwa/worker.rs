@@ -41,7 +41,7 @@ pub(super) struct Frame {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A streaming thread. After this is dropped, the thread ends as soon as its current call returns.
+/// A streaming thread.
 #[derive(Debug)]
 pub(super) struct Worker {
     shared: Arc<Shared>,
@@ -57,7 +57,7 @@ struct Shared {
 #[derive(Default)]
 struct State {
     queue: VecDeque<WorkerEvent>,
-    /// The caller has dropped the worker.
+    /// The caller has stopped the worker.
     stop: bool,
 }
 
@@ -98,10 +98,9 @@ impl Worker {
             state = self.shared.arrived.wait_timeout(state, remaining).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
-}
 
-impl Drop for Worker {
-    fn drop(&mut self) {
+    /// Ends the thread as soon as its current call returns.
+    pub(super) fn stop(&self) {
         self.shared.lock().stop = true;
     }
 }
