@@ -8,7 +8,12 @@ use crate::wire::{descriptor, foxglove, joint_state, point_cloud};
 use crate::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample};
 use crate::{can, franka, udp};
 use kinematics::{Intrinsics, JointState, Lens, Stamp, Transform};
+use mcap::Compression;
+use recompress::recompress;
 use std::path::{Path, PathBuf};
+
+#[path = "../../tests/recompress/mod.rs"]
+mod recompress;
 
 type Reader = fn(&[u8]);
 
@@ -97,7 +102,11 @@ fn write_seeds() {
     for (kind, (name, bytes)) in (0_u8..).zip(one_of_each_message()) {
         write("messages", name, &[&[kind], &bytes[..]].concat());
     }
-    write("recording", "rig.mcap", &small_recording());
+    let recording = small_recording();
+    write("recording", "rig.mcap", &recording);
+    for (name, compression) in [("rig-zstd.mcap", Compression::Zstd), ("rig-lz4.mcap", Compression::Lz4)] {
+        write("recording", name, &recompress(&recording, compression, 1000));
+    }
 }
 
 /// Small images with the header that [`pixels`] expects.
