@@ -115,7 +115,7 @@ mod tests {
     const TOLERANCE: f64 = 1e-12; // Rounding of products of poses near 1.
 
     fn bundled_rig() -> Rig {
-        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("rigs/static-arm.toml");
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs/static-arm.toml");
         Rig::load(&file, &[]).unwrap()
     }
 
