@@ -128,7 +128,7 @@ fn training_is_not_blocked_by_a_full_terminal() {
     // Like a broken connection: the terminal exists, but nothing reads it. 8 kB fill it.
     let args = ["train", "data", "--steps", "300", "--max-splats", "600", "--out", "out", "-vv"];
     let mut run = OnTerminal::start(folder, &args, true);
-    run.wait_for("step");
+    run.wait_for("of 10 images");
     let OnTerminal { child, terminal, .. } = run;
     assert_eq!(wait_for_exit(child).code(), Some(LOSS));
     drop(terminal);
