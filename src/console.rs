@@ -64,7 +64,7 @@ impl Observer for Console {
                 evaluation.seconds,
                 evaluation.step,
                 counted(evaluation.primitives, evaluation.primitive),
-                evaluation.smoothed_step_millis,
+                evaluation.step_millis.unwrap_or_default(),
                 evaluation.scores
             )),
             (SessionEvent::Finished(finished), OutputMode::Json) => {

@@ -1,9 +1,9 @@
 //! Measures the training speed of a neural field.
 
-use crate::error::Context;
 use crate::kernels::profile;
 use crate::{Error, Result};
 use serde::Serialize;
+use session::Context;
 use session::OpenGpu;
 use trainer::nerf::bench::time_steps;
 

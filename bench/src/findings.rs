@@ -1,8 +1,9 @@
 //! Writes the results of a bench: JSON with every number, charts as SVG and PNG, and an HTML page.
 
 use crate::Result;
-use crate::error::{Context, failed};
+use keyframe::failed;
 use serde_json::Value;
+use session::Context;
 use session::chart::drawing::escaped;
 use session::chart::{Chart, raster};
 use session::{Table, run_folder};

@@ -1,10 +1,11 @@
 //! Memory of this process over time, and its growth rate once all bounded stores are full.
 
 use crate::Result;
-use crate::error::{Context, failed};
-use crate::statistics::slope;
+use crate::statistics::theil_sen;
+use keyframe::failed;
 use kinematics::quantile::median;
 use serde::Serialize;
+use session::Context;
 
 /// Time after the keyframe store is full that is ignored, while buffers reach their final size.
 const SETTLE_SECS: f64 = 60.0;
@@ -76,7 +77,7 @@ pub struct Growth {
     pub to_seconds: f64,
     /// Median resident memory in that time.
     pub resident_bytes: f64,
-    /// Theil-Sen slope: the median of the slopes between all pairs of samples.
+    /// Theil-Sen slope: the median of the rates of change between all pairs of samples.
     pub bytes_per_hour: f64,
     /// The slope as a percentage of `resident_bytes`.
     pub percent_per_hour: f64,
@@ -100,7 +101,7 @@ impl Growth {
         };
         let groups: Vec<(f64, f64)> = counted.chunks(counted.len().div_ceil(MAX_GROUPS)).filter_map(of_group).collect();
         let resident: Vec<f64> = counted.iter().map(|sample| sample.resident_bytes as f64).collect();
-        let (resident_bytes, bytes_per_hour) = (median(&resident)?, slope(&groups)? * SECS_PER_HOUR);
+        let (resident_bytes, bytes_per_hour) = (median(&resident)?, theil_sen(&groups)? * SECS_PER_HOUR);
         Some(Self {
             store_was_full: full_at.is_some(),
             from_seconds: counted.first()?.seconds,

@@ -1,8 +1,8 @@
 //! Measures the speed of the splat kernels.
 
-use crate::error::Context;
 use crate::{Error, Result};
 use serde::Serialize;
+use session::Context;
 use session::OpenGpu;
 use std::path::PathBuf;
 use std::time::Duration;

@@ -32,7 +32,6 @@ pub mod ablation;
 pub mod budget;
 pub mod curve;
 mod disturb;
-mod error;
 pub mod field;
 mod findings;
 mod growth;

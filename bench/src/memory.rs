@@ -125,7 +125,7 @@ impl MemoryRun {
             title: "Memory of a long run".to_owned(),
             sentences: vec![
                 format!("{conditions}: {rate}."),
-                "Growth is that of resident memory from one minute after the keyframe store is full: the median of the slopes between \
+                "Growth is that of resident memory from one minute after the keyframe store is full: the median of the rates of change between \
                  all pairs of samples. On a software adapter, resident memory includes GPU buffers; the model, and the working memory of \
                  training, which grows with the model, are subtracted."
                     .to_owned(),

@@ -1,11 +1,12 @@
 //! The runs of a bench. Each is trained once and saved to a file, so that a bench continued in the same folder does not
 //! repeat it.
 
-use crate::error::{Context, ensure, failed};
 use crate::{Error, Result};
 use capture::Stop;
 use keyframe::{Keyframe, Split};
+use keyframe::{ensure, failed};
 use serde::{Deserialize, Serialize};
+use session::Context;
 use session::methods::MAX_SPLATS;
 use session::run_folder::{self, CreatedFolders};
 use session::{

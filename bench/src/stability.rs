@@ -1,12 +1,12 @@
 //! Accuracy over the size of a disturbance, and its break points.
 
 use crate::disturb::Disturbance;
-use crate::error::ensure;
 use crate::findings::{BenchResult, Findings};
 use crate::runs::{Disturbed, Host, Job, NamedData, Run, Runs, RunsOptions};
 use crate::statistics::{Interpolation, break_point, extent};
 use crate::variant::Variant;
 use crate::{Error, Result};
+use keyframe::ensure;
 use keyframe::{Keyframe, Split};
 use kinematics::quantile::median;
 use serde::Serialize;

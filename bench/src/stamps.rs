@@ -1,12 +1,12 @@
 //! Measures the stamp errors of images from a camera with its own clock and a link with jitter.
 
-use crate::error::Context;
 use crate::findings::{BenchResult, Findings};
 use crate::{Error, Result};
 use kinematics::quantile::{Rank, median, quantile};
 use kinematics::random::Random;
 use kinematics::{ClockMap, JointHistory, JointState, Stamp};
 use serde::Serialize;
+use session::Context;
 use session::Table;
 use session::chart::{Axis, Chart, Line, Point, Scale};
 use std::path::PathBuf;

@@ -29,15 +29,15 @@ pub(crate) fn secs_to(curve: &[(f64, f64)], target_db: f64) -> Option<f64> {
     Some(previous_secs * (secs / previous_secs).powf(frac))
 }
 
-/// Slope of a line through `(x, y)`: the median of the slopes between all pairs. `None` with fewer than two values of
+/// Rate of change of `(x, y)` by the Theil-Sen estimator (Sen 1968): the median of the rates between all pairs. `None` with fewer than two values of
 /// x.
 ///
 /// Source: Theil 1950, Sen 1968. A few outliers do not change it.
-pub(crate) fn slope(points: &[(f64, f64)]) -> Option<f64> {
+pub(crate) fn theil_sen(points: &[(f64, f64)]) -> Option<f64> {
     let pairs = points.iter().enumerate().flat_map(|(ix, from)| points[ix + 1..].iter().map(move |to| (from, to)));
-    let slopes: Vec<f64> =
+    let rates: Vec<f64> =
         pairs.filter(|(from, to)| to.0 != from.0).map(|(from, to)| (to.1 - from.1) / (to.0 - from.0)).collect();
-    median(&slopes)
+    median(&rates)
 }
 
 /// How values between two levels of a disturbance are interpolated.
@@ -125,12 +125,12 @@ mod tests {
     }
 
     #[test]
-    fn slope_is_robust_to_outliers() {
+    fn theil_sen_is_robust_to_outliers() {
         let mut points: Vec<(f64, f64)> = (0..50).map(|x| (f64::from(x), 3.0 - 0.25 * f64::from(x))).collect();
         points[20].1 = 1e6;
         points[21].1 = -1e6;
-        assert!((slope(&points).expect("many points") + 0.25).abs() < 1e-9);
-        assert_eq!(slope(&[(1.0, 2.0)]), None);
-        assert_eq!(slope(&[(1.0, 2.0), (1.0, 3.0)]), None);
+        assert!((theil_sen(&points).expect("many points") + 0.25).abs() < 1e-9);
+        assert_eq!(theil_sen(&[(1.0, 2.0)]), None);
+        assert_eq!(theil_sen(&[(1.0, 2.0), (1.0, 3.0)]), None);
     }
 }

@@ -3,10 +3,11 @@
 //! It runs in the measured process, so it reads through one small buffer.
 
 use crate::Result;
-use crate::error::{Context, ensure, failed};
+use keyframe::{ensure, failed};
 use kinematics::Transform;
 use nalgebra::{Point3, Vector3};
 use serde_json::{Value, json};
+use session::Context;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
 use std::sync::Arc;

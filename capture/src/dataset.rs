@@ -1,8 +1,9 @@
 //! Converts the photos of a dataset to keyframes: decodes, undistorts, scales, and splits them.
 
 use crate::downscale;
-use crate::error::{Context, ensure};
+use crate::error::Context;
 use drivers::dataset::{Dataset, DatasetImage, DepthImage};
+use keyframe::ensure;
 use keyframe::{DepthMap, Holdout, Keyframe, Split, counted};
 use kinematics::{Intrinsics, Undistortion};
 use rayon::prelude::*;

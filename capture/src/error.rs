@@ -1,7 +1,7 @@
 //! Errors of this crate.
 
 use crate::config::ConfigError;
-use keyframe::ErrorClass;
+use keyframe::{ErrorClass, define_context, impl_from, write_chain};
 use std::error::Error as StdError;
 use std::fmt::{Display, Formatter};
 
@@ -10,7 +10,7 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 /// Why a rig cannot be opened, read or joined.
 ///
-/// [`Error::class`] tells apart invalid input, insufficient data and failures. The message of the error is its
+/// [`Error::class`] distinguishes invalid input, insufficient data and failures. The message of the error is its
 /// outermost context; `{:#}` gives the message with all causes.
 #[derive(Debug)]
 #[non_exhaustive]
@@ -80,16 +80,6 @@ impl Display for Error {
     }
 }
 
-fn write_chain(f: &mut Formatter<'_>, error: &(dyn StdError + 'static)) -> std::fmt::Result {
-    write!(f, "{error}")?;
-    let mut cause = error.source().filter(|_| f.alternate());
-    while let Some(error) = cause {
-        write!(f, ": {error}")?;
-        cause = error.source();
-    }
-    Ok(())
-}
-
 impl StdError for Error {
     fn source(&self) -> Option<&(dyn StdError + 'static)> {
         match self {
@@ -105,84 +95,12 @@ impl StdError for Error {
     }
 }
 
-impl From<ConfigError> for Error {
-    fn from(error: ConfigError) -> Self {
-        Self::Config(error)
-    }
-}
-
-impl From<keyframe::Error> for Error {
-    fn from(error: keyframe::Error) -> Self {
-        Self::Keyframe(error)
-    }
-}
-
-impl From<drivers::Error> for Error {
-    fn from(error: drivers::Error) -> Self {
-        Self::Driver(error)
-    }
-}
-
-impl From<kinematics::Error> for Error {
-    fn from(error: kinematics::Error) -> Self {
-        Self::Kinematics(error)
-    }
-}
-
-impl From<std::io::Error> for Error {
-    fn from(error: std::io::Error) -> Self {
-        Self::Io(error)
-    }
-}
-
-macro_rules! from_other {
-    ($($error:ty),*) => { $(impl From<$error> for Error {
-        fn from(error: $error) -> Self {
-            Self::other(error)
-        }
-    })* };
-}
-from_other!(image::ImageError, std::str::Utf8Error, std::net::AddrParseError);
+impl_from!(
+    Error: Config(ConfigError), Keyframe(keyframe::Error), Driver(drivers::Error), Kinematics(kinematics::Error), Io(std::io::Error), Other(image::ImageError), Other(std::str::Utf8Error), Other(std::net::AddrParseError),
+);
 #[cfg(feature = "sim")]
-from_other!(sim::Error);
-
-/// Adds the operation that failed to an error.
-pub(crate) trait Context<T> {
-    fn context(self, context: impl Into<String>) -> Result<T>;
-    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T>;
-}
-
-impl<T, E: Into<Error>> Context<T> for std::result::Result<T, E> {
-    fn context(self, context: impl Into<String>) -> Result<T> {
-        self.with_context(|| context)
-    }
-
-    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T> {
-        self.map_err(|error| Error::Context { context: context().into(), source: Box::new(error.into()) })
-    }
-}
-
-impl<T> Context<T> for Option<T> {
-    fn context(self, context: impl Into<String>) -> Result<T> {
-        self.ok_or_else(|| Error::Failed(context.into()))
-    }
-
-    fn with_context<C: Into<String>>(self, context: impl FnOnce() -> C) -> Result<T> {
-        self.ok_or_else(|| Error::Failed(context().into()))
-    }
-}
-
-/// Returns an [`Error::Failed`] with a formatted message.
-macro_rules! bail {
-    ($($message:tt)*) => { return Err($crate::Error::Failed(format!($($message)*))) };
-}
-pub(crate) use bail;
-
-/// Returns an [`Error::Failed`] with a formatted message unless the condition holds.
-macro_rules! ensure {
-    ($condition:expr, $($message:tt)*) => { if !$condition { $crate::error::bail!($($message)*) } };
-}
-pub(crate) use ensure;
+impl_from!(Error: Other(sim::Error));
+define_context!(Error);
 
 #[cfg(test)]
 mod tests {

@@ -25,7 +25,7 @@ const MAX_LIVE_AGE_SECS: f64 = 60.0;
 
 /// Receives the camera images of a running input, for example to show them.
 pub trait ImageObserver: Send {
-    /// Whether anyone looks at images at the moment. If not, they are not decoded.
+    /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
 
     /// Takes an image.

@@ -30,6 +30,7 @@
 //! # Ok::<(), keyframe::Error>(())
 //! ```
 
+mod context;
 mod counted;
 mod error;
 mod error_class;
@@ -42,6 +43,7 @@ mod range_points;
 pub mod scenes;
 mod shutter;
 
+pub use context::write_chain;
 pub use counted::{counted, listed};
 pub use error::Error;
 pub use error_class::ErrorClass;

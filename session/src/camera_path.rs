@@ -1,7 +1,8 @@
 //! Viewpoints for rendering: a single pose, or a camera path exported by nerfstudio's viewer.
 
 use crate::Error;
-use crate::error::{Context, ensure};
+use crate::error::Context;
+use keyframe::ensure;
 use kinematics::Transform;
 use nalgebra::{Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 use serde::Deserialize;

@@ -2,13 +2,13 @@
 
 use crate::Error;
 use crate::depth_from::{DepthSource, RenderedDepth};
-use crate::error::ensure;
 use crate::methods::methods_of;
 use crate::read_progress::{OnReadProgress, ReadProgress};
 use crate::run_folder::is_recording;
 use capture::config::{Override, Rig};
 use capture::open::{self, Opened};
 use capture::{Join, JoinEvent, SampleUse, StationReport, Stations, dataset};
+use keyframe::ensure;
 use keyframe::{Holdout, Keyframe, KeyframeList, Split, counted};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

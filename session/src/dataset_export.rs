@@ -1,10 +1,11 @@
 //! Exports keyframes as a nerfstudio folder: color PNG, 16-bit depth, poses, split lists.
 
-use crate::error::{Context, bail, ensure};
+use crate::error::Context;
 use crate::partial::Partial;
 use drivers::dataset::nerfstudio;
 use image::ExtendedColorType;
 use keyframe::{DepthMap, Keyframe, Split};
+use keyframe::{bail, ensure};
 use kinematics::{Transform, transform};
 use serde_json::{Map, Value, json};
 use std::path::Path;

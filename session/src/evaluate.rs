@@ -84,24 +84,24 @@ pub struct ImageScores {
 /// Mean scores over the test images. `None` means unknown, never zero.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Scores {
-    /// Mean PSNR, dB.
+    /// See [`ImageScores::psnr`].
     pub psnr: Option<f64>,
-    /// Mean SSIM.
+    /// See [`ImageScores::ssim`].
     pub ssim: Option<f64>,
-    /// Mean LPIPS.
+    /// See [`ImageScores::lpips`].
     pub lpips: Option<f64>,
-    /// Root mean square error of depth, meters.
+    /// See [`ImageScores::depth_rmse_m`].
     pub depth_rmse_m: Option<f64>,
-    /// Mean distance of the rendered surface from the true one, meters; only in simulation.
+    /// See [`ImageScores::surface_error_m`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_error_m: Option<f64>,
-    /// Fraction of the surface within 5 mm of the true one; only in simulation.
+    /// See [`ImageScores::surface_within_5_mm`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub surface_within_5_mm: Option<f64>,
-    /// PSNR against images without sensor noise, dB; only in simulation.
+    /// See [`ImageScores::psnr_truth`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_truth: Option<f64>,
-    /// PSNR of the noisy images against those without noise, dB; only in simulation.
+    /// See [`ImageScores::psnr_ceiling`].
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr_ceiling: Option<f64>,
     /// PSNR per camera; empty if there is only one.

@@ -61,7 +61,7 @@ pub use clock::Clock;
 pub use data::{Data, DataOptions, Purpose, expect};
 pub use dataset_export::{Written, write_nerfstudio};
 pub use decisions::{DecisionLog, RunDescription, Settings};
-pub use error::{Error, Result};
+pub use error::{Context, Error, Result};
 pub use evaluate::Evaluator;
 pub use gpu_loss::lose_gpu_at_step;
 pub use live::{Live, LiveOptions, Pace};

@@ -56,18 +56,15 @@ pub struct Evaluation {
     pub scores: Scores,
     /// Number of test images in the mean scores.
     pub(crate) n_images: usize,
-    /// Number of splats, blocks or samples, depending on the method.
+    /// Number of primitives of the model, such as splats.
     pub primitives: u64,
     /// Size of the model, bytes.
     pub bytes: u64,
-    /// Time of a step, milliseconds.
-    pub(crate) step_millis: Option<f64>,
+    /// Time of a step, milliseconds; `None` before the first.
+    pub step_millis: Option<f64>,
     /// Name of the model's primitive, in the singular.
     #[serde(skip)]
     pub primitive: &'static str,
-    /// Smoothed time of a step, milliseconds; 0 before the first.
-    #[serde(skip)]
-    pub smoothed_step_millis: f64,
 }
 
 /// Result of training. Serialized, it is the event `done`.
@@ -83,7 +80,7 @@ pub struct DoneEvent<'a> {
     /// Mean scores of the test images.
     #[serde(flatten)]
     pub scores: Scores,
-    /// Number of splats, blocks or samples, depending on the method.
+    /// Number of primitives of the model, such as splats.
     pub primitives: u64,
     /// Size of the model, bytes.
     pub bytes: u64,

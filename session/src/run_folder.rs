@@ -1,9 +1,10 @@
 //! The folder of a run, and the files in it.
 
 use crate::Error;
-use crate::error::{Context, bail, ensure};
+use crate::error::Context;
 use capture::config::Rig;
 use keyframe::{Keyframe, listed};
+use keyframe::{bail, ensure};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use std::io::Write;

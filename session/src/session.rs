@@ -483,7 +483,7 @@ impl Session {
 
     /// Restores the model on another device from the newest checkpoint or, without one, from the start.
     pub fn restart_on(&mut self, gpu: &Arc<Gpu>) -> crate::Result<()> {
-        let Some(recovery) = &self.recovery else { crate::error::bail!("this run cannot continue on another device") };
+        let Some(recovery) = &self.recovery else { keyframe::bail!("this run cannot continue on another device") };
         let written = self.checkpoints.as_mut().and_then(Checkpoints::newest).map(Path::to_owned);
         let checkpoint = match (written, &recovery.resumed) {
             (Some(path), _) => Some(Checkpoint::read(&path).map_err(crate::Error::from)),
@@ -957,7 +957,6 @@ impl Session {
             bytes: progress.bytes,
             step_millis: (progress.step > 0).then_some(progress.step_millis),
             primitive: self.kind.entry().primitive,
-            smoothed_step_millis: progress.step_millis,
         };
         self.observer.on_event(&SessionEvent::Evaluated(&eval));
         self.reported.push(eval);

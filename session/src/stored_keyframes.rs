@@ -3,9 +3,10 @@
 //! Each keyframe is a separate file in the layout of a checkpoint (`docs/reference/files.md`), with its color and depth
 //! as PNG. Ground truth from a simulator is left out.
 
-use crate::error::{Context, ensure};
+use crate::error::Context;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
+use keyframe::ensure;
 use keyframe::{BaseState, DepthMap, Keyframe, split_from_name, split_name};
 use kinematics::{Stamp, Transform, Twist};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion, Vector3};

@@ -1,4 +1,4 @@
-//! Joins images, joint readings and calibration to keyframes. This is the only place where devices and trainer meet.
+//! Joins images, joint readings and calibration to keyframes.
 //!
 //! Samples are pushed one by one. The result depends only on their order, so a live lockstep run, its recording and the
 //! replay of that recording give bit-identical keyframes.

@@ -373,7 +373,7 @@ fn every_rejection_reason_is_reachable() {
     assert_eq!(
         counts_with(|image| image, &[]).rejected.keys().collect::<Vec<_>>(),
         [&Rejection::NotMoved],
-        "no other rejections for good images"
+        "sharp and well-exposed images are not rejected for other reasons"
     );
 }
 

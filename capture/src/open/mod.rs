@@ -13,9 +13,10 @@ pub use real::franka_chain;
 pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
-use crate::error::{Context, Error, bail};
+use crate::error::{Context, Error};
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
 use drivers::{Live, Sample, Source};
+use keyframe::bail;
 use kinematics::Chain;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};

@@ -3,7 +3,7 @@
 #[cfg(target_os = "linux")]
 use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
-use crate::error::{Context, bail};
+use crate::error::Context;
 #[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
@@ -17,6 +17,7 @@ use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
 #[cfg(target_os = "linux")]
 use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
+use keyframe::bail;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::time::Duration;
 

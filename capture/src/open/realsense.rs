@@ -3,7 +3,7 @@
 /// Opens a camera.
 #[cfg(not(feature = "realsense"))]
 pub(super) fn open(camera: &mut crate::config::Camera) -> crate::Result<Box<dyn drivers::Camera>> {
-    crate::error::bail!(
+    keyframe::bail!(
         "camera {:?}: this program was built without RealSense support: install the RealSense SDK (librealsense2) \
          and build it with `cargo build --release --features realsense`",
         camera.name

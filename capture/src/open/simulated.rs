@@ -1,8 +1,8 @@
 //! Opens the simulated twin of a rig: the same cameras and joints in MuJoCo.
 
 use crate::config::{BaseDriver, Camera, CameraDriver, Parent, Rig, Scanner, ScannerDriver};
-use crate::error::bail;
 use drivers::{Devices, Error, Live, Sample, Source};
+use keyframe::bail;
 use kinematics::{Stamp, Transform};
 use std::sync::Arc;
 

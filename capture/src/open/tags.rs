@@ -1,12 +1,12 @@
 //! Locates the base from tags that its cameras see: estimates base poses from images and adds them to the samples.
 
 use crate::config::{BaseDriver, Camera, Parent, Rig};
-use crate::error::bail;
 use crate::join::{CameraPose, Motion};
 use drivers::tags::{
     LocateError, RollingShutterCamera, StationaryPoseFilter, TagDetections, TagDetector, TagPlacement, locate,
 };
 use drivers::{BasePose, Error, Image, Sample, Source};
+use keyframe::bail;
 use kinematics::{HistoryError, Stamp, Transform, Twist};
 use nalgebra::{Matrix6, Vector3, Vector6};
 use std::collections::{BTreeMap, VecDeque};
