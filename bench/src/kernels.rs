@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 use trainer::gpu::PassTiming;
 use trainer::splat::arrays::SplatArrays;
-use trainer::splat::bench::{Eye, Repeats, time_kernels};
+use trainer::splat::bench::{Eye, KernelFigures, Repeats, time_kernels};
 use trainer::splat::cloud::{load_cloud_npz, synthetic_cloud};
 
 /// Settings if an option is not given.
@@ -51,24 +51,9 @@ pub struct KernelsRow {
     pub size_px: [u32; 2],
     /// Number of splats.
     pub n_splats: usize,
-    /// Number of intersections of splats with tiles.
-    pub n_intersections: u64,
-    /// GPU time of an image, milliseconds.
-    pub render_millis: f64,
-    /// GPU time of a step that updates every splat, milliseconds.
-    pub step_millis: f64,
-    /// GPU time of a step that updates only the visible splats, milliseconds.
-    pub step_visible_millis: f64,
-    /// Number of visible splats.
-    pub n_visible: u64,
-    /// Wall time of an image, milliseconds.
-    pub render_wall_millis: f64,
-    /// Wall time of a step, milliseconds.
-    pub step_wall_millis: f64,
-    /// Mean color of the image.
-    pub mean_rgb: [f64; 3],
-    /// Peak size of live GPU buffers, bytes.
-    pub peak_bytes: u64,
+    /// Times and counts.
+    #[serde(flatten)]
+    pub figures: KernelFigures,
     /// Names and milliseconds of the passes of a step, if requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub passes: Vec<(&'static str, f64)>,
@@ -125,20 +110,8 @@ pub fn measure<E: From<Error>>(
                 let [width, height] = size_px;
                 format!("{width}x{height} pixels and {n_splats} splats: try fewer --splats or a smaller --size")
             })?;
-            on_row(&KernelsRow {
-                size_px: *size_px,
-                n_splats: *n_splats,
-                n_intersections: figures.n_intersections,
-                render_millis: figures.render_millis,
-                step_millis: figures.step_millis,
-                step_visible_millis: figures.step_visible_millis,
-                n_visible: figures.n_visible,
-                render_wall_millis: figures.render_wall_millis,
-                step_wall_millis: figures.step_wall_millis,
-                mean_rgb: figures.mean_rgb,
-                peak_bytes: figures.peak_bytes,
-                passes: profile(&figures.passes, options.profile),
-            })?;
+            let passes = profile(&figures.passes, options.profile);
+            on_row(&KernelsRow { size_px: *size_px, n_splats: *n_splats, figures, passes })?;
         }
     }
     Ok(())

@@ -71,15 +71,15 @@ impl Args {
             row.size_px[0],
             row.size_px[1],
             row.n_splats,
-            row.n_intersections,
-            row.render_millis,
-            row.step_millis,
-            row.render_wall_millis,
-            row.step_wall_millis,
-            row.n_visible,
-            row.step_visible_millis,
-            row.mean_rgb,
-            row.peak_bytes >> 20
+            row.figures.n_intersections,
+            row.figures.render_millis,
+            row.figures.step_millis,
+            row.figures.render_wall_millis,
+            row.figures.step_wall_millis,
+            row.figures.n_visible,
+            row.figures.step_visible_millis,
+            row.figures.mean_rgb,
+            row.figures.peak_bytes >> 20
         ))?;
         for (name, millis) in &row.passes {
             print::line(format_args!("    {millis:>9.4} ms  {name}"))?;

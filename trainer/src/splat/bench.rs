@@ -12,6 +12,7 @@ use crate::Error;
 use crate::gpu::{Buffer, Gpu, PassTiming, Passes, f32_of};
 use kinematics::Transform;
 use kinematics::quantile::{Rank, quantile};
+use serde::Serialize;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -19,7 +20,7 @@ use std::time::{Duration, Instant};
 const RATE: f32 = 1e-5;
 
 /// Results for one image size and cloud.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize)]
 pub struct KernelFigures {
     /// Intersections of splats with tiles.
     pub n_intersections: u64,
@@ -41,6 +42,7 @@ pub struct KernelFigures {
     /// Peak size of all GPU buffers, bytes.
     pub peak_bytes: u64,
     /// GPU time of each pass of one step; empty without timestamps.
+    #[serde(skip)]
     pub passes: Vec<PassTiming>,
 }
 
