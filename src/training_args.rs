@@ -3,7 +3,7 @@
 use capture::config::{MAX_BYTES_RANGE, MAX_SPLATS_RANGE, SEED_RANGE};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::value_parser;
-use session::methods::describe;
+use keyframe::listed;
 use session::{Refine, TrainingOptions};
 use std::sync::LazyLock;
 use trainer::ModelKind;
@@ -56,8 +56,10 @@ pub(crate) struct Methods(Vec<ModelKind>);
 fn methods(text: &str) -> Result<Methods, String> {
     let mut kinds = Vec::new();
     for name in text.split(',') {
-        let kind = ModelKind::from_name(name)
-            .ok_or_else(|| format!("unknown method {name:?}, expected {}", describe(ModelKind::ALL)))?;
+        let kind = ModelKind::from_name(name).ok_or_else(|| {
+            let known: Vec<&str> = ModelKind::ALL.iter().map(|kind| kind.name()).collect();
+            format!("unknown method {name:?}, expected {}", listed(&known, "or"))
+        })?;
         if kinds.contains(&kind) {
             return Err(format!("{name} is listed twice"));
         }
