@@ -151,7 +151,7 @@ fn invalid_methods_give_one_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     for (methods, word) in
-        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf is listed twice"), ("", "splat, tsdf and nerf")]
+        [("splat,mesh", "\"mesh\""), ("tsdf,splat,tsdf", "tsdf is listed twice"), ("", "splat, tsdf or nerf")]
     {
         assert_fails_with(folder, &["train", "data", "--method", methods], &["--method", word]);
         assert_fails_with(folder, &["run", "rig.toml", "--method", methods], &["--method", word]);
