@@ -1,7 +1,8 @@
 //! A scene model that restarts with aligned cameras.
 //!
-//! Alignment runs in parallel with training. If it keeps corrections, the model restarts with corrected keyframes.
-//! Splats, which support more trials of camera parameters, implement alignment separately.
+//! Alignment is requested when the model is created, runs in parallel with training, and its result is applied at a
+//! planned step: if it has corrections, the model forgets everything and trains again on corrected keyframes, because a
+//! model trained on wrong poses would have to be corrected, too.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
@@ -11,9 +12,10 @@ use crate::{Bounds, Error, Method, Picture, Progress, RenderRequest};
 use calibration::TrialReport;
 use calibration::{Alignment, AlignmentTask, alignment_step};
 use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
-use keyframe::Keyframe;
+use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -23,8 +25,9 @@ const METADATA_KEY: &str = "alignment";
 
 /// A model that can restart.
 pub trait Restartable: Method {
-    /// Forgets all keyframes and all training; compiled kernels may be kept.
-    fn restart(&mut self) -> Result<(), Error>;
+    /// Forgets all keyframes and all training; compiled kernels may be kept. The keyframes pushed from now on have the
+    /// corrections of `alignment`.
+    fn restart(&mut self, alignment: &Alignment) -> Result<(), Error>;
     /// Correction of a camera that was optimized with the scene, relative to the pushed keyframes; `None` if there is
     /// none.
     fn learned_correction(&mut self, _camera: &str) -> Result<Option<CameraCorrection>, Error> {
@@ -41,8 +44,10 @@ pub struct Aligned<M> {
     model: M,
     choice: CameraRefinement,
     alignment_task: AlignmentTask,
-    /// The uncorrected keyframes, kept until alignment is done.
+    /// The uncorrected keyframes in the order of their arrival, kept until alignment is done.
     original_keyframes: Vec<Arc<Keyframe>>,
+    /// How many of them had arrived when alignment began; `None` before that.
+    n_begun: Option<usize>,
     alignment_step: u64,
     /// Steps of the model before its restart.
     n_steps_before_restart: u64,
@@ -57,19 +62,25 @@ struct AlignedState {
     alignment: Option<Alignment>,
     alignment_step: u64,
     n_steps_before_restart: u64,
+    /// Camera and stamp of the keyframes, until alignment is done.
+    keyframes: Vec<(String, i64)>,
+    n_begun: Option<usize>,
+}
+
+fn id_of(keyframe: &Keyframe) -> (&str, i64) {
+    (&keyframe.camera, keyframe.stamp.0)
 }
 
 impl<M: Restartable + 'static> Aligned<M> {
     /// A model whose keyframes are aligned as specified by `choice`; the result is applied early in `n_planned_steps`.
     pub fn new(model: M, choice: CameraRefinement, is_software: bool, n_planned_steps: u64) -> Self {
-        let (alignment_task, alignment_step) =
-            (AlignmentTask::new(&choice), alignment_step(is_software, n_planned_steps));
         Self {
             model,
+            alignment_task: AlignmentTask::new(&choice),
             choice,
-            alignment_task,
             original_keyframes: Vec::new(),
-            alignment_step,
+            n_begun: None,
+            alignment_step: alignment_step(is_software, n_planned_steps),
             n_steps_before_restart: 0,
         }
     }
@@ -85,14 +96,7 @@ impl<M: Restartable + 'static> Aligned<M> {
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
         let alignment_task = AlignmentTask::Done(read_metadata(folder)?.alignment);
-        Ok(Self {
-            model,
-            choice: CameraRefinement::default(),
-            alignment_task,
-            original_keyframes: Vec::new(),
-            alignment_step: 0,
-            n_steps_before_restart: 0,
-        })
+        Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
     /// Resumes from a checkpoint. `resume` receives the corrected keyframes and finds those that the model was trained
@@ -108,76 +112,86 @@ impl<M: Restartable + 'static> Aligned<M> {
             return Ok((Box::new(model), untrained));
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
-        let AlignedState { choice, is_aligned, alignment, alignment_step, n_steps_before_restart } =
-            serde_json::from_value(state).map_err(invalid_state)?;
+        let AlignedState {
+            choice,
+            is_aligned,
+            alignment,
+            alignment_step,
+            n_steps_before_restart,
+            keyframes: ids,
+            n_begun,
+        } = serde_json::from_value(state).map_err(invalid_state)?;
         let alignment_task = if is_aligned { AlignmentTask::Done(alignment) } else { AlignmentTask::new(&choice) };
         let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
+        let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
+        let original = |id: (&str, i64)| originals.get(&id).map(|keyframe| Arc::clone(keyframe));
+        let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
         // These are corrected when they are pushed again.
-        let is_untrained = |keyframe: &Arc<Keyframe>| {
-            untrained.iter().any(|other| (&other.camera, other.stamp) == (&keyframe.camera, keyframe.stamp))
-        };
-        let (untrained_originals, learned): (Vec<_>, Vec<_>) = keyframes.iter().cloned().partition(is_untrained);
-        let original_keyframes = if is_aligned { Vec::new() } else { learned };
-        Ok((
-            Box::new(Self {
-                model,
-                choice,
-                alignment_task,
-                original_keyframes,
-                alignment_step,
-                n_steps_before_restart,
-            }),
-            untrained_originals,
-        ))
+        let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
+        let aligned =
+            Self { model, choice, alignment_task, original_keyframes, n_begun, alignment_step, n_steps_before_restart };
+        Ok((Box::new(aligned), untrained))
     }
 
-    /// Applies the result of alignment; if there are corrections, restarts the model.
-    fn finish_alignment(&mut self) -> Result<(), Error> {
-        let has_corrections = self.alignment_task.finish()?;
-        let original_keyframes = std::mem::take(&mut self.original_keyframes);
-        if !has_corrections {
+    /// Starts alignment, if it is requested.
+    fn begin_alignment(&mut self) {
+        if self.alignment_task.is_requested() {
+            let n_begun = *self.n_begun.get_or_insert(self.original_keyframes.len());
+            self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
+        }
+    }
+
+    /// Applies the result of alignment when due; if there are corrections, restarts the model.
+    fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
+        let step = self.model.progress().step;
+        let is_due = step >= self.alignment_step || (self.model.is_idle() && step > 0);
+        if self.alignment_task.is_done() || !is_due {
             return Ok(());
         }
+        self.begin_alignment(); // A model that was resumed at this step has not started it.
+        let has_corrections = self.alignment_task.finish()?;
+        let original_keyframes = std::mem::take(&mut self.original_keyframes);
+        let Some(alignment) = self.alignment_task.result().filter(|_| has_corrections) else { return Ok(()) };
         log::info!("training restarts with corrected cameras");
         self.n_steps_before_restart += self.model.n_total_steps()?;
-        self.model.restart()?;
+        self.model.restart(alignment)?;
         original_keyframes.iter().try_for_each(|keyframe| self.model.push(self.alignment_task.corrected(keyframe)))
+    }
+
+    /// Steps until the result of alignment is due.
+    fn steps_to_alignment(&self) -> u64 {
+        match self.alignment_task.is_done() {
+            true => u64::MAX,
+            false => self.alignment_step.saturating_sub(self.model.progress().step),
+        }
     }
 }
 
 impl<M: Restartable + 'static> Method for Aligned<M> {
     fn push(&mut self, keyframe: Arc<Keyframe>) -> Result<(), Error> {
-        let corrected = self.alignment_task.corrected(&keyframe);
-        if !self.alignment_task.is_done() {
+        self.model.push(self.alignment_task.corrected(&keyframe))?;
+        let is_used = !self.alignment_task.is_done() && keyframe.split != Split::Test && keyframe.is_finite();
+        // After resuming, validation keyframes are pushed again.
+        if is_used && !self.original_keyframes.iter().any(|known| id_of(known) == id_of(&keyframe)) {
             self.original_keyframes.push(keyframe);
         }
-        self.model.push(corrected)
+        Ok(())
     }
 
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
-        self.original_keyframes.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        if let Some(ix) = self.original_keyframes.iter().position(|keyframe| id_of(keyframe) == (camera, stamp.0)) {
+            self.original_keyframes.remove(ix);
+            self.n_begun = self.n_begun.map(|n_begun| n_begun - usize::from(ix < n_begun));
+        }
         self.model.remove(camera, stamp)
     }
 
     fn step(&mut self, n: u64) -> Result<u64, Error> {
-        let step = self.model.progress().step;
-        if !self.alignment_task.is_done() && (step >= self.alignment_step || (self.model.is_idle() && step > 0)) {
-            // A model that was resumed at this step has not started the task.
-            if self.alignment_task.is_requested() {
-                self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
-            }
-            self.finish_alignment()?;
-        }
-        let remaining = if self.alignment_task.is_done() {
-            u64::MAX
-        } else {
-            self.alignment_step.saturating_sub(self.model.progress().step)
-        };
-        let n_steps = self.model.step(n.min(remaining))?;
-        // After the first step, which itself needs much CPU time.
-        if self.alignment_task.is_requested() && n_steps > 0 {
-            self.alignment_task.begin(self.original_keyframes.clone(), &self.choice);
+        self.finish_alignment_when_due()?;
+        let n_steps = self.model.step(n.min(self.steps_to_alignment()))?;
+        if n_steps > 0 {
+            self.begin_alignment(); // After the first step, which itself needs much CPU time.
         }
         Ok(n_steps)
     }
@@ -260,6 +274,12 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             alignment: self.alignment_task.result().cloned(),
             alignment_step: self.alignment_step,
             n_steps_before_restart: self.n_steps_before_restart,
+            keyframes: self
+                .original_keyframes
+                .iter()
+                .map(|keyframe| (keyframe.camera.to_string(), keyframe.stamp.0))
+                .collect(),
+            n_begun: self.n_begun,
         };
         let invalid_state = |error: serde_json::Error| Error::CheckpointState { reason: error.to_string() };
         let state = serde_json::to_value(state).map_err(invalid_state)?;
@@ -285,7 +305,6 @@ mod tests {
     use crate::tsdf::TsdfModel;
     use calibration::ParamSet;
     use calibration::scenes::{Miscalibration, capture, remaining, wrong_extrinsics};
-    use keyframe::Split;
 
     /// The step at which the result is applied.
     const ALIGNMENT_STEP: u64 = 6;

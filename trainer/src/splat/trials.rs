@@ -8,8 +8,10 @@
 //! loss of all reductions is at most [`MAX_TOTAL_LOSS_DB`]. After the last trial, the validation keyframes become
 //! training keyframes.
 
+use super::buffers::SplatBuffers;
 use super::snapshot::Snapshot;
-use crate::gpu::Buffer;
+use crate::Error;
+use crate::gpu::{Buffer, Gpu};
 use calibration::{CameraRefinement, Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -51,6 +53,17 @@ pub enum CountPolicy {
 pub(crate) struct ValidationImage {
     pub(crate) keyframe: Arc<Keyframe>,
     pub(crate) image: Option<Buffer>,
+}
+
+impl ValidationImage {
+    /// The image on the GPU.
+    pub(crate) fn uploaded(&mut self, gpu: &Gpu) -> Result<&Buffer, Error> {
+        let image = match self.image.take() {
+            Some(image) => image,
+            None => gpu.storage_with("splat.validation", &self.keyframe.rgba_srgb)?,
+        };
+        Ok(self.image.insert(image))
+    }
 }
 
 /// Camera and stamp of a keyframe.
@@ -97,6 +110,8 @@ pub(crate) struct SplatTrials {
     degree: u32,
     pub(crate) validation: Vec<ValidationImage>,
     pub(crate) finished: Vec<Trial>,
+    /// Optimizer updates that were reverted.
+    pub(crate) n_reverted_steps: u64,
     trial_phase: SplatTrialPhase,
 }
 
@@ -203,7 +218,15 @@ impl SplatTrials {
         };
         let is_finished = candidates.is_empty() && count == CountState::ToCap;
         let trial_phase = if is_finished { SplatTrialPhase::Finished } else { SplatTrialPhase::Waiting };
-        Self { candidates, count, degree: 0, validation: Vec::new(), finished: Vec::new(), trial_phase }
+        Self {
+            candidates,
+            count,
+            degree: 0,
+            validation: Vec::new(),
+            finished: Vec::new(),
+            n_reverted_steps: 0,
+            trial_phase,
+        }
     }
 
     /// Whether validation keyframes are still excluded from training.
@@ -322,7 +345,7 @@ impl SplatTrials {
             }
             _ => SHARED_STEPS,
         };
-        let until = from.step + n_steps;
+        let until = from.schedule.step + n_steps;
         let scored = self.scored();
         self.trial_phase = SplatTrialPhase::Baseline(RunningTrial {
             candidate,
@@ -414,6 +437,11 @@ impl SplatTrials {
             SplatTrialPhase::Variant { trial, .. } => Some(&trial.other),
             _ => None,
         }
+    }
+
+    /// The splats that viewers see: during a trial, those without the change.
+    pub(crate) fn displayed<'a>(&'a self, in_training: &'a SplatBuffers) -> &'a SplatBuffers {
+        self.baseline().map_or(in_training, |snapshot| &snapshot.splats)
     }
 
     /// State for a checkpoint, except for a trial in progress.
