@@ -1,9 +1,10 @@
 //! An arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller gets states of all
 //! joints.
 
-use super::bus::{Bus, BusEvent, WireErrors};
+use super::bus::Bus;
 use super::bus_load::max_cycle_rate_hz;
 use super::config::{ArmConfig, BusConfig};
+use super::frame_io::{BusEvent, WireErrors};
 use super::joints::{JointReading, Joints};
 use super::motor::Motor;
 use crate::wire::can::{Frame, canopen};

@@ -5,9 +5,10 @@
 //! that the watchdogs of the motors have expired or are about to. After that it sends none of the earlier setpoints,
 //! and no new ones until it receives [`Request::Recover`].
 
-use super::bus::{Bus, BusEvent, WireErrors};
+use super::bus::Bus;
 use super::bus_load::max_cycle_rate_hz;
 use super::config::{Family, MovableArmConfig};
+use super::frame_io::{BusEvent, WireErrors};
 use super::joints::JointReading;
 use super::motor::Reading;
 use super::movable_motor::{Health, MovableMotor};

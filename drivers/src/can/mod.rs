@@ -1,7 +1,8 @@
 //! Arms whose joints are motors on CAN buses, over Linux sockets.
 //!
 //! * `config` describes buses, motors and arms.
-//! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on the wire.
+//! * `link` checks the configuration of an interface. `bus` transfers frames and counts errors on the wire, which code
+//!   above it accesses through the trait of `frame_io`.
 //! * `motor` reads one motor of any family. `arm` combines the readings of all motors into joint states, with one
 //!   thread per bus. Neither commands a motor.
 //! * `movable_motor` is a motor that may be moved. `watchdog` configures what it does when this computer stops
@@ -18,6 +19,7 @@ mod bus;
 mod bus_load;
 mod config;
 pub mod emulated;
+mod frame_io;
 #[cfg(all(target_os = "linux", any(test, fuzzing)))]
 pub(crate) mod fuzz;
 mod interfaces;
@@ -33,14 +35,17 @@ mod movable;
 mod movable_motor;
 #[cfg(target_os = "linux")]
 mod query;
+#[cfg(all(target_os = "linux", test))]
+mod transcript_tests;
 #[cfg(target_os = "linux")]
 mod watchdog;
 
 #[cfg(target_os = "linux")]
 pub use arm::CanArm;
 #[cfg(target_os = "linux")]
-pub use bus::{Bus, BusEvent, WireErrors};
+pub use bus::Bus;
 pub use config::{ArmConfig, BusConfig, Family, Gains, MotorConfig, MovableArmConfig};
+pub use frame_io::{BusEvent, FrameIo, WireErrors};
 pub use interfaces::interfaces;
 #[cfg(target_os = "linux")]
 pub use link::{Link, LinkProblem, State};

@@ -6,8 +6,8 @@
 //! while another master commands it.
 
 use super::ROBSTRIDE_HOST;
-use super::bus::Bus;
 use super::config::{Family, MotorConfig};
+use super::frame_io::FrameIo;
 use super::query::MotorQuery;
 use crate::Error;
 use crate::wire::can::canopen::{self, Direction, Nmt, NodeState, Object, Pdo};
@@ -52,8 +52,8 @@ pub(super) struct Motor {
 
 impl Motor {
     /// Reads the ranges of the motor's raw values, if it has them, and makes it report.
-    pub(super) fn set_up(bus: &Bus, config: &MotorConfig) -> Result<Self, Error> {
-        let query = MotorQuery::new(bus, config);
+    pub(super) fn set_up(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
+        let query = MotorQuery::new(bus, &config.joint);
         let mut motor = Self::with_limits(config.clone(), Limits::of(1.0, 1.0, 1.0));
         match config.family {
             Family::Damiao { motor: number, feedback } => {

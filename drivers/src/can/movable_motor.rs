@@ -6,8 +6,8 @@
 //! they were tuned to.
 
 use super::ROBSTRIDE_HOST;
-use super::bus::Bus;
 use super::config::{Family, MotorConfig};
+use super::frame_io::FrameIo;
 use super::motor::{Motor, Reading, map_pdo_at_every_sync, start_drive};
 use super::query::MotorQuery;
 use super::watchdog::{self, WatchdogPlan};
@@ -60,14 +60,14 @@ pub(super) struct MovableMotor {
 
 impl MovableMotor {
     /// Finds a motor, disables it, clears its faults, sets its watchdog and its mode, and verifies both.
-    pub(super) fn prepare(bus: &Bus, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Self, Error> {
+    pub(super) fn prepare(bus: &dyn FrameIo, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Self, Error> {
         let motor = match config.family {
             // It answers only commands, so it is polled with the command that disables it.
             Family::TMotor { model, .. } => Motor::with_limits(config.clone(), model.limits()),
             _ => Motor::set_up(bus, config)?,
         };
         let movable_motor = Self { motor, health: None, drive: cia402::State::NotReadyToSwitchOn };
-        let query = MotorQuery::new(bus, config);
+        let query = MotorQuery::new(bus, &config.joint);
         movable_motor.check_gains(&query)?;
         movable_motor.switch_off(&query)?;
         watchdog::set(&query, &config.family, movable_motor.motor.limits(), plan)?;

@@ -1,8 +1,7 @@
 //! Requests to one motor and its answers, for use before the cycle starts, while nothing else reads the bus.
 
 use super::ROBSTRIDE_HOST;
-use super::bus::{Bus, BusEvent, WireErrors};
-use super::config::MotorConfig;
+use super::frame_io::{BusEvent, FrameIo, WireErrors};
 use crate::wire::can::canopen::{self, Object, SdoAnswer};
 use crate::wire::can::damiao::{self, Access, Register, RegisterMessage};
 use crate::wire::can::mit::Limits;
@@ -19,23 +18,24 @@ const MAX_ATTEMPTS: usize = 4;
 
 /// Request-response access to one motor.
 pub(super) struct MotorQuery<'a> {
-    bus: &'a Bus,
-    config: &'a MotorConfig,
+    bus: &'a dyn FrameIo,
+    joint: &'a str,
     errors: Cell<WireErrors>,
 }
 
 impl<'a> MotorQuery<'a> {
-    pub(super) fn new(bus: &'a Bus, config: &'a MotorConfig) -> Self {
-        Self { bus, config, errors: Cell::default() }
+    /// Access to the motor of a joint.
+    pub(super) fn new(bus: &'a dyn FrameIo, joint: &'a str) -> Self {
+        Self { bus, joint, errors: Cell::default() }
     }
 
     pub(super) fn name(&self) -> String {
-        format!("joint {:?} on {:?}", self.config.joint, self.bus.config().interface)
+        format!("joint {:?} on {:?}", self.joint, self.bus.interface())
     }
 
     pub(super) fn fault(&self, reason: impl Into<String>) -> Error {
-        let interface = self.bus.config().interface.clone();
-        Error::Motor { joint: self.config.joint.clone(), interface, reason: reason.into() }
+        let interface = self.bus.interface().to_owned();
+        Error::Motor { joint: self.joint.to_owned(), interface, reason: reason.into() }
     }
 
     /// Converts the error of a codec to an error of this motor.

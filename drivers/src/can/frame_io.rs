@@ -1,0 +1,69 @@
+//! Access to a bus as plain frames and counters of errors, independent of the operating system.
+
+use crate::Error;
+use crate::wire::can::Frame;
+use kinematics::Stamp;
+use std::time::Duration;
+
+/// Sends and receives frames.
+pub trait FrameIo {
+    /// Name of the interface.
+    fn interface(&self) -> &str;
+    /// Sends a frame. Returns whether it was accepted; it is not if the interface's queue stays full.
+    fn send(&self, frame: &Frame) -> Result<bool, Error>;
+    /// Waits for the next event. Returns `None` if there was none within the timeout.
+    fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error>;
+}
+
+/// Something received from the bus.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BusEvent {
+    /// A frame from another node.
+    Frame(Frame),
+    /// Errors on the wire, reported by the controller.
+    Errors(WireErrors),
+}
+
+/// Counters of error frames. One error frame may report several errors.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct WireErrors {
+    /// Error frames.
+    pub n_frames: u64,
+    /// The controller went off the bus.
+    pub n_bus_off: u64,
+    /// The controller restarted.
+    pub n_restarts: u64,
+    /// The controller reached its warning level of 96 errors.
+    pub n_warnings: u64,
+    /// The controller became error-passive, at 128 errors.
+    pub n_passive: u64,
+    /// Nobody acknowledged a frame: there is no other node, or none at this bit rate.
+    pub n_unacknowledged: u64,
+    /// Frames dropped because a buffer of the controller or the kernel was full.
+    pub n_overflows: u64,
+}
+
+impl WireErrors {
+    /// Adds the counters of `other`.
+    pub fn add(&mut self, other: &Self) {
+        self.n_frames += other.n_frames;
+        self.n_bus_off += other.n_bus_off;
+        self.n_restarts += other.n_restarts;
+        self.n_warnings += other.n_warnings;
+        self.n_passive += other.n_passive;
+        self.n_unacknowledged += other.n_unacknowledged;
+        self.n_overflows += other.n_overflows;
+    }
+}
+
+impl std::fmt::Display for WireErrors {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
+        let times = if *n_bus_off == 1 { "time" } else { "times" };
+        write!(
+            f,
+            "{n_bus_off} {times} off the bus, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
+             {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in total"
+        )
+    }
+}
