@@ -1,52 +1,13 @@
 //! The keys of arms on CAN buses: `[arm.bus.NAME]` and `[arm.motor.NAME]`.
 
 use super::section::Section;
-use super::values::{is, name_of, table, whole};
-use drivers::can::{BusConfig, Family, Gains, MotorConfig};
-use drivers::wire::can::cia402::Units;
-use drivers::wire::can::{canopen, odrive, robstride, tmotor};
+use super::values::{is, table, whole};
+use drivers::can::{
+    AllowedValues, BusConfig, FAMILIES, Gains, MotorConfig, MotorFamily, MotorKey, MotorSettings, SettingValue,
+};
+use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// A motor family without its parameters.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum FamilyKind {
-    Damiao,
-    Robstride,
-    TMotor,
-    Odrive,
-    Cia402,
-}
-
-const FAMILIES: [(&str, FamilyKind); 5] = [
-    ("damiao", FamilyKind::Damiao),
-    ("robstride", FamilyKind::Robstride),
-    ("tmotor", FamilyKind::TMotor),
-    ("odrive", FamilyKind::Odrive),
-    ("cia402", FamilyKind::Cia402),
-];
-
-/// Motor models with known scaling, of the two families whose motors do not report it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Model {
-    Robstride(robstride::Model),
-    TMotor(tmotor::Model),
-}
-
-const MODELS: [(&str, Model); 13] = [
-    ("rs00", Model::Robstride(robstride::Model::Rs00)),
-    ("rs01", Model::Robstride(robstride::Model::Rs01)),
-    ("rs02", Model::Robstride(robstride::Model::Rs02)),
-    ("rs03", Model::Robstride(robstride::Model::Rs03)),
-    ("rs04", Model::Robstride(robstride::Model::Rs04)),
-    ("rs05", Model::Robstride(robstride::Model::Rs05)),
-    ("rs06", Model::Robstride(robstride::Model::Rs06)),
-    ("ak10-9", Model::TMotor(tmotor::Model::Ak10x9)),
-    ("ak60-6", Model::TMotor(tmotor::Model::Ak60x6)),
-    ("ak70-10", Model::TMotor(tmotor::Model::Ak70x10)),
-    ("ak80-6", Model::TMotor(tmotor::Model::Ak80x6)),
-    ("ak80-9", Model::TMotor(tmotor::Model::Ak80x9)),
-    ("ak80-64", Model::TMotor(tmotor::Model::Ak80x64)),
-];
 /// Gear ratios outside this range are considered typing errors.
 const GEAR_RATIO_RANGE: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
 
@@ -81,9 +42,10 @@ fn bus(interface: String, mut keys: Section<'_>) -> BusConfig {
 
 /// Returns `None` if a value is invalid, which has been reported.
 fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<MotorConfig> {
-    let kind = keys.choice("family", &FAMILIES);
-    if kind.is_none() {
-        keys.missing("family", "damiao, robstride, tmotor, odrive or cia402");
+    let families: Vec<_> = FAMILIES.iter().map(|family| (family.name(), *family)).collect();
+    let family = keys.choice("family", &families);
+    if family.is_none() {
+        keys.missing("family", family_names());
     }
     let bus = keys.text("bus");
     if bus.is_none() {
@@ -95,80 +57,96 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
         let allowed = if names.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { names.join(", ") };
         found.or_else(|| keys.invalid("bus", &Value::String(bus), &allowed))
     });
-    let max_id = match kind {
-        Some(FamilyKind::Damiao) => 0x7FE,
-        Some(FamilyKind::Odrive) => 62,
-        Some(FamilyKind::Cia402) => 127,
-        _ => 255,
-    };
-    let id = keys.whole("id", u64::from(kind == Some(FamilyKind::Cia402))..=max_id);
+    let id = keys.whole("id", family.map_or(0..=u64::MAX, MotorFamily::ids));
     if id.is_none() {
         keys.missing("id", "ID of the motor, axis or node");
     }
-    // Keys of other families are unknown; without a valid family, all keys are known.
-    let applies = |own: &[FamilyKind]| kind.is_none_or(|kind| own.contains(&kind));
-    let feedback = applies(&[FamilyKind::Damiao]).then(|| keys.whole("feedback_id", 0..=0x7FE)).flatten();
-    let model = applies(&[FamilyKind::Robstride, FamilyKind::TMotor]).then(|| keys.choice("model", &MODELS)).flatten();
-    let counts_per_turn = applies(&[FamilyKind::Cia402]).then(|| keys.number("counts_per_turn", 1.0..=1e12)).flatten();
-    let rated_torque_nm = applies(&[FamilyKind::Cia402]).then(|| keys.number("rated_torque_nm", 0.0..=1e6)).flatten();
-    let rated_torque_nm = rated_torque_nm.unwrap_or(0.0);
-    let gains =
-        applies(&[FamilyKind::Damiao, FamilyKind::Robstride, FamilyKind::TMotor]).then(|| gains(&mut keys)).flatten();
+    let values = match family {
+        Some(family) => family.keys().iter().filter_map(|key| Some((key.name, setting(&mut keys, key)?))).collect(),
+        // Keys of other families are unknown; without a valid family, all keys are known.
+        None => {
+            all_keys().for_each(|key| keys.ignore(key.name));
+            BTreeMap::new()
+        }
+    };
+    let gains = family.is_none_or(MotorFamily::has_gains).then(|| gains(&mut keys)).flatten();
     let gear_ratio = keys.number("gear_ratio", GEAR_RATIO_RANGE).unwrap_or(1.0);
     let is_reversed = keys.flag("reversed").unwrap_or(false);
     let offset_rad = keys.number("offset_rad", -100.0..=100.0).unwrap_or(0.0);
-    let to_u8 = |id: u64| u8::try_from(id).ok();
-    let Some(kind) = kind else {
-        keys.end();
-        return None;
-    };
-    let family = match (kind, id) {
-        (FamilyKind::Damiao, id) => {
-            if feedback.is_none() {
-                keys.missing("feedback_id", "CAN ID of the motor's feedback, its register MST_ID");
-            }
-            let to_u16 = |id: u64| u16::try_from(id).ok();
-            id.and_then(to_u16)
-                .zip(feedback.and_then(to_u16))
-                .map(|(motor, feedback)| Family::Damiao { motor, feedback })
-        }
-        (kind @ (FamilyKind::Robstride | FamilyKind::TMotor), id) => {
-            let family = match (kind, model, id.and_then(to_u8)) {
-                (FamilyKind::Robstride, Some(Model::Robstride(model)), Some(motor)) => {
-                    Some(Family::Robstride { motor, model })
-                }
-                (FamilyKind::TMotor, Some(Model::TMotor(model)), Some(motor)) => Some(Family::TMotor { motor, model }),
-                _ => None,
-            };
-            let expected_models = match (kind, model) {
-                (FamilyKind::TMotor, Some(Model::Robstride(_))) => Some("ak10-9 to ak80-64, as the family is tmotor"),
-                (FamilyKind::Robstride, Some(Model::TMotor(_))) => Some("rs00 to rs06, as the family is robstride"),
-                _ => None,
-            };
-            if let (Some(allowed), Some(value)) = (expected_models, model.and_then(|model| name_of(&MODELS, &model))) {
-                keys.invalid::<()>("model", &value, allowed);
-            } else if family.is_none() && id.is_some() {
-                keys.missing(
-                    "model",
-                    "model printed on the motor: rs00 to rs06 of Robstride, ak10-9 to ak80-64 of T-Motor",
-                );
-            }
-            family
-        }
-        (FamilyKind::Odrive, id) => {
-            id.and_then(to_u8).and_then(|id| odrive::Node::new(id).ok()).map(|node| Family::Odrive { node })
-        }
-        (FamilyKind::Cia402, id) => {
-            if counts_per_turn.is_none() {
-                keys.missing("counts_per_turn", "position counts of the drive per turn of its encoder");
-            }
-            let node = id.and_then(to_u8).and_then(|id| canopen::Node::new(id).ok());
-            let units = counts_per_turn.map(|counts_per_turn| Units { counts_per_turn, rated_torque_nm });
-            node.zip(units).map(|(node, units)| Family::Cia402 { node, units })
-        }
-    };
+    let protocol = family.and_then(|family| {
+        check_settings(&keys, family, &values);
+        family.motor(&MotorSettings { id: id?, values })
+    });
     keys.end();
-    Some(MotorConfig { joint, bus_ix: bus_ix?, family: family?, gear_ratio, is_reversed, offset_rad, gains })
+    Some(MotorConfig { joint, bus_ix: bus_ix?, protocol: protocol?, gear_ratio, is_reversed, offset_rad, gains })
+}
+
+/// Names of all families, for example "a, b or c".
+fn family_names() -> String {
+    let names: Vec<_> = FAMILIES.iter().map(|family| family.name()).collect();
+    match names.split_last() {
+        Some((last, [])) => (*last).to_owned(),
+        Some((last, others)) => format!("{} or {last}", others.join(", ")),
+        None => String::new(),
+    }
+}
+
+/// Keys that depend on the family.
+fn all_keys() -> impl Iterator<Item = MotorKey> {
+    FAMILIES.iter().flat_map(|family| family.keys())
+}
+
+/// Reads a key that depends on the family. Words of other families are accepted here, so that [`check_settings`] can
+/// report what is wrong with them.
+fn setting(keys: &mut Section<'_>, key: &MotorKey) -> Option<SettingValue> {
+    match &key.allowed {
+        AllowedValues::Whole(range) => keys.whole(key.name, range.clone()).map(SettingValue::Whole),
+        AllowedValues::Number(range) => keys.number(key.name, range.clone()).map(SettingValue::Number),
+        AllowedValues::Words(_) => {
+            let words = all_keys().filter(|known| known.name == key.name).flat_map(|known| words(&known));
+            let choices: Vec<_> = words.map(|word| (word, word)).collect();
+            keys.choice(key.name, &choices).map(SettingValue::Word)
+        }
+    }
+}
+
+/// Allowed words of a key; empty if its values are numbers.
+fn words(key: &MotorKey) -> Vec<&'static str> {
+    match &key.allowed {
+        AllowedValues::Words(words) => words.clone(),
+        AllowedValues::Whole(_) | AllowedValues::Number(_) => Vec::new(),
+    }
+}
+
+/// The first and the last word of a list.
+fn span(words: &[&str]) -> Option<String> {
+    Some(format!("{} to {}", words.first()?, words.last()?))
+}
+
+/// Reports missing settings and words of other families.
+fn check_settings(keys: &Section<'_>, family: &dyn MotorFamily, values: &BTreeMap<&str, SettingValue>) {
+    for key in family.keys() {
+        let own_words = words(&key);
+        match (values.get(key.name), key.required) {
+            (None, Some(meaning)) => keys.missing(key.name, meaning_with_words(key.name, meaning)),
+            (Some(SettingValue::Word(word)), _) if !own_words.contains(word) => {
+                let allowed = span(&own_words).unwrap_or_default();
+                let allowed = format!("{allowed}, as the family is {}", family.name());
+                keys.invalid::<()>(key.name, &Value::from(*word), &allowed);
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Meaning of a key, with its words for each family.
+fn meaning_with_words(name: &str, meaning: &str) -> String {
+    let spans = FAMILIES.iter().flat_map(|family| {
+        let keys = family.keys().into_iter().filter(|key| key.name == name);
+        keys.filter_map(|key| Some(format!("{} of {}", span(&words(&key))?, family.title()))).collect::<Vec<_>>()
+    });
+    let spans: Vec<_> = spans.collect();
+    if spans.is_empty() { meaning.to_owned() } else { format!("{meaning}: {}", spans.join(", ")) }
 }
 
 /// Reads both gains; they need each other.
@@ -202,40 +180,24 @@ pub(super) fn write(buses: &[BusConfig], motors: &[MotorConfig]) -> [Option<Valu
 }
 
 fn motor_table(motor: &MotorConfig, bus: &str) -> Table {
-    let mut model = None;
-    let mut feedback = None;
-    let mut units = None;
-    let (kind, id) = match motor.family {
-        Family::Damiao { motor, feedback: answers } => {
-            feedback = Some(answers);
-            (FamilyKind::Damiao, motor)
-        }
-        Family::Robstride { motor, model: own } => {
-            model = Some(Model::Robstride(own));
-            (FamilyKind::Robstride, motor.into())
-        }
-        Family::TMotor { motor, model: own } => {
-            model = Some(Model::TMotor(own));
-            (FamilyKind::TMotor, motor.into())
-        }
-        Family::Odrive { node } => (FamilyKind::Odrive, node.number().into()),
-        Family::Cia402 { node, units: own } => {
-            units = Some(own);
-            (FamilyKind::Cia402, node.number().into())
-        }
-    };
-    table([
-        ("family", name_of(&FAMILIES, &kind)),
+    let MotorSettings { id, values } = motor.protocol.settings();
+    let mut keys = table([
+        ("family", is(motor.protocol.family().name())),
         ("bus", is(bus)),
-        ("id", whole(id.into())),
-        ("feedback_id", feedback.and_then(|id| whole(id.into()))),
-        ("model", model.and_then(|model| name_of(&MODELS, &model))),
-        ("counts_per_turn", units.and_then(|units| is(units.counts_per_turn))),
-        ("rated_torque_nm", units.and_then(|units| is(units.rated_torque_nm))),
+        ("id", whole(id)),
         ("gear_ratio", is(motor.gear_ratio)),
         ("reversed", is(motor.is_reversed)),
         ("offset_rad", is(motor.offset_rad)),
         ("stiffness_nm_rad", motor.gains.and_then(|gains| is(gains.stiffness_nm_rad))),
         ("damping_nm_s_rad", motor.gains.and_then(|gains| is(gains.damping_nm_s_rad))),
-    ])
+    ]);
+    for (name, value) in values {
+        let value = match value {
+            SettingValue::Whole(number) => whole(number),
+            SettingValue::Number(number) => is(number),
+            SettingValue::Word(word) => is(word),
+        };
+        keys.extend(value.map(|value| (name.to_owned(), value)));
+    }
+    keys
 }

@@ -1,5 +1,6 @@
 //! Errors in rig files.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 
 /// Why a rig file was rejected. The message names the file, the line and the key.
@@ -44,7 +45,7 @@ pub enum ConfigError {
         /// Dotted path of the key.
         key: String,
         /// Meaning of the key, or its allowed values.
-        meaning: &'static str,
+        meaning: Cow<'static, str>,
     },
     /// A value outside the allowed ones.
     #[error("{at}: {key} is {got}, allowed: {allowed}")]

@@ -155,7 +155,8 @@ fn resolve_motors(file: &str, arm: &mut Arm) -> Result<(), ConfigError> {
         return Err(problem(format!("the joint {joint:?} has no table [arm.motor.{joint}]")));
     }
     for (ix, motor) in arm.motors.iter().enumerate() {
-        let is_same = |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.family.conflicts_with(&motor.family);
+        let is_same =
+            |other: &&MotorConfig| other.bus_ix == motor.bus_ix && other.protocol.conflicts_with(&*motor.protocol);
         if let Some(same) = arm.motors[..ix].iter().find(is_same) {
             let interface = &arm.buses[motor.bus_ix].interface;
             let message = format!("{:?} and {:?} have the same ID on {interface:?}", same.joint, motor.joint);

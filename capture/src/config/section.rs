@@ -3,6 +3,7 @@
 //! Problems are collected, so that a misspelled key is reported as such and not as a missing key.
 
 use super::error::{ConfigError, SourceLocation};
+use std::borrow::Cow;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -184,6 +185,11 @@ impl<'a> Section<'a> {
         }
     }
 
+    /// Accepts any value of a key.
+    pub(super) fn ignore(&mut self, key: &'static str) {
+        self.take(key);
+    }
+
     /// `true` or `false`; `None` if absent or invalid.
     pub(super) fn flag(&mut self, key: &'static str) -> Option<bool> {
         let value = self.take(key)?;
@@ -292,11 +298,12 @@ impl<'a> Section<'a> {
     }
 
     /// Reports a missing key, unless its value was just reported as invalid.
-    pub(super) fn missing(&self, key: &str, meaning: &'static str) {
+    pub(super) fn missing(&self, key: &str, meaning: impl Into<Cow<'static, str>>) {
         let key = join(&self.path, key);
         let is_reported = |problem: &ConfigError| matches!(problem, ConfigError::InvalidValue { key: invalid, .. } if *invalid == key);
         if !self.context.problems.borrow().iter().any(is_reported) {
-            self.context.report(ConfigError::Missing { file: self.context.file.clone(), key, meaning });
+            let (file, meaning) = (self.context.file.clone(), meaning.into());
+            self.context.report(ConfigError::Missing { file, key, meaning });
         }
     }
 

@@ -5,6 +5,8 @@ use crate::config::Depth;
 use crate::config::{ArmDriver, ArmMotion, BaseDriver, Camera, CameraDriver, Rig, ScannerDriver};
 use crate::error::Context;
 #[cfg(target_os = "linux")]
+use drivers::can::odrive::Endpoints;
+#[cfg(target_os = "linux")]
 use drivers::can::{self, CanArm, MovableArmConfig, MovableCanArm};
 #[cfg(target_os = "linux")]
 use drivers::franka::{self, FrankaArm, MovableFrankaArm};
@@ -14,8 +16,6 @@ use drivers::motion::{MotionConfig, MotionLimits};
 use drivers::udp::{UdpArm, UdpBase, UdpScanner};
 #[cfg(target_os = "linux")]
 use drivers::v4l2::{Config, Settings, V4l2Camera, V4l2Format};
-#[cfg(target_os = "linux")]
-use drivers::wire::can::odrive::Endpoints;
 use drivers::{Arm, Base, Devices, RangeScanner};
 use keyframe::bail;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};

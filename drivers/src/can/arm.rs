@@ -110,13 +110,13 @@ struct Cycle {
 impl Cycle {
     /// Polls at the requested rate, or at the highest rate that keeps the bus load within bounds.
     fn new(bus: &BusConfig, motors: &[(usize, Motor)], rate_hz: f64) -> Self {
-        let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.poll_frame()).collect();
-        if motors.iter().any(|(_, motor)| motor.needs_sync()) {
+        let mut poll_frames: Vec<_> = motors.iter().filter_map(|(_, motor)| motor.protocol().poll_frame()).collect();
+        if motors.iter().any(|(_, motor)| motor.protocol().canopen_node().is_some()) {
             poll_frames.push(canopen::encode_sync());
         }
         let mut cycle_frames = poll_frames.clone();
         let mut unsolicited = Vec::new();
-        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.typical_answer()) {
+        for (answer, own_rate_hz) in motors.iter().map(|(_, motor)| motor.protocol().typical_answer()) {
             match own_rate_hz {
                 Some(own_rate_hz) => unsolicited.push((answer, own_rate_hz)),
                 None => cycle_frames.push(answer),
@@ -230,7 +230,8 @@ impl BusReader {
 
 #[cfg(test)]
 mod tests {
-    use super::super::config::{Family, MotorConfig};
+    use super::super::config::MotorConfig;
+    use super::super::damiao::Damiao;
     use super::*;
 
     #[test]
@@ -243,12 +244,12 @@ mod tests {
         };
         let motors: Vec<_> = (0..7)
             .map(|ix| {
-                let family = Family::Damiao { motor: ix + 1, feedback: 0x10 + ix };
+                let protocol = Arc::new(Damiao { motor: ix + 1, feedback: 0x10 + ix });
                 let joint = format!("joint{ix}");
                 let config = MotorConfig {
                     joint,
                     bus_ix: 0,
-                    family,
+                    protocol,
                     gear_ratio: 1.0,
                     is_reversed: false,
                     offset_rad: 0.0,

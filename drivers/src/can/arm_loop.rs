@@ -6,12 +6,13 @@
 //! and no new ones until it receives [`Request::Recover`].
 
 use super::bus::Bus;
-use super::bus_load::max_cycle_rate_hz;
-use super::config::{Family, MovableArmConfig};
+use super::config::MovableArmConfig;
+use super::family::Health;
 use super::frame_io::{BusEvent, WireErrors};
 use super::joints::JointReading;
 use super::motor::Reading;
-use super::movable_motor::{Health, MovableMotor};
+use super::movable_motor::MovableMotor;
+use super::plan::watchdog_plan;
 use super::watchdog::WatchdogPlan;
 use crate::motion::{JointTarget, Motion, MotionLimits, OnLoss, TrajectoryGenerator};
 use crate::wire::can::Frame;
@@ -27,8 +28,6 @@ use std::time::Duration;
 /// Fraction of the motors' timeout after which we stop. We stop before the motors do, so that no motor is commanded
 /// while others have already stopped.
 const SILENCE_FRAC: f64 = 0.8;
-/// Minimum length of the timeout in cycles.
-const MIN_CYCLES: u32 = 4;
 /// A motor counts as silent only after this many cycles: if we were late ourselves, its answer is still to come.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
@@ -114,7 +113,7 @@ impl ArmLoop {
         motion: Arc<Mutex<Motion>>,
         is_shutting_down: Arc<AtomicBool>,
     ) -> Result<Self, Error> {
-        let plan = WatchdogPlan::new(config)?;
+        let plan = watchdog_plan(config)?;
         let arm_state = ArmState::stopped(clock::now(), None);
         Ok(Self {
             config: config.clone(),
@@ -425,7 +424,8 @@ impl ArmLoop {
             *pending_fail_safe = None;
             return;
         };
-        let has_no_watchdog = |movable_motor: &MovableMotor| !self.plan.has_watchdog(&movable_motor.config().family);
+        let has_no_watchdog =
+            |movable_motor: &MovableMotor| !movable_motor.motor().protocol().watchdog(&self.plan).is_available();
         prepared.shutdown(fail_safe, has_no_watchdog);
         let watchdog_deadline = *since + self.plan.timeout;
         let all = prepared.movable_motors.iter().zip(&prepared.last_heard);
@@ -444,41 +444,6 @@ impl ArmLoop {
             );
         }
         *pending_fail_safe = None;
-    }
-}
-
-impl WatchdogPlan {
-    /// Checks everything that can be checked before anything is sent.
-    pub(super) fn new(config: &MovableArmConfig) -> Result<Self, Error> {
-        let (arm, motion_config) = (&config.arm, &config.motion);
-        if motion_config.limits.len() != arm.motors.len() {
-            let reason = format!(
-                "limits are given for {} joints, but the arm has {}",
-                motion_config.limits.len(),
-                arm.motors.len()
-            );
-            return Err(Error::Motion { reason });
-        }
-        let host = unused_node(config)?;
-        let plan = Self {
-            on_loss: motion_config.on_loss,
-            timeout: motion_config.timeout,
-            accept_no_watchdog: motion_config.accept_no_watchdog,
-            endpoints: config.odrive_endpoints.clone(),
-            period: period(config, host),
-            host,
-        };
-        for motor in &arm.motors {
-            plan.check(motor, &arm.buses[motor.bus_ix].interface)?;
-        }
-        if plan.timeout < MIN_CYCLES * plan.period {
-            let reason = format!(
-                "arm.motion.timeout_millis must be at least {MIN_CYCLES} cycles of {:.1} ms",
-                1e3 * plan.period.as_secs_f64()
-            );
-            return Err(Error::Motion { reason });
-        }
-        Ok(plan)
     }
 }
 
@@ -542,7 +507,7 @@ impl PreparedMotors {
     /// Polls motors that are executing `on_loss` for their positions, as a read-only arm does. Sends no SYNC, because
     /// drives would then take the last target they received.
     fn poll_stopped(&self) -> Result<(), Error> {
-        self.poll(|movable_motor| movable_motor.motor().poll_frame())
+        self.poll(|movable_motor| movable_motor.motor().protocol().poll_frame())
     }
 
     fn poll(&self, poll_frame: impl Fn(&MovableMotor) -> Option<Frame>) -> Result<(), Error> {
@@ -590,7 +555,8 @@ impl PreparedMotors {
         let has_drives = |bus_ix: usize| {
             self.movable_motors
                 .iter()
-                .any(|movable_motor| movable_motor.needs_sync() && movable_motor.config().bus_ix == bus_ix)
+                .filter(|movable_motor| movable_motor.config().bus_ix == bus_ix)
+                .any(|movable_motor| movable_motor.motor().protocol().canopen_node().is_some())
         };
         self.buses.iter().enumerate().filter(move |(ix, _)| has_drives(*ix)).map(|(_, bus)| bus)
     }
@@ -626,7 +592,7 @@ impl PreparedMotors {
         for (movable_motor, sent_rad) in
             self.movable_motors.iter().zip(&self.sent_rad).filter(|(movable_motor, _)| selects(movable_motor))
         {
-            for frame in movable_motor.shutdown(fail_safe, *sent_rad).unwrap_or_default() {
+            if let Ok(frame) = movable_motor.shutdown(fail_safe, *sent_rad) {
                 let _ = self.bus_of(movable_motor).send_within(&frame, MAX_FAIL_SAFE_WAIT);
             }
         }
@@ -666,103 +632,5 @@ fn reason_of(error: &Error) -> String {
     match error {
         Error::Motion { reason } => reason.clone(),
         other => other.to_string(),
-    }
-}
-
-/// An unused CANopen node number for this computer.
-fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
-    let is_used = |node: canopen::Node| {
-        config.arm.motors.iter().any(|motor| matches!(motor.family, Family::Cia402 { node: used, .. } if used == node))
-    };
-    let mut numbers = (1..=127).rev().filter_map(|number| canopen::Node::new(number).ok());
-    let unused = numbers.find(|node| !is_used(*node));
-    unused.ok_or_else(|| motion("no free CANopen node number is left for this computer".to_owned()))
-}
-
-/// Cycle period that the slowest bus allows. It is rounded up to whole milliseconds if there are drives, because they
-/// count in milliseconds.
-fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
-    let mut rate_hz = config.arm.rate_hz;
-    let is_drive = |family: &Family| matches!(family, Family::Cia402 { .. });
-    for (bus_ix, bus) in config.arm.buses.iter().enumerate() {
-        let families: Vec<_> =
-            config.arm.motors.iter().filter(|motor| motor.bus_ix == bus_ix).map(|motor| motor.family).collect();
-        if families.is_empty() {
-            continue;
-        }
-        let (mut cycle_frames, mut unsolicited) = (Vec::new(), Vec::new());
-        for traffic in families.iter().map(MovableMotor::traffic) {
-            cycle_frames.extend(traffic.cycle_frames);
-            unsolicited.extend(traffic.unsolicited);
-        }
-        if families.iter().any(is_drive) {
-            cycle_frames.extend([canopen::encode_sync(), canopen::encode_heartbeat(host, NodeState::Operational)]);
-        }
-        rate_hz = rate_hz.min(max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, config.arm.rate_hz));
-    }
-    let period = Duration::from_secs_f64(1.0 / rate_hz);
-    match config.arm.motors.iter().any(|motor| is_drive(&motor.family)) {
-        true => Duration::from_millis(period.as_nanos().div_ceil(1_000_000).try_into().unwrap_or(u64::MAX)),
-        false => period,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::config::{ArmConfig, BusConfig, MotorConfig};
-    use super::*;
-    use crate::motion::{MotionConfig, OnLoss};
-    use crate::wire::can::cia402::Units;
-
-    fn config(families: Vec<Family>) -> MovableArmConfig {
-        let motors = families.into_iter().map(|family| MotorConfig {
-            joint: "any".to_owned(),
-            bus_ix: 0,
-            family,
-            gear_ratio: 1.0,
-            is_reversed: false,
-            offset_rad: 0.0,
-            gains: None,
-        });
-        MovableArmConfig {
-            arm: ArmConfig {
-                buses: vec![BusConfig {
-                    interface: "can0".to_owned(),
-                    bitrate_hz: 1_000_000,
-                    data_bitrate_hz: None,
-                    accept_no_restart: false,
-                }],
-                motors: motors.collect(),
-                rate_hz: 1000.0,
-            },
-            motion: MotionConfig {
-                limits: Vec::new(),
-                on_loss: OnLoss::Release,
-                timeout: Duration::from_millis(100),
-                accept_no_watchdog: false,
-            },
-            odrive_endpoints: None,
-        }
-    }
-
-    #[test]
-    fn cycle_keeps_bus_load_under_70_percent() {
-        let host = canopen::Node::new(127).expect("a node");
-        let damiao = |ix: u16| Family::Damiao { motor: ix, feedback: 0x10 + ix };
-        assert_eq!(period(&config(vec![damiao(1), damiao(2)]), host), Duration::from_millis(1));
-        // Seven motors with two frames each, at most 135 bits per frame.
-        let seven = period(&config((1..8).map(damiao).collect()), host).as_secs_f64();
-        assert!((seven - 14.0 * 135e-6 / 0.7).abs() < 1e-6, "{seven}");
-    }
-
-    #[test]
-    fn drives_get_whole_millisecond_period_and_unused_node() {
-        let node = |number| canopen::Node::new(number).expect("a node");
-        let drive =
-            |number| Family::Cia402 { node: node(number), units: Units { counts_per_turn: 1.0, rated_torque_nm: 1.0 } };
-        let arm = config(vec![drive(127), drive(126), drive(1)]);
-        assert_eq!(unused_node(&arm).expect("125 are free"), node(125));
-        // 9 x 135 bits, a SYNC of 55 and a heartbeat of 65 take 1.34 ms of 70 %: 1.91 ms.
-        assert_eq!(period(&arm, node(125)), Duration::from_millis(2));
     }
 }

@@ -7,7 +7,7 @@ use super::arm::MAX_WAITING;
 use super::arm_loop::{ArmLoop, Request};
 use super::config::MovableArmConfig;
 use super::joints::{JointReading, Joints};
-use super::watchdog::WatchdogPlan;
+use super::plan::watchdog_plan;
 use crate::motion::{JointTarget, Motion, MovableArm};
 use crate::{Arm, Error};
 use kinematics::JointState;
@@ -41,7 +41,7 @@ pub struct MovableCanArm {
 impl MovableCanArm {
     /// Checks what can be checked without the motors: the limits, and whether each motor supports the configuration.
     pub fn check(config: &MovableArmConfig) -> Result<(), Error> {
-        WatchdogPlan::new(config).map(drop)
+        watchdog_plan(config).map(drop)
     }
 
     /// Checks the capabilities of the motors, sets and verifies their timeouts, and enables them, holding their

@@ -1,26 +1,29 @@
-//! Conversations of the driver with an emulated motor of each family, compared byte by byte with `transcripts.txt`.
+//! Conversations of the driver with an emulated motor of each family, compared byte by byte with `transcript.txt` of the
+//! family's folder.
 //!
-//! In that file, `>` is a frame to the motor, `<` a frame from it, and `=` a result of the driver. After an intended
+//! In these files, `>` is a frame to the motor, `<` a frame from it, and `=` a result of the driver. After an intended
 //! change of a protocol, replace the file with the text that the test prints.
 
 use super::emulated::EmulatedMotor;
+use super::family::{Health, LIMITS};
 use super::frame_io::{BusEvent, FrameIo};
-use super::fuzz::{LIMITS, motors};
+use super::fuzz::motors;
 use super::motor::Motor;
-use super::movable_motor::{Health, MovableMotor};
+use super::movable_motor::MovableMotor;
+use super::odrive::Endpoints;
+use super::odrive::emulated;
+use super::plan::check_motor;
 use super::watchdog::WatchdogPlan;
-use super::{Family, Gains, MotorConfig, emulated};
+use super::{Gains, MotorConfig};
 use crate::Error;
 use crate::motion::{MotionLimits, OnLoss};
-use crate::wire::can::odrive::Endpoints;
-use crate::wire::can::{Frame, Id, canopen};
+use crate::wire::can::{Frame, canopen};
 use kinematics::Stamp;
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::fmt::Write;
 use std::time::Duration;
 
-const EXPECTED: &str = include_str!("transcripts.txt");
 /// Cycle period and timeout of the watchdog.
 const PERIOD: Duration = Duration::from_millis(5);
 const TIMEOUT: Duration = Duration::from_millis(100);
@@ -39,7 +42,7 @@ struct TestBus {
 
 impl TestBus {
     fn new(config: &MotorConfig) -> Self {
-        let motor = RefCell::new(EmulatedMotor::new(config.family, LIMITS));
+        let motor = RefCell::new(EmulatedMotor::new(&*config.protocol, LIMITS));
         let (waiting, is_quiet, transcript) = (RefCell::default(), Cell::new(false), RefCell::default());
         Self { motor, now: Cell::new(Stamp(0)), waiting, other_master: None, is_quiet, transcript }
     }
@@ -103,23 +106,15 @@ fn text_of(frame: &Frame) -> String {
     format!("{id}{} {}", if frame.is_remote() { " remote" } else { "" }, bytes.join(" "))
 }
 
-/// Frames with which another master makes a motor report that answers only commands.
-fn other_master(config: &MotorConfig) -> Option<Frame> {
-    match config.family {
-        Family::TMotor { motor, .. } => Some(Frame::classic(Id::standard(motor.into()).unwrap(), &[0; 8]).unwrap()),
-        _ => None,
-    }
-}
-
 /// Finds a motor as a read-only arm does, and polls it.
 fn reading(config: &MotorConfig) -> String {
-    let bus = TestBus { other_master: other_master(config), ..TestBus::new(config) };
+    let bus = TestBus { other_master: config.protocol.family().fuzzing().other_master, ..TestBus::new(config) };
     let motor = Motor::set_up(&bus, config).unwrap();
-    let (answer, rate_hz) = motor.typical_answer();
+    let (answer, rate_hz) = motor.protocol().typical_answer();
     bus.note(&format!("= answers like {} at {rate_hz:?} Hz", text_of(&answer)));
     for _ in 0..3 {
-        motor.poll_frame().iter().for_each(|frame| drop(bus.send(frame)));
-        if motor.needs_sync() {
+        motor.protocol().poll_frame().iter().for_each(|frame| drop(bus.send(frame)));
+        if motor.protocol().canopen_node().is_some() {
             bus.send(&canopen::encode_sync()).unwrap();
         }
         for _ in 0..12 {
@@ -144,7 +139,7 @@ fn cycles(bus: &TestBus, motor: &mut MovableMotor, n: usize, position_rad: Optio
         bus.is_quiet.set(cycle >= 2);
         if let Some(position_rad) = position_rad {
             bus.send(&motor.command(position_rad, 0.125).unwrap()).unwrap();
-            if motor.needs_sync() {
+            if motor.motor().protocol().canopen_node().is_some() {
                 bus.send(&canopen::encode_heartbeat(canopen::Node::new(127).unwrap(), canopen::NodeState::Operational))
                     .unwrap();
                 bus.send(&canopen::encode_sync()).unwrap();
@@ -182,10 +177,10 @@ fn start(bus: &TestBus, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Mov
 /// Moves a motor, lets its watchdog expire, moves it again, and lets it fail.
 fn moving(config: &MotorConfig, plan: &WatchdogPlan) -> String {
     let bus = TestBus::new(config);
-    if let Err(error) = plan.check(config, "test0") {
+    if let Err(error) = check_motor(plan, config, "test0") {
         return format!("= {error}\n");
     }
-    let traffic = MovableMotor::traffic(&config.family);
+    let traffic = config.protocol.traffic();
     traffic.cycle_frames.iter().for_each(|frame| bus.note(&format!("= in each cycle {}", text_of(frame))));
     traffic.unsolicited.iter().for_each(|(frame, rate_hz)| bus.note(&format!("= {} at {rate_hz} Hz", text_of(frame))));
     let run = || {
@@ -203,7 +198,7 @@ fn moving(config: &MotorConfig, plan: &WatchdogPlan) -> String {
         assert!(matches!(motor.health(), Some(Health::Enabled)), "{:?}", motor.health());
         for on_loss in [OnLoss::Hold, OnLoss::Damp, OnLoss::Release] {
             bus.note(&format!("# shut down: {}", on_loss.name()));
-            motor.shutdown(on_loss, 0.375).unwrap().iter().for_each(|frame| drop(bus.send(frame)));
+            bus.send(&motor.shutdown(on_loss, 0.375).unwrap()).unwrap();
             cycles(&bus, &mut motor, 4, None);
         }
         Ok(())
@@ -255,9 +250,10 @@ fn conversation(config: &MotorConfig) -> String {
     }
     text += "## rejected\n";
     let strict = WatchdogPlan { accept_no_watchdog: false, ..plan(OnLoss::Release, None) };
-    text += &strict.check(config, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
+    text += &check_motor(&strict, config, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
     let without_gains = MotorConfig { gains: None, ..config.clone() };
-    text += &strict.check(&without_gains, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
+    text +=
+        &check_motor(&strict, &without_gains, "test0").map_or_else(|error| format!("= {error}\n"), |()| String::new());
     let lenient = plan(OnLoss::Release, Some(emulated::endpoints()));
     text += &rejected(config, &lenient, EmulatedMotor::ignore_timeout);
     let endpoints = Endpoints { firmware: "0.6.8".to_owned(), ..emulated::endpoints() };
@@ -269,13 +265,15 @@ fn conversation(config: &MotorConfig) -> String {
 
 #[test]
 fn conversations_match_transcripts() {
-    let text: String =
-        motors().iter().map(|config| format!("#### {}\n{}", config.joint, conversation(config))).collect();
-    if text != EXPECTED {
-        println!("{text}");
+    for config in motors() {
+        let family = config.protocol.family();
+        let (text, expected) = (conversation(&config), family.fuzzing().transcript);
+        if text != expected {
+            println!("{text}");
+        }
+        for (number, (got, expected)) in (1..).zip(text.lines().zip(expected.lines())) {
+            assert_eq!(got, expected, "line {number} of transcript.txt of {}", family.name());
+        }
+        assert_eq!(text.lines().count(), expected.lines().count(), "lines of transcript.txt of {}", family.name());
     }
-    for (number, (got, expected)) in (1..).zip(text.lines().zip(EXPECTED.lines())) {
-        assert_eq!(got, expected, "line {number} of transcripts.txt");
-    }
-    assert_eq!(text.lines().count(), EXPECTED.lines().count(), "lines of transcripts.txt");
 }

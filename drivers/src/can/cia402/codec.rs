@@ -4,8 +4,8 @@
 //! controlword (`0x6040`), statusword (`0x6041`) and modes (`0x6060`); the same masks in
 //! `ros-industrial/ros_canopen`. Positions, velocities and torques are in units that each drive defines: [`Units`].
 
-use super::CanError;
-use super::canopen::Object;
+use crate::wire::can::CanError;
+use crate::wire::can::canopen::Object;
 use std::f64::consts::TAU;
 
 /// Reaction of the drive to a missing host heartbeat: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop.
@@ -250,8 +250,8 @@ fn checked_count(field: &'static str, count: f64, range: (f64, f64), value: f64,
 
 #[cfg(test)]
 mod tests {
-    use super::super::canopen::{Node, encode_write};
     use super::*;
+    use crate::wire::can::canopen::{Node, encode_write};
     use kinematics::random::Random;
 
     const ALL: [State; 8] = [

@@ -1,14 +1,14 @@
 //! An emulated CiA 402 drive with cyclic synchronous position mode.
 
-use super::shaft::Actuation;
-use super::{EmulatedMotor, State};
-use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT, Direction, Node, NodeState, Object, Pdo};
-use crate::wire::can::cia402::{self, StateCommand, Units};
+use super::Cia402;
+use super::codec::{self, StateCommand};
+use crate::can::emulated::{Actuation, EmulatedDrive, EmulatedProtocol, State};
+use crate::wire::can::canopen::{self, CONSUMER_HEARTBEAT, Direction, NodeState, Object, Pdo};
 use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame, Id};
 use std::time::Duration;
 
-/// Value of [`cia402::SUPPORTED_MODES`]: profile position and the three cyclic modes.
+/// Value of [`codec::SUPPORTED_MODES`]: profile position and the three cyclic modes.
 const SUPPORTED_MODES_MASK: u32 = 0b11_1000_0001;
 
 /// Key of an object in the settings.
@@ -31,17 +31,29 @@ fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     }
 }
 
-impl EmulatedMotor {
-    fn object(&self, object: Object) -> Option<u32> {
-        self.setting(number(object.index, object.subindex))
-    }
+/// Value of an object that was written.
+fn written(drive: &EmulatedDrive, object: Object) -> Option<u32> {
+    drive.setting(number(object.index, object.subindex))
+}
 
-    pub(super) fn handle_drive(&mut self, frame: &Frame, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
+#[derive(Debug)]
+pub(super) struct EmulatedCia402 {
+    address: Cia402,
+    node_state: NodeState,
+    state: codec::State,
+    /// Controlword and target that take effect at the next SYNC.
+    pending_command: Option<(u16, i32)>,
+    last_controlword: u16,
+}
+
+impl EmulatedProtocol for EmulatedCia402 {
+    fn take(&mut self, frame: &Frame, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         if frame.is_remote() || frame.id().is_extended() {
             return Ok(Vec::new());
         }
+        let node = self.address.node;
         let sdo = 0x600 + u32::from(node.number());
-        let watched_node = self.object(CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
+        let watched_node = written(drive, CONSUMER_HEARTBEAT).map_or(0, |entry| entry >> 16 & 0x7F);
         match (frame.id().value(), frame.data()) {
             (0, &[state_command, to]) if to == 0 || to == node.number() => {
                 self.node_state = match state_command {
@@ -52,13 +64,13 @@ impl EmulatedMotor {
                 };
                 Ok(Vec::new())
             }
-            (0x80, &[]) if self.node_state == NodeState::Operational => self.synchronous(node, units),
+            (0x80, &[]) if self.node_state == NodeState::Operational => self.synchronous(drive),
             (id, &[_]) if watched_node > 0 && id == 0x700 + watched_node => {
-                self.reset_watchdog();
+                drive.reset_watchdog();
                 Ok(Vec::new())
             }
             (id, &[low, high, a, b, c, d]) if id == Pdo::First.id(Direction::Receive, node).value() => {
-                if self.node_state == NodeState::Operational && self.accepts_targets(node) {
+                if self.node_state == NodeState::Operational && self.accepts_targets(drive) {
                     self.pending_command = Some((u16::from_le_bytes([low, high]), i32::from_le_bytes([a, b, c, d])));
                 }
                 Ok(Vec::new())
@@ -69,14 +81,14 @@ impl EmulatedMotor {
                     1 => {
                         let value = u32::from_le_bytes([a, b, c, d]);
                         let is_timeout = index == CONSUMER_HEARTBEAT.index;
-                        self.set(number(index, subindex), value, is_timeout);
-                        if index == cia402::CONTROLWORD.index {
-                            self.state_command(u16::from_le_bytes([a, b]), None);
+                        drive.set(number(index, subindex), value, is_timeout);
+                        if index == codec::CONTROLWORD.index {
+                            self.state_command(u16::from_le_bytes([a, b]), None, drive);
                         }
                         [0x60, low, high, subindex, 0, 0, 0, 0]
                     }
                     2 => {
-                        let [a, b, c, d] = self.reply(index, subindex).to_le_bytes();
+                        let [a, b, c, d] = self.reply(index, subindex, drive).to_le_bytes();
                         [0x43, low, high, subindex, a, b, c, d]
                     }
                     _ => return Ok(Vec::new()),
@@ -87,59 +99,98 @@ impl EmulatedMotor {
         }
     }
 
+    fn heartbeat(&self, _drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
+        Ok(Some(canopen::encode_heartbeat(self.address.node, self.node_state)))
+    }
+
+    fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
+        let millis = written(drive, CONSUMER_HEARTBEAT)? & 0xFFFF;
+        (millis > 0).then(|| Duration::from_millis(millis.into()))
+    }
+
+    /// Reaction of an enabled drive to a missing heartbeat.
+    fn time_out(&mut self, drive: &mut EmulatedDrive) {
+        if drive.state() != State::Enabled {
+            return;
+        }
+        match written(drive, codec::ABORT_CONNECTION) {
+            Some(1) => self.change_state(codec::State::Fault, drive),
+            Some(2) => self.change_state(codec::State::SwitchOnDisabled, drive),
+            Some(3) => self.change_state(codec::State::QuickStopActive, drive),
+            _ => {}
+        }
+    }
+
+    fn fail(&mut self, _drive: &mut EmulatedDrive) {
+        self.state = codec::State::Fault;
+    }
+}
+
+impl EmulatedCia402 {
+    /// A drive that has just started.
+    pub(super) fn new(address: Cia402) -> Self {
+        Self {
+            address,
+            node_state: NodeState::PreOperational,
+            state: codec::State::SwitchOnDisabled,
+            pending_command: None,
+            last_controlword: 0,
+        }
+    }
+
     /// Value of an object.
-    fn reply(&self, index: u16, subindex: u8) -> u32 {
+    fn reply(&self, index: u16, subindex: u8, drive: &EmulatedDrive) -> u32 {
         let is_object = |object: Object| object.index == index;
-        if is_object(cia402::STATUSWORD) {
-            self.drive_state.statusword().into()
-        } else if is_object(cia402::SUPPORTED_MODES) {
+        if is_object(codec::STATUSWORD) {
+            self.state.statusword().into()
+        } else if is_object(codec::SUPPORTED_MODES) {
             SUPPORTED_MODES_MASK
-        } else if is_object(cia402::MODE_DISPLAY) {
-            self.object(cia402::MODE).unwrap_or(0)
+        } else if is_object(codec::MODE_DISPLAY) {
+            written(drive, codec::MODE).unwrap_or(0)
         } else {
-            self.setting(number(index, subindex)).unwrap_or(0)
+            drive.setting(number(index, subindex)).unwrap_or(0)
         }
     }
 
     /// Whether the first PDO delivers controlword and target at every SYNC.
-    fn accepts_targets(&self, node: Node) -> bool {
-        let mapped = [cia402::CONTROLWORD, cia402::TARGET_POSITION].map(|object| Some(object.mapped()));
-        let entries = [1, 2].map(|entry| self.object(Pdo::First.mapping(Direction::Receive, entry)));
-        self.is_on(Pdo::First, Direction::Receive, node) && entries == mapped
+    fn accepts_targets(&self, drive: &EmulatedDrive) -> bool {
+        let mapped = [codec::CONTROLWORD, codec::TARGET_POSITION].map(|object| Some(object.mapped()));
+        let entries = [1, 2].map(|entry| written(drive, Pdo::First.mapping(Direction::Receive, entry)));
+        self.is_on(Pdo::First, Direction::Receive, drive) && entries == mapped
     }
 
-    fn is_on(&self, pdo: Pdo, direction: Direction, node: Node) -> bool {
-        self.object(pdo.communication(direction, 1)) == Some(pdo.id(direction, node).value())
-            && self.object(pdo.communication(direction, 2)) == Some(1)
+    fn is_on(&self, pdo: Pdo, direction: Direction, drive: &EmulatedDrive) -> bool {
+        written(drive, pdo.communication(direction, 1)) == Some(pdo.id(direction, self.address.node).value())
+            && written(drive, pdo.communication(direction, 2)) == Some(1)
     }
 
     /// Applies a controlword, and a target if the drive is enabled in cyclic position mode.
-    fn state_command(&mut self, controlword: u16, target: Option<Command>) {
+    fn state_command(&mut self, controlword: u16, target: Option<Command>, drive: &mut EmulatedDrive) {
         if let Some(state_command) = decode_controlword(controlword, self.last_controlword) {
-            self.change_state(self.drive_state.after(state_command));
+            self.change_state(self.state.after(state_command), drive);
         }
         self.last_controlword = controlword;
-        let is_cyclic = self.object(cia402::MODE) == Some(cia402::Mode::CyclicPosition as u32);
-        if let Some(target) = target.filter(|_| is_cyclic && self.state() == State::Enabled) {
-            self.actuation = Actuation::Follow(target);
-            self.target = Some(target);
+        let is_cyclic = written(drive, codec::MODE) == Some(codec::Mode::CyclicPosition as u32);
+        if let Some(target) = target.filter(|_| is_cyclic && drive.state() == State::Enabled) {
+            drive.actuation = Actuation::Follow(target);
+            drive.target = Some(target);
         }
     }
 
-    fn change_state(&mut self, state: cia402::State) {
-        if state == self.drive_state {
+    fn change_state(&mut self, state: codec::State, drive: &mut EmulatedDrive) {
+        if state == self.state {
             return;
         }
-        self.drive_state = state;
-        self.actuation = match state {
-            cia402::State::OperationEnabled => {
-                let position_rad = self.shaft.motion.position_rad;
+        self.state = state;
+        drive.actuation = match state {
+            codec::State::OperationEnabled => {
+                let position_rad = drive.motion().position_rad;
                 Actuation::Follow(Command { position_rad, ..Command::default() })
             }
-            cia402::State::QuickStopActive => match self.object(cia402::QUICK_STOP_OPTION) {
+            codec::State::QuickStopActive => match written(drive, codec::QUICK_STOP_OPTION) {
                 Some(5..=7) => Actuation::Stop,
                 _ => {
-                    self.drive_state = cia402::State::SwitchOnDisabled;
+                    self.state = codec::State::SwitchOnDisabled;
                     Actuation::Free
                 }
             },
@@ -147,54 +198,33 @@ impl EmulatedMotor {
         };
     }
 
-    /// Reaction of an enabled drive to a missing heartbeat.
-    pub(super) fn time_out_drive(&mut self) {
-        if self.state() != State::Enabled {
-            return;
-        }
-        match self.object(cia402::ABORT_CONNECTION) {
-            Some(1) => self.change_state(cia402::State::Fault),
-            Some(2) => self.change_state(cia402::State::SwitchOnDisabled),
-            Some(3) => self.change_state(cia402::State::QuickStopActive),
-            _ => {}
-        }
-    }
-
-    pub(super) fn drive_timeout(&self) -> Option<Duration> {
-        let millis = self.object(CONSUMER_HEARTBEAT)? & 0xFFFF;
-        (millis > 0).then(|| Duration::from_millis(millis.into()))
-    }
-
-    pub(super) fn drive_heartbeat(&self, node: Node) -> Frame {
-        canopen::encode_heartbeat(node, self.node_state)
-    }
-
     /// Applies pending commands, and sends the mapped PDOs that are enabled for every SYNC.
-    fn synchronous(&mut self, node: Node, units: Units) -> Result<Vec<Frame>, CanError> {
+    fn synchronous(&mut self, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         if let Some((controlword, target)) = self.pending_command.take() {
-            let position_rad = units.rad_from_raw(target);
-            self.state_command(controlword, Some(Command { position_rad, ..Command::default() }));
+            let position_rad = self.address.units.rad_from_raw(target);
+            self.state_command(controlword, Some(Command { position_rad, ..Command::default() }), drive);
         }
         let mut sent = Vec::new();
         for pdo in [Pdo::First, Pdo::Second] {
-            if self.is_on(pdo, Direction::Transmit, node) {
-                sent.push(self.transmit(pdo, node, units)?);
+            if self.is_on(pdo, Direction::Transmit, drive) {
+                sent.push(self.transmit(pdo, drive)?);
             }
         }
         Ok(sent)
     }
 
-    fn transmit(&self, pdo: Pdo, node: Node, units: Units) -> Result<Frame, CanError> {
-        let n = self.object(pdo.mapping(Direction::Transmit, 0)).unwrap_or(0);
+    fn transmit(&self, pdo: Pdo, drive: &EmulatedDrive) -> Result<Frame, CanError> {
+        let Cia402 { node, units } = self.address;
+        let n = written(drive, pdo.mapping(Direction::Transmit, 0)).unwrap_or(0);
         let mut bytes = Vec::new();
         for entry in 1..=u8::try_from(n).unwrap_or(8) {
-            let mapped = self.object(pdo.mapping(Direction::Transmit, entry)).unwrap_or(0);
+            let mapped = written(drive, pdo.mapping(Direction::Transmit, entry)).unwrap_or(0);
             let mapped = Object::from_mapped(mapped)?;
-            let motion = self.shaft.motion;
+            let motion = drive.motion();
             let value = match mapped {
-                cia402::POSITION => units.raw_from_rad("the position", motion.position_rad)?,
-                cia402::VELOCITY => units.raw_from_rad("the velocity", motion.velocity_rad_s)?,
-                cia402::STATUSWORD => self.drive_state.statusword().into(),
+                codec::POSITION => units.raw_from_rad("the position", motion.position_rad)?,
+                codec::VELOCITY => units.raw_from_rad("the velocity", motion.velocity_rad_s)?,
+                codec::STATUSWORD => self.state.statusword().into(),
                 _ => 0,
             };
             bytes.extend_from_slice(&value.to_le_bytes()[..usize::from(mapped.n_bytes)]);

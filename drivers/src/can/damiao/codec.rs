@@ -5,8 +5,8 @@
 //! errors, registers, TIMEOUT in ticks of 50 us). Commands have the motor's ID as identifier, register and refresh
 //! requests `0x7FF`. All answers have the motor's feedback identifier (register `MST_ID`).
 
-use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id, decode_enum, eight_bytes};
+use crate::wire::can::mit::{self, Command, Limits, Motion};
+use crate::wire::can::{CanError, Frame, Id, decode_enum, eight_bytes};
 
 /// Identifier of register messages.
 const REGISTER_ID: u32 = 0x7FF;
@@ -294,8 +294,8 @@ fn value_bytes(register: Register, value: Value) -> Result<[u8; 4], CanError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
+    use crate::wire::can::testing::{random_frames, truncated_and_doubled};
 
     const LIMITS: Limits = Model::Dm4310.limits();
 

@@ -18,7 +18,7 @@ const MAX_SECS: f64 = 1.0;
 
 /// What a drive does with its shaft.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Actuation {
+pub(in crate::can) enum Actuation {
     /// Releases it.
     Free,
     /// Applies the torque law of MIT mode.

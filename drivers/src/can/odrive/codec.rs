@@ -5,11 +5,7 @@
 //! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. Nodes
 //! send their messages at the rates set in `can.config` or `axis.config.can`, or in answer to a remote frame.
 
-mod endpoints;
-
-pub use endpoints::{Endpoints, EndpointsError};
-
-use super::{CanError, Frame, Id, decode_enum};
+use crate::wire::can::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
 
 /// First byte of the answer to `Get_Version`.
@@ -335,8 +331,8 @@ fn encode_thousandths(field: &'static str, value: f64) -> Result<[u8; 2], CanErr
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
+    use crate::wire::can::testing::{random_frames, truncated_and_doubled};
     use kinematics::random::Random;
 
     const NODE: Node = Node(1);

@@ -1,15 +1,15 @@
 //! An emulated `ODrive` axis. It follows positions with its own loop. Its watchdog also runs while it is idle.
 
-use super::shaft::Actuation;
-use super::{EmulatedMotor, State};
+use super::Endpoints;
+use super::codec::{self, Answer, Code, Node};
+use crate::can::emulated::{Actuation, EmulatedDrive, EmulatedProtocol, State};
 use crate::wire::can::mit::{Command, Motion};
-use crate::wire::can::odrive::{self, Answer, Code, Endpoints, Node};
 use crate::wire::can::{CanError, Frame};
 use std::f64::consts::TAU;
 use std::time::Duration;
 
 /// One of its error bits.
-pub(super) const CURRENT_LIMIT: u32 = 1 << 12;
+const CURRENT_LIMIT: u32 = 1 << 12;
 const HARDWARE: [u8; 3] = [4, 4, 58];
 const FIRMWARE: [u8; 3] = [0, 6, 9];
 const WATCHDOG_TIMEOUT: u16 = 218;
@@ -26,33 +26,38 @@ pub fn endpoints() -> Endpoints {
     }
 }
 
-impl EmulatedMotor {
-    pub(super) fn handle_odrive(&mut self, frame: &Frame, node: Node) -> Result<Vec<Frame>, CanError> {
+#[derive(Debug)]
+pub(super) struct EmulatedOdrive {
+    pub(super) node: Node,
+}
+
+impl EmulatedProtocol for EmulatedOdrive {
+    fn take(&mut self, frame: &Frame, drive: &mut EmulatedDrive) -> Result<Vec<Frame>, CanError> {
         let id = frame.id();
-        if id.is_extended() || id.value() >> 5 != u32::from(node.number()) {
+        if id.is_extended() || id.value() >> 5 != u32::from(self.node.number()) {
             return Ok(Vec::new());
         }
         let is_object = |code: Code| id.value() & 0x1F == code as u32;
         if frame.is_remote() {
             let version = Answer::Version { hardware: HARDWARE, firmware: FIRMWARE };
             return if is_object(Code::Version) {
-                Ok(vec![odrive::encode_answer(node, &version)?])
+                Ok(vec![codec::encode_answer(self.node, &version)?])
             } else {
                 Ok(Vec::new())
             };
         }
         if is_object(Code::SetState) {
             match frame.data() {
-                [1, 0, 0, 0] => self.actuation = Actuation::Free,
-                [8, 0, 0, 0] if self.faults == 0 => {
+                [1, 0, 0, 0] => drive.actuation = Actuation::Free,
+                [8, 0, 0, 0] if drive.faults == 0 => {
                     // It starts at its current position, whatever was requested before.
-                    let position_rad = self.shaft.motion.position_rad;
-                    self.actuation = Actuation::Follow(Command { position_rad, ..Command::default() });
+                    let position_rad = drive.motion().position_rad;
+                    drive.actuation = Actuation::Follow(Command { position_rad, ..Command::default() });
                 }
                 _ => {}
             }
         } else if is_object(Code::ClearErrors) {
-            self.faults = 0;
+            drive.faults = 0;
         } else if is_object(Code::SetPosition) {
             let &[a, b, c, d, e, f, ..] = frame.data() else { return Ok(Vec::new()) };
             let command = Command {
@@ -60,41 +65,54 @@ impl EmulatedMotor {
                 velocity_rad_s: f64::from(i16::from_le_bytes([e, f])) * 1e-3 * TAU,
                 ..Command::default()
             };
-            if self.state() == State::Enabled {
-                self.actuation = Actuation::Follow(command);
-                self.target = Some(command);
+            if drive.state() == State::Enabled {
+                drive.actuation = Actuation::Follow(command);
+                drive.target = Some(command);
             }
         } else if is_object(Code::EndpointRequest) {
             let &[operation, low, high, _, a, b, c, d] = frame.data() else { return Ok(Vec::new()) };
             let number = u16::from_le_bytes([low, high]);
             if operation == 1 {
-                self.set(number.into(), u32::from_le_bytes([a, b, c, d]), number == WATCHDOG_TIMEOUT);
+                drive.set(number.into(), u32::from_le_bytes([a, b, c, d]), number == WATCHDOG_TIMEOUT);
             } else {
-                let value = self.setting(number.into()).unwrap_or(0).to_le_bytes();
-                return Ok(vec![odrive::encode_answer(node, &Answer::Endpoint(number, value))?]);
+                let value = drive.setting(number.into()).unwrap_or(0).to_le_bytes();
+                return Ok(vec![codec::encode_answer(self.node, &Answer::Endpoint(number, value))?]);
             }
         }
         // Any frame to the axis resets its watchdog.
-        self.reset_watchdog();
+        drive.reset_watchdog();
         Ok(Vec::new())
     }
 
-    pub(super) fn odrive_timeout(&self) -> Option<Duration> {
-        let is_on = self.setting(ENABLE_WATCHDOG.into()).is_some_and(|bytes| bytes & 1 == 1);
-        let secs = f32::from_bits(self.setting(WATCHDOG_TIMEOUT.into()).unwrap_or(0));
+    fn reports(&self) -> bool {
+        true
+    }
+
+    fn report(&self, drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
+        let Motion { position_rad, velocity_rad_s, .. } = drive.motion();
+        codec::encode_answer(self.node, &Answer::Motion { position_rad, velocity_rad_s }).map(Some)
+    }
+
+    fn heartbeat(&self, drive: &EmulatedDrive) -> Result<Option<Frame>, CanError> {
+        let state = match drive.state() {
+            State::Enabled => codec::State::ClosedLoopControl,
+            State::Free | State::Holding => codec::State::Idle,
+        };
+        codec::encode_answer(self.node, &Answer::Heartbeat { errors: drive.faults, state }).map(Some)
+    }
+
+    fn timeout(&self, drive: &EmulatedDrive) -> Option<Duration> {
+        let is_on = drive.setting(ENABLE_WATCHDOG.into()).is_some_and(|bytes| bytes & 1 == 1);
+        let secs = f32::from_bits(drive.setting(WATCHDOG_TIMEOUT.into()).unwrap_or(0));
         if is_on { Duration::try_from_secs_f32(secs).ok() } else { None }
     }
 
-    pub(super) fn odrive_motion(&self, node: Node) -> Result<Frame, CanError> {
-        let Motion { position_rad, velocity_rad_s, .. } = self.shaft.motion;
-        odrive::encode_answer(node, &Answer::Motion { position_rad, velocity_rad_s })
+    fn time_out(&mut self, drive: &mut EmulatedDrive) {
+        drive.faults |= codec::WATCHDOG_TIMER_EXPIRED;
+        drive.actuation = Actuation::Free;
     }
 
-    pub(super) fn odrive_heartbeat(&self, node: Node) -> Result<Frame, CanError> {
-        let state = match self.state() {
-            State::Enabled => odrive::State::ClosedLoopControl,
-            State::Free | State::Holding => odrive::State::Idle,
-        };
-        odrive::encode_answer(node, &Answer::Heartbeat { errors: self.faults, state })
+    fn fail(&mut self, drive: &mut EmulatedDrive) {
+        drive.faults = CURRENT_LIMIT;
     }
 }

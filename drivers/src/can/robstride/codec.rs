@@ -6,12 +6,10 @@
 //! RS05 and RS06, and gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull request
 //! 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
 
-mod parameter;
+pub use super::parameter::{Parameter, Value, timeout};
 
-pub use parameter::{Parameter, Value, timeout};
-
-use super::mit::{Command, Limits, Motion, Scales};
-use super::{CanError, Frame, Id, decode_enum, eight_bytes};
+use crate::wire::can::mit::{Command, Limits, Motion, Scales};
+use crate::wire::can::{CanError, Frame, Id, decode_enum, eight_bytes};
 use std::f64::consts::PI;
 
 /// Name of a motor's frames in errors.
@@ -291,8 +289,8 @@ fn id_of(kind: Communication, middle: u16, to: u8) -> Result<Id, CanError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
+    use crate::wire::can::testing::{random_frames, truncated_and_doubled};
 
     const LIMITS: Limits = Model::Rs00.limits();
     const HOST: u8 = 0xFD;

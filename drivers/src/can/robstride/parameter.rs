@@ -1,8 +1,8 @@
 //! Parameters of Robstride motors and the encoding of their values.
 //!
-//! Sources: see the parent module.
+//! Sources: see the module `codec`.
 
-use super::super::{CanError, decode_enum};
+use crate::wire::can::{CanError, decode_enum};
 
 /// Ticks of `canTimeout` per second.
 const TIMEOUT_TICKS_HZ: f64 = 20_000.0;

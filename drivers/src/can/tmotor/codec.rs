@@ -4,8 +4,8 @@
 //! MIT mode (feedback, temperature offset of 40). The limits depend on the firmware: newer versions have others for
 //! some models.
 
-use super::mit::{self, Command, Limits, Motion};
-use super::{CanError, Frame, Id, decode_enum};
+use crate::wire::can::mit::{self, Command, Limits, Motion};
+use crate::wire::can::{CanError, Frame, Id, decode_enum};
 
 /// A model with known limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -166,8 +166,8 @@ pub fn encode_feedback(
 
 #[cfg(test)]
 mod tests {
-    use super::super::testing::{random_frames, truncated_and_doubled};
     use super::*;
+    use crate::wire::can::testing::{random_frames, truncated_and_doubled};
 
     const LIMITS: Limits = Model::Ak80x9.limits();
 

@@ -70,12 +70,12 @@ pub struct Motion {
 }
 
 /// Conversion of the numbers of a command to raw values.
-pub(super) struct Scales {
-    pub(super) position: Scale,
-    pub(super) velocity: Scale,
-    pub(super) kp: Scale,
-    pub(super) kd: Scale,
-    pub(super) torque: Scale,
+pub(crate) struct Scales {
+    pub(crate) position: Scale,
+    pub(crate) velocity: Scale,
+    pub(crate) kp: Scale,
+    pub(crate) kd: Scale,
+    pub(crate) torque: Scale,
 }
 
 impl Scales {
@@ -85,7 +85,7 @@ impl Scales {
     }
 
     /// Scales with 16 bits for the position and `n_bits` for everything else.
-    pub(super) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
+    pub(crate) fn with_bits(limits: &Limits, n_bits: u32) -> Self {
         Self {
             position: Scale::symmetric(limits.position_rad, 16),
             velocity: Scale::symmetric(limits.velocity_rad_s, n_bits),

@@ -1,0 +1,116 @@
+//! What emulated motors of all families have in common: the drive of the shaft with its settings, faults and
+//! watchdog.
+
+use super::shaft::{Actuation, Shaft};
+use crate::wire::can::mit::{Command, Limits, Motion};
+use kinematics::Stamp;
+use std::collections::BTreeMap;
+
+/// What a motor does with its shaft.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum State {
+    /// Disabled: the shaft turns freely.
+    Free,
+    /// Executes its last command.
+    Enabled,
+    /// Stopped by its watchdog or a quick stop, and holds its position.
+    Holding,
+}
+
+/// The drive of an emulated motor.
+#[derive(Debug)]
+pub struct EmulatedDrive {
+    /// Ranges of the motor's raw values.
+    pub(in crate::can) limits: Limits,
+    shaft: Shaft,
+    pub(in crate::can) actuation: Actuation,
+    now: Option<Stamp>,
+    /// Time up to which the shaft has been simulated.
+    simulated_until: Option<Stamp>,
+    /// Registers, parameters, endpoints or objects that were written, by number.
+    settings: BTreeMap<u32, u32>,
+    pub(super) ignores_timeout: bool,
+    /// When the watchdog was last reset, and when it last expired.
+    pub(super) watchdog_reset_at: Option<Stamp>,
+    pub(super) timed_out_at: Option<Stamp>,
+    /// Fault bits in the numbering of the family.
+    pub(in crate::can) faults: u32,
+    pub(in crate::can) target: Option<Command>,
+}
+
+impl EmulatedDrive {
+    /// A disabled drive at rest at 0.
+    pub(super) fn new(limits: Limits) -> Self {
+        Self {
+            limits,
+            shaft: Shaft::at_rest(),
+            actuation: Actuation::Free,
+            now: None,
+            simulated_until: None,
+            settings: BTreeMap::new(),
+            ignores_timeout: false,
+            watchdog_reset_at: None,
+            timed_out_at: None,
+            faults: 0,
+            target: None,
+        }
+    }
+
+    pub(super) fn set_motion(&mut self, motion: Motion) {
+        self.shaft.motion = motion;
+        self.simulated_until = None;
+    }
+
+    /// Current motion of the shaft.
+    pub(in crate::can) fn motion(&self) -> Motion {
+        self.shaft.motion
+    }
+
+    /// Advances the simulation of the shaft to `now`.
+    pub(super) fn advance(&mut self, now: Stamp) {
+        self.now = Some(now);
+        if let Some(before) = self.simulated_until.replace(now) {
+            self.shaft.advance(now.secs_since(before), &self.actuation, &self.limits);
+        }
+    }
+
+    /// What the motor does with its shaft.
+    pub(in crate::can) fn state(&self) -> State {
+        match self.actuation {
+            Actuation::Free => State::Free,
+            Actuation::Mit(_) | Actuation::Follow(_) => State::Enabled,
+            Actuation::Stop => State::Holding,
+        }
+    }
+
+    /// Resets the watchdog.
+    pub(in crate::can) fn reset_watchdog(&mut self) {
+        self.watchdog_reset_at = self.now;
+    }
+
+    /// Follows an MIT-mode command if the motor is enabled.
+    pub(in crate::can) fn obey(&mut self, command: Command) {
+        if self.state() == State::Enabled {
+            self.actuation = Actuation::Mit(command);
+            self.target = Some(command);
+            self.reset_watchdog();
+        }
+    }
+
+    /// Writes a setting, unless it is a timeout and timeouts are ignored.
+    pub(in crate::can) fn set(&mut self, number: u32, value: u32, is_timeout: bool) {
+        if !(is_timeout && self.ignores_timeout) {
+            self.settings.insert(number, value);
+        }
+    }
+
+    pub(in crate::can) fn setting(&self, number: u32) -> Option<u32> {
+        self.settings.get(&number).copied()
+    }
+
+    /// Enables the motor, holding the current position.
+    pub(in crate::can) fn switch_on(&mut self) {
+        self.actuation = Actuation::Mit(Command { position_rad: self.shaft.motion.position_rad, ..Command::default() });
+        self.reset_watchdog();
+    }
+}
