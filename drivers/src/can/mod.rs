@@ -9,7 +9,7 @@
 //!   Neither commands a motor.
 //! * `movable_motor` is a motor that may be moved. `plan` checks how it is configured to react when this computer stops
 //!   sending (`watchdog`). `movable` is an arm of such motors; `arm_loop` is its thread.
-//! * `emulated` has emulated motors for tests and simulators.
+//! * `emulated` has emulated motors for tests and simulators, behind the feature `emulation`.
 
 #[cfg(target_os = "linux")]
 mod arm;

@@ -6,7 +6,7 @@
 //! * `movable` is an arm that may be moved. Orders pass through `mailbox` to `motion_loop`, which runs on the reading
 //!   thread. `reference` tracks the robot's commanded joint positions, `limits` has the motion limits, and `request`
 //!   encodes requests.
-//! * `emulated` is an emulated controller for tests and simulators.
+//! * `emulated` is an emulated controller for tests and simulators, behind the feature `emulation`.
 //!
 //! Motions use the crate's wire structs instead of its `Robot`, which waits for answers without a time limit, does
 //! not expose the datagrams, so that lost and late ones cannot be counted, and prints to the terminal.
@@ -15,6 +15,7 @@
 //! FR3) and 0.9.2 (FCI 5, Panda).
 
 mod arm;
+#[cfg(feature = "emulation")]
 pub mod emulated;
 mod limits;
 mod mailbox;

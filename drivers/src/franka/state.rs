@@ -46,9 +46,3 @@ pub(super) fn decode(version: FciVersion, bytes: &[u8]) -> Option<NumberedState>
 pub(super) fn pose(columns: &[f64; 16]) -> Result<Transform, kinematics::Error> {
     transform::from_rows(&std::array::from_fn(|at| columns[(at % 4) * 4 + at / 4]))
 }
-
-/// Matrix of a pose in column-major order.
-pub(super) fn columns(pose: &Transform) -> [f64; 16] {
-    let rows = transform::to_rows(pose);
-    std::array::from_fn(|at| rows[(at % 4) * 4 + at / 4])
-}

@@ -156,6 +156,7 @@ impl Device {
     }
 
     /// Pointer for other calls, valid while this device is alive.
+    #[cfg(feature = "emulation")]
     pub(super) fn as_ptr(&self) -> *mut sys::rs2_device {
         self.raw.as_ptr()
     }
@@ -391,6 +392,7 @@ impl Queue {
 
 impl Queue {
     /// Frees all queued images.
+    #[cfg(feature = "emulation")]
     pub(super) fn empty(&self) -> Result<(), Problem> {
         loop {
             let mut frame = null_mut();
