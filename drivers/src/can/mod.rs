@@ -46,7 +46,8 @@ mod query;
 pub mod robstride;
 mod settings;
 pub mod tmotor;
-#[cfg(all(target_os = "linux", test))]
+#[cfg(test)]
+#[cfg(target_os = "linux")]
 mod transcript_tests;
 mod watchdog;
 

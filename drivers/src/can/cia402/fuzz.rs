@@ -17,7 +17,8 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
         #[cfg(test)]
         command: {
             use crate::wire::can::canopen::{Direction, Pdo};
-            Frame::classic(Pdo::First.id(Direction::Receive, node), &[0, 0, 0, 4, 0, 0]).unwrap()
+            Frame::classic(Pdo::First.id(Direction::Receive, node), &[0, 0, 0, 4, 0, 0])
+                .expect("the example can be encoded")
         },
         #[cfg(test)]
         transcript: include_str!("transcript.txt"),
@@ -37,7 +38,7 @@ fn set_up(node: Node) -> Vec<Frame> {
         (pdo.communication(direction, 2), 1),
         (pdo.communication(direction, 1), i64::from(pdo.id(direction, node).value())),
     ];
-    let objects = objects.map(|(object, value)| encode_write(node, object, value).unwrap());
+    let objects = objects.map(|(object, value)| encode_write(node, object, value).expect("the example can be encoded"));
     objects.into_iter().chain([encode_nmt(Nmt::Start, Some(node))]).collect()
 }
 

@@ -17,10 +17,11 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
         set_up: [codec::Register::PositionLimit, codec::Register::Timeout]
             .map(|register| codec::RegisterMessage { motor: MOTOR.motor, access: codec::Access::Read(register) })
             .iter()
-            .map(|message| codec::encode_register(message, None).unwrap())
+            .map(|message| codec::encode_register(message, None).expect("the example can be encoded"))
             .collect(),
         #[cfg(test)]
-        command: codec::encode_command(MOTOR.motor, &crate::can::family::STIFF_COMMAND, &LIMITS).unwrap(),
+        command: codec::encode_command(MOTOR.motor, &crate::can::family::STIFF_COMMAND, &LIMITS)
+            .expect("the example can be encoded"),
         #[cfg(test)]
         transcript: include_str!("transcript.txt"),
         #[cfg(test)]

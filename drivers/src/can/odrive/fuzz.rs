@@ -16,7 +16,7 @@ pub(super) fn fuzzing() -> FamilyFuzzing {
         #[cfg(test)]
         command: {
             let request = codec::Request::SetPosition { position_rad: 1.0, velocity_rad_s: 0.0, torque_nm: 0.0 };
-            codec::encode_request(node, &request).unwrap()
+            codec::encode_request(node, &request).expect("the example can be encoded")
         },
         #[cfg(test)]
         transcript: include_str!("transcript.txt"),

@@ -10,7 +10,9 @@ const MOTOR: Robstride = Robstride { motor: 2, model: Model::Rs02 };
 
 pub(super) fn fuzzing() -> FamilyFuzzing {
     #[cfg(test)]
-    let encode = |request| codec::encode_request(HOST, MOTOR.motor, &request, &MOTOR.model.limits()).unwrap();
+    let encode = |request| {
+        codec::encode_request(HOST, MOTOR.motor, &request, &MOTOR.model.limits()).expect("the example can be encoded")
+    };
     FamilyFuzzing {
         motor: Arc::new(MOTOR),
         run_codecs,
