@@ -30,6 +30,8 @@ pub mod nokhwa;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 mod outage;
 pub mod realsense;
+#[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
+mod reconnecting;
 pub mod recording;
 mod sample;
 pub mod tags;
@@ -44,6 +46,8 @@ mod yuv;
 pub use error::{Error, RecordedSpan};
 pub use live::{Devices, Live};
 pub use motion::MovableArm;
+#[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
+pub use reconnecting::CameraCounts;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};
 pub use yuv::{V4l2Colors, YuvColors, YuvLayout, YuvMatrix, YuvRange};
 

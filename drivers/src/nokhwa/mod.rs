@@ -9,7 +9,7 @@ mod camera;
 mod gap_estimator;
 mod worker;
 
-pub use camera::{Counts, NokhwaCamera};
+pub use camera::NokhwaCamera;
 
 use crate::v4l2::{Delivery, V4l2Format};
 use kinematics::Intrinsics;

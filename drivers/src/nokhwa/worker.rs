@@ -42,7 +42,7 @@ pub(super) struct Frame {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A streaming thread. After this is dropped, the thread ends as soon as its current call returns.
+/// A streaming thread.
 #[derive(Debug)]
 pub(super) struct Worker {
     shared: Arc<Shared>,
@@ -58,7 +58,7 @@ struct Shared {
 #[derive(Default)]
 struct State {
     queue: VecDeque<WorkerEvent>,
-    /// The caller has dropped the worker.
+    /// The caller has stopped the worker.
     stop: bool,
 }
 
@@ -99,10 +99,9 @@ impl Worker {
             self.shared.arrived.wait_for(&mut state, remaining);
         }
     }
-}
 
-impl Drop for Worker {
-    fn drop(&mut self) {
+    /// Ends the thread as soon as its current call returns.
+    pub(super) fn stop(&self) {
         self.shared.state.lock().stop = true;
     }
 }

@@ -31,7 +31,7 @@ mod stamps;
 mod streams;
 
 #[cfg(feature = "realsense")]
-pub use camera::{Counts, RealsenseCamera};
+pub use camera::RealsenseCamera;
 pub use config::{Config, Filter, Pace, Settings, Stream};
 #[cfg(feature = "realsense")]
 pub use find::{FoundCamera, cameras};

@@ -38,7 +38,7 @@ pub(super) struct Session {
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
-    n_images: u64,
+    has_image: bool,
     /// Files only: number of images that were due before the file was opened.
     n_before_open: u64,
     description: String,
@@ -96,7 +96,7 @@ impl Session {
             is_file: config.file.is_some(),
             started_at: Instant::now(),
             last_image: Instant::now(),
-            n_images: 0,
+            has_image: false,
             n_before_open: 0,
             description,
             started,
@@ -113,11 +113,6 @@ impl Session {
 
     pub(super) fn calibration(&self) -> &Calibration {
         &self.started.calibration
-    }
-
-    /// Number of images returned since the start.
-    pub(super) fn n_images(&self) -> u64 {
-        self.n_images
     }
 
     /// Time since the last image.
@@ -150,7 +145,7 @@ impl Session {
                     }
                     self.pending = image;
                 }
-                None if has_stopped && (self.n_images > 0 || self.started_at.elapsed() > MAX_STARTUP) => {
+                None if has_stopped && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) => {
                     self.warn_of_images_before_open("all of the");
                     return Ok(Next::End);
                 }
@@ -174,7 +169,7 @@ impl Session {
     fn deliver(&mut self, image: Image) -> Image {
         self.warn_of_images_before_open("the first");
         self.last_image = Instant::now();
-        self.n_images += 1;
+        self.has_image = true;
         image
     }
 

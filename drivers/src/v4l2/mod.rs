@@ -28,7 +28,7 @@ mod sequence;
 mod stream;
 
 #[cfg(target_os = "linux")]
-pub use camera::{Counts, V4l2Camera};
+pub use camera::V4l2Camera;
 #[cfg(target_os = "linux")]
 pub use config::{Config, control, set_control};
 #[cfg(target_os = "linux")]

@@ -6,6 +6,7 @@ use super::device::{Device, FilledBuffer, Refused, Stream};
 use super::format::{self, Mode};
 use super::sequence::Sequence;
 use super::{Config, Delivery, Problem, V4l2Format, find};
+use crate::reconnecting::Failure;
 use crate::{Error, Image, PixelFormat, V4l2Colors, clock};
 use kinematics::Stamp;
 use rustix::io::Errno;
@@ -35,7 +36,7 @@ pub(super) struct V4l2Stream {
     started_at: Stamp,
     /// Number of lost images that are not reported yet.
     n_unreported: u64,
-    n_images: u64,
+    /// Number of damaged images since [`Self::take_n_damaged`]. They also count as skipped.
     n_damaged: u64,
     last_image_at: Instant,
     has_warned_of_clock: bool,
@@ -43,9 +44,8 @@ pub(super) struct V4l2Stream {
 
 impl V4l2Stream {
     /// Opens the device of a configuration and starts its stream.
-    pub(super) fn start(config: &Config) -> Result<Self, Error> {
-        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
-        let candidates = find::candidates(&config.device).map_err(named)?;
+    pub(super) fn start(config: &Config) -> Result<Self, Failure<Problem>> {
+        let candidates = find::candidates(&config.device)?;
         // A depth camera has nodes for color, infrared and depth under one serial number. The node with the most
         // preferred format is used.
         let rank = |path: &&PathBuf| {
@@ -55,14 +55,13 @@ impl V4l2Stream {
         };
         match candidates.iter().min_by_key(rank) {
             Some(path) => Self::start_node(config, path),
-            None => Err(named(Problem::NoDevice { device: config.device.clone() })),
+            None => Err(Problem::NoDevice { device: config.device.clone() }.into()),
         }
     }
 
-    fn start_node(config: &Config, path: &Path) -> Result<Self, Error> {
-        let named = |problem| Error::V4l2 { camera: config.name.clone(), problem: Box::new(problem) };
-        let device = open(config, path).map_err(named)?;
-        let (mode, pix) = set_mode(config, path, &device).map_err(named)?;
+    fn start_node(config: &Config, path: &Path) -> Result<Self, Failure<Problem>> {
+        let device = open(config, path)?;
+        let (mode, pix) = set_mode(config, path, &device)?;
         let colors = V4l2Colors {
             colorspace: pix.colorspace,
             ycbcr_enc: pix.ycbcr_enc,
@@ -70,17 +69,17 @@ impl V4l2Stream {
             is_hdtv: device.is_hdtv(),
         };
         if mode.format == V4l2Format::Z16 && config.meters_per_count.is_none() {
-            return Err(named(Problem::NoDepthScale));
+            return Err(Problem::NoDepthScale.into());
         }
-        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0))?;
-        controls::apply(&config.settings, &device).map_err(named)?;
+        let format = mode.format.pixels(colors, config.meters_per_count.unwrap_or(0.0)).map_err(Failure::Final)?;
+        controls::apply(&config.settings, &device)?;
         let requested = requested(config, Some(mode.format));
         let started_at = clock::now();
         let stream = device.stream(N_BUFFERS).map_err(|refused| {
             let bytes_per_sec = mode.format.bytes_per_sec(config.intrinsics.size_px, config.rate_hz);
-            named(stream_problem(refused, path, requested.clone(), bytes_per_sec))
+            stream_problem(refused, path, requested.clone(), bytes_per_sec)
         })?;
-        let applied = controls::confirm(&config.settings, stream.device()).map_err(named)?;
+        let applied = controls::confirm(&config.settings, stream.device())?;
         Ok(Self {
             stream,
             camera: config.name.as_str().into(),
@@ -92,7 +91,6 @@ impl V4l2Stream {
             sequence: Sequence::default(),
             started_at,
             n_unreported: 0,
-            n_images: 0,
             n_damaged: 0,
             last_image_at: Instant::now(),
             has_warned_of_clock: false,
@@ -109,14 +107,9 @@ impl V4l2Stream {
         &self.applied.read_back
     }
 
-    /// Number of images returned since the start.
-    pub(super) fn n_images(&self) -> u64 {
-        self.n_images
-    }
-
-    /// Number of damaged images since the start. They also count as skipped.
-    pub(super) fn n_damaged(&self) -> u64 {
-        self.n_damaged
+    /// Number of damaged images since the last call.
+    pub(super) fn take_n_damaged(&mut self) -> u64 {
+        std::mem::take(&mut self.n_damaged)
     }
 
     /// Time since the last complete image.
@@ -146,7 +139,6 @@ impl V4l2Stream {
                 Some(Ok(mut image)) => {
                     image.exposure_secs = self.exposure_secs(config.rate_hz);
                     image.n_skipped = std::mem::take(&mut self.n_unreported);
-                    self.n_images += 1;
                     self.last_image_at = Instant::now();
                     return Ok(Some(image));
                 }
