@@ -5,7 +5,7 @@ use super::{SplatOptions, SplatTrainer};
 use crate::checkpoint::Checkpoint;
 use crate::gpu::Gpu;
 use crate::method_entry::{Export, ExportRequest, ExportWriter, Exported, MethodEntry, SingleFile};
-use crate::model_options::{MethodOptions, default_options};
+use crate::model_options::{MethodOptions, ModelOptions, default_options};
 use crate::{Aligned, Error, Method, ResumedModel};
 use calibration::ParamSet;
 use keyframe::Keyframe;
