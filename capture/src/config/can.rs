@@ -93,8 +93,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     let MotorKeys { family, bus, id, gear_ratio, reversed: is_reversed, offset_rad } = motor;
     let bus_ix = buses.iter().position(|known| known.interface == bus).or_else(|| {
         let interfaces = quoted(buses.iter().map(|bus| &*bus.interface));
-        let allowed =
-            if interfaces.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { interfaces };
+        let allowed = if interfaces.is_empty() { "the name of a table [arm.bus.NAME]".to_owned() } else { interfaces };
         keys.invalid("bus", &Value::String(bus), &allowed)
     });
     let gains = if family.has_gains() { gains(&mut keys) } else { None };
