@@ -4,7 +4,8 @@
 //! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
 //! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
 //! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a thread of its own.
-//! [`dataset`] loads datasets with known poses instead.
+//! [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
+//! ready.
 //!
 //! ```
 //! use capture::{Join, Rig};
@@ -29,6 +30,7 @@
 
 pub mod config;
 pub mod dataset;
+pub mod doctor;
 pub mod downscale;
 mod error;
 mod feed;

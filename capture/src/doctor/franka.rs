@@ -2,8 +2,8 @@
 //! connection.
 
 use super::{Finding, Verdict, field};
-use capture::config::{ArmDriver, Rig};
-use capture::open::FCI_PORT;
+use crate::config::{ArmDriver, Rig};
+use crate::open::FCI_PORT;
 use std::io::ErrorKind;
 use std::net::{TcpStream, ToSocketAddrs};
 use std::path::Path;

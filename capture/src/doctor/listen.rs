@@ -1,9 +1,9 @@
 //! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
-use capture::config::{BaseDriver, Rig};
-use capture::open::{self, Devices, Opened};
-use capture::{Join, JoinEvent, Rejection, Stop};
+use crate::config::{ArmDriver, BaseDriver, Rig};
+use crate::open::{self, Devices, Opened};
+use crate::{Join, JoinEvent, Rejection, Result, Stop};
 use drivers::{Sample, clock};
 use kinematics::Stamp;
 use kinematics::quantile::{Rank, quantile};
@@ -16,35 +16,42 @@ const MIN_RATE_FRAC: f64 = 0.95;
 
 /// Measurements of one device, or of the keyframes made of its images.
 #[derive(Debug, PartialEq, Serialize)]
-pub(super) struct DeviceStatistics {
-    device: String,
-    samples: u64,
-    rate_hz: f64,
+pub struct DeviceStatistics {
+    /// Name with the kind of device, for example `camera "wrist"`.
+    pub device: String,
+    /// Number of samples.
+    pub samples: u64,
+    /// Mean rate.
+    pub rate_hz: f64,
     /// Rate in the rig file; `None` if it has none.
-    expected_hz: Option<f64>,
+    pub expected_hz: Option<f64>,
     /// Images dropped by the device or the driver.
-    dropped: u64,
+    pub dropped: u64,
     /// `None` for simulated devices.
     #[serde(flatten)]
-    latency: Option<Latency>,
+    pub latency: Option<Latency>,
     /// 99th percentile of the intervals between samples.
-    gap_p99_millis: f64,
+    pub gap_p99_millis: f64,
 }
 
 /// Time from mid-exposure, or from the stamp of a state, until the sample is available.
 #[derive(Debug, PartialEq, Serialize)]
-struct Latency {
-    /// Median, 99th percentile and maximum.
-    latency_p50_millis: f64,
-    latency_p99_millis: f64,
-    latency_max_millis: f64,
+pub struct Latency {
+    /// Median.
+    pub latency_p50_millis: f64,
+    /// 99th percentile.
+    pub latency_p99_millis: f64,
+    /// Maximum.
+    pub latency_max_millis: f64,
 }
 
 /// Everything that was measured.
 #[derive(Debug)]
-pub(super) struct ListenResult {
-    pub(super) devices: Vec<DeviceStatistics>,
-    pub(super) findings: Vec<Finding>,
+pub struct ListenResult {
+    /// Measurements of each device.
+    pub devices: Vec<DeviceStatistics>,
+    /// Problems in them.
+    pub findings: Vec<Finding>,
 }
 
 /// Raw measurements of one device.
@@ -85,8 +92,11 @@ impl Track {
     }
 }
 
-/// Reads the rig's devices for `secs` seconds, or until Ctrl-C.
-pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<ListenResult> {
+/// Reads the rig's devices with the drivers of a run for `secs` seconds, or until `stop` is requested.
+///
+/// # Errors
+/// A device cannot be opened.
+pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
     let Opened { rig, mut source, .. } = open::rig(rig.clone(), Devices::Real)?;
     let mut join = Join::new(&rig)?;
     let mut tracks: BTreeMap<String, Track> = BTreeMap::new();
@@ -152,7 +162,7 @@ pub(super) fn listen(rig: &Rig, secs: f64, stop: &Stop) -> anyhow::Result<Listen
 
 /// The devices of a rig with their rates, as far as the rig file gives them.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
-    use capture::config::ArmDriver;
+    use crate::config::ArmDriver;
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));

@@ -1,0 +1,79 @@
+//! `fieldrig doctor`: checks this computer for a rig and names a remedy for each problem.
+
+mod gpu;
+mod page_address;
+
+use super::number_in_range;
+use crate::exit::Exit;
+use crate::{print, signals};
+use capture::Rig;
+use capture::doctor::{self, Finding, Verdict};
+use std::path::PathBuf;
+
+/// Default address of the page that `run` serves.
+const DEFAULT_ADDRESS: &str = "127.0.0.1:7007";
+
+/// Flags of `doctor`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Rig file; its devices are checked, too
+    rig: Option<PathBuf>,
+    /// Then read the rig's devices for S seconds and print rates, latencies and losses; nothing is moved
+    #[arg(long, value_name = "S", requires = "rig", value_parser = number_in_range(1.0..=3600.0))]
+    listen: Option<f64>,
+    /// Print JSON, one object per line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs all checks; the exit code is 1 if one fails.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
+    let rig = args.rig.as_ref().map(|path| Rig::load(path, &[])).transpose()?;
+    let mut findings = gpu::gpu();
+    findings.push(simulation());
+    findings.push(page_address::page_address(DEFAULT_ADDRESS));
+    findings.extend(doctor::check(rig.as_ref()));
+    print_findings(&findings, args.json)?;
+    if let (Some(rig), Some(secs)) = (&rig, args.listen) {
+        let result = doctor::listen(rig, secs, &signals::stop_on_signals()?)?;
+        for device in &result.devices {
+            if args.json {
+                print::json(device)?;
+            } else {
+                print::line(device)?;
+            }
+        }
+        print_findings(&result.findings, args.json)?;
+        findings.extend(result.findings);
+    }
+    let failed = findings.iter().any(|finding| finding.verdict == Verdict::Fail);
+    Ok(if failed { Exit::Failed } else { Exit::Done })
+}
+
+fn print_findings(findings: &[Finding], as_json: bool) -> anyhow::Result<()> {
+    for finding in findings {
+        if as_json {
+            print::json(finding)?;
+            continue;
+        }
+        let label = match finding.verdict {
+            Verdict::Ok => "ok  ",
+            Verdict::Warn => "warn",
+            Verdict::Fail => "fail",
+        };
+        print::line(format_args!("{label}  {:12} {}", finding.check, finding.message))?;
+        if let Some(remedy) = &finding.remedy {
+            print::line(format_args!("      {:12} -> {remedy}", ""))?;
+        }
+    }
+    Ok(())
+}
+
+fn simulation() -> Finding {
+    if cfg!(feature = "sim") {
+        Finding::ok("simulation", "MuJoCo is built in")
+    } else {
+        let remedy = "make deps && cargo build --release --features sim";
+        Finding::warn("simulation", "built without MuJoCo: `--sim` is not available", remedy)
+    }
+}
