@@ -106,8 +106,8 @@ mod testing {
     }
 
     /// A rig file of the folder `rigs`, with changed keys.
-    pub(super) fn bundled_rig(name: &str, overrides: &[(&str, &str)]) -> Rig {
-        let overrides: Vec<_> = overrides.iter().map(|(key, value)| Override::new(*key, *value)).collect();
+    pub(super) fn bundled_rig(name: &str, overrides: &[(&'static str, &str)]) -> Rig {
+        let overrides: Vec<_> = overrides.iter().map(|(key, value)| Override::new(key, *value)).collect();
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
         Rig::load(&path, &overrides).expect("a bundled rig file")
     }
