@@ -36,6 +36,7 @@ mod error;
 mod feed;
 mod join;
 pub mod open;
+mod stamp_clock;
 mod stations;
 mod stop;
 #[cfg(test)]
@@ -44,7 +45,8 @@ mod test_data;
 
 pub use config::{ConfigError, Override, Rig};
 pub use error::{Error, Result};
-pub use feed::{Feed, ImageObserver, Input, InputResult, ObservedImage, ObservedPixels};
+pub use feed::{Feed, FeedItem, ImageObserver, Input, InputResult, InputTimes, ObservedImage, ObservedPixels};
 pub use join::{Change, Counts, Join, JoinEvent, PosedImage, Rejection, SampleUse};
+pub use stamp_clock::StampClock;
 pub use stations::{StationReport, Stations};
 pub use stop::Stop;

@@ -29,6 +29,7 @@ pub mod motion;
 pub mod nokhwa;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 mod outage;
+mod playback;
 pub mod realsense;
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 mod reconnecting;
@@ -46,6 +47,7 @@ mod yuv;
 pub use error::{Error, RecordedSpan};
 pub use live::{Devices, Live};
 pub use motion::MovableArm;
+pub use playback::{Playback, PlaybackClock};
 #[cfg(any(target_os = "linux", feature = "nokhwa", feature = "realsense"))]
 pub use reconnecting::CameraCounts;
 pub use sample::{BasePose, Image, PixelFormat, RangePoint, RangeScan, Sample, TruthImage};

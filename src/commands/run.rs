@@ -11,7 +11,7 @@ use anyhow::Context;
 use capture::config::{ArmDriver, Override, Rig};
 use capture::doctor;
 use capture::open::{self, Devices, Opened};
-use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
+use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StampClock, StationReport, Stations, Stop};
 use drivers::Source;
 use keyframe::{Keyframe, Split, counted};
 use kinematics::Stamp;
@@ -50,6 +50,10 @@ pub(crate) struct Args {
     /// Replay a recording instead of live devices
     #[arg(long, value_name = "RECORDING")]
     from: Option<PathBuf>,
+    /// Play the recording at the speed of its devices, instead of as fast as it is used: keyframes are taken as they
+    /// arrive, and images that come too fast are dropped
+    #[arg(long, requires = "from", conflicts_with = "steps_per_keyframe")]
+    real_time: bool,
     /// Also write everything that the devices send to an MCAP file. Images that devices drop then count as a loss (exit
     /// code 3)
     #[arg(long, value_name = "FILE")]
@@ -293,11 +297,11 @@ pub(super) fn start(
     for finding in doctor::suspicious_values(&rig) {
         log::warn!("{finding}");
     }
-    let Opened { rig, source, damage } = args.open(rig)?;
+    let Opened { rig, source, damage, stamp_clock } = args.open(rig)?;
     args.print_address(&server.url())?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
-    let (input, evicted) = args.input(&rig, source, held)?;
+    let (input, evicted) = args.input(&rig, (source, stamp_clock), held)?;
     let feed = Feed::start(input, Box::new(Viewers(hub.clone())), stop.clone())?;
     let notes = notes(&gpu);
     let evaluators = Evaluators {
@@ -609,6 +613,7 @@ impl Args {
 
     fn open(&self, rig: Rig) -> anyhow::Result<Opened> {
         match &self.from {
+            Some(recording) if self.real_time => Ok(open::recording(recording, Some(rig), &[])?.in_real_time()),
             Some(recording) => Ok(open::recording(recording, Some(rig), &[])?),
             None => Ok(open::rig(rig, if self.sim { Devices::Sim } else { Devices::Real })?),
         }
@@ -619,7 +624,7 @@ impl Args {
     fn input(
         &self,
         rig: &Rig,
-        source: Box<dyn Source>,
+        (source, stamp_clock): (Box<dyn Source>, StampClock),
         previous: &[Arc<Keyframe>],
     ) -> anyhow::Result<(Input, Vec<Evicted>)> {
         let (join, evicted) = Join::new(rig)?.resume_from(previous);
@@ -628,7 +633,7 @@ impl Args {
             join,
             stations: Stations::new(rig).map(|stations| stations.resume_from(previous)),
             recorder: self.record.as_deref().map(|file| open::recorder(file, rig)).transpose()?,
-            is_live: self.from.is_none(),
+            stamp_clock,
             camera_intrinsics: rig
                 .cameras
                 .iter()
@@ -641,7 +646,7 @@ impl Args {
     /// Recordings and lockstep simulations wait for the trainer; everything else runs in real time.
     fn pace(&self, rig: &Rig) -> Result<Pace, BadArgument> {
         let simulated = self.sim || rig.arm.driver == ArmDriver::Sim;
-        if self.from.is_some() || (simulated && rig.sim.lockstep) {
+        if (self.from.is_some() && !self.real_time) || (simulated && rig.sim.lockstep) {
             let steps_per_keyframe = self.steps_per_keyframe.unwrap_or(DEFAULT_STEPS_PER_KEYFRAME);
             return Ok(Pace::Lockstep { steps_per_keyframe });
         }

@@ -96,6 +96,7 @@ impl Hub {
             started: Instant::now(),
             hub: self.clone(),
             job,
+            n_keyframes: None,
             is_released: false,
         })
     }
@@ -162,6 +163,7 @@ pub struct PendingRender {
     started: Instant,
     hub: Hub,
     job: RenderJob,
+    n_keyframes: Option<u64>,
     is_released: bool,
 }
 
@@ -169,6 +171,13 @@ impl PendingRender {
     /// Requested model; the first if `None`. The name comes from the client and may not exist.
     pub fn method(&self) -> Option<&str> {
         self.job.view_request.method.as_deref()
+    }
+
+    /// Tells the client that the model contains this many keyframes, counted from the start of the run.
+    #[must_use]
+    pub fn of_keyframes(mut self, n_keyframes: u64) -> Self {
+        self.n_keyframes = Some(n_keyframes);
+        self
     }
 
     /// Sends the rendered picture to the client. Encoding happens on the server's threads.
@@ -204,7 +213,10 @@ impl PendingRender {
             projection: projection_message(&view_request.request.projection),
             near_m: view_request.request.near_m,
             far_m: view_request.request.far_m,
+            waited_millis: (self.started - view_request.received).as_secs_f64() * 1e3,
             render_millis: self.started.elapsed().as_secs_f64() * 1e3,
+            encode_millis: None,
+            keyframes: self.n_keyframes,
             color: None,
             depth: None,
         }

@@ -5,6 +5,7 @@ use crate::jpeg::{Chroma, JpegError, Layout, Pixels, encode, n_threads, shrink};
 use crate::protocol::{BinaryHeader, ColorPart, DepthFormat, DepthPart, LiveHeader, PictureHeader, frame};
 use crate::updates::{LiveImage, LivePixels};
 use crate::view_request::ViewRequest;
+use std::time::Instant;
 use trainer::Picture;
 
 /// JPEG quality of the last stage: no visible blocks on textures.
@@ -37,6 +38,7 @@ pub(crate) fn pack_picture(
     mut header: PictureHeader,
     picture: &Picture,
 ) -> Result<Vec<u8>, PackError> {
+    let began = Instant::now();
     let (color, depth) = std::thread::scope(|scope| {
         // Color and depth in parallel: color takes most of the time and runs on this thread.
         let depth = view_request.depth.map(|format| scope.spawn(move || pack_depth(format, picture)));
@@ -58,6 +60,7 @@ pub(crate) fn pack_picture(
             bytes: depth_bytes.len(),
         });
     }
+    header.encode_millis = Some(began.elapsed().as_secs_f64() * 1e3);
     Ok(frame(&BinaryHeader::Picture(&header), &[&color, &depth_bytes]))
 }
 

@@ -214,7 +214,10 @@ pub(crate) struct PictureHeader {
     pub(crate) projection: ProjectionMessage,
     pub(crate) near_m: f64,
     pub(crate) far_m: f64,
+    pub(crate) waited_millis: f64,
     pub(crate) render_millis: f64,
+    pub(crate) encode_millis: Option<f64>,
+    pub(crate) keyframes: Option<u64>,
     pub(crate) color: Option<ColorPart>,
     pub(crate) depth: Option<DepthPart>,
 }

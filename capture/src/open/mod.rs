@@ -14,8 +14,9 @@ pub use real::{check_motion, movable_arm, udp_arm_address};
 
 use crate::config::{ArmDriver, BaseDriver, CameraDriver, Override, Parent, Rig, ScannerDriver};
 use crate::error::{Context, Error};
+use crate::stamp_clock::StampClock;
 use drivers::recording::{RIG_FILE, Recorder, Recording, RecordingMetadata, URDF_FILE};
-use drivers::{Live, Sample, Source};
+use drivers::{Live, Playback, Sample, Source};
 use keyframe::bail;
 use kinematics::Chain;
 use std::path::Path;
@@ -45,6 +46,17 @@ pub struct Opened {
     pub source: Box<dyn Source>,
     /// Set when the samples end early because the recording is damaged.
     pub damage: Arc<OnceLock<String>>,
+    /// The clock of the stamps.
+    pub stamp_clock: StampClock,
+}
+
+impl Opened {
+    /// Plays a recording at the speed of its devices. If the caller is too slow, images are dropped.
+    #[must_use]
+    pub fn in_real_time(self) -> Self {
+        let playback = Playback::new(self.source);
+        Self { stamp_clock: StampClock::Playback(playback.clock()), source: Box::new(playback), ..self }
+    }
 }
 
 /// Opens the devices of a rig. Calibration that the rig file omits is read from the cameras that store it.
@@ -81,7 +93,7 @@ pub fn rig(mut rig: Rig, devices: Devices) -> crate::Result<Opened> {
         BaseDriver::Tags => Box::new(TagBaseSource::new(&rig, source)?),
         _ => source,
     };
-    Ok(Opened { rig, source, damage: Arc::default() })
+    Ok(Opened { rig, source, damage: Arc::default(), stamp_clock: StampClock::Computer })
 }
 
 /// Opens a recording with the rig stored in it, or with the given one. The joint order is the one stored in the
@@ -110,7 +122,7 @@ pub fn recording(path: &Path, rig: Option<Rig>, overrides: &[Override]) -> crate
     check_intrinsics(&rig)?;
     let damage = Arc::default();
     let source = Box::new(RecordingSource { recording, damage: Arc::clone(&damage) });
-    Ok(Opened { rig, source, damage })
+    Ok(Opened { rig, source, damage, stamp_clock: StampClock::Unrelated })
 }
 
 /// Creates a recording of a rig, with the rig file and the URDF attached.
