@@ -667,6 +667,11 @@ impl Session {
         &self.history
     }
 
+    /// The scheduled evaluations so far.
+    pub fn evaluations(&self) -> &[Evaluation] {
+        &self.reported
+    }
+
     /// The result of keyframe alignment, once it is decided.
     pub fn alignment(&self) -> Option<&Alignment> {
         self.method.alignment()

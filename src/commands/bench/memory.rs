@@ -6,7 +6,7 @@ use crate::exit::{BadArgument, Exit};
 use crate::print;
 use anyhow::Context;
 use bench::memory::MemoryRun;
-use bench::{BenchResult, Sample, Viewer};
+use bench::{BenchResult, Sample, Viewer, ViewerOptions};
 use clap::Parser;
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
@@ -82,7 +82,8 @@ pub(super) fn run(args: &Args) -> anyhow::Result<Exit> {
 fn measure(args: &Args, flags: &run::Args) -> anyhow::Result<(MemoryRun, Option<drivers::Error>)> {
     let mut running = run::start(flags, None, &mut CreatedFolders::default())?;
     let address = running.server.address();
-    let viewers: Vec<Viewer> = (0..args.viewers).map(|_| Viewer::connect(address)).collect::<bench::Result<_>>()?;
+    let viewers: Vec<Viewer> =
+        (0..args.viewers).map(|_| Viewer::connect(address, ViewerOptions::default())).collect::<bench::Result<_>>()?;
     let every = Duration::from_secs_f64(args.every_secs);
     let mut measured = MemoryRun {
         input: args.input(),

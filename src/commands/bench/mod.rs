@@ -5,6 +5,7 @@ mod budget;
 mod curve;
 mod field;
 mod kernels;
+mod live;
 mod memory;
 mod runs_args;
 mod stability;
@@ -36,6 +37,9 @@ enum BenchCommand {
     Stability(stability::Args),
     /// Errors of image stamps with jitter and clock drift, as a histogram
     Stamps(stamps::Args),
+    /// A live run as an operator sees it: latency of pictures, shutter to model, and PSNR over time with right and wrong
+    /// calibration
+    Live(live::Args),
     /// Memory use of a long run by component, and its growth rate once the keyframe store is full
     Memory(memory::Args),
 }
@@ -49,6 +53,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Exit> {
         BenchCommand::Ablation(args) => ablation::run(args),
         BenchCommand::Stability(args) => stability::run(args),
         BenchCommand::Stamps(args) => stamps::run(args),
+        BenchCommand::Live(args) => live::run(args),
         BenchCommand::Memory(args) => memory::run(args),
     }
 }
