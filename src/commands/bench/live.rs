@@ -1,14 +1,14 @@
 //! `fieldrig bench live`: plays a recording in real time into runs with viewers, and measures latency and accuracy.
 
+use super::run_flags;
 use super::runs_args::print_result;
 use crate::commands::run;
-use crate::exit::{BadArgument, Exit};
+use crate::exit::Exit;
 use crate::print;
 use anyhow::Context;
 use bench::live::{Conditions, HandEyeError, LiveRun, findings};
 use bench::{BenchResult, Viewer, ViewerOptions};
 use capture::{Rig, open};
-use clap::Parser;
 use session::run_folder::CreatedFolders;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -48,13 +48,6 @@ pub(crate) struct Args {
     /// More flags for `fieldrig run`
     #[arg(last = true, value_name = "RUN FLAGS")]
     run_flags: Vec<OsString>,
-}
-
-/// The flags of `run`, parsed as a command line.
-#[derive(Debug, Parser)]
-struct RunFlags {
-    #[command(flatten)]
-    args: run::Args,
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
@@ -129,7 +122,9 @@ impl Args {
             error.apply(&mut rig);
         }
         rig.write_resolved(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
-        let flags = self.flags_of_run(&folder.join(drivers::recording::RIG_FILE), &folder.join("out"))?;
+        let flags = vec!["--from".into(), self.recording.clone().into(), "--real-time".into()];
+        let (rig_file, out) = (folder.join(drivers::recording::RIG_FILE), folder.join("out"));
+        let flags = run_flags::parse(&rig_file, self.seconds, (&out, self.json), flags, &self.run_flags)?;
         let mut running = run::start(&flags, None, &mut CreatedFolders::default())?;
         let address = running.server.address();
         let options = ViewerOptions { size_px: self.size, is_panorama: self.panorama };
@@ -143,28 +138,12 @@ impl Args {
             None => Ok(measured),
         }
     }
-
-    fn flags_of_run(&self, rig_file: &Path, out: &Path) -> anyhow::Result<run::Args> {
-        let mut line: Vec<OsString> = vec!["run".into(), rig_file.into()];
-        line.extend(["--from".into(), self.recording.clone().into(), "--real-time".into()]);
-        line.extend(["--seconds".into(), self.seconds.to_string().into()]);
-        line.extend(["--out".into(), out.into(), "--listen".into(), "127.0.0.1:0".into()]);
-        if self.json {
-            line.push("--json".into());
-        }
-        line.extend(self.run_flags.iter().cloned());
-        let flags = RunFlags::try_parse_from(line).map_err(|error| {
-            let message = error.to_string();
-            let first = message.lines().next().unwrap_or_default();
-            BadArgument(format!("flags of run: {}", first.strip_prefix("error: ").unwrap_or(first)))
-        })?;
-        Ok(flags.args)
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
 
     #[derive(Debug, Parser)]
     struct Flags {

@@ -7,6 +7,7 @@ mod field;
 mod kernels;
 mod live;
 mod memory;
+mod run_flags;
 mod runs_args;
 mod stability;
 mod stamps;
