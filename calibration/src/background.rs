@@ -18,15 +18,19 @@ pub fn alignment_step(is_software: bool, n_planned_steps: u64) -> u64 {
     default_step.min(n_planned_steps / 4).max(1)
 }
 
-/// State of the alignment.
+/// Alignment in the background, once or several times with more keyframes.
 #[derive(Debug)]
-pub enum AlignmentTask {
-    /// Starts with the next step.
+pub struct AlignmentTask {
+    state: TaskState,
+    /// The latest result; `None` before the first end, or if alignment was not possible.
+    result: Option<Alignment>,
+}
+
+#[derive(Debug)]
+enum TaskState {
     Requested,
-    /// Runs on its own thread.
     Running(JoinHandle<Option<Alignment>>),
-    /// Finished, with the result if alignment was possible.
-    Done(Option<Alignment>),
+    Done,
 }
 
 impl AlignmentTask {
@@ -36,43 +40,58 @@ impl AlignmentTask {
             CameraRefinement::Always(params) => !params.is_empty(),
             CameraRefinement::Try(candidates) => !candidates.is_empty(),
         };
-        if is_requested { Self::Requested } else { Self::Done(None) }
+        Self { state: if is_requested { TaskState::Requested } else { TaskState::Done }, result: None }
     }
 
-    /// The result; `None` before the end, or if alignment was not possible.
+    /// Alignment that ended with this result.
+    pub fn done(result: Option<Alignment>) -> Self {
+        Self { state: TaskState::Done, result }
+    }
+
+    /// The latest result; `None` before the first end, or if alignment was not possible.
     pub fn result(&self) -> Option<&Alignment> {
-        match self {
-            Self::Done(result) => result.as_ref(),
-            Self::Requested | Self::Running(_) => None,
-        }
+        self.result.as_ref()
     }
 
     /// Whether alignment has not started yet.
     pub fn is_requested(&self) -> bool {
-        matches!(self, Self::Requested)
+        matches!(self.state, TaskState::Requested)
     }
 
     /// Whether alignment has ended or was not requested.
     pub fn is_done(&self) -> bool {
-        matches!(self, Self::Done(_))
+        matches!(self.state, TaskState::Done)
     }
 
-    /// Starts alignment on its own thread.
+    /// Requests another alignment. Its result replaces the latest one.
+    pub fn request_again(&mut self) {
+        self.state = TaskState::Requested;
+    }
+
+    /// Starts alignment of uncorrected keyframes on its own thread.
     pub fn begin(&mut self, keyframes: Vec<Arc<Keyframe>>, choice: &CameraRefinement) {
         let choice = choice.clone();
-        *self = Self::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
+        self.state =
+            TaskState::Running(std::thread::spawn(move || run_in_background_pool(|| align(&keyframes, &choice))));
     }
 
-    /// Waits for the result. Returns whether keyframes must be corrected.
-    pub fn finish(&mut self) -> Result<bool, Error> {
-        let Self::Running(thread) = std::mem::replace(self, Self::Done(None)) else { return Ok(false) };
+    /// Waits for the result. Returns whether these keyframes must be corrected differently than before. If alignment
+    /// was not possible, the latest result stays.
+    pub fn finish(&mut self, keyframes: &[Arc<Keyframe>]) -> Result<bool, Error> {
+        let TaskState::Running(thread) = std::mem::replace(&mut self.state, TaskState::Done) else { return Ok(false) };
         let result = thread.join().map_err(|_| Error::AlignmentPanicked)?;
         for line in result.iter().flat_map(Alignment::lines) {
             log::info!("{line}");
         }
-        let has_corrections = result.as_ref().is_some_and(Alignment::has_corrections);
-        *self = Self::Done(result);
-        Ok(has_corrections)
+        let Some(result) = result else { return Ok(false) };
+        let is_changed = match &self.result {
+            None => result.has_corrections(),
+            Some(latest) => keyframes.iter().any(|keyframe| latest.differs(&result, keyframe)),
+        };
+        if is_changed || self.result.is_none() {
+            self.result = Some(result);
+        }
+        Ok(is_changed)
     }
 
     fn correction(&self, camera: &str) -> Option<&CameraCorrection> {

@@ -20,9 +20,10 @@ use session::methods::{self, COUNT};
 use session::next_commands::{DataSource, quoted};
 use session::run_folder::{self, CreatedFolders};
 use session::{
-    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel, Limits, Live,
-    LiveOptions, ModelViewer, Pace, REALIGN, Recovery, Refine, RunDescription, RunFlags, ServedModel, Session,
-    Settings, StoredKeyframes, Viewers, checkpoints, methods_of, recovery,
+    AvailableData, Checkpoints, Clock, DecisionLog, EndingSession, Evaluator, Evaluators, FinishedModel,
+    LIVE_ALIGNMENT_KEYFRAMES, Limits, Live, LiveOptions, ModelViewer, Pace, REALIGN, Recovery, RefineSettings,
+    RunDescription, RunFlags, ServedModel, Session, Settings, StoredKeyframes, Viewers, checkpoints, methods_of,
+    recovery,
 };
 use std::collections::BTreeMap;
 use std::io::IsTerminal;
@@ -272,15 +273,17 @@ pub(super) fn start(
     let rig = Rig::load(&args.rig_file, &overrides)?;
     let kinds = methods_of(&rig)?;
     args.training.options().check_for(&kinds)?;
-    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth: false }; // Depth arrives during the run.
+    let depth = rig.cameras.iter().any(|camera| camera.depth.is_some());
+    let available = AvailableData { joints: true, drifts: rig.has_moving_base(), depth };
     let training = args.training.options();
-    let cameras = training.refining(available, Refine::None)?.with_scene;
     training.check_learned(&kinds, available)?;
+    training.refining_live(available, true)?; // Invalid flags are rejected before the GPU is opened.
     let (common, mut settings) = methods::options(&rig.train, args.steps);
     settings.push((COUNT, serde_json::json!(training.count.unwrap_or(CountPolicy::ToCap))));
-    let common = CommonOptions { cameras, ..common };
     let pace = args.pace(&rig)?;
     let gpu = open_gpu()?;
+    let RefineSettings { align, with_scene: cameras } = training.refining_live(available, gpu.is_software())?;
+    let common = CommonOptions { cameras, align, align_at_keyframes: LIVE_ALIGNMENT_KEYFRAMES.to_vec(), ..common };
     let models: Vec<Resumed> = match previous {
         Some(previous) => vec![trainer::resume(gpu.clone(), &previous.checkpoint, &previous.keyframes)?],
         None => {

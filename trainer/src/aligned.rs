@@ -1,8 +1,9 @@
 //! A scene model that restarts with aligned cameras.
 //!
-//! Alignment is requested when the model is created, runs in parallel with training, and its result is applied at a
-//! planned step: if it has corrections, the model forgets everything and trains again on corrected keyframes, because a
-//! model trained on wrong poses would have to be corrected, too.
+//! Alignment is requested when the model is created, runs in parallel with training, and its result is applied a planned
+//! number of steps after it began: if it has corrections, the model forgets everything and trains again on corrected
+//! keyframes, because a model trained on wrong poses would have to be corrected, too. In a live run, alignment is repeated
+//! when there are more keyframes, and the model restarts only if the corrections changed noticeably.
 
 use crate::checkpoint::{Checkpoint, PendingCheckpoint};
 use crate::gpu::{Gpu, PassTiming};
@@ -15,7 +16,7 @@ use calibration::{CalibratedCamera, CameraCorrection, CameraRefinement};
 use keyframe::{Keyframe, Split};
 use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -48,8 +49,15 @@ pub struct Aligned<M> {
     original_keyframes: Vec<Arc<Keyframe>>,
     /// How many of them had arrived when alignment began; `None` before that.
     n_begun: Option<usize>,
-    alignment_step: u64,
-    /// Steps of the model before its restart.
+    /// Number of steps from the beginning of alignment to the use of its result.
+    alignment_steps: u64,
+    /// Step at which the result of the alignment that has begun is due.
+    due_step: Option<u64>,
+    /// Numbers of keyframes at which alignment begins; if there were none from the start, it begins at the first step.
+    at_keyframes: VecDeque<usize>,
+    /// Whether alignment is repeated with more keyframes.
+    is_live: bool,
+    /// Steps of the model before its last restart.
     n_steps_before_restart: u64,
 }
 
@@ -60,7 +68,10 @@ struct AlignedState {
     choice: CameraRefinement,
     is_aligned: bool,
     alignment: Option<Alignment>,
-    alignment_step: u64,
+    alignment_steps: u64,
+    due_step: Option<u64>,
+    at_keyframes: VecDeque<usize>,
+    is_live: bool,
     n_steps_before_restart: u64,
     /// Camera and stamp of the keyframes, until alignment is done.
     keyframes: Vec<(String, i64)>,
@@ -80,7 +91,10 @@ impl<M: Restartable + 'static> Aligned<M> {
             choice,
             original_keyframes: Vec::new(),
             n_begun: None,
-            alignment_step: alignment_step(is_software, n_planned_steps),
+            alignment_steps: alignment_step(is_software, n_planned_steps),
+            due_step: None,
+            at_keyframes: VecDeque::new(),
+            is_live: false,
             n_steps_before_restart: 0,
         }
     }
@@ -90,12 +104,17 @@ impl<M: Restartable + 'static> Aligned<M> {
         if common.align == CameraRefinement::default() {
             return Box::new(model);
         }
-        Box::new(Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps))
+        let at_keyframes = VecDeque::from(common.align_at_keyframes.clone());
+        Box::new(Self {
+            is_live: !at_keyframes.is_empty(),
+            at_keyframes,
+            ..Self::new(model, common.align.clone(), gpu.is_software(), common.n_planned_steps)
+        })
     }
 
     /// A saved model, with the alignment stored in its folder.
     pub fn load(model: M, folder: &Path) -> Result<Self, Error> {
-        let alignment_task = AlignmentTask::Done(read_metadata(folder)?.alignment);
+        let alignment_task = AlignmentTask::done(read_metadata(folder)?.alignment);
         Ok(Self { alignment_task, ..Self::new(model, CameraRefinement::default(), false, 0) })
     }
 
@@ -116,12 +135,18 @@ impl<M: Restartable + 'static> Aligned<M> {
             choice,
             is_aligned,
             alignment,
-            alignment_step,
+            alignment_steps,
+            due_step,
+            at_keyframes,
+            is_live,
             n_steps_before_restart,
             keyframes: ids,
             n_begun,
         } = serde_json::from_value(state).map_err(invalid_state)?;
-        let alignment_task = if is_aligned { AlignmentTask::Done(alignment) } else { AlignmentTask::new(&choice) };
+        let mut alignment_task = AlignmentTask::done(alignment);
+        if !is_aligned {
+            alignment_task.request_again();
+        }
         let corrected: Vec<_> = keyframes.iter().map(|keyframe| alignment_task.corrected(keyframe)).collect();
         let (model, untrained) = resume(&own_checkpoint, &corrected)?;
         let originals: BTreeMap<_, _> = keyframes.iter().map(|keyframe| (id_of(keyframe), keyframe)).collect();
@@ -129,41 +154,73 @@ impl<M: Restartable + 'static> Aligned<M> {
         let original_keyframes = ids.iter().filter_map(|(camera, nanos)| original((camera, *nanos))).collect();
         // These are corrected when they are pushed again.
         let untrained = untrained.iter().filter_map(|keyframe| original(id_of(keyframe))).collect();
-        let aligned =
-            Self { model, choice, alignment_task, original_keyframes, n_begun, alignment_step, n_steps_before_restart };
+        let aligned = Self {
+            model,
+            choice,
+            alignment_task,
+            original_keyframes,
+            n_begun,
+            alignment_steps,
+            due_step,
+            at_keyframes,
+            is_live,
+            n_steps_before_restart,
+        };
         Ok((Box::new(aligned), untrained))
     }
 
-    /// Starts alignment, if it is requested.
+    /// Starts alignment, if it is requested and there are enough keyframes.
     fn begin_alignment(&mut self) {
-        if self.alignment_task.is_requested() {
-            let n_begun = *self.n_begun.get_or_insert(self.original_keyframes.len());
-            self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
+        let n_keyframes = self.original_keyframes.len();
+        let has_begun = self.n_begun.is_some();
+        let waits = self.is_live && !has_begun && self.at_keyframes.front().is_none_or(|n| n_keyframes < *n);
+        if !self.alignment_task.is_requested() || waits {
+            return;
         }
+        let n_begun = *self.n_begun.get_or_insert(n_keyframes);
+        let from = if self.is_live { self.model.progress().step } else { 0 };
+        self.due_step.get_or_insert(from + self.alignment_steps);
+        self.alignment_task.begin(self.original_keyframes[..n_begun].to_vec(), &self.choice);
     }
 
-    /// Applies the result of alignment when due; if there are corrections, restarts the model.
+    /// Applies the result of alignment when due; if it changes corrections, restarts the model.
     fn finish_alignment_when_due(&mut self) -> Result<(), Error> {
         let step = self.model.progress().step;
-        let is_due = step >= self.alignment_step || (self.model.is_idle() && step > 0);
+        let is_idle = self.model.is_idle() && step > 0;
+        let is_due = self.due_step.is_some_and(|due_step| step >= due_step) || (is_idle && !self.is_waiting());
         if self.alignment_task.is_done() || !is_due {
             return Ok(());
         }
         self.begin_alignment(); // A model that was resumed at this step has not started it.
-        let has_corrections = self.alignment_task.finish()?;
-        let original_keyframes = std::mem::take(&mut self.original_keyframes);
-        let Some(alignment) = self.alignment_task.result().filter(|_| has_corrections) else { return Ok(()) };
+        let is_changed = self.alignment_task.finish(&self.original_keyframes)?;
+        (self.n_begun, self.due_step) = (None, None);
+        let n_keyframes = self.original_keyframes.len();
+        self.at_keyframes.retain(|n| *n > n_keyframes);
+        let original_keyframes = match self.at_keyframes.is_empty() {
+            true => std::mem::take(&mut self.original_keyframes),
+            false => {
+                self.alignment_task.request_again();
+                self.original_keyframes.clone()
+            }
+        };
+        let Some(alignment) = self.alignment_task.result().filter(|_| is_changed) else { return Ok(()) };
         log::info!("training restarts with corrected cameras");
         self.n_steps_before_restart += self.model.n_total_steps()?;
         self.model.restart(alignment)?;
         original_keyframes.iter().try_for_each(|keyframe| self.model.push(self.alignment_task.corrected(keyframe)))
     }
 
+    /// Whether the next alignment waits for more keyframes.
+    fn is_waiting(&self) -> bool {
+        self.is_live && self.n_begun.is_none()
+    }
+
     /// Steps until the result of alignment is due.
     fn steps_to_alignment(&self) -> u64 {
-        match self.alignment_task.is_done() {
-            true => u64::MAX,
-            false => self.alignment_step.saturating_sub(self.model.progress().step),
+        let step = self.model.progress().step;
+        match self.due_step {
+            Some(due_step) if !self.alignment_task.is_done() => due_step.saturating_sub(step),
+            _ => u64::MAX,
         }
     }
 }
@@ -197,7 +254,8 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
     }
 
     fn is_idle(&self) -> bool {
-        self.model.is_idle() && (self.alignment_task.is_done() || self.model.progress().step == 0)
+        let has_ended = self.alignment_task.is_done() || self.is_waiting();
+        self.model.is_idle() && (has_ended || self.model.progress().step == 0)
     }
 
     fn n_total_steps(&mut self) -> Result<u64, Error> {
@@ -272,7 +330,10 @@ impl<M: Restartable + 'static> Method for Aligned<M> {
             choice: self.choice.clone(),
             is_aligned: self.alignment_task.is_done(),
             alignment: self.alignment_task.result().cloned(),
-            alignment_step: self.alignment_step,
+            alignment_steps: self.alignment_steps,
+            due_step: self.due_step,
+            at_keyframes: self.at_keyframes.clone(),
+            is_live: self.is_live,
             n_steps_before_restart: self.n_steps_before_restart,
             keyframes: self
                 .original_keyframes
@@ -412,6 +473,46 @@ mod tests {
             CalibratedCamera::of(test),
             "there must be no corrections without the file"
         );
+    }
+
+    #[test]
+    fn live_model_restarts_when_more_keyframes_change_the_corrections() {
+        let gpu = Gpu::open(&GpuOptions::default()).unwrap();
+        let miscalibration = Miscalibration { extrinsics: wrong_extrinsics(), ..Miscalibration::none() };
+        let keyframes = capture(&miscalibration);
+        let is_used = |keyframe: &&Arc<Keyframe>| keyframe.split != Split::Test;
+        let n_used = keyframes.iter().filter(is_used).count();
+        let n_first = 2 * n_used / 3;
+        let common = CommonOptions {
+            align: CameraRefinement::Always(ParamSet::EXTRINSICS),
+            align_at_keyframes: vec![n_first, n_used],
+            n_planned_steps: 4 * ALIGNMENT_STEP,
+            ..CommonOptions::default()
+        };
+        let start = || Aligned::if_requested(MeanColor::new(ModelOptions::default()), &common, &gpu);
+        let mut model = start();
+        let (first, rest): (Vec<_>, Vec<_>) =
+            keyframes.iter().filter(is_used).enumerate().partition(|(ix, _)| *ix + 1 < n_first);
+        first.iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
+        train(&mut *model, ALIGNMENT_STEP + 3);
+        assert!(model.alignment().is_none(), "there are too few keyframes");
+        model.push(rest[0].1.clone()).unwrap();
+        train(&mut *model, ALIGNMENT_STEP + 2);
+        assert!(model.progress().step < ALIGNMENT_STEP, "the model must have restarted");
+        let correction = |model: &dyn Method| model.alignment().unwrap().corrections["wrist"].clone();
+        let remaining_after = |model: &dyn Method| remaining(&correction(model), &miscalibration.extrinsics);
+        let (degrees, mm) = remaining_after(&*model);
+        assert!(degrees < 0.1 && mm < 1.0, "{degrees} degrees, {mm} mm");
+        let step = model.progress().step;
+        rest[1..].iter().for_each(|(_, keyframe)| model.push((*keyframe).clone()).unwrap());
+        let before = correction(&*model);
+        train(&mut *model, ALIGNMENT_STEP + 2);
+        let has_restarted = model.progress().step < step + ALIGNMENT_STEP + 2;
+        assert_eq!(has_restarted, correction(&*model) != before, "it restarts only for other corrections");
+        let (degrees, mm) = remaining_after(&*model);
+        assert!(degrees < 0.05 && mm < 0.5, "{degrees} degrees, {mm} mm");
+        train(&mut *model, 3 * ALIGNMENT_STEP);
+        assert!(model.progress().step > 2 * ALIGNMENT_STEP, "no further alignment");
     }
 
     #[test]

@@ -4,10 +4,17 @@ use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
 use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::{CameraCorrection, Candidate, ParamSet, Trial};
+use crate::{CalibratedCamera, CameraCorrection, Candidate, ParamSet, Trial};
+use keyframe::Keyframe;
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// Smaller differences between two alignments do not matter: rotation of the camera (0.03 degrees), translation, and
+/// relative change of the focal length.
+const NOTICEABLE_RAD: f64 = 5e-4;
+const NOTICEABLE_M: f64 = 5e-4;
+const NOTICEABLE_FOCAL: f64 = 1e-3;
 
 /// Result of alignment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -292,6 +299,21 @@ impl Alignment {
     /// Whether any correction was accepted.
     pub fn has_corrections(&self) -> bool {
         !self.corrections.is_empty()
+    }
+
+    /// Whether another alignment places the camera of a keyframe noticeably differently.
+    pub(crate) fn differs(&self, other: &Self, keyframe: &Keyframe) -> bool {
+        let keyframe = Keyframe { rgba_srgb: [].into(), depth: None, ..keyframe.clone() };
+        let camera = |alignment: &Self| match alignment.corrections.get(&*keyframe.camera) {
+            Some(correction) => correction.apply(&keyframe),
+            None => CalibratedCamera::of(&keyframe),
+        };
+        let (here, there) = (camera(self), camera(other));
+        let motion = here.world_from_camera.inverse() * there.world_from_camera;
+        let focal_change = (0..2).map(|axis| (there.focal_px[axis] / here.focal_px[axis] - 1.0).abs());
+        motion.rotation.angle() > NOTICEABLE_RAD
+            || motion.translation.vector.norm() > NOTICEABLE_M
+            || focal_change.fold(0.0, f64::max) > NOTICEABLE_FOCAL
     }
 
     /// Whether there were enough validation images for decisions.
