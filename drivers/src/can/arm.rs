@@ -217,7 +217,7 @@ impl BusReader {
         Err(Error::Motor { joint: motor.config().joint.clone(), interface, reason })
     }
 
-    /// Logs errors on the wire: each time the controller goes off the bus or restarts, and otherwise each time the
+    /// Logs errors on the wire: each time the controller goes bus-off or restarts, and otherwise each time the
     /// count has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
         let previous = total.n_frames.checked_ilog2();

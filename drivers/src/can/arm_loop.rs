@@ -336,7 +336,7 @@ impl ArmLoop {
                         let interface = &prepared.buses[bus_ix].config().interface;
                         log::debug!("{interface}: errors on the wire so far: {:?}", prepared.errors);
                         if new_errors.n_bus_off > 0 && !is_stopped {
-                            return Err(motion(format!("{interface} went off the bus")));
+                            return Err(motion(format!("{interface} went bus-off")));
                         }
                     }
                 }

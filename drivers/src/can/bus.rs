@@ -62,7 +62,7 @@ impl Bus {
     /// frame.
     ///
     /// It returns `false` if the queue stayed full, which happens if no node acknowledges. `true` does not mean that
-    /// the frame was sent: the kernel accepts and drops frames for a controller that is off the bus.
+    /// the frame was sent: the kernel accepts and drops frames while the controller is bus-off.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }

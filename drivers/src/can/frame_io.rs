@@ -29,7 +29,7 @@ pub enum BusEvent {
 pub struct WireErrors {
     /// Error frames.
     pub n_frames: u64,
-    /// The controller went off the bus.
+    /// The controller went bus-off.
     pub n_bus_off: u64,
     /// The controller restarted.
     pub n_restarts: u64,
@@ -59,10 +59,10 @@ impl WireErrors {
 impl std::fmt::Display for WireErrors {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
-        let times = if *n_bus_off == 1 { "time" } else { "times" };
+        let bus_offs = if *n_bus_off == 1 { "bus-off" } else { "bus-offs" };
         write!(
             f,
-            "{n_bus_off} {times} off the bus, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
+            "{n_bus_off} {bus_offs}, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
              {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in total"
         )
     }

@@ -146,7 +146,7 @@ impl Session {
                     self.pending = image;
                 }
                 None if has_stopped && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) => {
-                    self.warn_of_images_before_open("all of the");
+                    self.warn_of_images_before_open("all");
                     return Ok(Next::End);
                 }
                 None if remaining <= POLL => return Ok(Next::NoImage),
@@ -155,12 +155,12 @@ impl Session {
         }
     }
 
-    /// Logs once how many images of a file were due too early.
+    /// Logs once how many images of a file were due before the file was opened.
     fn warn_of_images_before_open(&mut self, which: &str) {
         let n_before_open = std::mem::take(&mut self.n_before_open);
         if n_before_open > 0 {
             log::warn!(
-                "camera {:?}: {which} images of its file ({n_before_open}) were due before it was opened and are skipped",
+                "camera {:?}: skipped {which} images of the .bag file ({n_before_open}): they were due before fieldrig opened the file",
                 self.camera
             );
         }

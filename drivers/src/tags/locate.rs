@@ -74,7 +74,7 @@ pub enum LocateError {
         rms_error_px: f64,
     },
     /// Two poses explain the tags almost equally well.
-    #[error("a single tag in view is too small to determine to which side it is tilted")]
+    #[error("the only visible tag is too small in the image: its pose is ambiguous (two tilts fit)")]
     Ambiguous,
 }
 

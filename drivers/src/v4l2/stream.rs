@@ -207,7 +207,7 @@ impl V4l2Stream {
         }
         if !std::mem::replace(&mut self.has_warned_of_clock, true) {
             log::warn!(
-                "camera {:?}: its stamps are not of the monotonic clock; images are stamped on arrival",
+                "camera {:?}: its stamps do not come from the monotonic clock; images are stamped on arrival",
                 self.camera
             );
         }
