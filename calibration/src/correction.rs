@@ -202,9 +202,10 @@ pub fn interpolate<const N: usize>(known: &BTreeMap<i64, [f64; N]>, stamp: Stamp
     }
 }
 
-/// Share of the drift between images that also applies to other images, 0 to 1. Leaves out each image in turn, predicts
-/// its drift from its neighbors in time, and returns 1 minus the ratio of the squared prediction errors to the squared
-/// drifts.
+/// Share of the drift between images that also applies to other images, 0 to 1.
+///
+/// Leaves out each image in turn, predicts its drift from its neighbors in time, and returns 1 minus the ratio of the
+/// squared prediction errors to the squared drifts.
 ///
 /// Returns 0 if the errors of images are independent, if predicting is worse than assuming no drift, or if there are
 /// too few images.

@@ -203,8 +203,9 @@ impl AlignmentScene {
         restricted
     }
 
-    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer significant. If
-    /// extrinsics are not corrected, they may still be wrong in directions that the motion does not make observable.
+    /// Adds each candidate whose gain is significant, then removes those whose gain is no longer significant.
+    ///
+    /// If extrinsics are not corrected, they may still be wrong in directions that the motion does not make observable.
     /// These directions are added to `unobservable`.
     fn select_params(
         &self,

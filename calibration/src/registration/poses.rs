@@ -23,9 +23,10 @@ const MAX_ITERATIONS: [usize; 4] = [6, 4, 4, 6];
 const MAX_STEP: f64 = 2.0;
 
 /// Estimates the poses of all images that are connected by pairs, starting from given corrections. Other images get the
-/// interpolated drift of their neighbors, weighted by its predictability. The expected pose error is estimated from the
-/// corrections themselves at each level. If almost all poses are correct, it becomes small, so noise does not move
-/// them.
+/// interpolated drift of their neighbors, weighted by its predictability.
+///
+/// The expected pose error is estimated from the corrections themselves at each level. If almost all poses are correct,
+/// it becomes small, so noise does not move them.
 pub(super) fn fit(images: &[PreparedImage], pairs: &[Pair], from: &Corrections) -> Option<Corrections> {
     let layout = Layout::default();
     let mut corrections = from.clone();
@@ -138,8 +139,10 @@ fn median_depth_m(images: &[PreparedImage]) -> f64 {
 }
 
 /// Removes the significant part of the mean correction of a camera's images from the steps, because other parameters
-/// explain that part. A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and
-/// removing it would leave the images misaligned.
+/// explain that part.
+///
+/// A mean within its tolerance is not removed: independent errors have a nonzero mean, too, and removing it would leave
+/// the images misaligned.
 fn remove_mean(
     steps: &mut [Vector6<f64>],
     total: &[Vector6<f64>],
