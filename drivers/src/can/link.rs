@@ -36,13 +36,13 @@ pub struct Link {
     pub is_up: bool,
     /// Whether it accepts FD frames.
     pub is_fd: bool,
-    /// Bit rate, bit/s; `None` if it has none (virtual interfaces) or none is set.
+    /// Bit rate, bit/s; `None` for virtual interfaces, or if none is set.
     pub bitrate_hz: Option<u32>,
     /// Bit rate of the data phase of FD frames, bit/s.
     pub data_bitrate_hz: Option<u32>,
     /// Time from a bus-off to the automatic restart, milliseconds; 0 means no restart.
     pub restart_millis: Option<u32>,
-    /// State according to its error counters; `None` if it has no counters.
+    /// State of the controller according to its error counters; `None` for virtual interfaces.
     pub state: Option<State>,
     /// Current transmit and receive error counters.
     pub n_errors: Option<[u16; 2]>,
@@ -169,7 +169,7 @@ impl std::fmt::Display for Link {
     }
 }
 
-/// Command that sets an interface up as configured.
+/// Shell command that configures an interface as in the rig file.
 fn set_up_command(interface: &str, is_virtual: bool, config: &BusConfig) -> String {
     if is_virtual {
         return match config.data_bitrate_hz {
