@@ -32,14 +32,14 @@ pub(super) struct Session {
     stamps: Stamps,
     filters: Filters,
     counter: [FrameCounter; 2],
-    /// Files only: an image that was read but is not due yet.
+    /// For files only: an image that was read but is not due yet.
     pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
     has_image: bool,
-    /// Files only: number of images that were due before the file was opened.
+    /// For files only: number of images that were due before the file was opened.
     n_before_open: u64,
     description: String,
     started: ActiveStreams,
@@ -135,7 +135,7 @@ impl Session {
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // Checked before the queue, so that all images until then are in the queue.
+            // This is checked before the queue, so that all images read until then are in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
