@@ -269,10 +269,7 @@ fn persistent_bus_off_is_reported_as_cause() {
         }
     };
     println!("kvaser: {error}");
-    assert!(
-        error.contains("no frame from the motor for 1s") && error.contains("1 bus-off, 0 restarts"),
-        "{error}"
-    );
+    assert!(error.contains("no frame from the motor for 1s") && error.contains("1 bus-off, 0 restarts"), "{error}");
 }
 
 #[test]
