@@ -18,8 +18,8 @@ pub enum State {
     Active,
     /// An error counter has reached 96.
     Warning,
-    /// An error counter has reached 128. The controller no longer sends active error flags, which would destroy frames of
-    /// other nodes.
+    /// An error counter has reached 128. The controller no longer sends active error flags, which would destroy the
+    /// frames of other nodes.
     Passive,
     /// The transmit error counter has exceeded 255. The controller takes no part in the bus until it is restarted.
     BusOff,
