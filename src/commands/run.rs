@@ -1,5 +1,6 @@
 //! `fieldrig run`: opens devices, joins their samples, trains, and serves the page.
 
+use super::number_in_range;
 use crate::checkpoint_args::CheckpointArgs;
 use crate::console::{Console, OutputMode, print_next_commands};
 use crate::exit::{self, BadArgument, Exit, InsufficientData};
@@ -8,6 +9,7 @@ use crate::training_args::TrainingArgs;
 use crate::{print, signals};
 use anyhow::Context;
 use capture::config::{ArmDriver, Override, Rig};
+use capture::doctor;
 use capture::open::{self, Devices, Opened};
 use capture::{Counts, Feed, Input, Join, Rejection, SampleUse, StationReport, Stations, Stop};
 use drivers::Source;
@@ -57,7 +59,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FOLDER", conflicts_with_all = ["from", "method", "seed", "max_bytes", "max_splats", "refine", "count"])]
     resume: Option<PathBuf>,
     /// Stop S seconds after the first image; time before --resume counts [default: run until Ctrl-C]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true, value_parser = number_in_range(0.0..=1e9))]
     seconds: Option<f64>,
     /// Stop after N optimizer steps, or when the devices have ended and all data is fused; steps before --resume count.
     /// With --lockstep, a seed then gives one result
@@ -288,9 +290,11 @@ pub(super) fn start(
     };
     let hub = Hub::new();
     let server = Server::start(ServerConfig { listen: args.listen }, hub.clone())?;
-    args.print_address(&server.url())?;
-
+    for finding in doctor::suspicious_values(&rig) {
+        log::warn!("{finding}");
+    }
     let Opened { rig, source, damage } = args.open(rig)?;
+    args.print_address(&server.url())?;
     let folders = created.make_each(args.out(), &kinds, Some(&rig))?;
     let held = previous.map_or(&[][..], |previous| &previous.keyframes);
     let (input, evicted) = args.input(&rig, source, held)?;

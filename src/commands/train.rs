@@ -54,7 +54,7 @@ pub(crate) struct Args {
     replay_decisions: Option<PathBuf>,
     /// Stop after S seconds of training; loading and scoring do not count, time before --resume does
     /// [default: 120, unless --steps is given]
-    #[arg(long, value_name = "S")]
+    #[arg(long, value_name = "S", allow_negative_numbers = true)]
     seconds: Option<f64>,
     /// Stop after N optimizer steps; steps before --resume count. Without --seconds, no decision depends on timing, so
     /// one seed gives one result

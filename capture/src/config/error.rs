@@ -59,6 +59,14 @@ pub enum ConfigError {
         /// The allowed values.
         allowed: String,
     },
+    /// Several problems.
+    #[error("{first}{}", .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>())]
+    Several {
+        /// The one that explains most.
+        first: Box<Self>,
+        /// The others.
+        others: Vec<Self>,
+    },
     /// The robot description does not match the rig file.
     #[error("{file}: {key}: {reason}")]
     Robot {

@@ -198,13 +198,18 @@ impl Key for f64 {
     type Limits = RangeInclusive<Self>;
 
     fn read(keys: &mut Section<'_>, key: &'static str, limits: Self::Limits) -> Option<Self> {
-        let allowed = || format!("{} to {}", limits.start(), limits.end());
+        let allowed = || format!("numbers from {} to {}", rounded(*limits.start()), rounded(*limits.end()));
         keys.parse(key, |value| number(value).filter(|number| limits.contains(number)), allowed)
     }
 
     fn write(&self) -> Option<Value> {
         Some((*self).into())
     }
+}
+
+/// A limit for messages: without the digits of a division.
+fn rounded(limit: f64) -> f64 {
+    if limit.abs() < 1.0 { limit } else { (limit * 1e3).round() / 1e3 }
 }
 
 /// Converts integers and finite floats.

@@ -9,6 +9,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
+/// Keys that are less similar than this (Jaro-Winkler) are not suggested for an unknown key.
+const MIN_SIMILARITY: f64 = 0.75;
+
 /// State shared by all sections while a rig file is read.
 #[derive(Debug)]
 pub(super) struct ParseContext {
@@ -34,11 +37,28 @@ impl ParseContext {
         Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
     }
 
-    /// The problem to report, if there is one. Unknown keys come first, because they explain missing keys.
+    /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing keys.
     pub(super) fn into_problem(self) -> Option<ConfigError> {
-        let mut problems = self.problems.into_inner();
-        let first = problems.iter().position(|problem| matches!(problem, ConfigError::UnknownKey { .. })).unwrap_or(0);
-        (!problems.is_empty()).then(|| problems.swap_remove(first))
+        let is_unknown = |problem: &ConfigError| matches!(problem, ConfigError::UnknownKey { .. });
+        let (mut problems, others): (Vec<_>, Vec<_>) = self.problems.into_inner().into_iter().partition(is_unknown);
+        problems.sort_by_key(|problem| match problem {
+            ConfigError::UnknownKey { at: SourceLocation::Line { line, .. }, .. } => *line,
+            _ => 0,
+        });
+        let meant = |key: &str| {
+            problems
+                .iter()
+                .any(|problem| matches!(problem, ConfigError::UnknownKey { nearest: Some(meant), .. } if meant == key))
+        };
+        let is_meant = |problem: &ConfigError| matches!(problem, ConfigError::Missing { key, .. } if meant(key));
+        let others: Vec<_> = others.into_iter().filter(|problem| !is_meant(problem)).collect();
+        problems.extend(others);
+        let first = (!problems.is_empty()).then(|| problems.remove(0))?;
+        Some(if problems.is_empty() {
+            first
+        } else {
+            ConfigError::Several { first: Box::new(first), others: problems }
+        })
     }
 
     /// Every key read so far.
@@ -109,7 +129,7 @@ impl<'a> Section<'a> {
         for key in self.table.keys() {
             let close = |known: &&&str| (strsim::jaro_winkler(key, known) * 1000.0).round();
             let nearest = self.known.iter().max_by(|a, b| close(a).total_cmp(&close(b)));
-            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > 0.7);
+            let nearest = nearest.filter(|known| strsim::jaro_winkler(key, known) > MIN_SIMILARITY);
             let path = join(&self.path, key);
             self.context.report(ConfigError::UnknownKey {
                 at: self.context.location(&path),

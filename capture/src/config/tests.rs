@@ -380,7 +380,7 @@ fn missing_keys_and_syntax_errors_are_reported() {
 #[test]
 fn invalid_value_error_names_line_or_flag() {
     let message = parse(&RIG.replace("rate_hz = 30", "rate_hz = 3000"), &[]).expect_err("too fast").to_string();
-    assert_eq!(message, "rig.toml line 9: camera.wrist.rate_hz is 3000, allowed: 0.01 to 1000");
+    assert_eq!(message, "rig.toml line 9: camera.wrist.rate_hz is 3000, allowed: numbers from 0.01 to 1000");
     let message = parse(RIG, &[Override::new("train.sh_degree", 9)]).expect_err("no such degree").to_string();
     assert_eq!(message, "command line: train.sh_degree is 9, allowed: whole numbers from 0 to 3");
 }

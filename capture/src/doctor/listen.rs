@@ -162,7 +162,6 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
 
 /// The devices of a rig with their expected rates; `None` if the rig file does not set a rate.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
-    use crate::config::ArmDriver;
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
         expected.insert(format!("camera {:?}", camera.name), Some(camera.rate_hz));

@@ -1,5 +1,6 @@
 //! Checks this computer and the devices of a rig, and suggests a remedy for each problem. Nothing is moved.
 
+mod calibration;
 #[cfg(target_os = "linux")]
 mod can;
 mod clock;
@@ -64,6 +65,15 @@ impl Finding {
     }
 }
 
+impl std::fmt::Display for Finding {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.remedy {
+            Some(remedy) => write!(f, "{}; {remedy}", self.message),
+            None => f.write_str(&self.message),
+        }
+    }
+}
+
 /// Checks clocks, memory, priorities and permissions, the devices of `rig`, and connected devices in general.
 pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     let (dev, proc, sys) = (Path::new("/dev"), Path::new("/proc"), Path::new("/sys"));
@@ -74,14 +84,21 @@ pub fn check(rig: Option<&Rig>) -> Vec<Finding> {
     {
         findings.extend(drivers::v4l2::cameras().into_iter().flatten().filter_map(|camera| usb::usb(&camera)));
         findings.extend(rig.into_iter().flat_map(video_devices::missing));
+        findings.extend(rig.into_iter().flat_map(video_devices::unstable_nodes));
     }
     findings.extend(realsense::realsense(rig));
     #[cfg(target_os = "linux")]
     findings.extend(can::can(rig));
     findings.extend(franka::franka(rig));
     findings.extend(rig.and_then(motion::motion));
+    findings.extend(rig.into_iter().flat_map(calibration::calibration));
     findings.extend(rig.into_iter().flat_map(|rig| udp::senders(rig).into_iter().chain(realsense::files(rig))));
     findings
+}
+
+/// Warnings about values in a rig file that are probably mistakes, such as lengths in millimeters.
+pub fn suspicious_values(rig: &Rig) -> Vec<Finding> {
+    calibration::calibration(rig)
 }
 
 /// The first word after `key` at the start of a line.
@@ -106,8 +123,8 @@ mod testing {
     }
 
     /// A rig file of the folder `rigs`, with changed keys.
-    pub(super) fn bundled_rig(name: &str, overrides: &[(&str, &str)]) -> Rig {
-        let overrides: Vec<_> = overrides.iter().map(|(key, value)| Override::new(*key, *value)).collect();
+    pub(super) fn bundled_rig<V: Clone + Into<toml::Value>>(name: &str, overrides: &[(&'static str, V)]) -> Rig {
+        let overrides: Vec<_> = overrides.iter().map(|(key, value)| Override::new(key, value.clone())).collect();
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../rigs").join(name);
         Rig::load(&path, &overrides).expect("a bundled rig file")
     }

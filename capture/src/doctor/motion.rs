@@ -25,7 +25,7 @@ mod tests {
 
     #[test]
     fn unsupported_settings_are_reported_without_the_arm() {
-        assert_eq!(motion(&bundled_rig("static-arm.toml", &[])), None, "the arm is only read");
+        assert_eq!(motion(&bundled_rig::<&str>("static-arm.toml", &[])), None, "the arm is only read");
         for (on_loss, verdict) in [("hold", Verdict::Ok), ("release", Verdict::Fail)] {
             let rig = bundled_rig("wire/static-arm.toml", &[("arm.motion.on_loss", on_loss)]);
             let finding = motion(&rig).expect("the arm can be moved");

@@ -2,7 +2,7 @@
 
 use super::Finding;
 #[cfg(target_os = "linux")]
-use crate::config::{CameraDriver, Rig};
+use crate::config::{Camera, CameraDriver, Rig};
 #[cfg(target_os = "linux")]
 use drivers::v4l2;
 use std::path::{Path, PathBuf};
@@ -31,6 +31,18 @@ pub(super) fn permissions(dev: &Path) -> Finding {
     Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
 }
 
+/// Reports V4L2 cameras of a rig whose device node may belong to another camera after a restart.
+#[cfg(target_os = "linux")]
+pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
+    let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
+    let unstable = cameras.filter(|camera| camera.device.starts_with("/dev/video"));
+    let warn = |camera: &Camera| {
+        let message = format!("camera {:?}: {} may become another camera after a restart", camera.name, camera.device);
+        Finding::warn("cameras", message, "use the stable name that fieldrig devices prints")
+    };
+    unstable.map(warn).collect()
+}
+
 /// Reports V4L2 cameras of a rig that are not connected.
 #[cfg(target_os = "linux")]
 pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
@@ -44,7 +56,7 @@ pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
         Some(Finding::fail(
             "cameras",
             format!("camera {name:?}: {problem}"),
-            "connect it, or change the device in the rig file",
+            format!("connect it, or set camera.{name}.device to one that fieldrig devices lists"),
         ))
     });
     missing.collect()
