@@ -59,12 +59,12 @@ pub enum ConfigError {
         /// The allowed values.
         allowed: String,
     },
-    /// Several problems.
+    /// The rig file has several problems.
     #[error("{first}{}", .others.iter().map(|other| format!("\n  also: {other}")).collect::<String>())]
     Several {
-        /// The one that explains most.
+        /// The problem that is most likely the cause of others.
         first: Box<Self>,
-        /// The others.
+        /// The other problems.
         others: Vec<Self>,
     },
     /// The robot description does not match the rig file.

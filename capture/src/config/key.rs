@@ -207,7 +207,7 @@ impl Key for f64 {
     }
 }
 
-/// A limit for messages: without the digits of a division.
+/// Rounds a limit for messages, so that limits computed by a division have few digits.
 fn rounded(limit: f64) -> f64 {
     if limit.abs() < 1.0 { limit } else { (limit * 1e3).round() / 1e3 }
 }
