@@ -1,5 +1,5 @@
-//! Alignment in parallel with training: starts with the first step on its own thread; the result is applied at a
-//! fixed step.
+//! Runs alignment in parallel with training. Alignment starts with the first training step, on its own thread; its
+//! result is applied at a fixed step.
 
 use crate::registration::{Alignment, align};
 use crate::{CalibratedCamera, CameraCorrection, CameraRefinement, Error};
@@ -7,8 +7,8 @@ use keyframe::Keyframe;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// Step at which the result is applied, after waiting for it if necessary. It is smaller on software adapters, where
-/// steps are as expensive as alignment.
+/// Step at which training waits for the result and applies it. It is smaller on software adapters, where a step takes
+/// as long as alignment.
 const ALIGNMENT_STEP: u64 = 400;
 const SOFTWARE_ALIGNMENT_STEP: u64 = 50;
 
@@ -28,8 +28,11 @@ pub struct AlignmentTask {
 
 #[derive(Debug)]
 enum TaskState {
+    /// Alignment can start.
     Requested,
+    /// Alignment runs on its own thread.
     Running(JoinHandle<Option<Alignment>>),
+    /// Alignment has finished or was not requested.
     Done,
 }
 
@@ -106,7 +109,8 @@ impl AlignmentTask {
         }
     }
 
-    /// The camera of a keyframe with the corrections of alignment, then those estimated with the splats.
+    /// The camera of a keyframe with the corrections of alignment, followed by the corrections that were learned with
+    /// the splats.
     pub fn calibrated_camera(&self, keyframe: &Keyframe, learned: Option<&CameraCorrection>) -> CalibratedCamera {
         let posed = |keyframe: &Keyframe| {
             learned.map_or_else(|| CalibratedCamera::of(keyframe), |correction| correction.apply(keyframe))
@@ -121,8 +125,8 @@ impl AlignmentTask {
     }
 }
 
-/// Runs `work` in a thread pool of its own, so that training, which downscales images on all processors, does not
-/// wait for it.
+/// Runs `work` in a separate thread pool. In the global pool, training, which downscales images on all processors,
+/// would wait for it.
 pub fn run_in_background_pool<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     let n_processors = std::thread::available_parallelism().map_or(1, usize::from);
     match rayon::ThreadPoolBuilder::new().num_threads((3 * n_processors).div_ceil(4)).build() {

@@ -1,11 +1,11 @@
-//! Gain of a part of a model on validation images, and its statistical significance.
+//! Gain of a model variant on validation images, and its statistical significance.
 
-/// Minimum gain for keeping a part, dB.
+/// Minimum gain for accepting a variant, dB.
 pub const MIN_GAIN_DB: f64 = 0.05;
 /// Minimum gain in standard errors.
 const MIN_STANDARD_ERRORS: f64 = 2.0;
 
-/// Mean gain over the same images with a variant and without it.
+/// Mean gain of a variant over the baseline, scored on the same images.
 ///
 /// ```
 /// use calibration::{Gain, MIN_GAIN_DB};
@@ -25,7 +25,7 @@ pub struct Gain {
 }
 
 impl Gain {
-    /// Computes the gain from those of single images, dB.
+    /// Computes the mean gain from the gains of single images, dB.
     pub fn of(gains_db: &[f64]) -> Self {
         let n = gains_db.len().max(1) as f64;
         let mean_db = gains_db.iter().sum::<f64>() / n;
@@ -33,7 +33,7 @@ impl Gain {
         Self { mean_db, standard_error_db: (variance / n).sqrt(), n_images: gains_db.len() }
     }
 
-    /// Whether the gain is above both `min_db` and its own uncertainty.
+    /// Whether the gain exceeds both `min_db` and two standard errors.
     pub fn is_significant(&self, min_db: f64) -> bool {
         self.mean_db > f64::max(min_db, MIN_STANDARD_ERRORS * self.standard_error_db)
     }

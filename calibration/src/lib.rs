@@ -1,10 +1,10 @@
 //! Calibration parameters of cameras and their estimation from keyframes.
 //!
-//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics, joint
-//! offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are estimated.
-//! [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
-//! ([`Trial`], [`Gain`]) and reports the others with their uncertainty. [`AlignmentTask`] does that in parallel with
-//! training. [`register_station`] estimates the pose of a mobile base at one station.
+//! A [`CameraCorrection`] holds the estimated errors of one camera: extrinsics (hand-eye), time offset, intrinsics,
+//! joint offsets, and the pose, scale and timing of its depth camera. A [`ParamSet`] selects which of them are
+//! estimated. [`align`] estimates them by registering keyframes with depth, keeps those that improve validation images
+//! ([`Trial`], [`Gain`]), and reports their uncertainty. [`AlignmentTask`] runs [`align`] in parallel with training.
+//! [`register_station`] estimates the pose of a mobile base at one station.
 //!
 //! ```
 //! use calibration::CameraCorrection;

@@ -4,7 +4,7 @@ use crate::ParamSet;
 use crate::gain::{Gain, MIN_GAIN_DB};
 use serde::{Deserialize, Serialize};
 
-/// Gains from twice as many splats that are below this value are not significant, dB.
+/// Minimum gain that justifies twice as many splats, dB.
 const MIN_GAIN_OF_DOUBLING_DB: f64 = 0.1;
 
 /// Selection of the camera parameters to optimize.
@@ -28,7 +28,7 @@ impl Default for CameraRefinement {
 pub enum Candidate {
     /// Optimizes these camera parameters in addition.
     Cameras(ParamSet),
-    /// Removes the half of the splats that contributes least.
+    /// Removes the half of the splats with the smallest contribution.
     Halved {
         /// Splats before.
         from: u32,
@@ -100,7 +100,7 @@ impl Trial {
         Self { candidate, gain_db, standard_error_db, n_images, kept: n_images > 1 && is_significant }
     }
 
-    /// Report on the part of the model that was tested: the addition, or what the reduction would remove.
+    /// Report on the tested part of the model: the addition, or the part that the reduction would remove.
     pub fn report(&self) -> TrialReport {
         let (candidate, is_reduction) = match self.candidate {
             Candidate::Cameras(params) => (params.to_string(), false),
@@ -137,9 +137,9 @@ impl Trial {
 /// Result of a trial on validation images, for reports.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrialReport {
-    /// Description of the tested part of the model: the addition, or what the reduction would remove.
+    /// Description of the tested part of the model: the addition, or the part that the reduction would remove.
     pub candidate: String,
-    /// Mean PSNR with that part minus that without it, dB.
+    /// Mean PSNR with that part minus mean PSNR without it, dB.
     pub gain_db: f64,
     /// Standard error of the mean, dB.
     pub standard_error_db: f64,

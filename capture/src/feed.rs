@@ -1,5 +1,5 @@
-//! The input side of a run: a thread reads the source, records, joins and corrects base poses at stations. Keyframes
-//! come out of a bounded queue.
+//! The input side of a run: a thread reads the source, records and joins the samples, and corrects base poses at
+//! stations. Keyframes are delivered through a bounded queue.
 
 use crate::error::{Context, Error};
 use crate::join::{Change, Join, JoinEvent, PosedImage};
@@ -17,8 +17,8 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Maximum number of keyframes that wait for the trainer. When the queue is full, the source waits too, and live
-/// devices drop (and count) images.
+/// Maximum number of keyframes that wait for the trainer. If the queue is full, the input thread waits, and live
+/// devices drop and count images.
 const MAX_WAITING: usize = 8;
 
 /// Number of images whose arrival is remembered until they become keyframes: more than a station holds back.
@@ -49,22 +49,22 @@ pub trait ImageObserver: Send {
     /// Whether images are needed. If not, they are not decoded.
     fn needs_images(&self) -> bool;
 
-    /// Takes an image.
+    /// Receives an image.
     fn observe(&self, image: ObservedImage);
 }
 
-/// A camera image with its pose, as it arrived.
+/// A camera image as received from the device, with its pose.
 #[derive(Clone, Debug)]
 pub struct ObservedImage {
     /// Name of the camera.
     pub camera: Arc<str>,
     /// Mid-exposure.
     pub stamp: Stamp,
-    /// The same moment on this process's clock; the time of arrival if the stamp is on another clock.
+    /// Mid-exposure on this process's clock; the time of arrival if the stamp comes from another clock.
     pub captured_at: Instant,
     /// Width and height, pixels.
     pub size_px: [u32; 2],
-    /// The image, not undistorted.
+    /// The pixels, not undistorted.
     pub pixels: ObservedPixels,
     /// Pose of the camera at the stamp, with the correction of its station.
     pub world_from_camera: Transform,
@@ -83,7 +83,7 @@ pub enum ObservedPixels {
     Rgb(Arc<[u8]>),
 }
 
-/// State of the input that the run reads while it runs.
+/// State of the input that the run reads while the input thread runs.
 #[derive(Debug, Default)]
 struct Shared {
     first_image: OnceLock<Instant>,
@@ -95,11 +95,11 @@ struct Shared {
 pub struct Input {
     /// The open devices or recording.
     pub source: Box<dyn Source>,
-    /// Makes keyframes of the samples.
+    /// Makes keyframes from the samples.
     pub join: Join,
     /// Corrects base poses at stations, if the base moves.
     pub stations: Option<Stations>,
-    /// Records all samples, if they are recorded.
+    /// Records all samples; `None` if the run is not recorded.
     pub recorder: Option<Recorder>,
     /// The clock of the stamps.
     pub stamp_clock: StampClock,
@@ -107,7 +107,7 @@ pub struct Input {
     pub camera_intrinsics: HashMap<Arc<str>, ([f64; 2], [f64; 2])>,
 }
 
-/// The input after it ended.
+/// Results of an input that has ended.
 pub struct InputResult {
     /// The join with its keyframes and counts.
     pub join: Join,
@@ -128,7 +128,7 @@ pub struct Feed {
 }
 
 impl Feed {
-    /// Starts to read `input`. The feed ends when the input ends, at `stop`, or at an error of the source.
+    /// Starts reading `input`. The feed ends when the input ends, when `stop` is requested, or when the source fails.
     ///
     /// # Errors
     ///
@@ -142,7 +142,7 @@ impl Feed {
         Ok(Self { changes, shared, thread, ended: false })
     }
 
-    /// Time at which the first image arrived; `None` before.
+    /// Time at which the first image arrived; `None` if none has arrived.
     #[must_use]
     pub fn first_image(&self) -> Option<Instant> {
         self.shared.first_image.get().copied()
@@ -154,7 +154,7 @@ impl Feed {
         self.shared.rejected.lock().clone()
     }
 
-    /// Waits at most `timeout` for the next change; `None` if there is none yet or the input has ended.
+    /// Waits at most `timeout` for the next change. Returns `None` if none arrived or the input has ended.
     pub fn next(&mut self, timeout: Duration) -> Option<FeedItem> {
         match self.changes.recv_timeout(timeout) {
             Ok(item) => Some(item),
@@ -200,7 +200,7 @@ struct Pump {
     arrivals: VecDeque<(Arc<str>, Stamp, Instant)>,
 }
 
-/// The trainer accepts no more keyframes.
+/// The trainer has ended and accepts no more keyframes.
 struct TrainerGone;
 
 impl Pump {

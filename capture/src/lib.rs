@@ -3,7 +3,7 @@
 //! A [`Rig`] is a checked rig file. [`open::rig`] opens its devices, real or simulated, and [`open::recording`] a
 //! recording, as one source of samples. A [`Join`] turns the samples into keyframes: it pairs each image with the pose
 //! of its camera at mid-exposure, rejects images that are blurred, badly exposed or too close to others, and bounds the
-//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a thread of its own.
+//! memory. [`Stations`] corrects the drift of a moving base. [`Feed`] does all of this on a separate thread.
 //! [`dataset`] loads datasets with known poses instead. [`doctor`] checks whether this computer and its devices are
 //! ready.
 //!

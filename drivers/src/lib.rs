@@ -71,8 +71,8 @@ pub trait Camera: Send {
     /// reconnect to the camera. Cameras played back from a file return [`Error::NotDue`] if the next image is due
     /// later, and [`Error::Ended`] at the end.
     fn next_image(&mut self, timeout: Duration) -> Result<Image, Error>;
-    /// Whether the source waits for a slow caller instead of dropping images, for example a file that is read as fast
-    /// as possible.
+    /// Whether the camera waits for a slow caller instead of dropping images. True, for example, for a file that is
+    /// read as fast as possible.
     fn waits_for_caller(&self) -> bool {
         false
     }

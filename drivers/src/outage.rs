@@ -20,8 +20,8 @@ impl Outage {
         *outage
     }
 
-    /// Waits until the next attempt is due, one pause after the last attempt, and counts it. If it is due after the
-    /// deadline, waits until the deadline and returns false.
+    /// Waits until the next attempt is due, one pause after the last attempt, and counts the attempt. If it is due
+    /// after the deadline, waits until the deadline and returns false.
     pub(crate) fn wait_for_retry(&mut self, pause: Duration, deadline: Instant) -> bool {
         let next_try = self.last_try + pause;
         std::thread::sleep(next_try.min(deadline).saturating_duration_since(Instant::now()));

@@ -1,7 +1,7 @@
-//! A camera that is reopened after it was disconnected, shared by all camera drivers.
+//! Reopens a camera after it was disconnected. All camera drivers use this code.
 //!
-//! A driver implements [`Device`]: how to open the camera, read an image and describe the problem. [`Reconnecting`]
-//! decides when to try again and when to give up, and counts the images that were lost in the meantime.
+//! A driver implements [`Device`], which opens the camera, reads images and describes problems. [`Reconnecting`]
+//! decides when to retry and when to give up, and counts the images that were lost in the meantime.
 
 use crate::outage::{Outage, n_between};
 use crate::{Error, Image};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 pub(crate) trait Device: Debug {
     /// The open camera. Dropping it closes the camera.
     type Stream: Debug;
-    /// Problem of this kind of camera.
+    /// A problem of this kind of camera.
     type Problem: Display;
 
     /// Opens the camera.
@@ -22,15 +22,16 @@ pub(crate) trait Device: Debug {
     /// Description of device, mode and settings for the log; `None` as long as the camera is still being opened.
     fn describe(&self, stream: &Self::Stream) -> Option<String>;
 
-    /// Waits for the next image. Returns `None` if none came before the deadline, or to be called again before that.
+    /// Waits for the next image. Returns `None` if no image arrived; the caller may call again if the deadline has not
+    /// passed.
     fn next_image(
         &mut self,
         stream: &mut Self::Stream,
         deadline: Instant,
     ) -> Result<Option<Image>, Failure<Self::Problem>>;
 
-    /// Called before each attempt to reopen the camera, counted from one. Returns true if it reset the camera, in which
-    /// case the attempt ends here.
+    /// Called before each attempt to reopen the camera. `n_tries` counts the attempts from 1. Returns true if it reset
+    /// the camera, which ends the attempt.
     fn reset(&mut self, _n_tries: u32) -> bool {
         false
     }
@@ -39,10 +40,10 @@ pub(crate) trait Device: Debug {
     fn lost(&self, waited: Duration, n_tries: u32, last: Self::Problem) -> Error;
 }
 
-/// Why a camera cannot be opened or delivers no images.
+/// The reason why a camera cannot be opened or delivers no images.
 #[derive(Debug)]
 pub(crate) enum Failure<P> {
-    /// It is disconnected, or has a problem that may disappear after reopening it.
+    /// The camera is disconnected, or has a problem that may disappear if it is reopened.
     Lost(P),
     /// An error that is returned without another attempt.
     #[cfg_attr(
@@ -59,7 +60,7 @@ impl<P> From<P> for Failure<P> {
 }
 
 impl<P> Failure<P> {
-    /// The error if there is no further attempt.
+    /// The error that is returned if there is no further attempt.
     pub(crate) fn into_error(self, error_of: impl FnOnce(P) -> Error) -> Error {
         match self {
             Self::Lost(problem) => error_of(problem),
@@ -68,14 +69,14 @@ impl<P> Failure<P> {
     }
 }
 
-/// When to reopen a camera.
+/// Determines when a camera is reopened.
 #[derive(Clone, Debug)]
 pub(crate) struct ReconnectPolicy {
     /// Name in the rig file.
     pub(crate) camera: String,
     /// Images per second.
     pub(crate) rate_hz: f64,
-    /// The first problem after this time is returned.
+    /// Time after which the next problem is returned as an error.
     pub(crate) reconnect_for: Duration,
     /// Pause before the first attempt.
     pub(crate) first_pause: Duration,
@@ -103,18 +104,18 @@ pub(crate) struct Reconnecting<D: Device> {
     stream: Option<D::Stream>,
     /// Whether the camera has finished opening.
     is_streaming: bool,
-    /// Set from the start of an outage until the next image. A camera that can be opened but sends nothing is still
+    /// The outage, from its start until the next image. A camera that can be opened but sends nothing still counts as
     /// disconnected.
     outage: Option<Outage>,
-    /// By kind, color or depth: stamp of the last image, kept across reconnections.
+    /// Stamp of the last color image and of the last depth image, kept across reconnections.
     last: [Option<Stamp>; 2],
-    /// By kind: whether an image has arrived since the camera was last opened.
+    /// Whether a color image and a depth image have arrived since the camera was last opened.
     has_image: [bool; 2],
     counts: CameraCounts,
 }
 
 impl<D: Device> Reconnecting<D> {
-    /// A camera that was opened and streams.
+    /// Takes over a camera that was opened and streams.
     pub(crate) fn new(device: D, stream: D::Stream, policy: ReconnectPolicy) -> Self {
         Self {
             device,
@@ -174,7 +175,8 @@ impl<D: Device> Reconnecting<D> {
         }
     }
 
-    /// Counts an image, and before the first one of its kind since the camera was reopened those that were missed.
+    /// Counts an image. If it is the first of its kind since the camera was reopened, also counts the images missed
+    /// before it.
     fn count(&mut self, mut image: Image) -> Image {
         let kind = usize::from(image.is_depth());
         let last = self.last[kind].replace(image.stamp);
@@ -188,7 +190,7 @@ impl<D: Device> Reconnecting<D> {
         image
     }
 
-    /// Closes the camera before it is reopened, because an open device node keeps its number.
+    /// Closes the camera, because an open device node would keep its number when the camera returns.
     fn disconnect(&mut self, problem: D::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
         self.stream = None;

@@ -86,7 +86,7 @@ impl Hub {
         self.queue().n_clients()
     }
 
-    /// The next picture to render, if a client waits for one.
+    /// The next picture to render, if a client is waiting for one.
     ///
     /// Each call returns one stage of one client; clients are served in turn.
     pub fn next_request(&self) -> Option<PendingRender> {
@@ -103,7 +103,7 @@ impl Hub {
 
     /// Waits up to `timeout` until a client requests a picture. Returns whether one did.
     ///
-    /// For callers with nothing to train.
+    /// For callers that have nothing to train.
     pub fn wait_for_request(&self, timeout: Duration) -> bool {
         let mut queue = self.queue();
         self.shared.work_arrived.wait_while_for(&mut queue, |queue| !queue.has_work(), timeout);
@@ -155,7 +155,8 @@ impl Hub {
     }
 }
 
-/// A picture that a client waits for. If dropped without an answer, the client receives nothing for this stage.
+/// A picture for which a client is waiting. If it is dropped without an answer, the client receives nothing for this
+/// stage.
 #[derive(Debug)]
 pub struct PendingRender {
     /// What to render, at the size of this stage.

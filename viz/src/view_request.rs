@@ -17,7 +17,7 @@ const DEFAULT_NEAR_M: f64 = 0.01;
 /// Default far limit, meters.
 const DEFAULT_FAR_M: f64 = 100.0;
 
-/// Reason why a message is invalid; sent to the client.
+/// The reason why a message is invalid, which is sent to the client.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum InvalidRequest {
     #[error("cannot parse the message: {0}")]

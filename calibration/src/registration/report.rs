@@ -40,7 +40,7 @@ pub enum Estimate {
     HandEye(PoseEstimate),
     /// Correction of the pose of the depth frame in the color frame, in the axes of the color frame.
     DepthPose(PoseEstimate),
-    /// Time by which images were taken later than their stamps, seconds.
+    /// Time from the stamps of the images to their exposure, seconds.
     TimeOffset(ScalarEstimate),
     /// Factor to apply to depth readings, minus 1.
     DepthScale(ScalarEstimate),
@@ -113,7 +113,8 @@ pub struct ScalarEstimate {
     pub sigma: f64,
 }
 
-/// A direction that the motion does not make observable: changing all its parts together changes no residual.
+/// A direction in parameter space that the motion does not make observable: changing all its parts together changes no
+/// residual.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Unobservable {
     /// Descriptions of the parts.
@@ -156,7 +157,8 @@ pub(super) fn alignment(
     Alignment { corrections, estimates, unobservable, trials, n_pairs: scene.pairs.len() }
 }
 
-/// Estimate for a parameter; `None` unless it is the first of its group.
+/// The estimate of the group of parameters that starts with a parameter; `None` if the parameter is not the first of
+/// its group.
 fn estimate(
     scene: &AlignmentScene,
     kept: &CalibrationModel,
@@ -235,7 +237,7 @@ fn pose_estimate(
     }
 }
 
-/// Directions that are not observable in a fit.
+/// Unobservable directions of a fit.
 pub(super) fn unobservable(scene: &AlignmentScene, fit: &Fit) -> Vec<Unobservable> {
     let is_not_translation = |ix: usize| {
         !matches!(fit.layout.params[ix], CalibrationParam::Extrinsics(_, 0..3) | CalibrationParam::DepthPose(_, 0..3))
@@ -259,10 +261,10 @@ fn describe(scene: &AlignmentScene, params: &[CalibrationParam], direction: &DVe
         let name = |camera: usize| &scene.cameras[camera];
         parts.extend(match *param {
             CalibrationParam::Extrinsics(camera, 0) if is_significant(ix, 3) => {
-                Some(format!("translation of camera {:?} along {} of its own axes", name(camera), axis(ix)))
+                Some(format!("translation of camera {:?} along its own {} axis", name(camera), axis(ix)))
             }
             CalibrationParam::Extrinsics(camera, 3) if is_significant(ix, 3) => {
-                Some(format!("rotation of camera {:?} about {} of its own axes", name(camera), axis(ix)))
+                Some(format!("rotation of camera {:?} about its own {} axis", name(camera), axis(ix)))
             }
             CalibrationParam::DepthPose(camera, 0) if is_significant(ix, 3) => {
                 Some(format!("translation of the depth frame of camera {:?} along {}", name(camera), axis(ix)))

@@ -13,7 +13,7 @@ use toml::Table;
 const MAX_JOINT_OFFSET: f64 = 1.0;
 
 keys! {
-    /// The arm that carries the cameras, or that they see.
+    /// The arm of the rig.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Arm {
         /// Source of the joint states.
@@ -24,7 +24,8 @@ keys! {
         pub urdf_text: String => String::new();
         /// Moving joints in the order of the joint states.
         pub joints: Vec<String> = Vec::new();
-        /// Offsets added to the joint states, in their order, rad or m, each from -1 to 1; empty if there are none.
+        /// Offsets added to the joint positions, in the order of `joints`, rad or m, each from -1 to 1; empty if there
+        /// are none.
         pub joint_offsets: Vec<f64> = Vec::new();
         /// Link of the URDF that is the base of the robot.
         pub base_link: String = String::new();
@@ -62,7 +63,7 @@ choices! {
     ArmDriver { None = "none", Franka = "franka", Can = "can", Udp = "udp", Sim = "sim" }
 }
 
-/// Reads the arm without its robot description, and the path of that; the path is empty if there is none.
+/// Reads the arm without its robot description, and the path of the description, which is empty if there is none.
 pub(super) fn read(mut keys: Section<'_>) -> Option<(Arm, String)> {
     let has_flange_link = keys.has("flange_link");
     let arm = Arm::read_keys(&mut keys);

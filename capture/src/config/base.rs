@@ -27,11 +27,11 @@ keys! {
         pub realign: bool = true;
         /// Measured poses with a larger root mean square position error are discarded, meters.
         pub max_sigma_m: f64 = 0.05, in 0.0001..=100.0;
-        /// The same for the orientation, radians.
+        /// Measured poses with a larger root mean square orientation error are discarded, radians.
         pub max_sigma_rad: f64 = 0.03, in 0.0001..=3.2;
         /// Family of the tags that [`BaseDriver::Tags`] detects.
         pub tag_family: Family = Family::Tag36h11;
-        /// These tags and their poses in the world, by ID.
+        /// Sizes and poses of the tags in the world, by ID.
         pub tags: BTreeMap<u32, TagPlacement> => BTreeMap::new();
         /// Errors of a simulated base.
         pub sim: BaseSim;
@@ -58,9 +58,9 @@ keys! {
 pub enum BaseDriver {
     /// The base does not move.
     Fixed,
-    /// AprilTags in the images of cameras on the base or the arm.
+    /// AprilTags in the images of cameras on the base or arm.
     Tags,
-    /// Reserved: color and depth images. It cannot be opened.
+    /// Reserved for estimating the pose from color and depth images. This version cannot open it.
     Rgbd,
     /// Datagrams from another program.
     Udp,
@@ -87,7 +87,7 @@ pub(super) fn read(mut keys: Section<'_>) -> Option<Base> {
     Some(base)
 }
 
-/// Reads a tag and its ID; returns `None` if a value is invalid, which has been reported.
+/// Reads a tag and its ID. Reports an invalid value and returns `None`.
 fn tag(id: &str, family: Family, keys: Section<'_>) -> Option<(u32, TagPlacement)> {
     let number = id.parse().ok().filter(|number: &u32| number.to_string() == id && *number < family.n_tags());
     let allowed = format!("ID of a tag in its family, 0 to {}, as the name of the table", family.n_tags() - 1);

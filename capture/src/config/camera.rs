@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use toml::Table;
 
-/// Controls are 32 bits wide; the camera's own limits are checked when it is opened.
+/// Range of control values. The limits of the camera are checked when it is opened.
 const CONTROL_RANGE: RangeInclusive<i32> = -1_000_000..=1_000_000;
 
 keys! {
@@ -26,8 +26,8 @@ keys! {
         pub device: String = String::new();
         /// Frame rate, Hz.
         pub rate_hz: f64, in 0.01..=1000.0, required "images per second";
-        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the camera reports the exposure
-        /// time with each image if it can.
+        /// Exposure time, microseconds, at most one frame period. `None`: automatic; the exposure time of each image is
+        /// then known only if the camera reports it.
         pub exposure_micros: Option<f64>, in 0.0..=period_micros(rate_hz);
         /// Time from the first to the last row, microseconds, at most one frame period; `None` if unknown, 0 for a
         /// global shutter.
@@ -84,7 +84,7 @@ keys! {
         pub brightness: Option<i32>, in CONTROL_RANGE;
         /// Color temperature, kelvin. `None`: automatic.
         pub white_balance_kelvin: Option<i32>, in 1000..=20_000;
-        /// Preset of the depth camera, by the name that the camera gives it. `None`: unchanged.
+        /// Name of a preset of the depth camera. `None`: unchanged.
         pub preset: Option<String>;
         /// Power of the projector or laser in units of the camera. `None`: unchanged.
         pub laser_power: Option<f64>, in 0.0..=1000.0;
@@ -92,7 +92,7 @@ keys! {
         pub filters: Vec<Filter> = Vec::new();
         /// How long to search for a disconnected camera, seconds.
         pub reconnect_secs: f64 = 30.0, in 0.0..=86_400.0;
-        /// Calibration that the camera reports when it is opened.
+        /// Calibration values that are unknown until the camera is opened and reports them.
         pub unknown: UnknownCalibration => UnknownCalibration::default();
     }
 
@@ -103,7 +103,7 @@ keys! {
         pub value_millis: f64 as "value", in -1000.0..=1000.0, required "milliseconds from the stamp to mid-exposure";
         /// Standard deviation of the value, milliseconds.
         pub sigma_millis: f64 as "sigma" = 0.0, in 0.0..=1000.0;
-        /// How it was measured; may be empty.
+        /// Description of how the offset was measured; may be empty.
         pub source: String = String::new();
     }
 
@@ -116,7 +116,7 @@ keys! {
         pub meters_per_count: Option<f64>, in 1e-6..=0.1;
         /// Lens and size of the depth images.
         pub intrinsics: Intrinsics = PLACEHOLDER_INTRINSICS;
-        /// Pose of the optical frame of the depth images in that of the color images.
+        /// Pose of the optical frame of the depth images in the optical frame of the color images.
         pub camera_from_depth: Transform = Transform::identity();
         /// Scale factor for the readings.
         pub factor: f64 = 1.0, in 0.5..=2.0;
@@ -141,7 +141,7 @@ keys! {
         pub dropped_frac: f64 = 0.0, in 0.0..=0.9;
         /// Rendered samples per pixel along each axis.
         pub supersample: u32 = 1, in 1..=4;
-        /// Standard deviation of depth at 1 m, meters; grows with the square of the depth.
+        /// Standard deviation of the depth noise at 1 m, meters; it grows with the square of the depth.
         pub depth_noise_sigma_m: f64 = 0.0015, in 0.0..=1.0;
         /// Fraction of depth pixels without a reading.
         pub depth_hole_frac: f64 = 0.02, in 0.0..=0.9;
@@ -182,15 +182,15 @@ pub enum Parent {
     World,
 }
 
-/// Which calibration values are missing in the rig file until the camera reports them; their placeholders must not be
-/// used.
+/// Calibration values that are missing in the rig file and not yet reported by the camera. Until then, the rig contains
+/// placeholders that must not be used.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct UnknownCalibration {
-    /// [`Camera::intrinsics`], except the size.
+    /// Whether [`Camera::intrinsics`] are unknown, except for the size.
     pub intrinsics: bool,
-    /// [`Depth::intrinsics`], except the size.
+    /// Whether [`Depth::intrinsics`] are unknown, except for the size.
     pub depth_intrinsics: bool,
-    /// [`Depth::camera_from_depth`].
+    /// Whether [`Depth::camera_from_depth`] is unknown.
     pub camera_from_depth: bool,
 }
 
@@ -256,7 +256,7 @@ fn depth(mut keys: Section<'_>, color: &Intrinsics, unknown: &mut UnknownCalibra
     Some(Depth { intrinsics: Intrinsics { size_px, rectified, ..lens }, ..depth })
 }
 
-/// Calibration that only the camera reports is omitted.
+/// Writes the keys of a camera, without calibration that only the camera reports.
 pub(super) fn write(camera: &Camera) -> Table {
     let Camera { intrinsics, realsense, .. } = camera;
     let mut table = camera.write_keys();

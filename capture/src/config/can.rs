@@ -26,13 +26,13 @@ keys! {
         family: &'static dyn MotorFamily, required family_names();
         bus: String, required "interface of the motor, which has a table [arm.bus.NAME]";
         id: u64, in family.map_or(0..=u64::MAX, MotorFamily::ids), required "ID of the motor, axis or node";
-        /// Ratios outside the limits are considered typing errors.
+        /// Ratios outside this range are considered typing errors.
         gear_ratio: f64 = 1.0, in 0.001..=10_000.0;
         reversed: bool = false;
         offset_rad: f64 = 0.0, in -100.0..=100.0;
     }
 
-    /// The gains of the families whose commands include them; they need each other.
+    /// The gains of motors whose commands include them. Either both keys or none must be set.
     struct GainKeys {
         stiffness_nm_rad: Option<f64>, in 0.0..=1e6;
         damping_nm_s_rad: Option<f64>, in 0.0..=1e5;
@@ -81,10 +81,10 @@ fn bus(interface: String, keys: Section<'_>) -> Option<BusConfig> {
     Some(BusConfig { interface, bitrate_hz, data_bitrate_hz, accept_no_restart })
 }
 
-/// Returns `None` if a value is invalid, which has been reported.
+/// Reads a motor. Reports an invalid value and returns `None`.
 fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<MotorConfig> {
     let Some(motor) = MotorKeys::read_keys(&mut keys) else {
-        // Without these keys, those of all families are known.
+        // Without a valid family, the keys of all families are accepted, so that they are not reported as unknown.
         FAMILIES.iter().flat_map(|family| family.keys()).for_each(|key| drop(keys.take(key.name)));
         gains(&mut keys);
         keys.end();
@@ -102,7 +102,7 @@ fn motor(joint: String, mut keys: Section<'_>, buses: &[BusConfig]) -> Option<Mo
     Some(MotorConfig { joint, bus_ix: bus_ix?, protocol: protocol?, gear_ratio, is_reversed, offset_rad, gains })
 }
 
-/// Reads the keys of the family. Returns `None` if a required one is missing or invalid, which is reported.
+/// Reads the keys of the family. Reports a required key that is missing or invalid, and returns `None`.
 fn protocol(keys: &mut Section<'_>, family: &dyn MotorFamily, id: u64) -> Option<Arc<dyn MotorProtocol>> {
     let mut values = BTreeMap::new();
     for key in family.keys() {
@@ -115,7 +115,7 @@ fn protocol(keys: &mut Section<'_>, family: &dyn MotorFamily, id: u64) -> Option
     family.motor(&MotorSettings { id, values })
 }
 
-/// What a required key means, and its words if there are some to choose from.
+/// Meaning of a required key, with its allowed words if it is a choice.
 fn meaning_of(allowed: &AllowedValues, meaning: &'static str) -> String {
     match allowed {
         AllowedValues::Words(words) => format!("{meaning}: {}", quoted(words.iter().copied())),
@@ -134,7 +134,7 @@ fn setting(keys: &mut Section<'_>, key: &MotorKey) -> Option<SettingValue> {
     }
 }
 
-/// Reads both gains; they need each other.
+/// Reads both gains. Reports an error if only one is set.
 fn gains(keys: &mut Section<'_>) -> Option<Gains> {
     let GainKeys { stiffness_nm_rad, damping_nm_s_rad } = GainKeys::read_keys(keys)?;
     match (stiffness_nm_rad, damping_nm_s_rad) {

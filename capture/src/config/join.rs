@@ -12,7 +12,8 @@ keys! {
         pub max_keyframes: usize = 400, in 8..=1_000_000;
         /// Maximum host memory of the keyframes in the store, bytes.
         pub max_bytes: u64 = 4_000_000_000, in 1_000_000..=1 << 50;
-        /// Minimum distance to every keyframe of the same camera, meters; this or the rotation suffices.
+        /// Minimum distance to every keyframe of the same camera, meters. A keyframe needs this distance or
+        /// `min_rotation_rad`.
         pub min_translation_m: f64 = 0.02, in 1e-6..=100.0;
         /// Minimum rotation relative to every keyframe of the same camera, radians.
         pub min_rotation_rad: f64 = 0.05, in 1e-6..=3.2;

@@ -1,7 +1,7 @@
-//! Keys: how the value of a key is read, checked and written, by its type, and structs whose fields are keys.
+//! Reads, checks and writes the values of keys according to their types, and defines structs whose fields are keys.
 //!
-//! This is not done with serde, whose derived code has no place for ranges and ends at the first problem. Here all
-//! problems are collected, so that an unknown key is reported rather than the missing key that it was meant to be.
+//! serde is not used, because its derived code has no ranges and stops at the first problem. Here, all problems are
+//! collected, so that a misspelled key is reported as unknown, and not the correct key as missing.
 
 use super::section::Section;
 use std::borrow::Cow;
@@ -12,7 +12,7 @@ use toml::{Table, Value};
 
 /// A type that a key can have.
 pub(super) trait Key: Sized {
-    /// The allowed values, as far as the type leaves them open.
+    /// Limits of the allowed values, in addition to those of the type.
     type Limits;
 
     /// Reads the value of a key; `None` if it is absent or invalid. An invalid value is reported.
@@ -22,28 +22,29 @@ pub(super) trait Key: Sized {
     fn write(&self) -> Option<Value>;
 }
 
-/// A type with a value for an absent key, whatever the key.
+/// A type that has a value for any absent key.
 pub(super) trait Optional: Key {
-    /// That value. `None` if the type is a table and one of its keys is required.
+    /// The value for an absent key. `None` if the type is a table and one of its keys is required.
     fn absent(keys: &mut Section<'_>, key: &'static str) -> Option<Self>;
 }
 
 /// A struct whose fields are keys of one table, defined by [`keys!`].
 pub(super) trait Keys: Sized {
-    /// Reads the fields. `None` if a required key is missing or a value without default is invalid, which is reported.
+    /// Reads the fields. Reports a required key that is missing, or an invalid value without default, and returns
+    /// `None`.
     fn read_keys(keys: &mut Section<'_>) -> Option<Self>;
 
-    /// The table of the fields.
+    /// Writes the fields to a table.
     fn write_keys(&self) -> Table;
 }
 
-/// A type of which a rig file names each value, defined by [`choices!`].
+/// A type whose values have names in rig files, defined by [`choices!`].
 pub(super) trait Choice: Copy + PartialEq + 'static {
     /// The names.
     const NAMES: &'static [(&'static str, Self)];
 }
 
-/// Names the values of types for rig files.
+/// Defines the names of a type's values in rig files.
 macro_rules! choices {
     ($($Type:ty { $($Variant:ident = $name:literal),* })*) => {$(
         impl $crate::config::key::Choice for $Type {
@@ -143,7 +144,7 @@ pub(super) fn entry(key: &str, value: &impl Key) -> Option<(String, Value)> {
 }
 
 impl Section<'_> {
-    /// The value of a key; `None` if it is absent or invalid, which is reported.
+    /// The value of a key; `None` if it is absent or invalid. An invalid value is reported.
     pub(super) fn get<T: Key>(&mut self, key: &'static str, limits: T::Limits) -> Option<T> {
         T::read(self, key, limits)
     }
@@ -206,7 +207,7 @@ impl Key for f64 {
     }
 }
 
-/// A limit for messages: without the digits of a division.
+/// Rounds a limit for messages, so that limits computed by a division have few digits.
 fn rounded(limit: f64) -> f64 {
     if limit.abs() < 1.0 { limit } else { (limit * 1e3).round() / 1e3 }
 }
@@ -313,7 +314,7 @@ fn names<T: Choice>() -> String {
     names.join(", ")
 }
 
-/// A list without duplicates; a single name may stand without brackets.
+/// A list without duplicates. A single name does not need brackets.
 impl<T: Choice> Key for Vec<T> {
     type Limits = ();
 

@@ -6,7 +6,7 @@ use super::section::Section;
 use kinematics::{Intrinsics, Lens};
 use toml::Value;
 
-/// Intrinsics until the camera reports them, and in a rig with missing keys, which is not returned.
+/// Placeholder until the camera reports its intrinsics, and in a rig with missing keys, which is never returned.
 pub(super) const PLACEHOLDER_INTRINSICS: Intrinsics =
     Intrinsics { size_px: [1, 1], focal_px: [1.0; 2], principal_px: [0.5; 2], lens: Lens::Pinhole, rectified: true };
 
@@ -33,7 +33,7 @@ choices! {
     LensModel { Pinhole = "pinhole", BrownConrady = "brown_conrady", KannalaBrandt = "kannala_brandt" }
 }
 
-/// The table `intrinsics`. The size and whether images are rectified are keys of the camera.
+/// The table `intrinsics`, without image size and `rectified`, which are keys of the camera.
 impl Key for Intrinsics {
     type Limits = ();
 

@@ -60,7 +60,7 @@ pub struct Override {
 }
 
 impl Override {
-    /// An override of `key`, a dotted path as in `docs/reference/rig.md`, such as `train.seed`.
+    /// Creates an override of `key`, a dotted path as in `docs/reference/rig.md`, such as `train.seed`.
     #[must_use]
     pub fn new(key: &'static str, value: impl Into<toml::Value>) -> Self {
         Self { key, value: value.into() }
@@ -68,7 +68,7 @@ impl Override {
 }
 
 impl Rig {
-    /// Whether base poses come from a device, including its errors.
+    /// Whether base poses come from a device or a simulation, and may therefore have errors.
     #[must_use]
     pub fn has_moving_base(&self) -> bool {
         self.base.driver != BaseDriver::Fixed
@@ -88,7 +88,7 @@ impl Rig {
         let mut rig =
             rig_file::read(&file, &text, overrides, |urdf| read_file("the robot description", &folder.join(urdf)))?;
         if let Some(motion) = rig.arm.motion.as_mut().filter(|motion| !motion.odrive_endpoints.is_empty()) {
-            // An absolute path is valid wherever the effective rig file is.
+            // An absolute path stays valid in the effective rig file, which is in another folder.
             let path = folder.join(&motion.odrive_endpoints);
             let path = std::path::absolute(&path).map_err(|source| ConfigError::Read {
                 description: "ODrive's endpoints",
@@ -109,7 +109,7 @@ impl Rig {
     ///
     /// # Errors
     ///
-    /// As [`Rig::load`], without those of files.
+    /// As for [`Rig::load`], except for errors of reading files.
     pub fn parse(file: &str, text: &str, urdf_text: &str, overrides: &[Override]) -> Result<Self, ConfigError> {
         rig_file::read(file, text, overrides, |_| Ok(urdf_text.to_owned()))
     }
@@ -125,7 +125,7 @@ impl Rig {
     /// offsets.
     #[must_use]
     pub fn has_same_calibration(&self, other: &Self) -> bool {
-        const TOLERANCE: f64 = 1e-9; // Reading a pose back may change its last bit.
+        const TOLERANCE: f64 = 1e-9; // Writing and reading a pose may change its last bit.
         let is_same = |one: &Camera, other: &Camera| {
             let difference = one.parent_from_camera.inverse() * other.parent_from_camera;
             one.name == other.name
@@ -142,7 +142,7 @@ impl Rig {
             && self.cameras.iter().zip(&other.cameras).all(|(one, other)| is_same(one, other))
     }
 
-    /// The same rig with a single scene model.
+    /// Returns the same rig with a single scene model.
     #[must_use]
     pub fn with_method(&self, name: &str) -> Self {
         let methods = self.train.methods.with_single(name);

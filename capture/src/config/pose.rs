@@ -8,7 +8,8 @@ use toml::Value;
 
 /// Larger coordinates of poses and lenses are considered typing errors.
 pub(super) const MAX_COORDINATE: f64 = 1e4;
-/// A quaternion this close to unit length is not normalized, so that an effective rig file gives exactly the same rig.
+/// A quaternion whose length deviates from 1 by less than this is not normalized, so that an effective rig file gives
+/// exactly the same rig.
 const UNIT_NORM_TOLERANCE: f64 = 1e-12;
 
 keys! {

@@ -25,8 +25,8 @@ pub(super) fn read(
     Ok(rig)
 }
 
-/// Reads all keys: the rig without its robot description, the path of that, and the problems found. Without problems,
-/// there is a rig.
+/// Reads all keys. Returns the rig without its robot description, the path of the description, and the problems found.
+/// Without problems, the rig is present.
 pub(super) fn keys(
     file: &str,
     text: &str,
@@ -79,7 +79,7 @@ fn set(table: &mut Table, key: &str, value: Value) {
     }
 }
 
-/// The effective rig file: every key of a checked rig, such that reading it gives the same rig.
+/// Writes the effective rig file, which contains every key of a checked rig. Reading it gives the same rig.
 pub(super) fn write(rig: &Rig) -> String {
     let cameras = rig.cameras.iter().map(|camera| (camera.name.to_string(), Value::Table(camera::write(camera))));
     let scanners = rig.scanners.iter().filter_map(|scanner| entry(&scanner.name, scanner));

@@ -9,10 +9,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Keys that are less similar than this (Jaro-Winkler) are not suggested for an unknown one.
+/// Keys that are less similar than this (Jaro-Winkler) are not suggested for an unknown key.
 const MIN_SIMILARITY: f64 = 0.75;
 
-/// State while a rig file is read.
+/// State shared by all sections while a rig file is read.
 #[derive(Debug)]
 pub(super) struct ParseContext {
     file: String,
@@ -37,7 +37,7 @@ impl ParseContext {
         Ok(Self { file: file.to_owned(), lines, flags, problems: RefCell::default(), accessed: RefCell::default() })
     }
 
-    /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing ones.
+    /// The problems, if there are any, as one error. Unknown keys come first, because they explain missing keys.
     pub(super) fn into_problem(self) -> Option<ConfigError> {
         let is_unknown = |problem: &ConfigError| matches!(problem, ConfigError::UnknownKey { .. });
         let (mut problems, others): (Vec<_>, Vec<_>) = self.problems.into_inner().into_iter().partition(is_unknown);
@@ -139,12 +139,12 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// An empty table in place of one inside this one.
+    /// Returns an empty table instead of a table inside this one.
     pub(super) fn empty_section(&self, key: &str) -> Self {
         self.inner(key, key, Table::new())
     }
 
-    /// A table inside this one; an absent one reads as empty.
+    /// A table inside this one. An absent table reads as an empty one.
     pub(super) fn section(&mut self, key: &'static str) -> Self {
         self.optional_section(key).unwrap_or_else(|| self.empty_section(key))
     }
@@ -234,7 +234,7 @@ impl<'a> Section<'a> {
         }
     }
 
-    /// The value of a key, which counts as known from then on.
+    /// Takes the value of a key, and marks the key as known.
     pub(super) fn take(&mut self, key: &'static str) -> Option<Value> {
         self.known.push(key);
         self.context.accessed.borrow_mut().insert(join(&self.documented_path, key));

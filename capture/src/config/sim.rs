@@ -4,10 +4,10 @@ use super::key::keys;
 use super::train::{DEFAULT_SEED, SEED_RANGE};
 
 keys! {
-    /// Settings of the simulation, which is used with `--sim` and by drivers named `sim`.
+    /// Settings of the simulator, which is used with `--sim` and by drivers named `sim`.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Sim {
-        /// Name of the scene; the simulator knows the names.
+        /// Name of the scene. The simulator checks it.
         pub scene: String = "static-arm".to_owned();
         /// Random seed.
         pub seed: u64 = DEFAULT_SEED, in SEED_RANGE;
@@ -27,7 +27,8 @@ keys! {
         pub truth: bool = true;
         /// Whether the ground truth includes depth without noise.
         pub truth_depth: bool = false;
-        /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to outside.
+        /// Brightness of the lights while a camera on the flange is inside the cabinet, relative to their brightness
+        /// otherwise.
         pub light_inside_frac: f64 = 1.0, in 0.0..=4.0;
     }
 }

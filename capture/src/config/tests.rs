@@ -1,4 +1,5 @@
-//! Every key of the rig file is documented, has an effect and is checked; effective rig files give the same rig.
+//! Tests that every key of the rig file is documented, has an effect and is checked, and that effective rig files give
+//! the same rig.
 
 use super::{ConfigError, Override, Rig, rig_file};
 use std::collections::{BTreeMap, BTreeSet};

@@ -21,7 +21,7 @@ keys! {
     /// How the model is trained.
     #[derive(Clone, Debug, PartialEq)]
     pub struct Train {
-        /// The scene models to train; trainers know the names.
+        /// Names of the scene models to train. [`Methods::resolve`] checks them.
         pub methods: Methods as "method";
         /// Maximum number of splats. `None`: the trainer's default.
         pub max_splats: Option<u64>, in MAX_SPLATS_RANGE;
@@ -56,7 +56,7 @@ impl Methods {
         &self.names
     }
 
-    /// A single method in their place.
+    /// Returns the same key with a single method.
     pub(super) fn with_single(&self, name: &str) -> Self {
         Self { names: vec![name.to_owned()], location: self.location.clone() }
     }
@@ -65,7 +65,7 @@ impl Methods {
     ///
     /// # Errors
     ///
-    /// If a name is not among `known`, with its place in the rig file.
+    /// If a name is not among `known`. The error contains its line in the rig file.
     pub fn resolve<T: Copy>(&self, known: &[(&str, T)]) -> Result<Vec<T>, ConfigError> {
         let find = |name: &String| {
             known.iter().find(|(known, _)| known == name).map(|(_, method)| *method).ok_or_else(|| {

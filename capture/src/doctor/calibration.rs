@@ -1,23 +1,23 @@
-//! Values of cameras in the rig file that are possible, but are probably in other units or were forgotten.
+//! Checks for camera values in the rig file that are valid but implausible: in another unit, or left at the default.
 
 use super::Finding;
 use crate::config::{Camera, Parent, Rig};
 use kinematics::{Lens, Transform};
 
 const CHECK: &str = "calibration";
-/// Cameras on a flange are closer to it than this.
+/// Maximum plausible distance of a camera from the flange that carries it.
 const MAX_DISTANCE_M: f64 = 3.0;
-/// Fields of view of lenses that are in use.
+/// Plausible horizontal fields of view.
 const FIELD_OF_VIEW_DEG: std::ops::RangeInclusive<f64> = 5.0..=160.0;
-/// Shorter exposures are not possible with cameras for robots.
+/// Minimum plausible exposure time.
 const MIN_EXPOSURE_MICROS: f64 = 5.0;
 
-/// Checks the values of all cameras; empty if there is nothing to say.
+/// Checks the values of all cameras. Empty if all are plausible.
 pub(super) fn calibration(rig: &Rig) -> Vec<Finding> {
     rig.cameras.iter().flat_map(problems).map(|(message, remedy)| Finding::warn(CHECK, message, remedy)).collect()
 }
 
-/// Messages with remedies.
+/// Implausible values of a camera: messages with remedies.
 fn problems(camera: &Camera) -> Vec<(String, String)> {
     let name = &camera.name;
     let mut problems = Vec::new();

@@ -1,10 +1,10 @@
-//! The clock of all stamps.
+//! Checks the clock from which all stamps come.
 
 use super::Finding;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Stamps are compared with the readout time of an image row, tens of microseconds.
+/// Maximum step of the clock. It must be short compared with the readout time of an image row, tens of microseconds.
 const MAX_CLOCK_STEP: Duration = Duration::from_micros(1);
 
 /// Measures the smallest step of the monotonic clock.
@@ -28,7 +28,7 @@ pub(super) fn clock() -> Finding {
     }
 }
 
-/// Whether the kernel reads a fast clock.
+/// Checks that the kernel uses a fast clock source.
 pub(super) fn clock_source(sys: &Path) -> Finding {
     let folder = sys.join("devices/system/clocksource/clocksource0");
     let Ok(current) = std::fs::read_to_string(folder.join("current_clocksource")) else {

@@ -1,4 +1,4 @@
-//! Checks of this computer and the network for a rig with a Franka arm. They do not occupy the robot's only client
+//! Checks this computer and the network for a rig with a Franka arm, without occupying the robot's only client
 //! connection.
 
 use super::{Finding, Verdict, field};
@@ -10,9 +10,9 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-/// Franka requires a lower latency between a state and its response.
+/// Maximum ping time. Franka requires that a response reaches the robot within 1 ms of the state.
 const MAX_PING_MILLIS: f64 = 1.0;
-/// A controller in the same network responds at once.
+/// Maximum time for opening a connection. A controller in the same network responds at once.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Number of pings, five per second.
 const N_PINGS: &str = "10";
@@ -49,8 +49,8 @@ pub(super) fn franka(rig: Option<&Rig>) -> Vec<Finding> {
     findings
 }
 
-/// Whether the controller accepts clients: opens a connection and closes it without sending, which does not occupy the
-/// robot.
+/// Checks that the controller accepts clients, by opening a connection and closing it without sending anything, which
+/// does not occupy the robot.
 fn port(address: &str) -> Finding {
     let has_no_port = host_of(address) == address;
     let found = if has_no_port { (address, FCI_PORT).to_socket_addrs() } else { address.to_socket_addrs() };
@@ -67,7 +67,7 @@ fn port(address: &str) -> Finding {
     }
 }
 
-/// An address without its port; IPv6 addresses with a port are in brackets.
+/// The host part of an address. IPv6 addresses with a port are in brackets.
 fn host_of(address: &str) -> &str {
     match address.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
         Some((host, _)) => host,
@@ -88,7 +88,7 @@ fn kernel(sys: &Path, os_release: &str) -> Finding {
     Finding::warn("kernel", "without PREEMPT_RT: states at 1 kHz are sometimes read some ms late", remedy)
 }
 
-/// How much memory this user may lock.
+/// Checks how much memory this user may lock.
 fn locked_memory(proc: &Path) -> Finding {
     match field(&proc.join("self/limits"), "Max locked memory").as_deref() {
         None => Finding::ok("memory lock", "not reported by the kernel"),

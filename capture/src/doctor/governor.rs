@@ -1,9 +1,9 @@
-//! The governor of the processor's frequency.
+//! Checks the frequency governor of the processor.
 
 use super::Finding;
 use std::path::Path;
 
-/// The CPU frequency governor, if the machine has one.
+/// Checks the CPU frequency governor, if the machine has one.
 pub(super) fn governor(sys: &Path) -> Option<Finding> {
     let governor = std::fs::read_to_string(sys.join("devices/system/cpu/cpu0/cpufreq/scaling_governor")).ok()?;
     let governor = governor.trim();

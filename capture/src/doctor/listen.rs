@@ -1,4 +1,4 @@
-//! Measures what a rig's devices deliver, with the drivers of `run`. Nothing is moved.
+//! Measures rates, latencies and losses of a rig's devices, with the drivers of `run`. Nothing is moved.
 
 use super::Finding;
 use crate::config::{ArmDriver, BaseDriver, Rig};
@@ -11,10 +11,10 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-/// A device slower than this fraction of the rate in the rig file is reported.
+/// A device is reported if its rate is below this fraction of the rate in the rig file.
 const MIN_RATE_FRAC: f64 = 0.95;
 
-/// Measurements of one device, or of the keyframes made of its images.
+/// Measurements of one device, or of the keyframes made from its images.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct DeviceStatistics {
     /// Name with the kind of device, for example `camera "wrist"`.
@@ -34,7 +34,7 @@ pub struct DeviceStatistics {
     pub gap_p99_millis: f64,
 }
 
-/// Time from mid-exposure, or from the stamp of a state, until the sample is available.
+/// Time from the stamp of a sample until the program receives it.
 #[derive(Debug, PartialEq, Serialize)]
 pub struct Latency {
     /// Median.
@@ -45,12 +45,12 @@ pub struct Latency {
     pub latency_max_millis: f64,
 }
 
-/// Everything that was measured.
+/// Result of listening to all devices.
 #[derive(Debug)]
 pub struct ListenResult {
     /// Measurements of each device.
     pub devices: Vec<DeviceStatistics>,
-    /// Problems in them.
+    /// Problems in the measurements.
     pub findings: Vec<Finding>,
 }
 
@@ -160,7 +160,7 @@ pub fn listen(rig: &Rig, secs: f64, stop: &Stop) -> Result<ListenResult> {
     Ok(ListenResult { devices, findings })
 }
 
-/// The devices of a rig with their rates, as far as the rig file gives them.
+/// The devices of a rig with their expected rates; `None` if the rig file does not set a rate.
 fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     let mut expected = BTreeMap::new();
     for camera in &rig.cameras {
@@ -172,7 +172,7 @@ fn expected(rig: &Rig) -> BTreeMap<String, Option<f64>> {
     match rig.arm.driver {
         ArmDriver::None => {}
         ArmDriver::Franka => drop(expected.insert("arm".to_owned(), Some(1000.0))),
-        // Motors that report on their own choose their rates.
+        // Motors that report without polling choose their own rates.
         _ => drop(expected.insert("arm".to_owned(), None)),
     }
     if rig.base.driver != BaseDriver::Fixed {
@@ -195,7 +195,7 @@ fn missing(rig: &Rig, expected: &BTreeMap<String, Option<f64>>, tracks: &BTreeMa
     silent.map(|device| Finding::fail("silent", format!("no data from {device}"), remedy(device))).collect()
 }
 
-/// The problem in the measurements of a device, if any.
+/// Checks rate and losses of a device. Returns a finding if there is a problem.
 fn problem(statistics: &DeviceStatistics) -> Option<Finding> {
     let DeviceStatistics { device, rate_hz, expected_hz, dropped, .. } = statistics;
     let slow = expected_hz.filter(|expected| *rate_hz < MIN_RATE_FRAC * expected);

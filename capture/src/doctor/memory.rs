@@ -1,4 +1,4 @@
-//! Free memory.
+//! Checks the available memory.
 
 use super::{Finding, field};
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 /// Enough for a model of a million splats with its keyframes and the optimizer state.
 const SUFFICIENT_MEMORY_KIB: u64 = 4 << 20;
 
-/// Whether the memory suffices for a run.
+/// Checks that the memory is sufficient for a run.
 pub(super) fn memory(proc: &Path) -> Finding {
     let Some(available_kib) = field(&proc.join("meminfo"), "MemAvailable:").and_then(|kib| kib.parse::<u64>().ok())
     else {

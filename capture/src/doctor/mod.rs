@@ -1,4 +1,4 @@
-//! Checks of this computer for a rig; each problem comes with a remedy. Nothing is moved.
+//! Checks this computer and the devices of a rig, and suggests a remedy for each problem. Nothing is moved.
 
 mod calibration;
 #[cfg(target_os = "linux")]
@@ -22,15 +22,15 @@ use crate::config::Rig;
 use serde::Serialize;
 use std::path::Path;
 
-/// What a check says.
+/// Verdict of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Verdict {
     /// No problem.
     Ok,
-    /// Something works worse than it could.
+    /// A problem that degrades results.
     Warn,
-    /// Something does not work.
+    /// A problem that prevents a run.
     Fail,
 }
 
@@ -39,27 +39,27 @@ pub enum Verdict {
 pub struct Finding {
     /// Name of the check.
     pub check: &'static str,
-    /// What it says.
+    /// Verdict of the check.
     pub verdict: Verdict,
-    /// What was found.
+    /// Result of the check, as text.
     pub message: String,
-    /// What to do about the problem, often a command; `None` if there is no problem.
+    /// Remedy for the problem, often a command; `None` if there is no problem.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub remedy: Option<String>,
 }
 
 impl Finding {
-    /// No problem.
+    /// Creates a finding without a problem.
     pub fn ok(check: &'static str, message: impl Into<String>) -> Self {
         Self { check, verdict: Verdict::Ok, message: message.into(), remedy: None }
     }
 
-    /// Something works worse than it could.
+    /// Creates a finding about a problem that degrades results.
     pub fn warn(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self { check, verdict: Verdict::Warn, message: message.into(), remedy: Some(remedy.into()) }
     }
 
-    /// Something does not work.
+    /// Creates a finding about a problem that prevents a run.
     pub fn fail(check: &'static str, message: impl Into<String>, remedy: impl Into<String>) -> Self {
         Self { check, verdict: Verdict::Fail, message: message.into(), remedy: Some(remedy.into()) }
     }

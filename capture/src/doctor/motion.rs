@@ -1,10 +1,10 @@
-//! Settings for moving the arm.
+//! Checks the settings for moving the arm.
 
 use super::Finding;
 use crate::config::{ArmDriver, Rig};
 use crate::open;
 
-/// Whether this kind of arm supports the settings in [arm.motion], as far as can be checked without the arm.
+/// Checks whether this kind of arm supports the settings in `[arm.motion]`, as far as possible without the arm.
 pub(super) fn motion(rig: &Rig) -> Option<Finding> {
     rig.arm.motion.as_ref().filter(|_| matches!(rig.arm.driver, ArmDriver::Can | ArmDriver::Franka))?;
     Some(match open::check_motion(rig) {

@@ -1,4 +1,4 @@
-//! RealSense cameras.
+//! Checks RealSense cameras.
 
 use super::Finding;
 use crate::config::{Camera, CameraDriver, Rig};
@@ -60,7 +60,7 @@ fn realsense_of(rig: Option<&Rig>) -> impl Iterator<Item = &Camera> {
     cameras.filter(|camera| camera.driver == CameraDriver::Realsense && camera.realsense.file.as_os_str().is_empty())
 }
 
-/// Whether the files that RealSense cameras play back exist.
+/// Checks that the files that replace RealSense cameras exist.
 pub(super) fn files(rig: &Rig) -> Vec<Finding> {
     let missing = |camera: &&Camera| {
         let file = &camera.realsense.file;

@@ -1,9 +1,9 @@
-//! Real-time priority.
+//! Checks real-time priority.
 
 use super::{Finding, field};
 use std::path::Path;
 
-/// The real-time priority that this user may request; arms at 1 kHz need it.
+/// Checks the real-time priority that this user may request. Arms at 1 kHz need it.
 pub(super) fn realtime(proc: &Path) -> Finding {
     let limit = field(&proc.join("self/limits"), "Max realtime priority");
     match limit.as_deref() {

@@ -1,11 +1,11 @@
-//! UDP addresses that a rig listens on.
+//! Checks the UDP addresses on which a rig listens.
 
 use super::Finding;
 use crate::config::{ArmDriver, BaseDriver, Rig, ScannerDriver};
 use crate::open;
 use std::net::UdpSocket;
 
-/// Whether the UDP addresses of the rig are free to listen on.
+/// Checks that no other program uses the UDP addresses of the rig.
 pub(super) fn senders(rig: &Rig) -> Vec<Finding> {
     let base = (rig.base.driver == BaseDriver::Udp).then(|| ("base".to_owned(), rig.base.address));
     let scanners = rig.scanners.iter().filter(|scanner| scanner.driver == ScannerDriver::Udp);

@@ -1,9 +1,9 @@
-//! Bandwidth of the USB ports of cameras.
+//! Checks the bandwidth of the USB ports of cameras.
 
 use super::Finding;
 use drivers::v4l2;
 
-/// Whether the USB port has enough bandwidth for all modes of a camera.
+/// Checks that the USB port has enough bandwidth for all modes of a camera.
 pub(super) fn usb(camera: &v4l2::FoundCamera) -> Option<Finding> {
     let bandwidth = format!("{:.1} MB/s", camera.usb_bytes_per_sec()? * 1e-6);
     let name = format!("{} ({})", camera.name, camera.node.display());

@@ -1,4 +1,4 @@
-//! Permission to open video devices, and the V4L2 cameras of a rig.
+//! Checks the permission to open video devices, and the presence of the V4L2 cameras of a rig.
 
 use super::Finding;
 #[cfg(target_os = "linux")]
@@ -7,7 +7,7 @@ use crate::config::{Camera, CameraDriver, Rig};
 use drivers::v4l2;
 use std::path::{Path, PathBuf};
 
-/// Whether the video devices can be opened.
+/// Checks that the video devices can be opened.
 pub(super) fn permissions(dev: &Path) -> Finding {
     let mut nodes: Vec<PathBuf> = std::fs::read_dir(dev)
         .into_iter()
@@ -31,7 +31,7 @@ pub(super) fn permissions(dev: &Path) -> Finding {
     Finding::warn("cameras", message, "sudo usermod -aG video $USER, then log in again")
 }
 
-/// V4L2 cameras of a rig whose device node may belong to another camera after a restart.
+/// Reports V4L2 cameras of a rig whose device node may belong to another camera after a restart.
 #[cfg(target_os = "linux")]
 pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
     let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);
@@ -43,7 +43,7 @@ pub(super) fn unstable_nodes(rig: &Rig) -> Vec<Finding> {
     unstable.map(warn).collect()
 }
 
-/// V4L2 cameras of a rig that are not connected.
+/// Reports V4L2 cameras of a rig that are not connected.
 #[cfg(target_os = "linux")]
 pub(super) fn missing(rig: &Rig) -> Vec<Finding> {
     let cameras = rig.cameras.iter().filter(|camera| camera.driver == CameraDriver::V4l2);

@@ -23,7 +23,7 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 use tags::TagBaseSource;
 
-/// Hint for missing devices.
+/// Hint in error messages about devices that cannot be opened.
 const SIM_HINT: &str = "--sim replaces every device by its simulated twin";
 
 /// The port of a Franka controller.
@@ -44,7 +44,7 @@ pub struct Opened {
     pub rig: Rig,
     /// The samples of all devices, or of the recording.
     pub source: Box<dyn Source>,
-    /// Set when the samples end early because the recording is damaged.
+    /// Description of the damage, set if the samples end early because the recording is damaged.
     pub damage: Arc<OnceLock<String>>,
     /// The clock of the stamps.
     pub stamp_clock: StampClock,
@@ -159,7 +159,7 @@ fn stored_rig(path: &Path, recording: &Recording, overrides: &[Override]) -> cra
     Ok(Rig::parse(RIG_FILE, text(RIG_FILE)?, text(URDF_FILE)?, overrides)?)
 }
 
-/// Cameras on the flange need joint readings.
+/// Checks that the rig has an arm if a camera is on the flange.
 fn check_arm(rig: &Rig) -> crate::Result<()> {
     let on_flange = rig.cameras.iter().find(|camera| camera.parent == Parent::Flange);
     if let (ArmDriver::None, Some(camera)) = (rig.arm.driver, on_flange) {
@@ -171,7 +171,8 @@ fn check_arm(rig: &Rig) -> crate::Result<()> {
     Ok(())
 }
 
-/// Intrinsics that are stored in the camera are unknown unless the camera is opened.
+/// Checks that all intrinsics are known. Intrinsics that are stored in the camera are unknown unless the camera is
+/// opened.
 fn check_intrinsics(rig: &Rig) -> crate::Result<()> {
     if let Some(camera) = rig.cameras.iter().find(|camera| camera.realsense.unknown.intrinsics) {
         bail!(
@@ -229,7 +230,7 @@ impl Source for RecordingSource {
         if sample.is_none()
             && let Some(damage) = self.recording.damage()
         {
-            // Reported once, at the end, with the other losses.
+            // The damage is reported once, at the end, with the other losses.
             let _ = self.damage.set(damage.to_owned());
         }
         Ok(sample)

@@ -1,5 +1,5 @@
-//! An arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller gets states of all
-//! joints.
+//! Reads an arm whose joints are motors on CAN buses. One thread per bus polls and listens; the caller receives states
+//! of all joints.
 
 use super::bus::Bus;
 use super::bus_load::max_cycle_rate_hz;
@@ -20,12 +20,12 @@ use std::time::{Duration, Instant};
 const POLL: Duration = Duration::from_millis(50);
 /// Capacity of the queue of readings for a slow caller: one second of seven motors at 1 kHz.
 pub(super) const MAX_WAITING: usize = 7000;
-/// A longer loop iteration of a bus thread means that the thread was not scheduled.
+/// If a loop iteration of a bus thread takes longer than this, the thread was not scheduled.
 const MAX_LOOP_DELAY: Duration = Duration::from_millis(200);
-/// A motor that sends nothing for this long while the others do is an error.
+/// A motor that sends nothing for this long causes an error.
 const MAX_SILENCE: Duration = Duration::from_secs(1);
 
-/// A read-only arm. Nothing here moves it. Dropping it stops the polling and does not change what the motors do.
+/// A read-only arm, which cannot be moved. Dropping it stops the polling but does not affect the motors otherwise.
 #[derive(Debug)]
 pub struct CanArm {
     names: Vec<String>,
@@ -123,7 +123,7 @@ impl Cycle {
             }
         }
         let poll_rate_hz = match poll_frames.is_empty() {
-            // There are no polls; the motors choose their own rates.
+            // Nothing is polled; the motors choose their own rates.
             true => rate_hz,
             false => max_cycle_rate_hz(bus, &cycle_frames, &unsolicited, rate_hz),
         };
@@ -131,7 +131,7 @@ impl Cycle {
     }
 }
 
-/// A bus with its motors, moved to the thread of the bus.
+/// A bus with its motors, owned by the thread of the bus.
 struct BusReader {
     bus: Bus,
     motors: Vec<(usize, Motor)>,
@@ -159,7 +159,8 @@ impl BusReader {
             let now = clock::now();
             let stall = now.duration_since(std::mem::replace(&mut previous, now));
             if stall > MAX_LOOP_DELAY {
-                // Nobody listened while this computer was stalled, so that time does not count as silence of a motor.
+                // While this computer was stalled, no frames were read, so this time does not count as silence of a
+                // motor.
                 last_heard.iter_mut().for_each(|last_heard| *last_heard = last_heard.plus_secs(stall.as_secs_f64()));
             }
             if !self.cycle.poll_frames.is_empty() && now >= next_cycle {
@@ -217,8 +218,8 @@ impl BusReader {
         Err(Error::Motor { joint: motor.config().joint.clone(), interface, reason })
     }
 
-    /// Logs errors on the wire: each time the controller goes off the bus or restarts, and otherwise each time the
-    /// count has doubled.
+    /// Logs errors on the wire each time the controller goes bus-off or restarts, and otherwise each time their number
+    /// has doubled.
     fn log_errors(&self, total: &mut WireErrors, new_errors: &WireErrors) {
         let previous = total.n_frames.checked_ilog2();
         total.add(new_errors);

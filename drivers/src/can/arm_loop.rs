@@ -2,8 +2,8 @@
 //! fault.
 //!
 //! It stops if a motor is silent or reports that it stopped, if a bus fails, or if this computer stalls for so long
-//! that the watchdogs of the motors have expired or are about to. After that it sends none of the earlier setpoints,
-//! and no new ones until it receives [`Request::Recover`].
+//! that the watchdogs of the motors have expired or are about to. After that, it discards earlier setpoints and sends
+//! no new ones until it receives [`Request::Recover`].
 
 use super::bus::Bus;
 use super::config::MovableArmConfig;
@@ -25,21 +25,22 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender};
 use std::time::Duration;
 
-/// Fraction of the motors' timeout after which we stop. We stop before the motors do, so that no motor is commanded
-/// while others have already stopped.
+/// Fraction of the watchdog timeout after which this thread stops the arm. It stops before the motors do, so that no
+/// motor is commanded while others have already stopped.
 const SILENCE_FRAC: f64 = 0.8;
-/// A motor counts as silent only after this many cycles: if we were late ourselves, its answer is still to come.
+/// A motor counts as silent only after this many cycles. If this thread was late, the answer of the motor may still
+/// arrive.
 const MIN_MISSED_CYCLES: u64 = 3;
 /// Maximum time for the motors to report their positions, and to report that they are enabled.
 const STARTUP_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which an interface's queue of ten frames, the usual length, is half emptied.
+/// Time in which an interface sends half of its queue, which usually holds ten frames.
 const MAX_QUEUED: Duration = Duration::from_micros(800);
 /// Maximum wait for space in the queue when sending a fail-safe command. If the queue stays full, nobody is
 /// receiving.
 const MAX_FAIL_SAFE_WAIT: Duration = Duration::from_millis(5);
 /// Interval at which an idle thread checks for requests.
 const POLL: Duration = Duration::from_millis(20);
-/// Extra time, beyond what its limits require, in which an arm must come to rest on shutdown.
+/// Additional time, beyond the time that its limits require, in which an arm must come to rest on shutdown.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 type Reply<T> = SyncSender<Result<T, Error>>;
@@ -74,7 +75,7 @@ struct PreparedMotors {
     buses: Vec<Bus>,
     /// One motor per joint.
     movable_motors: Vec<MovableMotor>,
-    /// When each motor was last heard, and in which cycle.
+    /// Time and cycle of the last frame from each motor.
     last_heard: Vec<(Stamp, u64)>,
     latest: Vec<Option<Reading>>,
     /// Last commanded position of each joint.
@@ -179,7 +180,7 @@ impl ArmLoop {
                 let _ = answer.try_send(Ok(()));
             }
             (Request::SetTarget(_, answer), arm_state) => drop(answer.try_send(Err(arm_state.refusal()))),
-            // An arm that is not moving is already at rest.
+            // The arm is not moving, so it is already at rest.
             (Request::Stop(answer), _) => drop(answer.try_send(Ok(()))),
             (Request::Recover(answer), ArmState::Stopped { .. }) => match self.prepare() {
                 Ok(prepared) => {
@@ -198,7 +199,7 @@ impl ArmLoop {
         }
     }
 
-    /// Reopens all buses and prepares every motor; enables none.
+    /// Reopens all buses and prepares every motor without enabling it.
     fn prepare(&self) -> Result<PreparedMotors, Error> {
         let arm = &self.config.arm;
         let buses = arm.buses.iter().map(Bus::open).collect::<Result<Vec<_>, _>>()?;
@@ -336,7 +337,7 @@ impl ArmLoop {
                         let interface = &prepared.buses[bus_ix].config().interface;
                         log::debug!("{interface}: errors on the wire so far: {:?}", prepared.errors);
                         if new_errors.n_bus_off > 0 && !is_stopped {
-                            return Err(motion(format!("{interface} went off the bus")));
+                            return Err(motion(format!("{interface} went bus-off")));
                         }
                     }
                 }
@@ -345,8 +346,8 @@ impl ArmLoop {
         Ok(())
     }
 
-    /// Stops commanding: sends each motor the fail-safe command, which does what its watchdog would soon do, and
-    /// reports the reason.
+    /// Stops the arm: sends each motor the fail-safe command, which has the same effect as the expiry of its watchdog,
+    /// and logs the reason.
     fn abort(&mut self, reason: &str) {
         if let ArmState::Stopped { .. } = self.arm_state {
             return;
@@ -358,7 +359,7 @@ impl ArmLoop {
         self.stopped(reason, Some(fail_safe));
     }
 
-    /// The fail-safe command of all motors: that of `on_loss`, or to release if not all motors were enabled yet.
+    /// The fail-safe command of all motors: `on_loss`, or release if not all motors were enabled yet.
     fn fail_safe_command(&self) -> OnLoss {
         if matches!(self.arm_state, ArmState::Moving { .. }) { self.plan.on_loss } else { OnLoss::Release }
     }
@@ -373,7 +374,7 @@ impl ArmLoop {
         }
     }
 
-    /// Returns whether the arm is at rest, and brings it to rest if it moves.
+    /// Returns whether the arm is at rest. If it moves, starts to bring it to rest.
     fn is_at_rest(&mut self) -> bool {
         match &mut self.arm_state {
             ArmState::Moving { generator } => {
@@ -391,7 +392,7 @@ impl ArmLoop {
         Duration::try_from_secs_f64(max_secs).unwrap_or(Duration::ZERO) + STOP_MARGIN
     }
 
-    /// Sends the fail-safe command, and resends it until it is no longer pending.
+    /// Sends the fail-safe command, and resends it to motors that may not have received it.
     fn end(mut self) {
         let fail_safe = self.fail_safe_command();
         if let Some(prepared) = &self.prepared
@@ -415,9 +416,10 @@ impl ArmLoop {
         }
     }
 
-    /// Resends the fail-safe command once per cycle to motors without a watchdog, which would otherwise execute their
-    /// last command forever if they missed it. Continues until each of them has been heard after the timeout, when the
-    /// watchdogs of the other motors have expired, or until [`STARTUP_TIMEOUT`] after that.
+    /// Resends the fail-safe command once per cycle to motors without a watchdog, because a motor that misses it would
+    /// execute its last command forever. Continues until each of these motors has sent a frame after the watchdog
+    /// timeout, when the watchdogs of the other motors have expired, but for at most [`STARTUP_TIMEOUT`] after that
+    /// timeout.
     fn resend_fail_safe(&mut self, now: Stamp) {
         let ArmState::Stopped { since, pending_fail_safe, .. } = &mut self.arm_state else { return };
         let (Some(prepared), Some(fail_safe)) = (&self.prepared, *pending_fail_safe) else {
@@ -452,7 +454,7 @@ impl ArmState {
         Self::Stopped { since, reason: String::new(), pending_fail_safe }
     }
 
-    /// Why a target is refused.
+    /// The reason why a target is refused.
     fn refusal(&self) -> Error {
         motion(match self {
             Self::Stopped { reason, .. } => format!("the arm stopped and has not been recovered: {reason}"),
@@ -499,13 +501,13 @@ impl PreparedMotors {
         Error::Motor { joint: movable_motor.config().joint.clone(), interface, reason: reason.into() }
     }
 
-    /// Polls motors that are disabled and stay so for their positions.
+    /// Polls the positions of disabled motors without enabling them.
     fn poll_disabled(&self) -> Result<(), Error> {
         self.poll(MovableMotor::poll_frame)
     }
 
-    /// Polls motors that are executing `on_loss` for their positions, as a read-only arm does. Sends no SYNC, because
-    /// drives would then take the last target they received.
+    /// Polls the positions of motors that are executing `on_loss`, as a read-only arm does. Sends no SYNC, because on a
+    /// SYNC, drives would accept the last target that they received.
     fn poll_stopped(&self) -> Result<(), Error> {
         self.poll(|movable_motor| movable_motor.motor().protocol().poll_frame())
     }
@@ -525,7 +527,7 @@ impl PreparedMotors {
         for (ix, movable_motor) in self.movable_motors.iter().enumerate() {
             let command = movable_motor.command(setpoint.position[ix], setpoint.velocity[ix]);
             let command = command.map_err(|error| self.fault(movable_motor, error.to_string()))?;
-            // If the queue is full, the frame is dropped: the next one is more recent.
+            // If the queue is full, the frame is dropped, because the next frame is more recent.
             self.bus_of(movable_motor).send_within(&command, MAX_QUEUED)?;
         }
         self.sent_rad = setpoint.position;
@@ -542,7 +544,7 @@ impl PreparedMotors {
         Ok(())
     }
 
-    /// Sends our heartbeat, and the SYNC at which drives take their targets.
+    /// Sends our heartbeat, and the SYNC at which drives accept their targets.
     fn send_sync(&self, host: canopen::Node) -> Result<(), Error> {
         for bus in self.buses_with_drives() {
             bus.send_within(&canopen::encode_heartbeat(host, NodeState::Operational), MAX_QUEUED)?;

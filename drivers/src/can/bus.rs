@@ -17,7 +17,7 @@ use std::io;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// How long sending is retried while the interface's queue is full.
+/// Maximum time for which sending is retried while the interface's queue is full.
 const MAX_SENDING: Duration = Duration::from_millis(20);
 /// `errno` for "no buffer space": the interface's queue is full.
 const ENOBUFS: i32 = 105;
@@ -35,7 +35,7 @@ impl Bus {
     /// Opens an interface and checks that it is set up as in `config`.
     ///
     /// # Errors
-    /// If it is not. The error contains the command that sets it up.
+    /// If the interface is not set up as in `config`. The error contains the command that sets it up.
     pub fn open(config: &BusConfig) -> Result<Self, Error> {
         Link::read(&config.interface)?.check(config)?;
         let open = CanFdSocket::open(&config.interface).and_then(|socket| {
@@ -61,8 +61,8 @@ impl Bus {
     /// Sends a frame, and waits briefly while the interface's queue is full. Returns whether the kernel accepted the
     /// frame.
     ///
-    /// It returns `false` if the queue stayed full, which happens if no node acknowledges. `true` does not mean that
-    /// the frame was sent: the kernel accepts and drops frames for a controller that is off the bus.
+    /// It returns `false` if the queue stayed full, which happens if no node acknowledges frames. `true` does not mean
+    /// that the frame was sent: the kernel accepts and drops frames while the controller is bus-off.
     pub fn send(&self, frame: &Frame) -> Result<bool, Error> {
         self.send_within(frame, MAX_SENDING)
     }
@@ -123,7 +123,7 @@ impl Bus {
             Err(source) => return Err(self.bus_error(source)),
         };
         let now = clock::now();
-        // The kernel stamps with the wall clock. The age of the frame converts that to our clock.
+        // The kernel stamps frames with the wall clock. The age of the frame is used to convert the stamp to our clock.
         let stamp = at.elapsed().map_or(now, |age| now - age);
         let frame = match frame {
             CanAnyFrame::Error(error) => return Ok(Some((stamp, BusEvent::Errors(wire_errors(error))))),
@@ -161,7 +161,7 @@ impl FrameIo for Bus {
     }
 }
 
-/// Counts what an error frame reports.
+/// Counts the errors that an error frame reports.
 fn wire_errors(frame: CanErrorFrame) -> WireErrors {
     let error = frame.into_error();
     let problems = error.controller();

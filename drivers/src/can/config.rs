@@ -24,7 +24,7 @@ pub struct MovableArmConfig {
     pub arm: ArmConfig,
     /// Limits of each joint, in the order of the motors, and the fail-safe behavior if this computer stops sending.
     pub motion: MotionConfig,
-    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
+    /// Endpoint numbers of `ODrive` axes. Without them, the watchdog of the axes cannot be set.
     pub odrive_endpoints: Option<Endpoints>,
 }
 
@@ -37,8 +37,8 @@ pub struct BusConfig {
     pub bitrate_hz: u32,
     /// Bit rate of the data phase of FD frames, bit/s; `None` on a classic bus.
     pub data_bitrate_hz: Option<u32>,
-    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`): once off the bus,
-    /// it stays off.
+    /// Accept that the kernel cannot restart the adapter, as with serial-line adapters (`slcan`). After a
+    /// bus-off, such an adapter stays bus-off.
     pub accept_no_restart: bool,
 }
 
@@ -60,8 +60,8 @@ pub struct MotorConfig {
     pub bus_ix: usize,
     /// Its protocol, and its address on the bus.
     pub protocol: Arc<dyn MotorProtocol>,
-    /// Turns of the reported shaft per turn of the joint: 1 if the motor reports its output shaft and no further gear
-    /// follows.
+    /// Turns that the motor reports per turn of the joint. It is 1 if the motor reports the angle of its output shaft
+    /// and drives the joint directly.
     pub gear_ratio: f64,
     /// Whether it turns in the opposite direction to its joint.
     pub is_reversed: bool,
@@ -71,7 +71,7 @@ pub struct MotorConfig {
     pub gains: Option<Gains>,
 }
 
-// Not derived: the derived code would move the trait object (rust-lang/rust#31740).
+// This is not derived, because the derived code would move the trait object (rust-lang/rust#31740).
 impl PartialEq for MotorConfig {
     fn eq(&self, other: &Self) -> bool {
         let Self { joint, bus_ix, protocol, gear_ratio, is_reversed, offset_rad, gains } = self;

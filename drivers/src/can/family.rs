@@ -1,5 +1,5 @@
-//! The interface of motor families: what the code for whole arms knows about a family, about one of its motors, and
-//! about moving that motor.
+//! The interface of motor families: the traits through which the code for whole arms accesses a family, one of its
+//! motors, and the motion of that motor.
 
 #[cfg(feature = "emulation")]
 use super::emulated::EmulatedProtocol;
@@ -14,13 +14,13 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
-/// Maximum time until the first report of a motor that reports unasked.
+/// Maximum time until the first report of a motor that sends unsolicited reports.
 pub(super) const MAX_REPORT: Duration = Duration::from_secs(1);
 /// Maximum time for a motor to report that it is disabled, or in another mode.
 pub(super) const MAX_CHANGE: Duration = Duration::from_secs(1);
-/// Fault of a motor whose own timeout has expired.
+/// Fault of a motor whose watchdog has expired.
 pub(super) const COMMUNICATION_LOST: &str = "it received no command for longer than its timeout";
-/// Ranges of motors whose values need no scaling. Their gains, if any, have the usual ranges.
+/// Ranges for motors whose values need no scaling. Their gains, if they have any, have the usual ranges.
 pub(super) const UNLIMITED: Limits = Limits::of(f64::INFINITY, f64::INFINITY, f64::INFINITY);
 
 /// Motors that share a protocol.
@@ -35,30 +35,30 @@ pub trait MotorFamily: Debug + Sync {
     fn keys(&self) -> Vec<MotorKey> {
         Vec::new()
     }
-    /// Whether each command includes stiffness and damping (MIT mode). Other motors keep the gains that they were
-    /// tuned to.
+    /// Whether each command includes stiffness and damping (MIT mode). Other motors keep the gains stored in them.
     fn has_gains(&self) -> bool;
-    /// The motor with these settings; `None` if a required one is missing.
+    /// The motor with these settings; `None` if a required setting is missing.
     fn motor(&self, settings: &MotorSettings) -> Option<Arc<dyn MotorProtocol>>;
-    /// What fuzzing and its tests need.
+    /// Data for fuzzing and its tests.
     #[cfg(any(test, fuzzing))]
     fn fuzzing(&self) -> FamilyFuzzing;
 }
 
-/// One motor: its address on the bus, and how it is read.
+/// One motor: its address on the bus, and the code that reads it.
 ///
-/// Reading never commands a motor; that is what [`MotionProtocol`] does.
+/// Reading never sends a motion command; only [`MotionProtocol`] does.
 pub trait MotorProtocol: Debug + Send + Sync {
-    /// The family, which has the names and limits for rig files.
+    /// The family, which defines names and limits for rig files.
     fn family(&self) -> &'static dyn MotorFamily;
     /// The settings from which [`MotorFamily::motor`] creates an equal motor.
     fn settings(&self) -> MotorSettings;
-    /// Numbers that no other motor of the family may use on the same bus.
+    /// IDs that no other motor of the family may use on the same bus.
     fn addresses(&self) -> Vec<u32>;
     /// Ranges of its raw values, infinite where there are none; `None` if [`MotorProtocol::set_up`] reads them from the
     /// motor.
     fn ranges(&self) -> Option<Limits>;
-    /// ID of a CANopen node. Such a motor reports and takes its targets at each SYNC, and monitors our heartbeat.
+    /// Node ID, if the motor is a CANopen node. Such a motor reports and accepts targets on each SYNC, and monitors our
+    /// heartbeat.
     fn canopen_node(&self) -> Option<canopen::Node> {
         None
     }
@@ -68,22 +68,23 @@ pub trait MotorProtocol: Debug + Send + Sync {
     /// # Errors
     /// If the motor does not answer as expected.
     fn set_up(&self, query: &MotorQuery<'_>) -> Result<Limits, Error>;
-    /// When it reports its position after [`MotorProtocol::set_up`].
+    /// When the motor reports its position after [`MotorProtocol::set_up`].
     fn reports(&self) -> Reports;
-    /// The frame that polls its position in each cycle; `None` if it reports unasked or at a SYNC.
+    /// The frame that polls its position in each cycle; `None` if the motor sends unsolicited reports or reports on
+    /// every SYNC.
     fn poll_frame(&self) -> Option<Frame> {
         None
     }
-    /// A frame like its position reports, and their rate in Hz if the motor determines it.
+    /// A frame of the same size as its position reports, and the rate of the reports in Hz if the motor determines it.
     fn typical_answer(&self) -> (Frame, Option<f64>);
     /// The reading in a frame; `None` if the frame is from another motor or has other content.
     fn read(&self, frame: &Frame, limits: &Limits) -> Option<MotorReading>;
 
     /// Traffic on its bus while it moves.
     fn traffic(&self) -> Traffic;
-    /// Its ability to detect missing commands.
+    /// Ability of the motor to detect missing commands.
     fn watchdog(&self, plan: &WatchdogPlan) -> Watchdog;
-    /// How it is moved. `limits` are the ranges of its raw values.
+    /// The protocol that moves the motor. `limits` are the ranges of its raw values.
     fn motion(&self, limits: &Limits) -> Box<dyn MotionProtocol>;
 
     /// The motor's side of the protocol.
@@ -91,7 +92,8 @@ pub trait MotorProtocol: Debug + Send + Sync {
     fn emulated(&self) -> Box<dyn EmulatedProtocol>;
 }
 
-/// How one motor is moved. It is disabled until the frames of [`MotionProtocol::enable`] are sent.
+/// Moves one motor. The motor is disabled until it receives the frames of [`MotionProtocol::enable`] or, if there are
+/// none, its first command.
 pub trait MotionProtocol: Debug + Send {
     /// Disables the motor, and clears its faults after logging them.
     ///
@@ -113,17 +115,17 @@ pub trait MotionProtocol: Debug + Send {
     fn poll_disabled(&self) -> Option<Frame> {
         None
     }
-    /// Frames that enable it; none if its commands do.
+    /// Frames that enable the motor; empty if its first command enables it.
     fn enable(&self) -> Result<Vec<Frame>, CanError>;
-    /// A command in coordinates of the motor.
+    /// The frame of a command in motor coordinates.
     fn command(&self, command: &Command) -> Result<Frame, CanError>;
-    /// A command to hold this position without further commands.
+    /// The frame that makes the motor hold this position without further commands.
     fn hold(&self, command: &Command) -> Result<Frame, CanError> {
         self.command(command)
     }
-    /// The frame that disables it.
+    /// The frame that disables the motor.
     fn release(&self) -> Result<Frame, CanError>;
-    /// The health that a frame of the motor reports; `None` if it reports none, or is from another motor.
+    /// The health that a frame reports; `None` if the frame contains none or comes from another motor.
     fn health(&mut self, frame: &Frame) -> Option<Health>;
     /// How long the motor may be silent before it counts as lost. `default_limit` applies to most families.
     fn max_silence(&self, default_limit: Duration) -> Duration {
@@ -132,7 +134,7 @@ pub trait MotionProtocol: Debug + Send {
 }
 
 impl dyn MotorProtocol {
-    /// Whether the two motors could not be distinguished on the same bus.
+    /// Whether the two motors would have conflicting IDs on the same bus.
     pub fn conflicts_with(&self, other: &Self) -> bool {
         let theirs = other.addresses();
         self.family().name() == other.family().name() && self.addresses().iter().any(|address| theirs.contains(address))
@@ -163,17 +165,17 @@ impl From<Motion> for MotorReading {
     }
 }
 
-/// When a motor reports its position.
+/// The occasion on which a motor reports its position.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reports {
-    /// When it is polled, or at a SYNC.
+    /// When the motor is polled, or on a SYNC.
     WhenPolled,
-    /// Periodically.
+    /// Periodically, without being polled.
     Unasked {
         /// What to check if it does not.
         if_silent: &'static str,
     },
-    /// As an answer to each command.
+    /// In reply to each command.
     WhenCommanded {
         /// What to check if it does not.
         if_silent: &'static str,
@@ -183,11 +185,11 @@ pub enum Reports {
 /// State of a motor according to its last report.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Health {
-    /// Disabled.
+    /// The motor is disabled.
     Off,
-    /// Enabled: it follows commands.
+    /// The motor is enabled and follows commands.
     Enabled,
-    /// It stopped because of a fault.
+    /// The motor stopped because of a fault.
     Fault(String),
 }
 
@@ -218,7 +220,7 @@ pub(super) const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 pub(super) const STIFF_COMMAND: Command =
     Command { position_rad: 1.0, velocity_rad_s: 0.0, kp_nm_rad: 200.0, kd_nm_s_rad: 2.0, torque_nm: 0.0 };
 
-/// What fuzzing and its tests need of a family.
+/// Data of a family for fuzzing and its tests.
 #[cfg(any(test, fuzzing))]
 #[derive(Debug)]
 pub struct FamilyFuzzing {
@@ -229,13 +231,13 @@ pub struct FamilyFuzzing {
     /// Frames with which the driver makes the motor report.
     #[cfg(test)]
     pub set_up: Vec<Frame>,
-    /// A command to move away stiffly. It does not enable the motor.
+    /// A motion command with high stiffness. It does not enable the motor.
     #[cfg(test)]
     pub command: Frame,
     /// Expected conversation of the driver with the motor.
     #[cfg(test)]
     pub transcript: &'static str,
-    /// A frame of another master that makes a motor report which answers only commands.
+    /// For a motor that replies only to commands, a frame with which another master makes it report.
     #[cfg(test)]
     pub other_master: Option<Frame>,
 }

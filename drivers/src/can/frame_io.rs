@@ -9,7 +9,7 @@ use std::time::Duration;
 pub trait FrameIo {
     /// Name of the interface.
     fn interface(&self) -> &str;
-    /// Sends a frame. Returns whether it was accepted; it is not if the interface's queue stays full.
+    /// Sends a frame. Returns whether it was accepted. It is not accepted if the interface's queue stays full.
     fn send(&self, frame: &Frame) -> Result<bool, Error>;
     /// Waits for the next event. Returns `None` if there was none within the timeout.
     fn receive(&self, timeout: Duration) -> Result<Option<(Stamp, BusEvent)>, Error>;
@@ -27,19 +27,19 @@ pub enum BusEvent {
 /// Counters of error frames. One error frame may report several errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct WireErrors {
-    /// Error frames.
+    /// Number of error frames.
     pub n_frames: u64,
-    /// The controller went off the bus.
+    /// Number of times the controller went bus-off.
     pub n_bus_off: u64,
-    /// The controller restarted.
+    /// Number of times the controller restarted.
     pub n_restarts: u64,
-    /// The controller reached its warning level of 96 errors.
+    /// Number of times an error counter reached the warning level of 96.
     pub n_warnings: u64,
-    /// The controller became error-passive, at 128 errors.
+    /// Number of times the controller became error-passive, at a counter of 128.
     pub n_passive: u64,
-    /// Nobody acknowledged a frame: there is no other node, or none at this bit rate.
+    /// Number of frames that no node acknowledged: there is no other node, or none at this bit rate.
     pub n_unacknowledged: u64,
-    /// Frames dropped because a buffer of the controller or the kernel was full.
+    /// Number of times a buffer of the controller or the kernel was full, so that frames were dropped.
     pub n_overflows: u64,
 }
 
@@ -59,10 +59,10 @@ impl WireErrors {
 impl std::fmt::Display for WireErrors {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let Self { n_frames, n_bus_off, n_restarts, n_warnings, n_passive, n_unacknowledged, n_overflows } = self;
-        let times = if *n_bus_off == 1 { "time" } else { "times" };
+        let bus_offs = if *n_bus_off == 1 { "bus-off" } else { "bus-offs" };
         write!(
             f,
-            "{n_bus_off} {times} off the bus, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
+            "{n_bus_off} {bus_offs}, {n_restarts} restarts; {n_warnings} warnings, {n_passive} passive, \
              {n_unacknowledged} frames not acknowledged, {n_overflows} overflows; {n_frames} error frames in total"
         )
     }

@@ -7,8 +7,8 @@
 //!   settings in rig files, how its motors are read and moved, and their emulation.
 //! * `motor` reads one motor. `arm` combines the readings of all motors into joint states, with one thread per bus.
 //!   Neither commands a motor.
-//! * `movable_motor` is a motor that may be moved. `plan` checks how it is configured to react when this computer stops
-//!   sending (`watchdog`). `movable` is an arm of such motors; `arm_loop` is its thread.
+//! * `movable_motor` is a motor that may be moved. `plan` checks how motors are configured to react when this computer
+//!   stops sending (`watchdog`). `movable` is an arm of such motors; `arm_loop` is its thread.
 //! * `emulated` has emulated motors for tests and simulators, behind the feature `emulation`.
 
 #[cfg(target_os = "linux")]

@@ -8,7 +8,7 @@ use crate::Error;
 use crate::wire::can::Frame;
 use crate::wire::can::mit::Limits;
 
-/// Greater positions (rad) or velocities (rad/s) of a joint are treated as noise.
+/// Greater positions (rad) or velocities (rad/s) of a joint are implausible and ignored.
 pub(super) const MAX_RAD: f64 = 1e4;
 
 /// Position, velocity and effort of a joint.
@@ -27,7 +27,7 @@ pub(super) struct Motor {
 }
 
 impl Motor {
-    /// Makes the motor report, and waits until it does.
+    /// Makes the motor report its position, and waits for the first report.
     pub(super) fn set_up(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
         let motor = Self::set_up_for_motion(bus, config)?;
         if let Reports::WhenCommanded { if_silent } = config.protocol.reports() {
@@ -36,8 +36,8 @@ impl Motor {
         Ok(motor)
     }
 
-    /// Like [`Motor::set_up`], but does not expect reports of a motor that sends them only when commanded: nobody
-    /// commands it yet.
+    /// Like [`Motor::set_up`], but does not wait for a motor that reports only when commanded, because no node commands
+    /// it yet.
     pub(super) fn set_up_for_motion(bus: &dyn FrameIo, config: &MotorConfig) -> Result<Self, Error> {
         let query = MotorQuery::new(bus, &config.joint);
         let limits = config.protocol.set_up(&query)?;
@@ -48,7 +48,7 @@ impl Motor {
         Ok(motor)
     }
 
-    /// A motor with these ranges of its raw values.
+    /// Creates a motor with these ranges of raw values.
     pub(super) fn with_limits(config: MotorConfig, limits: Limits) -> Self {
         Self { config, limits }
     }
@@ -72,7 +72,7 @@ impl Motor {
         direction / self.config.gear_ratio
     }
 
-    /// The reading of its joint in a frame; `None` if the frame is from another motor or has other content.
+    /// Decodes the reading of the joint in a frame; `None` if the frame comes from another motor or has other content.
     pub(super) fn read(&self, frame: &Frame) -> Option<Reading> {
         let MotorReading { position_rad, velocity_rad_s, torque_nm } = self.protocol().read(frame, &self.limits)?;
         let per_turn = self.per_turn();

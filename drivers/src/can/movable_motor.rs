@@ -1,8 +1,8 @@
-//! One motor that may be moved: its preparation while it is disabled, its commands in each cycle, and its health
-//! according to its reports.
+//! One motor that may be moved: prepares it while it is disabled, encodes its commands in each cycle, and tracks the
+//! health that it reports.
 //!
-//! Positions are sent as planned, with their velocity as feedforward where the protocol supports it. Motors in MIT
-//! mode get the rig's stiffness and damping with each command; the others keep the gains that they were tuned to.
+//! Positions are sent as planned, with their velocity as feedforward where the protocol supports it. Commands to motors
+//! in MIT mode contain the stiffness and damping of the rig file; other motors keep the gains stored in them.
 
 use super::config::MotorConfig;
 use super::family::{Health, MotionProtocol};
@@ -16,7 +16,8 @@ use crate::wire::can::mit::Command;
 use crate::wire::can::{CanError, Frame};
 use std::time::Duration;
 
-/// A motor that may be moved. It is disabled until [`MovableMotor::enable`] is sent.
+/// A motor that may be moved. It stays disabled until it receives the frames of [`MovableMotor::enable`] or, in
+/// families that have no such frames, its first command.
 #[derive(Debug)]
 pub(super) struct MovableMotor {
     motor: Motor,
@@ -25,7 +26,8 @@ pub(super) struct MovableMotor {
 }
 
 impl MovableMotor {
-    /// Finds a motor, disables it, clears its faults, sets its watchdog and its mode, and verifies both.
+    /// Finds the motor of `config`, disables it, clears its faults, and sets its watchdog and its mode. Verifies the
+    /// watchdog, and the mode if the family reports it.
     pub(super) fn prepare(bus: &dyn FrameIo, config: &MotorConfig, plan: &WatchdogPlan) -> Result<Self, Error> {
         let movable_motor = Self::new(Motor::set_up_for_motion(bus, config)?);
         let query = MotorQuery::new(bus, &config.joint);
@@ -44,7 +46,7 @@ impl MovableMotor {
         self.motor.config()
     }
 
-    /// The motor for reading only.
+    /// The part of the motor that only reads.
     pub(super) fn motor(&self) -> &Motor {
         &self.motor
     }
@@ -53,12 +55,12 @@ impl MovableMotor {
         self.health.as_ref()
     }
 
-    /// Forgets the last reported health.
+    /// Discards the last reported health.
     pub(super) fn clear_health(&mut self) {
         self.health = None;
     }
 
-    /// Limits of the joint, reduced to the range of the motor's raw values.
+    /// The limits of the joint, clipped to the range that the motor's protocol can encode.
     pub(super) fn limits(&self, joint: &MotionLimits) -> MotionLimits {
         let (config, per_turn, range) = (self.motor.config(), self.motor.per_turn(), self.motor.limits());
         let max = range.position_rad * per_turn.abs();
@@ -75,22 +77,23 @@ impl MovableMotor {
         self.motion.max_silence(default_limit)
     }
 
-    /// The frame that polls the position of the disabled motor; `None` if it reports unasked or at a SYNC.
+    /// The frame that polls the position of the disabled motor; `None` if the motor sends unsolicited reports or
+    /// reports on every SYNC.
     pub(super) fn poll_frame(&self) -> Option<Frame> {
         self.motion.poll_disabled().or_else(|| self.motor.protocol().poll_frame())
     }
 
-    /// Frames that enable it; none if its commands do.
+    /// Frames that enable the motor; empty if its first command enables it.
     pub(super) fn enable(&self) -> Result<Vec<Frame>, CanError> {
         self.motion.enable()
     }
 
-    /// A command for the position and velocity of its joint, rad and rad/s.
+    /// The frame that commands a position and velocity of the joint, rad and rad/s.
     pub(super) fn command(&self, position_rad: f64, velocity_rad_s: f64) -> Result<Frame, CanError> {
         self.motion.command(&self.motor_command(position_rad, velocity_rad_s))
     }
 
-    /// The command in coordinates of the motor.
+    /// Converts a joint position and velocity to a command in motor coordinates.
     fn motor_command(&self, position_rad: f64, velocity_rad_s: f64) -> Command {
         let per_turn = self.motor.per_turn();
         let [kp_nm_rad, kd_nm_s_rad] = self.gains().unwrap_or([0.0; 2]);
@@ -103,8 +106,8 @@ impl MovableMotor {
         }
     }
 
-    /// The fail-safe command, which makes the motor do what `on_loss` specifies without further commands.
-    /// `position_rad` is the last commanded position of its joint.
+    /// The fail-safe command, after which the motor does what `on_loss` specifies without further commands.
+    /// `position_rad` is the last commanded position of the joint.
     pub(super) fn shutdown(&self, on_loss: OnLoss, position_rad: f64) -> Result<Frame, CanError> {
         let command = self.motor_command(position_rad, 0.0);
         match on_loss {
@@ -114,7 +117,7 @@ impl MovableMotor {
         }
     }
 
-    /// Updates the motor's health from a frame, and returns the reading of its joint, if the frame has one.
+    /// Updates the motor's health from a frame. Returns the reading of the joint if the frame contains one.
     pub(super) fn process_frame(&mut self, frame: &Frame) -> Option<Reading> {
         if let Some(health) = self.motion.health(frame) {
             self.health = Some(health);
@@ -122,14 +125,14 @@ impl MovableMotor {
         self.motor.read(frame)
     }
 
-    /// Stiffness and damping of the motor: those of its joint, divided by the square of the gear ratio.
+    /// Stiffness and damping at the motor: those of the joint, divided by the square of the gear ratio.
     fn gains(&self) -> Option<[f64; 2]> {
         let squared = self.motor.per_turn().powi(2);
         let gains = self.motor.config().gains?;
         Some([gains.stiffness_nm_rad * squared, gains.damping_nm_s_rad * squared])
     }
 
-    /// Checks the gains against the motor's range, because larger values would be clamped silently.
+    /// Checks that the protocol can encode the gains, because larger values would be clamped silently.
     fn check_gains(&self, query: &MotorQuery<'_>) -> Result<(), Error> {
         let Some([kp, kd]) = self.gains() else { return Ok(()) };
         let max = self.motor.limits();
@@ -156,7 +159,7 @@ mod tests {
 
     const LIMITS: Limits = Limits::of(12.5, 30.0, 10.0);
 
-    /// A motor behind a gear of 4 that turns in the opposite direction.
+    /// A motor with a gear ratio of 4 that turns opposite to its joint.
     fn movable_motor(protocol: impl MotorProtocol + 'static) -> MovableMotor {
         let config = MotorConfig {
             joint: "elbow".to_owned(),
@@ -178,7 +181,7 @@ mod tests {
     fn commands_are_in_motor_coordinates() {
         let sent = damiao().command(1.0, 0.25).expect("numbers");
         let got = mit::decode(sent.data().try_into().expect("eight bytes"), &LIMITS);
-        // Half a raw unit of 16 and 12 bits.
+        // Tolerances: half a quantization step of the 16-bit position and of the 12-bit velocity and gains.
         assert!((got.position_rad + 2.0).abs() < 2e-4 && (got.velocity_rad_s + 1.0).abs() < 8e-3, "{got:?}");
         assert!((got.kp_nm_rad - 10.0).abs() < 0.07 && (got.kd_nm_s_rad - 1.0).abs() < 7e-4, "{got:?}");
         assert!(got.torque_nm.abs() < 3e-3, "{got:?}");

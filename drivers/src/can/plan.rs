@@ -1,4 +1,4 @@
-//! Checks an arm before anything is sent to its motors, and plans its cycle.
+//! Checks the configuration of an arm before any frame is sent to its motors, and plans its cycle.
 
 use super::bus_load::max_cycle_rate_hz;
 use super::config::{MotorConfig, MovableArmConfig};
@@ -7,10 +7,10 @@ use crate::Error;
 use crate::wire::can::canopen::{self, NodeState};
 use std::time::Duration;
 
-/// Minimum length of the timeout in cycles.
+/// Minimum watchdog timeout, in cycles.
 const MIN_CYCLES: u32 = 4;
 
-/// Checks everything that can be checked before anything is sent, and returns how the motors are configured.
+/// Makes all checks that are possible before any frame is sent, and returns the watchdog configuration of the motors.
 ///
 /// # Errors
 /// If a motor does not support the configuration.
@@ -77,8 +77,8 @@ fn unused_node(config: &MovableArmConfig) -> Result<canopen::Node, Error> {
     unused.ok_or(Error::Motion { reason })
 }
 
-/// Cycle period that the slowest bus allows. It is rounded up to whole milliseconds if there are drives, because they
-/// count in milliseconds.
+/// Cycle period that the slowest bus allows. If there are CiA 402 drives, it is rounded up to whole milliseconds,
+/// because drives count in milliseconds.
 fn period(config: &MovableArmConfig, host: canopen::Node) -> Duration {
     let mut rate_hz = config.arm.rate_hz;
     let is_drive = |motor: &&MotorConfig| motor.protocol.canopen_node().is_some();

@@ -1,4 +1,4 @@
-//! Requests to one motor and its answers, for use before the cycle starts, while nothing else reads the bus.
+//! Sends requests to one motor and waits for the answers, before the cycle starts and while nothing else reads the bus.
 
 use super::frame_io::{BusEvent, FrameIo, WireErrors};
 use crate::wire::can::{CanError, Frame};
@@ -19,7 +19,7 @@ pub struct MotorQuery<'a> {
 }
 
 impl<'a> MotorQuery<'a> {
-    /// Access to the motor of a joint.
+    /// Creates access to the motor of a joint.
     pub fn new(bus: &'a dyn FrameIo, joint: &'a str) -> Self {
         Self { bus, joint, errors: Cell::default() }
     }
@@ -29,24 +29,24 @@ impl<'a> MotorQuery<'a> {
         format!("joint {:?} on {:?}", self.joint, self.bus.interface())
     }
 
-    /// An error of this motor.
+    /// Creates an error of this motor.
     pub fn fault(&self, reason: impl Into<String>) -> Error {
         let interface = self.bus.interface().to_owned();
         Error::Motor { joint: self.joint.to_owned(), interface, reason: reason.into() }
     }
 
-    /// The error that a motor does not report that it was disabled.
+    /// Creates the error for a motor that does not report that it is disabled.
     pub fn not_disabled(&self, reported: &str) -> Error {
         self.fault(format!("the motor was disabled but does not report it: {reported}"))
     }
 
-    /// The error that a watchdog's timeout was not accepted.
+    /// Creates the error for a watchdog timeout that was not accepted.
     pub fn timeout_mismatch(&self, timeout: Duration, reported: &str) -> Error {
         let seconds = timeout.as_secs_f64();
         self.fault(format!("its timeout was set to {seconds} s but reads back as {reported}; the motor is not enabled"))
     }
 
-    /// The error that a control mode was not accepted.
+    /// Creates the error for a control mode that was not accepted.
     pub fn mode_mismatch(&self, reported: &str) -> Error {
         self.fault(format!("its mode was set but reads back as {reported}"))
     }
@@ -106,7 +106,7 @@ impl<'a> MotorQuery<'a> {
             }
         }
         let errors = self.errors.get();
-        // Not every controller's driver reports unacknowledged frames, but all report the resulting state of the
+        // Not every driver of a CAN controller reports unacknowledged frames, but all report the resulting state of the
         // error counters.
         Err(self.fault(match errors.n_unacknowledged + errors.n_passive + errors.n_bus_off {
             0 => format!("no answer to {MAX_ATTEMPTS} requests; check that the motor is powered and its id is correct"),

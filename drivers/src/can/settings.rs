@@ -10,7 +10,7 @@ pub struct MotorKey {
     pub name: &'static str,
     /// Allowed values.
     pub allowed: AllowedValues,
-    /// What the value is, for the message that a required key is missing; `None` if the key is optional.
+    /// Description of the value, for the message that a required key is missing; `None` if the key is optional.
     pub required: Option<&'static str>,
 }
 
@@ -46,12 +46,12 @@ pub struct MotorSettings {
 }
 
 impl MotorSettings {
-    /// Settings of a motor without further keys.
+    /// Creates settings with an ID only.
     pub fn new(id: impl Into<u64>) -> Self {
         Self { id: id.into(), values: BTreeMap::new() }
     }
 
-    /// The settings with another value.
+    /// Returns the settings with an additional value.
     #[must_use]
     pub fn with(mut self, name: &'static str, value: SettingValue) -> Self {
         self.values.insert(name, value);

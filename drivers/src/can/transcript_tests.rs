@@ -51,7 +51,7 @@ impl TestBus {
         writeln!(self.transcript.borrow_mut(), "{line}").unwrap();
     }
 
-    /// Notes a frame or a reading, of which there are many.
+    /// Adds a frame or reading to the transcript, unless they are left out.
     fn note_often(&self, line: &str) {
         if !self.is_quiet.get() {
             self.note(line);
@@ -133,7 +133,8 @@ fn plan(on_loss: OnLoss, endpoints: Option<Endpoints>) -> WatchdogPlan {
     WatchdogPlan { on_loss, timeout: TIMEOUT, accept_no_watchdog: true, endpoints, host, period: PERIOD }
 }
 
-/// Runs cycles of a moving arm. Notes frames and readings of the first two, and all changes of the motor's health.
+/// Runs cycles of a moving arm. The transcript contains frames and readings of the first two cycles, and all changes of
+/// the motor's health.
 fn cycles(bus: &TestBus, motor: &mut MovableMotor, n: usize, position_rad: Option<f64>) {
     for cycle in 0..n {
         bus.is_quiet.set(cycle >= 2);

@@ -1,4 +1,4 @@
-//! What motors do without this computer when its commands stop, and how they are configured for that.
+//! The behavior of motors when commands of this computer stop, and its configuration.
 
 use super::odrive::Endpoints;
 use crate::motion::OnLoss;
@@ -8,13 +8,13 @@ use std::time::Duration;
 /// Watchdog configuration of all motors of an arm.
 #[derive(Clone, Debug)]
 pub struct WatchdogPlan {
-    /// What the motors do when commands stop.
+    /// Action of the motors when commands stop.
     pub on_loss: OnLoss,
-    /// Time without commands until then.
+    /// Time without commands after which the motors take this action.
     pub timeout: Duration,
     /// Whether to move motors without a watchdog.
     pub accept_no_watchdog: bool,
-    /// Endpoint numbers of `ODrive` axes. Without them their watchdog cannot be set.
+    /// Endpoint numbers of `ODrive` axes. Without them, the watchdog of the axes cannot be set.
     pub endpoints: Option<Endpoints>,
     /// Our CANopen node number, whose heartbeat the drives monitor.
     pub host: canopen::Node,
@@ -25,11 +25,11 @@ pub struct WatchdogPlan {
 /// Ability of a motor to detect missing commands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Watchdog {
-    /// Its watchdog can be set to take one of these actions.
+    /// The watchdog of the motor can be set to take one of these actions.
     Available(&'static [OnLoss]),
-    /// It executes its last command forever.
+    /// The motor has no watchdog and executes its last command forever.
     Missing {
-        /// Why, as the start of a sentence.
+        /// The reason, as the start of a sentence.
         reason: &'static str,
         /// Actions that this computer can command while it is still running.
         actions: &'static [OnLoss],

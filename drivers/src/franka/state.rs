@@ -7,7 +7,7 @@ use zerocopy::FromBytes;
 
 /// One byte more than the longest state, so that datagrams that are too long are detected.
 pub(super) const MAX_STATE_BYTES: usize = size_of::<v5::RobotState>() + 1;
-/// Maximum angle of any joint; larger numbers are invalid.
+/// Maximum angle of any joint. States with larger angles are invalid.
 const MAX_RAD: f64 = 10.0;
 
 /// A state with its number, which increases by one per millisecond of the robot's clock.

@@ -10,7 +10,7 @@ use kinematics::Intrinsics;
 use std::sync::{Arc, Weak};
 use std::time::{Duration, Instant};
 
-/// If no image comes for this long, or for the time of this many images, the call is abandoned.
+/// If no image arrives for this long, or for the periods of this many images (next constant), the call is abandoned.
 const MAX_SILENCE: Duration = Duration::from_millis(1500);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 /// Opening takes longer: cameras adjust the exposure first.
@@ -19,7 +19,7 @@ const MAX_OPENING: Duration = Duration::from_secs(8);
 const RETRY_PAUSE: Duration = Duration::from_millis(200);
 /// Maximum number of threads that hang in a call and cannot be ended. After that, no new thread is started.
 const MAX_ABANDONED: usize = 8;
-/// How long to wait for a streaming thread to stop.
+/// Maximum time to wait until a streaming thread stops.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A streaming camera.
@@ -44,7 +44,7 @@ struct NokhwaDevice {
 #[derive(Debug)]
 struct NokhwaStream {
     worker: Worker,
-    /// Held by the thread until it ends.
+    /// Alive until the thread ends.
     alive: Weak<()>,
     /// Description of the camera, once it streams.
     description: Option<String>,
@@ -182,8 +182,8 @@ impl Device for NokhwaDevice {
 }
 
 impl Drop for NokhwaStream {
-    /// Stops the thread and waits for its end, because only then can the camera be opened again. A thread that hangs is
-    /// not waited for.
+    /// Stops the thread and waits for its end, because the camera can be opened again only after that. If the thread
+    /// hangs, does not wait.
     fn drop(&mut self) {
         self.worker.stop();
         let until = Instant::now() + SHUTDOWN_TIMEOUT;

@@ -1,11 +1,11 @@
-//! Estimates the number of dropped images from the arrival times of the others.
+//! Estimates the number of dropped images from the arrival times of the received images.
 
 use kinematics::Stamp;
 
-/// An image that is later than this many periods follows dropped images; a smaller lateness is jitter.
+/// If an image is late by more than this many periods, images were dropped before it. Smaller delays are jitter.
 const LATE_PERIODS: f64 = 0.75;
-/// Fraction of the lateness that corrects the next due time, because the actual frame rate differs from the nominal
-/// one.
+/// Fraction of the delay by which the next due time is corrected, because the actual frame rate differs from the
+/// nominal rate.
 const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.

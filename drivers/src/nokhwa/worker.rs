@@ -58,7 +58,7 @@ struct Shared {
 #[derive(Default)]
 struct State {
     queue: VecDeque<WorkerEvent>,
-    /// The caller has stopped the worker.
+    /// Whether the caller has stopped the worker.
     stop: bool,
 }
 
@@ -137,13 +137,13 @@ fn stream(config: &Config, shared: &Shared) -> Result<(), Problem> {
     Ok(())
 }
 
-/// Finds the camera by name. Numbers change with every connection, so this is repeated each time.
+/// Finds the camera by name. This is repeated for every connection, because the numbers of cameras may change.
 fn find(device: &str) -> Result<CameraIndex, Problem> {
     if let Some(index) = number(device) {
         return Ok(CameraIndex::Index(index));
     }
     let mut cameras = nokhwa::query(ApiBackend::Auto).unwrap_or_default();
-    // Some cameras have several nodes: the first one is for images.
+    // Some cameras have several nodes; the first one delivers images.
     cameras.sort_by_key(|camera| camera.index().as_index().unwrap_or(u32::MAX));
     let is_exact_match = |camera: &&CameraInfo| camera.human_name() == device;
     let is_partial_match = |camera: &&CameraInfo| !device.is_empty() && camera.human_name().contains(device);
@@ -167,7 +167,7 @@ fn number(device: &str) -> Option<u32> {
     node.strip_prefix("/dev/video").unwrap_or(node).parse().ok()
 }
 
-/// Opens the camera in the requested format, or in the first one it supports.
+/// Opens the camera in the requested format, or else in the first format that it supports.
 fn open(config: &Config, index: CameraIndex) -> Result<(Camera, V4l2Format), Problem> {
     let rate_hz = config.rate_hz;
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "compared with the original below")]

@@ -50,7 +50,7 @@ pub(super) fn intrinsics(raw: &sys::rs2_intrinsics, stream: &'static str) -> Res
     Ok(intrinsics)
 }
 
-/// Converts our intrinsics to those of the library, which has the same models.
+/// Converts our intrinsics to those of the library, which supports the same models.
 #[cfg(feature = "emulation")]
 pub(super) fn raw(intrinsics: &Intrinsics) -> sys::rs2_intrinsics {
     let lens = if intrinsics.is_pinhole() { Lens::Pinhole } else { intrinsics.lens };

@@ -191,7 +191,7 @@ impl Device {
 /// One sensor of a device, with its streams and options.
 pub(super) struct Sensor {
     raw: NonNull<sys::rs2_sensor>,
-    /// The same sensor. This does not own it.
+    /// Options of the same sensor. This field does not own the sensor.
     pub(super) options: Options,
 }
 
@@ -350,8 +350,8 @@ impl Mode {
     }
 }
 
-/// Queued images of all streams, in order of arrival. If the queue is full, the oldest image is dropped, except that a
-/// file waits.
+/// Queued images of all streams, in order of arrival. If the queue is full, a file waits, and a camera drops the oldest
+/// image.
 #[derive(Debug)]
 pub(super) struct Queue(NonNull<sys::rs2_frame_queue>);
 

@@ -32,14 +32,14 @@ pub(super) struct Session {
     stamps: Stamps,
     filters: Filters,
     counter: [FrameCounter; 2],
-    /// Files only: an image that was read but is not due yet.
+    /// For files only: an image that was read but is not due yet.
     pending: Option<Image>,
     image_secs_per_count: f64,
     is_file: bool,
     started_at: Instant,
     last_image: Instant,
     has_image: bool,
-    /// Files only: number of images that were due before the file was opened.
+    /// For files only: number of images that were due before the file was opened.
     n_before_open: u64,
     description: String,
     started: ActiveStreams,
@@ -135,7 +135,7 @@ impl Session {
                 std::thread::sleep(remaining.min(due_in));
                 continue;
             }
-            // Checked before the queue, so that all images until then are in the queue.
+            // This is checked before the queue, so that all images read until then are in the queue.
             let has_stopped = self.is_file && self.device.has_stopped()?;
             match self.queue.wait(remaining.min(POLL))? {
                 Some(frame) => {
@@ -146,7 +146,7 @@ impl Session {
                     self.pending = image;
                 }
                 None if has_stopped && (self.has_image || self.started_at.elapsed() > MAX_STARTUP) => {
-                    self.warn_of_images_before_open("all of the");
+                    self.warn_of_images_before_open("all");
                     return Ok(Next::End);
                 }
                 None if remaining <= POLL => return Ok(Next::NoImage),
@@ -155,12 +155,12 @@ impl Session {
         }
     }
 
-    /// Logs once how many images of a file were due too early.
+    /// Logs once how many images of a file were due before the file was opened.
     fn warn_of_images_before_open(&mut self, which: &str) {
         let n_before_open = std::mem::take(&mut self.n_before_open);
         if n_before_open > 0 {
             log::warn!(
-                "camera {:?}: {which} images of its file ({n_before_open}) were due before it was opened and are skipped",
+                "camera {:?}: skipped {which} images of the .bag file ({n_before_open}): they were due before fieldrig opened the file",
                 self.camera
             );
         }

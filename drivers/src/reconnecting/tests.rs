@@ -6,13 +6,13 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// Shorter than [`RETRY_PAUSE`]: a wait that ends before the next attempt.
+/// A wait that is shorter than [`RETRY_PAUSE`], so it ends before the next attempt.
 const BRIEFLY: Duration = Duration::from_millis(10);
-/// Limits of an outage: one that is never reached, and one that is reached at the first failed attempt.
+/// Limit of an outage that is never reached. The next one is reached at the first failed attempt.
 const UNLIMITED: Duration = Duration::from_secs(3600);
 const ONE_ATTEMPT: Duration = Duration::ZERO;
 
-/// What the camera does when it is asked next.
+/// Action of the camera at the next call.
 #[derive(Debug)]
 enum Step {
     /// Opening succeeds. The mode of the camera is described if it streams at once.
@@ -21,18 +21,18 @@ enum Step {
     Refuses(&'static str),
     /// Opening fails in a way that no further attempt can change.
     Unsupported,
-    /// A reset takes the place of an attempt to open it.
+    /// A reset replaces an attempt to open the camera.
     Resets,
     /// Opening completes later.
     Streams(&'static str),
-    /// It delivers an image stamped at this number of periods, after it skipped some.
+    /// The camera delivers an image stamped at this number of periods, after skipping some images.
     Color(i64, u64),
     Depth(i64),
-    /// It sends nothing until the deadline.
+    /// The camera sends nothing until the deadline.
     Quiet,
-    /// It is disconnected.
+    /// The camera is disconnected.
     Lost(&'static str),
-    /// It is a file that ends.
+    /// The file that replaces the camera ends.
     Ends,
 }
 use Step::{Color, Depth, Ends, Lost, Opens, Quiet, Refuses, Resets, Streams, Unsupported};

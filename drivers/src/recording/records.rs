@@ -9,19 +9,20 @@ use lz4_flex::frame::FrameDecoder;
 use ruzstd::decoding::StreamingDecoder;
 use std::io::{Cursor, Read};
 
-/// Longer records are treated as damage. The largest valid record contains one image.
+/// Maximum length of a record. Longer records are treated as damage; the largest valid record contains one image.
 const MAX_RECORD_BYTES: u64 = 512 << 20;
 /// Maximum allocation before any byte of a record was read.
 const MAX_PREALLOCATED_BYTES: u64 = 1 << 20;
-/// Header of a record: opcode and length.
+/// Length of a record's header: opcode and length.
 const HEAD_BYTES: usize = 1 + 8;
-/// Header of a chunk up to the name of its compression: times, uncompressed length, checksum, length of the name.
+/// Length of a chunk's header up to the name of the compression: times, uncompressed length, checksum, length of the
+/// name.
 const CHUNK_HEAD_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 
 const FOOTER: u8 = 0x02;
 const CHUNK: u8 = 0x06;
 
-/// Why reading ends before the end of a file.
+/// The reason why reading ends before the end of a file.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ReadError {
     #[error("is truncated")]
@@ -169,7 +170,8 @@ fn bytes_of(input: &mut (impl Read + ?Sized), n_bytes: u64) -> Result<Vec<u8>, R
     if bytes.len() as u64 == n_bytes { Ok(bytes) } else { Err(ReadError::Truncated) }
 }
 
-/// Appends at most the given number of decompressed bytes of one frame, and advances the input past the bytes read.
+/// A function that appends at most the given number of decompressed bytes of one frame, and advances the input past the
+/// bytes read.
 type Decompress = fn(&mut &[u8], u64, &mut Vec<u8>) -> std::io::Result<()>;
 
 /// Returns the decompressor for the name of a compression in the file.

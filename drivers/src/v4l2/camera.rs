@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 
 /// Pause between two attempts to reconnect.
 const RETRY_PAUSE: Duration = Duration::from_millis(100);
-/// A stream without images for this long, or for the time of this many images, is restarted, because cameras may hang.
+/// A stream without images for this long, or for the periods of this many images (next constant), is restarted, because
+/// cameras may hang.
 const MAX_SILENCE: Duration = Duration::from_secs(2);
 const MAX_SILENT_IMAGES: f64 = 5.0;
 
@@ -17,7 +18,7 @@ const MAX_SILENT_IMAGES: f64 = 5.0;
 ///
 /// A camera that is disconnected or hangs is reopened with the same settings for at most [`Config::reconnect_for`].
 /// During that time, [`Camera::next_image`] returns [`Error::Reconnecting`], afterwards the cause. Images missed in the
-/// meantime count as skipped. Dropping it stops the stream.
+/// meantime count as skipped. Dropping this value stops the stream.
 #[derive(Debug)]
 pub struct V4l2Camera(Reconnecting<V4l2Device>);
 
@@ -62,7 +63,7 @@ impl V4l2Camera {
         self.0.device().n_damaged
     }
 
-    /// Settings as read back from the camera, names and values. Empty while it is disconnected.
+    /// Names and values of the settings as read back from the camera. Empty while the camera is disconnected.
     pub fn read_back(&self) -> &[(&'static str, i32)] {
         self.0.stream().map_or(&[], V4l2Stream::read_back)
     }

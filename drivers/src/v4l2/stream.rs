@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 /// Number of image buffers: a quarter of a second at 30 Hz.
 const N_BUFFERS: u32 = 8;
-/// A stamp that is earlier than the start of the stream or later than now by more than this is of another clock,
+/// A stamp that is earlier than the start of the stream or later than now by more than this comes from another clock,
 /// regardless of its flag.
 const MAX_STAMP_ERROR_SECS: f64 = 1.0;
 /// Maximum duration of an exposure query, as a fraction of the time between two images.
@@ -156,7 +156,7 @@ impl V4l2Stream {
         }
     }
 
-    /// Takes the next buffer to deliver: the oldest, or the newest, in which case older ones are requeued.
+    /// Takes the next buffer to deliver: the oldest or the newest. In the latter case, older buffers are requeued.
     fn next_filled(&mut self, delivery: Delivery, deadline: Instant) -> Result<Option<FilledBuffer>, Problem> {
         let mut taken: Option<FilledBuffer> = None;
         loop {
@@ -196,8 +196,8 @@ impl V4l2Stream {
         .pack_rows(self.bytes_per_line)
     }
 
-    /// The stamp of the device if it is on our clock, else the current time. `stamp_to_mid_exposure_millis` of the rig
-    /// file defines its relation to the exposure.
+    /// The stamp of the device if it comes from our clock, or else the current time. `stamp_to_mid_exposure_millis` of
+    /// the rig file converts the stamp to mid-exposure.
     fn stamp_of(&mut self, filled: &FilledBuffer) -> Stamp {
         let now = clock::now();
         let stamp = Stamp(filled.stamp_nanos);
@@ -207,7 +207,7 @@ impl V4l2Stream {
         }
         if !std::mem::replace(&mut self.has_warned_of_clock, true) {
             log::warn!(
-                "camera {:?}: its stamps are not of the monotonic clock; images are stamped on arrival",
+                "camera {:?}: its stamps do not come from the monotonic clock; images are stamped on arrival",
                 self.camera
             );
         }
@@ -243,7 +243,7 @@ fn stream_problem(refused: Refused, path: &Path, mode: String, bytes_per_sec: Op
     }
 }
 
-/// An error of a streaming device is treated as a disconnection.
+/// Converts an error of a streaming device to a disconnection.
 fn lost(error: Errno) -> Problem {
     Problem::Unplugged { source: error.into() }
 }

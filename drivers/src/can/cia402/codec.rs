@@ -10,14 +10,13 @@ use std::f64::consts::TAU;
 
 /// Reaction of the drive to a missing host heartbeat: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop.
 pub const ABORT_CONNECTION: Object = Object { index: 0x6007, subindex: 0, n_bytes: 2 };
-/// Behavior at a quick stop: 0 releases, 1 to 3 stop and release, 5 to 7 stop and stay stopped; [`STAY_STOPPED`] does
-/// so on the quick-stop ramp.
+/// Behavior at a quick stop: 0 releases, 1 to 3 stop and release, 5 to 7 stop and stay stopped. See [`STAY_STOPPED`].
 pub const QUICK_STOP_OPTION: Object = Object { index: 0x605A, subindex: 0, n_bytes: 2 };
 /// Value of [`QUICK_STOP_OPTION`]: slow down on the quick-stop ramp and stay in [`State::QuickStopActive`].
 pub const STAY_STOPPED: i64 = 6;
-/// Value of [`ABORT_CONNECTION`]: as after [`StateCommand::DisableVoltage`].
+/// Value of [`ABORT_CONNECTION`]: react as to [`StateCommand::DisableVoltage`].
 pub const ABORT_BY_DISABLING: i64 = 2;
-/// Value of [`ABORT_CONNECTION`]: as after [`StateCommand::QuickStop`].
+/// Value of [`ABORT_CONNECTION`]: react as to [`StateCommand::QuickStop`].
 pub const ABORT_BY_QUICK_STOP: i64 = 3;
 /// Supported modes, one bit each: [`Mode`] `n` is bit `n - 1`.
 pub const SUPPORTED_MODES: Object = Object { index: 0x6502, subindex: 0, n_bytes: 4 };
@@ -52,19 +51,19 @@ pub const TARGET_VELOCITY: Object = Object { index: 0x60FF, subindex: 0, n_bytes
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(i8)]
 pub enum Mode {
-    /// A position, with the drive's own ramps.
+    /// The target is a position, approached with the drive's own ramps.
     ProfilePosition = 1,
-    /// A velocity, with the drive's own ramps.
+    /// The target is a velocity, approached with the drive's own ramps.
     ProfileVelocity = 3,
-    /// A torque, with the drive's own ramp.
+    /// The target is a torque, approached with the drive's own ramp.
     ProfileTorque = 4,
     /// Homing: finds the zero position.
     Homing = 6,
-    /// A position at every SYNC.
+    /// The drive accepts a target position at every SYNC.
     CyclicPosition = 8,
-    /// A velocity at every SYNC.
+    /// The drive accepts a target velocity at every SYNC.
     CyclicVelocity = 9,
-    /// A torque at every SYNC.
+    /// The drive accepts a target torque at every SYNC.
     CyclicTorque = 10,
 }
 
@@ -147,10 +146,10 @@ impl State {
         }
     }
 
-    /// The command that advances a drive by one state towards enabled; `None` if it is enabled, or the next
-    /// transition is its own.
+    /// The command that advances a drive by one state towards enabled; `None` if the drive is enabled, or makes the
+    /// next transition automatically.
     ///
-    /// A fault is reset only if `may_reset_fault`, because its cause may persist.
+    /// A fault is reset only if `may_reset_fault` is set, because its cause may persist.
     pub fn next_enabling_command(self, may_reset_fault: bool) -> Option<StateCommand> {
         match self {
             Self::SwitchOnDisabled => Some(StateCommand::Shutdown),
@@ -164,7 +163,7 @@ impl State {
 
     /// The state after a command; unchanged if the command has no effect in this state.
     ///
-    /// The drive's own transitions (0, 1, automatic 12, 13, 14) are not commands.
+    /// Automatic transitions of the drive (0, 1, automatic 12, 13, 14) are not commands.
     pub fn after(self, state_command: StateCommand) -> Self {
         match (self, state_command) {
             (Self::SwitchOnDisabled | Self::SwitchedOn | Self::OperationEnabled, StateCommand::Shutdown) => {
@@ -216,7 +215,7 @@ impl Units {
     /// Converts to the nearest count.
     ///
     /// # Errors
-    /// If it does not fit into 32 bits. Positions are not clamped, because that would change the target.
+    /// If the count does not fit into 32 bits. Positions are not clamped, because that would change the target.
     pub fn raw_from_rad(&self, field: &'static str, value: f64) -> Result<i32, CanError> {
         let count = (value * self.counts_per_turn / TAU).round();
         let range = (f64::from(i32::MIN), f64::from(i32::MAX));
@@ -231,7 +230,7 @@ impl Units {
     /// Converts to the nearest count of [`TARGET_TORQUE`].
     ///
     /// # Errors
-    /// If it does not fit into 16 bits.
+    /// If the count does not fit into 16 bits.
     pub fn raw_from_nm(&self, value: f64) -> Result<i16, CanError> {
         let count = (value * 1000.0 / self.rated_torque_nm).round();
         let range = (f64::from(i16::MIN), f64::from(i16::MAX));

@@ -16,7 +16,8 @@ fn number(index: u16, subindex: u8) -> u32 {
     u32::from(index) << 8 | u32::from(subindex)
 }
 
-/// Command of a controlword; `None` if its bits are no command. Source: CiA 402-2, table of the controlword.
+/// Decodes the command in a controlword; `None` if its bits form no command. Source: CiA 402-2, table of the
+/// controlword.
 fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     if controlword & !before & 0x80 != 0 {
         return Some(StateCommand::ResetFault);
@@ -31,7 +32,7 @@ fn decode_controlword(controlword: u16, before: u16) -> Option<StateCommand> {
     }
 }
 
-/// Value of an object that was written.
+/// Value that was written to an object.
 fn written(drive: &EmulatedDrive, object: Object) -> Option<u32> {
     drive.setting(number(object.index, object.subindex))
 }
@@ -127,7 +128,7 @@ impl EmulatedProtocol for EmulatedCia402 {
 }
 
 impl EmulatedCia402 {
-    /// A drive that has just started.
+    /// Creates a drive that has just started.
     pub(super) fn new(address: Cia402) -> Self {
         Self {
             address,

@@ -1,4 +1,4 @@
-//! CiA 402 drives: CANopen nodes that send a PDO with position and velocity at each SYNC.
+//! CiA 402 drives: CANopen nodes that send a PDO with position and velocity on each SYNC.
 //!
 //! Watchdog: consumer heartbeat (`0x1016`) with abort connection option code (`0x6007`): either a quick stop after which
 //! the drive stays stopped (`0x605A` = 6), or voltage off. Source: CiA 301, section 7.5.2.20; CiA 402-2, objects 6007h
@@ -29,7 +29,7 @@ use crate::wire::can::mit::Limits;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Heartbeat interval that a drive is set to, milliseconds.
+/// Heartbeat interval to which a drive is set, milliseconds.
 const HEARTBEAT_MILLIS: i64 = 500;
 const COUNTS_PER_TURN: &str = "counts_per_turn";
 const RATED_TORQUE_NM: &str = "rated_torque_nm";
@@ -144,7 +144,7 @@ impl MotorProtocol for Cia402 {
         Some(MotorReading { position_rad, velocity_rad_s, torque_nm: None })
     }
 
-    /// Target, position and state.
+    /// Frames with target, position and state.
     fn traffic(&self) -> Traffic {
         Traffic { cycle_frames: vec![short_frame(); 3], unsolicited: vec![] }
     }

@@ -24,12 +24,12 @@ pub(super) struct Cia402Motion {
 }
 
 impl Cia402Motion {
-    /// A state command outside the cycle.
+    /// Encodes a state command that is sent outside the cycle.
     fn encode(&self, state_command: StateCommand) -> Result<Frame, CanError> {
         canopen::encode_write(self.address.node, codec::CONTROLWORD, state_command.controlword().into())
     }
 
-    /// The state in the drive's second PDO.
+    /// Decodes the state in the drive's second PDO.
     fn decode_state(&self, frame: &Frame) -> Option<State> {
         if frame.id() != Pdo::Second.id(Direction::Transmit, self.address.node) || frame.is_remote() {
             return None;
@@ -96,8 +96,8 @@ impl MotionProtocol for Cia402Motion {
                 return Err(query.fault("the drive does not change to cyclic synchronous position mode"));
             }
         }
-        // With drives the period is in whole milliseconds. A drive that does not interpolate does not have this
-        // object.
+        // For arms with drives, the period is a whole number of milliseconds. A drive that does not interpolate does
+        // not have this object.
         let millis = i64::try_from(plan.period.as_millis()).unwrap_or(i64::MAX);
         for (object, value) in [(codec::INTERPOLATION_PERIOD, millis), (codec::INTERPOLATION_EXPONENT, -3)] {
             match try_set(query, node, object, value)? {
@@ -111,7 +111,7 @@ impl MotionProtocol for Cia402Motion {
         start_drive(query, node, &entries)
     }
 
-    /// The commands of a drive enable it.
+    /// Returns no frames, because the commands of a drive enable it.
     fn enable(&self) -> Result<Vec<Frame>, CanError> {
         Ok(Vec::new())
     }

@@ -11,7 +11,7 @@ const EVERY_SYNC: i64 = 1;
 /// Bit of PDO communication entry 1 that disables the PDO.
 const PDO_OFF: i64 = 1 << 31;
 
-/// Reads an object; the upper bytes are 0 if it is shorter.
+/// Reads an object. If it is shorter than the result, the upper bytes are 0.
 pub(super) fn get(query: &MotorQuery<'_>, node: Node, object: Object) -> Result<u32, Error> {
     let answer =
         query.request_answer(&canopen::encode_read(node, object), |frame| match canopen::decode_sdo(frame) {
@@ -46,7 +46,7 @@ pub(super) fn set(query: &MotorQuery<'_>, node: Node, object: Object, value: i64
     query.map_error(answer)
 }
 
-/// Like [`set`], but returns a refusal of the node as the inner error.
+/// Like [`set`], but returns an error as the inner result if the node refuses the value.
 pub(super) fn try_set(
     query: &MotorQuery<'_>,
     node: Node,
@@ -63,7 +63,7 @@ pub(super) fn try_set(
     })
 }
 
-/// The entries that map objects into a PDO of a drive and have it sent, or accepted, at every SYNC.
+/// The entries that map objects into a PDO of a drive, so that the drive sends or accepts the PDO on every SYNC.
 ///
 /// Source: CiA 301, section 7.5.2.36: a PDO is disabled while its mapping is changed.
 pub(super) fn map_pdo_at_every_sync(

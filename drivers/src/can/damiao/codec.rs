@@ -2,19 +2,19 @@
 //!
 //! Sources: `cmjang/DM_Control_Python` `DM_CAN.py` (frames, register numbers and types, limits of the models); Damiao
 //! DM-J4310-2EC manual V1.0, as described in `jia-xie/python-damiao-driver` `docs/concept/` (status nibble, clearing
-//! errors, registers, TIMEOUT in ticks of 50 us). Commands have the motor's ID as identifier, register and refresh
-//! requests `0x7FF`. All answers have the motor's feedback identifier (register `MST_ID`).
+//! errors, registers, TIMEOUT in ticks of 50 us). Commands have the motor's ID as their CAN ID; register and refresh
+//! requests have `0x7FF`. All answers have the motor's feedback ID (register `MST_ID`).
 
 use crate::wire::can::mit::{self, Command, Limits, Motion};
 use crate::wire::can::{CanError, Frame, Id, decode_enum, eight_bytes};
 
-/// Identifier of register messages.
+/// CAN ID of register messages.
 const REGISTER_ID: u32 = 0x7FF;
 /// Length of a tick of register `TIMEOUT`, seconds.
 const TIMEOUT_TICK_SECS: f64 = 50e-6;
 /// Value of [`Register::ControlMode`] for MIT mode.
 pub const MIT_MODE: u32 = 1;
-/// Names of messages from a motor in errors.
+/// Name of messages from a motor in errors.
 const FEEDBACK: &str = "feedback of a Damiao motor";
 const REGISTER: &str = "register message of a Damiao motor";
 
@@ -55,7 +55,7 @@ impl Model {
     }
 }
 
-/// A state command: seven bytes `FF` and this one.
+/// A state command. Its frame consists of seven bytes `FF` and this byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StateCommand {
@@ -126,13 +126,13 @@ pub struct Feedback {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Register {
-    /// Identifier of the motor's answers.
+    /// CAN ID of the motor's answers.
     FeedbackId = 7,
     /// ID of the motor.
     MotorId = 8,
     /// Time without commands after which the motor stops, in ticks of 50 us; 0 means never.
     Timeout = 9,
-    /// 1 is MIT mode.
+    /// Control mode; 1 is MIT mode.
     ControlMode = 10,
     /// Firmware version.
     SoftwareVersion = 14,
@@ -173,10 +173,10 @@ pub enum Value {
     Float(f32),
 }
 
-/// A register message to a motor, or its answer.
+/// A register message to a motor, or the answer of the motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RegisterMessage {
-    /// ID of the motor that it is sent to or comes from.
+    /// ID of the motor to which the message is sent or from which it comes.
     pub motor: u16,
     /// Operation.
     pub access: Access,
@@ -197,7 +197,8 @@ pub enum Access {
     Refresh,
 }
 
-/// Value of register `TIMEOUT` for a time, rounded up so that no motor stops too early; 0 disables the timeout.
+/// Converts a time to a value of register `TIMEOUT`, rounded up so that no motor stops too early. A time of 0 disables
+/// the timeout.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
 pub fn timeout_ticks(timeout_secs: f64) -> Result<u32, CanError> {
     let upper = f64::from(u32::MAX) * TIMEOUT_TICK_SECS;
@@ -210,7 +211,7 @@ pub fn timeout_ticks(timeout_secs: f64) -> Result<u32, CanError> {
     }
 }
 
-/// Time of a value of register `TIMEOUT`, seconds.
+/// Converts a value of register `TIMEOUT` to seconds.
 pub fn timeout_secs(ticks: u32) -> f64 {
     f64::from(ticks) * TIMEOUT_TICK_SECS
 }
@@ -235,7 +236,7 @@ pub fn encode_state_command(motor: u16, state_command: StateCommand) -> Result<F
     Frame::classic(Id::standard(motor.into())?, &[0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, state_command as u8])
 }
 
-/// Encodes a register message to a motor, or, with `answer_id`, the answer of a motor with this feedback identifier.
+/// Encodes a register message to a motor, or, with `answer_id`, the answer of a motor with this feedback ID.
 pub fn encode_register(message: &RegisterMessage, answer_id: Option<Id>) -> Result<Frame, CanError> {
     let (code, register, value) = match message.access {
         Access::Read(register) => (0x33, register as u8, [0; 4]),
@@ -265,7 +266,7 @@ pub fn decode_register(frame: &Frame) -> Result<RegisterMessage, CanError> {
     Ok(RegisterMessage { motor: u16::from_le_bytes([low, high]), access })
 }
 
-/// Decodes a motor's feedback. Register answers have the same identifier: the caller must distinguish them.
+/// Decodes a motor's feedback. Register answers have the same CAN ID, so the caller must distinguish them.
 pub fn decode_feedback(frame: &Frame, limits: &Limits) -> Result<Feedback, CanError> {
     let [head, a, b, c, d, e, drive_celsius, rotor_celsius] = eight_bytes(frame, FEEDBACK, false)?;
     Ok(Feedback {

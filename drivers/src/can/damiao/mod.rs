@@ -25,7 +25,7 @@ use codec::{Access, Register, RegisterMessage, Value};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Maximum ID of a motor, and identifier of its answers; the next one is that of register messages.
+/// Maximum ID of a motor and of its answers. The next ID is that of register messages.
 const MAX_ID: u64 = 0x7FE;
 const FEEDBACK_ID: &str = "feedback_id";
 
@@ -75,7 +75,7 @@ impl MotorFamily for DamiaoFamily {
 pub struct Damiao {
     /// Motor ID.
     pub motor: u16,
-    /// Identifier of its answers (register `MST_ID`).
+    /// CAN ID of its answers (register `MST_ID`).
     pub feedback: u16,
 }
 
@@ -102,7 +102,7 @@ impl Damiao {
         (u16::from(feedback.motor_low) == self.motor & 0xF).then_some(feedback)
     }
 
-    /// Whether a frame of the motor is a register answer: an answer that arrives late must not be taken for feedback.
+    /// Whether a frame from the motor is a register answer. A late register answer must not be mistaken for feedback.
     fn is_register(self, frame: &Frame) -> bool {
         codec::decode_register(frame).is_ok_and(|message| message.motor == self.motor)
     }
@@ -117,7 +117,7 @@ impl MotorProtocol for Damiao {
         MotorSettings::new(self.motor).with(FEEDBACK_ID, SettingValue::Whole(self.feedback.into()))
     }
 
-    /// Both numbers: a motor would take the answers of another one for commands.
+    /// Returns both IDs, because a motor would mistake answers of another motor with its ID for commands.
     fn addresses(&self) -> Vec<u32> {
         vec![self.motor.into(), self.feedback.into()]
     }

@@ -1,4 +1,4 @@
-//! What emulated motors of all families have in common: the drive of the shaft with its settings, faults and
+//! The part that emulated motors of all families share: a drive that moves the shaft, with settings, faults and a
 //! watchdog.
 
 use super::shaft::{Actuation, Shaft};
@@ -6,14 +6,14 @@ use crate::wire::can::mit::{Command, Limits, Motion};
 use kinematics::Stamp;
 use std::collections::BTreeMap;
 
-/// What a motor does with its shaft.
+/// Control state of a motor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum State {
     /// Disabled: the shaft turns freely.
     Free,
-    /// Executes its last command.
+    /// Enabled: the motor executes its last command.
     Enabled,
-    /// Stopped by its watchdog or a quick stop, and holds its position.
+    /// Stopped by the watchdog or a quick stop: the motor holds its position.
     Holding,
 }
 
@@ -30,7 +30,7 @@ pub struct EmulatedDrive {
     /// Registers, parameters, endpoints or objects that were written, by number.
     settings: BTreeMap<u32, u32>,
     pub(super) ignores_timeout: bool,
-    /// When the watchdog was last reset, and when it last expired.
+    /// Time at which the watchdog was last reset. The next field is the time at which it last expired.
     pub(super) watchdog_reset_at: Option<Stamp>,
     pub(super) timed_out_at: Option<Stamp>,
     /// Fault bits in the numbering of the family.
@@ -39,7 +39,7 @@ pub struct EmulatedDrive {
 }
 
 impl EmulatedDrive {
-    /// A disabled drive at rest at 0.
+    /// Creates a disabled drive at rest at position 0.
     pub(super) fn new(limits: Limits) -> Self {
         Self {
             limits,
@@ -74,7 +74,7 @@ impl EmulatedDrive {
         }
     }
 
-    /// What the motor does with its shaft.
+    /// Control state of the motor.
     pub(in crate::can) fn state(&self) -> State {
         match self.actuation {
             Actuation::Free => State::Free,

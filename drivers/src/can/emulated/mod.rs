@@ -1,8 +1,8 @@
 //! Emulated motors for tests and simulators. They answer, report, follow commands, and stop when their watchdog
 //! expires, as the manufacturers' documents describe.
 //!
-//! They were written from the same documents as the codecs. They therefore show that the driver works, but not that
-//! the documents were understood correctly; only real motors can show that.
+//! The emulated motors were written from the same documents as the codecs. Tests against them therefore cannot show
+//! whether the documents were understood correctly; only real motors can show that.
 
 mod drive;
 mod protocol;
@@ -35,14 +35,14 @@ pub struct EmulatedMotor {
 }
 
 impl EmulatedMotor {
-    /// Creates a disabled motor at rest at 0. `limits` are the ranges of raw values that it reports; of motors that do
-    /// not report them, the ranges follow from the model.
+    /// Creates a disabled motor at rest at position 0. `limits` are the ranges of raw values that it reports; for
+    /// motors that do not report them, the ranges follow from the model.
     pub fn new(motor: &dyn MotorProtocol, limits: Limits) -> Self {
         let drive = EmulatedDrive::new(motor.ranges().unwrap_or(limits));
         Self { protocol: motor.emulated(), drive, last_report: None, last_heartbeat: None }
     }
 
-    /// Sets the motion of the shaft. From then on the drive determines it, unless it is set again.
+    /// Sets the motion of the shaft. From then on, the drive determines the motion until it is set again.
     pub fn set_motion(&mut self, motion: Motion) {
         self.drive.set_motion(motion);
     }
@@ -52,7 +52,7 @@ impl EmulatedMotor {
         self.drive.motion()
     }
 
-    /// What the motor does with its shaft.
+    /// Control state of the motor.
     pub fn state(&self) -> State {
         self.drive.state()
     }
@@ -62,17 +62,17 @@ impl EmulatedMotor {
         self.drive.target
     }
 
-    /// When its watchdog was last reset.
+    /// Time at which its watchdog was last reset.
     pub fn watchdog_reset_at(&self) -> Option<Stamp> {
         self.drive.watchdog_reset_at
     }
 
-    /// When its watchdog last stopped it.
+    /// Time at which its watchdog last stopped it.
     pub fn timed_out_at(&self) -> Option<Stamp> {
         self.drive.timed_out_at
     }
 
-    /// From now on, ignores writes of the timeout without reporting an error, as older firmware does.
+    /// Makes the motor ignore writes of the timeout without reporting an error, as older firmware does.
     pub fn ignore_timeout(&mut self) {
         self.drive.ignores_timeout = true;
     }
@@ -83,8 +83,8 @@ impl EmulatedMotor {
         self.protocol.fail(&mut self.drive);
     }
 
-    /// Processes a frame at the time of the last [`EmulatedMotor::report`], and returns the answers; none if the
-    /// frame is not addressed to this motor.
+    /// Processes a frame at the time of the last [`EmulatedMotor::report`], and returns the answers. There are none if
+    /// the frame is not addressed to this motor.
     ///
     /// # Errors
     /// If the protocol cannot encode an answer.
@@ -111,7 +111,7 @@ impl EmulatedMotor {
         Ok(sent)
     }
 
-    /// Applies the expiry of the watchdog.
+    /// Lets the watchdog expire if it is due.
     fn time_out(&mut self, now: Stamp) {
         self.drive.watchdog_reset_at = None;
         if self.state() == State::Enabled {

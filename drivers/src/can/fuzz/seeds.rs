@@ -31,7 +31,7 @@ pub(crate) fn example_traffic() -> Vec<Frame> {
     record_traffic().into_iter().flat_map(|(sent_frames, _)| sent_frames).collect()
 }
 
-/// For each motor: the frames on its bus, and the readings that they contain.
+/// For each motor, the frames on its bus and the readings that they contain.
 pub(super) fn record_traffic() -> Vec<(Vec<Frame>, Vec<Reading>)> {
     motors().into_iter().map(|config| record_traffic_of(&config)).collect()
 }
@@ -47,7 +47,7 @@ fn record_traffic_of(config: &MotorConfig) -> (Vec<Frame>, Vec<Reading>) {
         emulated.set_motion(Motion { position_rad: 0.4 * f64::from(cycle), velocity_rad_s: 0.5, torque_nm: -0.25 });
         let mut poll_frames: Vec<Frame> = config.protocol.poll_frame().into_iter().collect();
         poll_frames.extend(config.protocol.canopen_node().map(|_| canopen::encode_sync()));
-        // In the real setup another master commands some motors; here the test does.
+        // In a real setup, another master commands some motors; here, the test commands them.
         poll_frames.extend(fuzzing(config).other_master);
         let mut answers: Vec<Frame> =
             poll_frames.iter().flat_map(|frame| emulated.take(frame).expect("a frame of the driver")).collect();

@@ -1,9 +1,10 @@
-//! ODrive's CANSimple: an 11-bit identifier with six bits node ID and five bits command; little-endian numbers in the
-//! payload.
+//! ODrive's CANSimple protocol: the 11-bit CAN ID consists of a 6-bit node ID and a 5-bit command; numbers in the
+//! payload are little-endian.
 //!
-//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol page and DBC of
-//! firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Turns on the wire are radians here. Nodes
-//! send their messages at the rates set in `can.config` or `axis.config.can`, or in answer to a remote frame.
+//! Sources: `odriverobotics/ODrive` `tools/odrive-cansimple.dbc` (messages since firmware 0.5); ODrive CAN protocol
+//! page and DBC of firmware 0.6.10 (heartbeat, errors, torques, endpoints, temperature). Frames contain turns; this
+//! module converts them to radians. Nodes send their messages at the rates set in `can.config` or `axis.config.can`, or
+//! in answer to a remote frame.
 
 use crate::wire::can::{CanError, Frame, Id, decode_enum};
 use std::f64::consts::TAU;
@@ -12,12 +13,12 @@ use std::f64::consts::TAU;
 const PROTOCOL_VERSION: u8 = 2;
 /// Name of a node's frames in errors.
 const MESSAGE: &str = "ODrive message";
-/// Unit of feedforward values: thousandths of a turn per second, and of a newton meter.
+/// Unit of feedforward values: 0.001 turns per second, and 0.001 N m.
 const FEED_FORWARD: f64 = 1e-3;
 /// Error bit of [`Answer::Heartbeat`]: no command arrived within the timeout of the axis' watchdog.
 pub const WATCHDOG_TIMER_EXPIRED: u32 = 1 << 24;
 
-/// ID of an axis on the bus, 0 to 62; 63 means that none is assigned.
+/// Node ID of an axis, 0 to 62; 63 means that no ID is assigned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Node(u8);
 
@@ -36,7 +37,7 @@ impl Node {
     }
 }
 
-/// Command in the lower five bits of an identifier.
+/// Command in the lower five bits of a CAN ID.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Code {
@@ -142,16 +143,16 @@ pub enum Request {
     SetPosition {
         /// Position of the motor, rad.
         position_rad: f64,
-        /// Feedforward, in steps of a thousandth of a turn per second, up to 205 rad/s.
+        /// Velocity feedforward, in steps of 0.001 turns per second, up to 205 rad/s.
         velocity_rad_s: f64,
-        /// Feedforward, in steps of 1 mN m, up to 32 N m.
+        /// Torque feedforward, in steps of 1 mN m, up to 32 N m.
         torque_nm: f64,
     },
     /// Sets the target velocity.
     SetVelocity {
         /// Velocity of the motor, rad/s.
         velocity_rad_s: f64,
-        /// Feedforward, N m.
+        /// Torque feedforward, N m.
         torque_nm: f64,
     },
     /// Sets the target torque, N m.
@@ -396,7 +397,7 @@ mod tests {
             let node = Node::new(random.byte() & 63).expect("masked");
             let (from, back) = decode_answer(&encode_answer(node, &answer).expect("numbers")).expect("own bytes");
             let Answer::Motion { position_rad: position, velocity_rad_s: velocity } = back else { panic!("{back:?}") };
-            // Half a unit in the last of 24 bits.
+            // Tolerance: half a unit in the last of 24 bits.
             assert!(from == node && (position - position_rad).abs() <= position_rad.abs() / f64::from(1 << 24));
             assert!((velocity - velocity_rad_s).abs() <= velocity_rad_s.abs() / f64::from(1 << 24));
         }

@@ -1,4 +1,5 @@
-//! An emulated `ODrive` axis. It follows positions with its own loop. Its watchdog also runs while it is idle.
+//! An emulated `ODrive` axis. It follows target positions with its own position loop. Its watchdog also runs while the
+//! axis is idle.
 
 use super::Endpoints;
 use super::codec::{self, Answer, Code, Node};
@@ -8,7 +9,7 @@ use crate::wire::can::{CanError, Frame};
 use std::f64::consts::TAU;
 use std::time::Duration;
 
-/// One of its error bits.
+/// Error bit that the emulated axis reports on a failure.
 const CURRENT_LIMIT: u32 = 1 << 12;
 const HARDWARE: [u8; 3] = [4, 4, 58];
 const FIRMWARE: [u8; 3] = [0, 6, 9];

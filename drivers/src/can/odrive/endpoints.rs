@@ -1,8 +1,9 @@
-//! Numbers of the endpoints that configure an axis' watchdog. They depend on the firmware; ODrive publishes a file
-//! for each version.
+//! Numbers of the endpoints that configure the watchdog of an axis. The numbers depend on the firmware; ODrive
+//! publishes a file for each version.
 //!
-//! Source: ODrive CAN protocol page, "Arbitrary parameter access"; `odriverobotics/ODriveResources` `can_restore_config.py`, which
-//! compares `fw_version` and `hw_version` of `flat_endpoints.json` with the axis' own (`Get_Version`) before it writes anything.
+//! Source: ODrive CAN protocol page, "Arbitrary parameter access"; `odriverobotics/ODriveResources`
+//! `can_restore_config.py`, which compares `fw_version` and `hw_version` of `flat_endpoints.json` with the versions
+//! that the axis reports (`Get_Version`) before it writes anything.
 
 use serde::Deserialize;
 use std::collections::BTreeMap;

@@ -28,9 +28,9 @@ use codec::Answer;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-/// Default rate of an encoder's message.
+/// Default rate of encoder messages.
 const REPORT_HZ: f64 = 100.0;
-/// Default rate of heartbeats, which have the state of the axis.
+/// Default rate of heartbeats, which contain the state of the axis.
 const HEARTBEAT_HZ: f64 = 10.0;
 
 /// The family.
@@ -46,7 +46,7 @@ impl MotorFamily for OdriveFamily {
         "ODrive"
     }
 
-    /// 63 means that no ID is assigned.
+    /// Excludes 63, which means that no ID is assigned.
     fn ids(&self) -> RangeInclusive<u64> {
         0..=62
     }

@@ -38,7 +38,7 @@ impl OdriveMotion {
         })
     }
 
-    /// Checks that the endpoint numbers are those of the axis' firmware: the numbers depend on it.
+    /// Checks that the endpoint numbers belong to the firmware of the axis.
     fn check_endpoints(&self, query: &MotorQuery<'_>, endpoints: &Endpoints) -> Result<(), Error> {
         let (hardware, firmware) = self.ask(query, &Request::Ask(Code::Version), |answer| match answer {
             Answer::Version { hardware, firmware } => Some((hardware, firmware)),
@@ -96,7 +96,7 @@ impl MotionProtocol for OdriveMotion {
     }
 
     fn enable(&self) -> Result<Vec<Frame>, CanError> {
-        // Its watchdog may have expired while it was disabled.
+        // The watchdog of the axis may have expired while the axis was disabled.
         [Request::ClearErrors, Request::SetState(State::ClosedLoopControl)].iter().map(|it| self.encode(it)).collect()
     }
 
@@ -121,7 +121,7 @@ impl MotionProtocol for OdriveMotion {
         }
     }
 
-    /// The axis reports unasked.
+    /// The limit follows from the report interval, because the axis reports without being polled.
     fn max_silence(&self, default_limit: Duration) -> Duration {
         default_limit.max(MAX_REPORT_INTERVAL)
     }

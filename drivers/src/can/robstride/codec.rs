@@ -1,10 +1,10 @@
-//! Robstride motors with their private protocol: 29-bit identifiers with a communication type, two IDs and flags.
+//! Robstride motors with their private protocol: the 29-bit CAN ID contains a communication type, two IDs and flags.
 //!
-//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to RS06 user
-//! manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 ticks per second, 0 for never). The
-//! scalings are those of the manuals. The table of the Python package `robstride_dynamics` differs for RS00, RS03,
-//! RS05 and RS06, and gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull request
-//! 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
+//! Sources: `RobStride/SampleProgram` (`Robstride.cpp`: types 0 to 25 and their bytes, active report of 10 ms); RS00 to
+//! RS06 user manuals (scalings, fault bits, parameter table, `canTimeout` of 20 000 ticks per second, 0 for never).
+//! This module uses the scalings of the manuals. The table of the Python package `robstride_dynamics` differs for RS00,
+//! RS03, RS05 and RS06, and gives torques of an RS05 that are three times too high (motorbridge/motorbridge pull
+//! request 11). RS02 firmware up to 0.2.2.11 uses a range of 12.5 rad.
 
 pub use super::parameter::{Parameter, Value, timeout};
 
@@ -16,7 +16,7 @@ use std::f64::consts::PI;
 const MESSAGE: &str = "answer of a Robstride motor";
 /// Value of [`Parameter::RunMode`] for motion mode, in which [`Request::Move`] is followed.
 pub const MOTION_MODE: u32 = 0;
-/// Fixed bytes in some requests, which protect against executing other data.
+/// Fixed bytes in some requests, which keep a motor from executing other data.
 const MAGIC: [u8; 6] = [1, 2, 3, 4, 5, 6];
 /// Destination of a motor's answer to [`Request::Identify`].
 const BROADCAST: u8 = 0xFE;
@@ -130,7 +130,7 @@ impl Faults {
 /// A message from a motor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Answer {
-    /// Type 0: its serial number.
+    /// Type 0: the serial number of the motor.
     Identity {
         /// ID of the motor.
         motor: u8,
@@ -148,7 +148,7 @@ pub enum Answer {
         /// Its value.
         value: Value,
     },
-    /// Type 21: its fault and warning words.
+    /// Type 21: the fault and warning words of the motor.
     Fault {
         /// ID of the motor.
         motor: u8,
@@ -172,7 +172,7 @@ pub struct Feedback {
     pub faults: Faults,
     /// Measured motion.
     pub motion: Motion,
-    /// Temperature of the windings, degrees Celsius; tenths of a degree on the wire.
+    /// Temperature of the windings, degrees Celsius; encoded in tenths of a degree.
     pub winding_celsius: f64,
 }
 
@@ -332,7 +332,7 @@ mod tests {
             Command { position_rad: 1.5, velocity_rad_s: -3.0, kp_nm_rad: 60.0, kd_nm_s_rad: 1.25, torque_nm: 0.5 };
         let sent = encode_request(HOST, 5, &Request::Move(command), &LIMITS).expect("numbers");
         let got = decode_move(&sent, 5, &LIMITS).expect("the command is addressed to this motor");
-        // Half a raw unit of 16 bits each.
+        // Tolerances: half a quantization step of 16 bits.
         assert!((got.position_rad - 1.5).abs() < 2e-4 && (got.velocity_rad_s + 3.0).abs() < 6e-4);
         assert!((got.kp_nm_rad - 60.0).abs() < 4e-3 && (got.kd_nm_s_rad - 1.25).abs() < 4e-5);
         assert!((got.torque_nm - 0.5).abs() < 3e-4);

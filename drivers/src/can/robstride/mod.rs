@@ -1,7 +1,8 @@
 //! Robstride motors with their private protocol. Once configured, they report periodically.
 //!
-//! Watchdog: parameter `canTimeout`; the motor goes to its reset mode. The damping of its parameter `damper` protects
-//! unpowered motors against surges, and cannot be relied on. Source: RS00 to RS06 user manuals, sections 4.2 and 4.3.5.
+//! Watchdog: parameter `canTimeout`; the motor goes to its reset mode. Do not rely on the damping of its parameter
+//! `damper`, which only protects unpowered motors against surges. Source: RS00 to RS06 user manuals, sections 4.2 and
+//! 4.3.5.
 
 pub mod codec;
 #[cfg(feature = "emulation")]
@@ -29,7 +30,7 @@ use std::sync::Arc;
 pub(super) const HOST: u8 = 0xFD;
 /// Value of [`Parameter::ReportInterval`] for the shortest interval.
 const SHORTEST_REPORT: u32 = 1;
-/// Report rate at that value.
+/// Report rate at [`SHORTEST_REPORT`], Hz.
 const REPORT_HZ: f64 = 100.0;
 const MODEL: &str = "model";
 const MODELS: [(&str, Model); 7] = [

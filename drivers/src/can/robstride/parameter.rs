@@ -95,7 +95,8 @@ pub enum Value {
     Float(f32),
 }
 
-/// Value of [`Parameter::Timeout`] for a time, rounded up so that no motor stops too early; 0 disables the timeout.
+/// Converts a time to a value of [`Parameter::Timeout`], rounded up so that no motor stops too early. A time of 0
+/// disables the timeout.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within u32 by the check")]
 pub fn timeout(timeout_secs: f64) -> Result<Value, CanError> {
     let upper = f64::from(u32::MAX) / TIMEOUT_TICKS_HZ;

@@ -1,8 +1,8 @@
 //! CubeMars (T-Motor) AK motors in MIT mode.
 //!
-//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module Product Manual,
-//! MIT mode (feedback, temperature offset of 40). The limits depend on the firmware: newer versions have others for
-//! some models.
+//! Sources: `neurobionics/TMotorCANControl` `mit_can.py` (limits, error codes, frames); CubeMars AK Series Module
+//! Product Manual, MIT mode (feedback, temperature offset of 40). The limits depend on the firmware: newer versions
+//! have different limits for some models.
 
 use crate::wire::can::mit::{self, Command, Limits, Motion};
 use crate::wire::can::{CanError, Frame, Id, decode_enum};
@@ -38,7 +38,7 @@ impl Model {
     }
 }
 
-/// A state command: seven bytes `FF` and this one.
+/// A state command. Its frame consists of seven bytes `FF` and this byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum StateCommand {
@@ -142,7 +142,7 @@ pub fn decode_feedback(frame: &Frame, limits: &Limits, thermometer: Thermometer)
     Ok(Feedback { motor, motion: mit::decode_motion(motion, limits), health })
 }
 
-/// Encodes the answer of an emulated motor. Its identifier is the host's `host`, by default 0.
+/// Encodes the answer of an emulated motor. Its CAN ID is that of the host, `host`, by default 0.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be 0 to 255 first")]
 pub fn encode_feedback(
     host: u8,

@@ -1,5 +1,5 @@
-//! CubeMars (T-Motor) AK motors in MIT mode. They answer only commands, and a command without gains would make a motor
-//! limp. A read-only arm therefore only listens to them, while another master commands them.
+//! CubeMars (T-Motor) AK motors in MIT mode. They reply only to commands, and a command without gains would make a
+//! motor limp. A read-only arm therefore sends nothing and only listens while another master commands the motors.
 //!
 //! Watchdog: none; the motor executes its last command forever. Source: CubeMars AK Series Module Product Manual, MIT
 //! mode.
@@ -84,8 +84,8 @@ pub struct TMotor {
 impl TMotor {
     /// The feedback in a frame; `None` if the frame is from another motor or has other content.
     fn feedback(self, frame: &Frame, limits: &Limits) -> Option<Feedback> {
-        // Commands carry the motor's number as identifier; answers carry the master's, and the motor's number in the
-        // first byte.
+        // The CAN ID of commands is the ID of the motor. The CAN ID of answers is the ID of the master, and their first
+        // byte is the ID of the motor.
         if frame.id().value() == u32::from(self.motor) {
             return None;
         }

@@ -12,7 +12,7 @@ pub mod scale;
 
 pub use frame::{Frame, Id};
 
-/// An invalid frame, or one that does not follow its protocol.
+/// A frame is invalid, or does not follow its protocol.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum CanError {
@@ -32,7 +32,7 @@ pub enum CanError {
         /// Requested length in bytes.
         got_bytes: usize,
     },
-    /// A frame that is not a message of the expected kind, according to its identifier or format.
+    /// According to its ID or format, a frame is not a message of the expected kind.
     #[error("expected {message}, found a frame with identifier {id:#x}")]
     UnexpectedFrame {
         /// Expected message.
@@ -40,10 +40,10 @@ pub enum CanError {
         /// Identifier of the frame.
         id: u32,
     },
-    /// A message of the wrong length.
+    /// A message has the wrong length.
     #[error("{message}: {got_bytes} bytes, expected {expected_bytes}")]
     Length {
-        /// Which message.
+        /// Name of the message.
         message: &'static str,
         /// Actual length in bytes.
         got_bytes: usize,
@@ -58,13 +58,13 @@ pub enum CanError {
         /// Its value.
         raw: u32,
     },
-    /// NaN, or infinity in a field that does not allow it.
+    /// A field contains NaN, or infinity where it is not allowed.
     #[error("{field} is not a finite number")]
     NotFinite {
         /// Which field.
         field: &'static str,
     },
-    /// A number outside the range of its field.
+    /// A number is outside the range of its field.
     #[error("{field} is {value}, must be {lower} to {upper}")]
     Range {
         /// Which field.

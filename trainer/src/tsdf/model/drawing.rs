@@ -1,4 +1,4 @@
-//! Pictures of a field.
+//! Renders views of a TSDF model.
 
 use super::TsdfModel;
 use super::frustum::ViewFrustum;
@@ -26,7 +26,8 @@ impl TsdfModel {
         read.finish_with(&self.gpu, |parts| Picture::from_parts(camera.size_px, parts))
     }
 
-    /// GPU time of a pinhole picture, milliseconds, without reading it back; `None` if the adapter has no timestamps.
+    /// Renders a pinhole view without reading it back, and returns its GPU time in milliseconds. Returns `None` if the
+    /// projection is not a pinhole, the model is empty, or the adapter has no timestamps.
     pub fn profile_picture(&mut self, request: &RenderRequest) -> Result<Option<f64>, Error> {
         self.finish_in_flight()?;
         let Projection::Pinhole { focal_px, principal_px } = request.projection else { return Ok(None) };

@@ -29,10 +29,10 @@ impl KeyframeQueue {
         self.fused.extend(self.pending.pop_front().map(|keyframe| KeyframeSignature::of(&keyframe)));
     }
 
-    /// Skips the first pending keyframe, which observes more than the `max_blocks` blocks that fit into memory.
+    /// Skips the first pending keyframe, which observes more than the `max_blocks` voxel blocks that fit into memory.
     pub(super) fn skip_first(&mut self, max_blocks: u32) {
         self.n_skipped += 1;
-        log::warn!("tsdf: skipped an image that observes more than the {max_blocks} blocks that fit into memory");
+        log::warn!("tsdf: skipped an image that observes more than the {max_blocks} voxel blocks that fit into memory");
         self.complete_first();
     }
 }
