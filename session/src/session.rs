@@ -407,7 +407,7 @@ impl Session {
 
     /// The scheduled evaluations so far.
     pub fn evaluations(&self) -> &[Evaluation] {
-        &self.reported
+        self.reporter.evaluations()
     }
 
     /// The result of keyframe alignment, once it is decided.
