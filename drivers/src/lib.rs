@@ -22,6 +22,8 @@ mod error;
 pub mod franka;
 #[cfg(any(test, fuzzing))]
 pub mod fuzz;
+#[cfg(feature = "nokhwa")]
+mod gap_estimator;
 pub mod jpeg;
 mod live;
 pub mod motion;

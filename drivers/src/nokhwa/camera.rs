@@ -1,8 +1,8 @@
 //! A nokhwa camera that reconnects after an outage and never blocks forever.
 
-use super::gap_estimator::GapEstimator;
 use super::worker::{Frame, Worker, WorkerEvent};
 use super::{Config, Problem};
+use crate::gap_estimator::GapEstimator;
 use crate::reconnecting::{CameraCounts, Device, Failure, ReconnectPolicy, Reconnecting};
 use crate::v4l2::Delivery;
 use crate::{Camera, Error, Image};

@@ -2,11 +2,10 @@
 //!
 //! A call for an image may never return and cannot be canceled. `worker.rs` therefore calls nokhwa on a separate
 //! thread. `camera.rs` monitors the thread, abandons it if it hangs, and starts a new one. Images are the unmodified
-//! bytes of the device. They have no sequence numbers, so `gap_estimator.rs` estimates the number of dropped images
-//! from stamps.
+//! bytes of the device. They have no sequence numbers, so the number of dropped images is estimated from
+//! stamps (`gap_estimator.rs` of the crate).
 
 mod camera;
-mod gap_estimator;
 mod worker;
 
 pub use camera::NokhwaCamera;

@@ -10,18 +10,18 @@ const DRIFT_GAIN: f64 = 0.05;
 
 /// Estimates when the images of a camera are due. Images may be late, but never early.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct GapEstimator {
+pub(crate) struct GapEstimator {
     period_secs: f64,
     due: Option<Stamp>,
 }
 
 impl GapEstimator {
-    pub(super) fn new(rate_hz: f64) -> Self {
+    pub(crate) fn new(rate_hz: f64) -> Self {
         Self { period_secs: 1.0 / rate_hz, due: None }
     }
 
     /// Estimated number of images that were dropped before an image with this stamp.
-    pub(super) fn n_lost_before(&mut self, stamp: Stamp) -> u64 {
+    pub(crate) fn n_lost_before(&mut self, stamp: Stamp) -> u64 {
         let Some(due) = self.due else {
             self.due = Some(stamp.plus_secs(self.period_secs));
             return 0;
