@@ -1,6 +1,6 @@
 //! Reopens a camera after it was disconnected. All camera drivers use this code.
 //!
-//! A driver implements [`Device`], which opens the camera, reads images and describes problems. [`Reconnecting`]
+//! A driver implements [`ReopenableCamera`], which opens the camera, reads images and describes problems. [`Reconnecting`]
 //! decides when to retry and when to give up, and counts the images that were lost in the meantime.
 
 use crate::outage::{Outage, n_between};
@@ -10,13 +10,17 @@ use std::fmt::{Debug, Display};
 use std::time::{Duration, Instant};
 
 /// A camera that can be opened repeatedly.
-pub(crate) trait Device: Debug {
+///
+/// Images that the camera queued before it was opened must not be returned. Stamps of cameras without a clock are taken
+/// when the last byte of an image has arrived.
+pub(crate) trait ReopenableCamera: Debug {
     /// The open camera. Dropping it closes the camera.
     type Stream: Debug;
     /// A problem of this kind of camera.
     type Problem: Display;
 
-    /// Opens the camera.
+    /// Opens the camera. Must return within about 100 ms, because the caller cannot stop in the meantime: a camera that
+    /// takes longer is opened by a thread of its own, and [`Self::describe`] returns `None` until it is open.
     fn open(&mut self) -> Result<Self::Stream, Failure<Self::Problem>>;
 
     /// Description of device, mode and settings for the log; `None` as long as the camera is still being opened.
@@ -45,7 +49,8 @@ pub(crate) trait Device: Debug {
 pub(crate) enum Failure<P> {
     /// The camera is disconnected, or has a problem that may disappear if it is reopened.
     Lost(P),
-    /// An error that is returned without another attempt.
+    /// An error that another attempt cannot remove, because the camera answered and refuses the rig file's settings. It
+    /// is returned without another attempt.
     #[cfg_attr(
         not(any(target_os = "linux", feature = "realsense", test)),
         expect(dead_code, reason = "the nokhwa driver has no such errors")
@@ -97,11 +102,11 @@ pub struct CameraCounts {
 
 /// A camera that is reopened with the same settings after it was disconnected.
 #[derive(Debug)]
-pub(crate) struct Reconnecting<D: Device> {
-    device: D,
+pub(crate) struct Reconnecting<C: ReopenableCamera> {
+    device: C,
     policy: ReconnectPolicy,
     /// `None` while the camera is disconnected.
-    stream: Option<D::Stream>,
+    stream: Option<C::Stream>,
     /// Whether the camera has finished opening.
     is_streaming: bool,
     /// The outage, from its start until the next image. A camera that can be opened but sends nothing still counts as
@@ -114,9 +119,9 @@ pub(crate) struct Reconnecting<D: Device> {
     counts: CameraCounts,
 }
 
-impl<D: Device> Reconnecting<D> {
+impl<C: ReopenableCamera> Reconnecting<C> {
     /// Takes over a camera that was opened and streams.
-    pub(crate) fn new(device: D, stream: D::Stream, policy: ReconnectPolicy) -> Self {
+    pub(crate) fn new(device: C, stream: C::Stream, policy: ReconnectPolicy) -> Self {
         Self {
             device,
             policy,
@@ -129,13 +134,13 @@ impl<D: Device> Reconnecting<D> {
         }
     }
 
-    pub(crate) fn device(&self) -> &D {
+    pub(crate) fn device(&self) -> &C {
         &self.device
     }
 
     /// The open camera; `None` while it is disconnected.
     #[cfg(target_os = "linux")]
-    pub(crate) fn stream(&self) -> Option<&D::Stream> {
+    pub(crate) fn stream(&self) -> Option<&C::Stream> {
         self.stream.as_ref()
     }
 
@@ -191,7 +196,7 @@ impl<D: Device> Reconnecting<D> {
     }
 
     /// Closes the camera, because an open device node would keep its number when the camera returns.
-    fn disconnect(&mut self, problem: D::Problem) -> Result<(), Error> {
+    fn disconnect(&mut self, problem: C::Problem) -> Result<(), Error> {
         let outage = Outage::of(&mut self.outage);
         self.stream = None;
         if outage.n_tries > 0 {
@@ -203,7 +208,7 @@ impl<D: Device> Reconnecting<D> {
     }
 
     /// Fails if the camera has been disconnected for longer than the rig file allows.
-    fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, problem: D::Problem) -> Result<(), Error> {
+    fn fail_if_overdue(&self, Outage { since, n_tries, .. }: Outage, problem: C::Problem) -> Result<(), Error> {
         let waited = since.elapsed();
         if waited < self.policy.reconnect_for {
             log::debug!("camera {:?}: {problem}", self.policy.camera);

@@ -3,7 +3,7 @@
 use super::worker::{Frame, Worker, WorkerEvent};
 use super::{Config, Problem};
 use crate::gap_estimator::GapEstimator;
-use crate::reconnecting::{CameraCounts, Device, Failure, ReconnectPolicy, Reconnecting};
+use crate::reconnecting::{CameraCounts, Failure, ReconnectPolicy, Reconnecting, ReopenableCamera};
 use crate::v4l2::Delivery;
 use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
@@ -116,7 +116,7 @@ impl NokhwaDevice {
     }
 }
 
-impl Device for NokhwaDevice {
+impl ReopenableCamera for NokhwaDevice {
     type Stream = NokhwaStream;
     type Problem = Problem;
 

@@ -108,11 +108,14 @@ impl Worker {
 
 impl Shared {
     /// Queues an event and returns whether the caller is still listening. If the queue is full, the oldest image is
-    /// dropped; the gap is detected from the stamps.
+    /// dropped; the gap is detected from the stamps. Other events are kept: without them, the caller would never learn
+    /// that the camera is open.
     fn send(&self, event: WorkerEvent) -> bool {
         let mut state = self.state.lock();
-        if state.queue.len() >= MAX_WAITING {
-            state.queue.pop_front();
+        if state.queue.len() >= MAX_WAITING
+            && let Some(ix) = state.queue.iter().position(|queued| matches!(queued, WorkerEvent::Frame(_)))
+        {
+            state.queue.remove(ix);
         }
         state.queue.push_back(event);
         self.arrived.notify_all();

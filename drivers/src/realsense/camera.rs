@@ -4,7 +4,7 @@ use super::find;
 use super::sdk::Context;
 use super::session::{Next, Session};
 use super::{Calibration, Config, Pace, Problem};
-use crate::reconnecting::{CameraCounts, Device, Failure, ReconnectPolicy, Reconnecting};
+use crate::reconnecting::{CameraCounts, Failure, ReconnectPolicy, Reconnecting, ReopenableCamera};
 use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
 use std::time::{Duration, Instant};
@@ -77,7 +77,7 @@ impl RealsenseDevice {
     }
 }
 
-impl Device for RealsenseDevice {
+impl ReopenableCamera for RealsenseDevice {
     type Stream = Session;
     type Problem = Problem;
 

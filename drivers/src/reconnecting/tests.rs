@@ -51,7 +51,7 @@ struct ScriptedStream {
     _open: Arc<()>,
 }
 
-impl Device for Scripted {
+impl ReopenableCamera for Scripted {
     type Stream = ScriptedStream;
     type Problem = String;
 

@@ -2,7 +2,7 @@
 
 use super::stream::V4l2Stream;
 use super::{Config, Problem};
-use crate::reconnecting::{CameraCounts, Device, Failure, ReconnectPolicy, Reconnecting};
+use crate::reconnecting::{CameraCounts, Failure, ReconnectPolicy, Reconnecting, ReopenableCamera};
 use crate::{Camera, Error, Image};
 use kinematics::Intrinsics;
 use std::time::{Duration, Instant};
@@ -75,7 +75,7 @@ impl V4l2Device {
     }
 }
 
-impl Device for V4l2Device {
+impl ReopenableCamera for V4l2Device {
     type Stream = V4l2Stream;
     type Problem = Problem;
 
