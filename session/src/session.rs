@@ -19,7 +19,7 @@ use crate::decisions::DecisionLog;
 use crate::evaluate::Evaluator;
 use crate::gpu_loss;
 use crate::next_commands::DataSource;
-use crate::observer::Observer;
+use crate::observer::{Evaluation, Observer};
 use crate::recovery::Recovery;
 use calibration::Alignment;
 use capture::Stop;

@@ -2,6 +2,7 @@
 
 use crate::Error;
 use keyframe::{Keyframe, Split};
+use kinematics::Stamp;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -41,6 +42,11 @@ impl KeyframeSignature {
                 rotation.w,
             ],
         }
+    }
+
+    /// Whether this is the keyframe of a camera with a stamp.
+    pub(crate) fn is_of(&self, camera: &str, stamp: Stamp) -> bool {
+        self.camera == camera && self.stamp_nanos == stamp.0
     }
 
     /// Description of a difference from the recorded keyframe; `None` if they match.

@@ -117,7 +117,6 @@ impl Reporter {
     }
 
     /// The evaluations reported so far.
-    #[cfg(test)]
     pub(super) fn evaluations(&self) -> &[Evaluation] {
         &self.evaluations
     }

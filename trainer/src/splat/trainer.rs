@@ -106,7 +106,7 @@ impl SplatTrainer {
 
     /// Loads the camera corrections of a saved model from its `model.json`.
     pub fn with_saved_corrections(mut self, folder: &Path) -> Result<Self, Error> {
-        self.saved_corrections = read_metadata(&folder.join(METADATA_FILE))?.cameras;
+        self.saved_corrections = read_metadata(folder)?.cameras;
         Ok(self)
     }
 

@@ -269,7 +269,7 @@ impl Method for TsdfModel {
     /// unknown; they fade as later keyframes observe the same place.
     fn remove(&mut self, camera: &str, stamp: Stamp) -> Result<(), Error> {
         self.finish_in_flight()?;
-        self.queue.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        self.queue.remove(camera, stamp);
         Ok(())
     }
 

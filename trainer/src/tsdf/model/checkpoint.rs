@@ -30,6 +30,7 @@ pub(super) struct TsdfState {
     pub(super) n_skipped: u64,
     pub(super) n_blocks: u64,
     pub(super) fused: Vec<KeyframeSignature>,
+    pub(super) n_removed: u64,
     /// Pushed but not fused yet, in order.
     pub(super) pending: Vec<KeyframeSignature>,
 }
@@ -50,6 +51,7 @@ impl TsdfModel {
             n_skipped: self.queue.n_skipped,
             n_blocks: blocks.len() as u64,
             fused: self.queue.fused.clone(),
+            n_removed: self.queue.n_removed,
             pending: self.queue.pending.iter().map(|keyframe| KeyframeSignature::of(keyframe)).collect(),
         };
         let state = serde_json::to_value(state).map_err(|error| invalid_state(error.to_string()))?;
@@ -87,7 +89,8 @@ impl TsdfModel {
             model.store = Some(FieldStore::with_blocks(&model.gpu, &model.pipelines, voxel_grid, max_bytes, blocks)?);
         }
         let (fused, unmatched) = (state.fused, state.pending);
-        model.queue = KeyframeQueue { fused, unmatched, n_skipped: state.n_skipped, ..KeyframeQueue::default() };
+        let (n_skipped, n_removed) = (state.n_skipped, state.n_removed);
+        model.queue = KeyframeQueue { fused, unmatched, n_skipped, n_removed, ..KeyframeQueue::default() };
         Ok(model)
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::keyframe_signature::KeyframeSignature;
 use keyframe::Keyframe;
+use kinematics::Stamp;
 use std::collections::VecDeque;
 use std::sync::Arc;
 
@@ -10,8 +11,10 @@ use std::sync::Arc;
 pub(super) struct KeyframeQueue {
     /// Keyframes not confirmed as fused yet, in order. The first ones may be in flight.
     pub(super) pending: VecDeque<Arc<Keyframe>>,
-    /// Keyframes that were fused or skipped.
+    /// Keyframes that were fused or skipped, and not removed afterwards.
     pub(super) fused: Vec<KeyframeSignature>,
+    /// Number of keyframes that were removed after they had been fused.
+    pub(super) n_removed: u64,
     /// Pending keyframes of a loaded checkpoint that were not provided.
     pub(super) unmatched: Vec<KeyframeSignature>,
     /// Number of keyframes that were skipped because they observe more blocks than fit into memory.
@@ -21,7 +24,15 @@ pub(super) struct KeyframeQueue {
 impl KeyframeQueue {
     /// Number of keyframes that were fused or skipped.
     pub(super) fn step(&self) -> u64 {
-        self.fused.len() as u64
+        self.fused.len() as u64 + self.n_removed
+    }
+
+    /// Forgets a keyframe. If it was fused, its contribution to the field stays, but resuming does not need it.
+    pub(super) fn remove(&mut self, camera: &str, stamp: Stamp) {
+        self.pending.retain(|keyframe| keyframe.camera.as_ref() != camera || keyframe.stamp != stamp);
+        let n_before = self.fused.len();
+        self.fused.retain(|signature| !signature.is_of(camera, stamp));
+        self.n_removed += (n_before - self.fused.len()) as u64;
     }
 
     /// Marks the first pending keyframe as fused.
