@@ -32,10 +32,7 @@ pub enum AlignmentTask {
 impl AlignmentTask {
     /// Requests alignment unless `choice` selects no parameter.
     pub fn new(choice: &CameraRefinement) -> Self {
-        let is_requested = match choice {
-            CameraRefinement::Always(params) => !params.is_empty(),
-            CameraRefinement::Try(candidates) => !candidates.is_empty(),
-        };
+        let is_requested = !choice.always().is_empty() || !choice.candidates().is_empty();
         if is_requested { Self::Requested } else { Self::Done(None) }
     }
 

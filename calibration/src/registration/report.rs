@@ -3,8 +3,8 @@
 use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
-use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::{CameraCorrection, Candidate, ParamSet, Trial};
+use super::{AlignmentScene, CalibrationModel};
+use crate::{CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
