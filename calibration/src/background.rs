@@ -39,10 +39,7 @@ enum TaskState {
 impl AlignmentTask {
     /// Requests alignment unless `choice` selects no parameter.
     pub fn new(choice: &CameraRefinement) -> Self {
-        let is_requested = match choice {
-            CameraRefinement::Always(params) => !params.is_empty(),
-            CameraRefinement::Try(candidates) => !candidates.is_empty(),
-        };
+        let is_requested = !choice.always().is_empty() || !choice.candidates().is_empty();
         Self { state: if is_requested { TaskState::Requested } else { TaskState::Done }, result: None }
     }
 

@@ -44,9 +44,8 @@ use sums::PixelSubset;
 /// of each image.
 const MAX_IMAGES: usize = 100;
 const PARTNERS_PER_IMAGE: usize = 4;
-/// Maximum number of validation images. The next constant is the minimum number that a decision needs.
+/// Maximum number of validation images.
 const MAX_VALIDATION_IMAGES: usize = 32;
-const MIN_VALIDATION_IMAGES: usize = 4;
 const MIN_PAIRS: usize = 4;
 /// Corrections smaller than this number of standard deviations are not significant.
 const MIN_SIGNIFICANT_SIGMAS: f64 = 3.0;
@@ -104,10 +103,8 @@ pub fn align(keyframes: &[Arc<Keyframe>], choice: &CameraRefinement) -> Option<A
 }
 
 fn includes_image_poses(choice: &CameraRefinement) -> bool {
-    match choice {
-        CameraRefinement::Always(set) => set.contains(ParamSet::IMAGE_POSES),
-        CameraRefinement::Try(candidates) => candidates.iter().any(|set| set.contains(ParamSet::IMAGE_POSES)),
-    }
+    let mut sets = choice.candidates().iter().copied().chain([choice.always()]);
+    sets.any(|set| set.contains(ParamSet::IMAGE_POSES))
 }
 
 /// Corrections for a set of parameters.
@@ -258,9 +255,7 @@ impl AlignmentScene {
         };
         let trial = |(baseline_db, variant_db): (Vec<f64>, Vec<f64>)| {
             log::debug!("alignment: {params}: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-            let mut trial = Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db);
-            trial.kept &= trial.n_images >= MIN_VALIDATION_IMAGES;
-            trial
+            Trial::of(Candidate::Cameras(params), &baseline_db, &variant_db).with_enough_images()
         };
         match (params.contains(ParamSet::IMAGE_POSES), baseline.set.contains(ParamSet::IMAGE_POSES)) {
             (true, _) => trial(comparison.scores_with_free_poses()),

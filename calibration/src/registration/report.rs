@@ -3,8 +3,8 @@
 use super::fit::Fit;
 use super::layout::CalibrationParam;
 use super::solve::Solution;
-use super::{AlignmentScene, CalibrationModel, MIN_VALIDATION_IMAGES};
-use crate::{CalibratedCamera, CameraCorrection, Candidate, ParamSet, Trial};
+use super::{AlignmentScene, CalibrationModel};
+use crate::{CalibratedCamera, CameraCorrection, Candidate, MIN_VALIDATION_IMAGES, ParamSet, Trial};
 use keyframe::Keyframe;
 use nalgebra::{DVector, Vector3};
 use serde::{Deserialize, Serialize};

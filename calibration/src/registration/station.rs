@@ -14,7 +14,7 @@ use super::solve::Solution;
 use super::sums::{self, Noise, PixelSubset, ResidualOptions};
 use super::validation;
 use super::view::CorrectedView;
-use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, MIN_VALIDATION_IMAGES, PARTNERS_PER_IMAGE};
+use super::{MAX_IMAGES, MIN_PAIRS, MIN_SIGNIFICANT_SIGMAS, PARTNERS_PER_IMAGE};
 use crate::{Candidate, ParamSet, Trial};
 use keyframe::{Keyframe, Split};
 use kinematics::Transform;
@@ -91,7 +91,7 @@ pub fn register_station(
         standard_error_db: trial.standard_error_db,
         n_validation_images: trial.n_images,
         n_pairs: scene.pairs.len(),
-        kept: trial.kept && trial.n_images >= MIN_VALIDATION_IMAGES && (0..6).any(is_significant),
+        kept: trial.kept && (0..6).any(is_significant),
     })
 }
 
@@ -265,7 +265,7 @@ impl StationScene {
         let (baseline_db, variant_db) =
             validation::scores(&self.images, &self.validation_pairs, &views, noise, validation_image_of);
         log::debug!("station: without {baseline_db:.2?}, with {variant_db:.2?} dB");
-        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db)
+        Trial::of(Candidate::Cameras(ParamSet::empty()), &baseline_db, &variant_db).with_enough_images()
     }
 }
 
@@ -279,6 +279,7 @@ fn compose_step(estimate: &DVector<f64>, step: &DVector<f64>) -> DVector<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::MIN_VALIDATION_IMAGES;
     use crate::scenes::{Miscalibration, capture};
 
     /// Reported pose of the base at the second station.

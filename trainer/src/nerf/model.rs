@@ -69,7 +69,7 @@ impl NerfModel {
     pub fn new(gpu: Arc<Gpu>, options: ModelOptions<NerfOptions>) -> Result<Self, Error> {
         Ok(Self {
             gpu,
-            learned_params: images::given(&options.common.cameras),
+            learned_params: images::image_params_of_set(options.common.cameras.always()),
             trials: Trials::of(&options.common.cameras),
             options,
             images: Vec::new(),

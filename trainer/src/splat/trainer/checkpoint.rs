@@ -13,7 +13,7 @@ use crate::splat::options::SplatOptions;
 use crate::splat::params::status;
 use crate::splat::schedule::Schedule;
 use crate::splat::snapshot::{ObservedScene, Snapshot};
-use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial, Scores};
+use crate::splat::trials::{Arrival, RemainingTrials, RunningTrial};
 use calibration::{Candidate, ParamSet, Trial};
 use keyframe::Keyframe;
 use kinematics::Stamp;
@@ -129,13 +129,14 @@ impl ModelState {
 }
 
 impl TrialState {
-    fn of(trial: &RunningTrial, baseline_db: Option<&Scores>) -> Self {
+    fn of(trial: &RunningTrial) -> Self {
         let Snapshot { splats, cameras: (params, param_buffer), schedule, scene } = &*trial.other;
         Self {
             candidate: trial.candidate,
             until: trial.until,
             scored: trial.scored.iter().map(image).collect(),
-            baseline_scores: baseline_db.map(|scores| scores.iter().map(|(of, db)| (image(of), *db)).collect()),
+            baseline_scores: (trial.baseline_db.as_ref())
+                .map(|scores| scores.iter().map(|(of, db)| (image(of), *db)).collect()),
             arrivals: trial
                 .arrivals
                 .iter()
@@ -154,7 +155,7 @@ impl TrialState {
         checkpoint: &Checkpoint,
         n_planned_steps: u64,
         keyframes: &[Arc<Keyframe>],
-    ) -> Result<(RunningTrial, Option<Scores>), Error> {
+    ) -> Result<RunningTrial, Error> {
         let params = checkpoint.array(&format!("{OTHER}{CAMERA_PARAMS}"), self.n_other_param_bytes)?;
         let state = Snapshot {
             splats: self.other.splats(gpu, checkpoint, OTHER)?,
@@ -163,15 +164,16 @@ impl TrialState {
             scene: self.other.scene(checkpoint, OTHER)?,
         };
         let arrivals = self.arrivals.iter().zip(keyframes);
-        let trial = RunningTrial {
+        let scores = |scores: Vec<(ImageKey, f64)>| scores.into_iter().map(|(of, db)| (id(of), db)).collect();
+        Ok(RunningTrial {
             candidate: self.candidate,
             until: self.until,
             other: Box::new(state),
             scored: self.scored.into_iter().map(id).collect(),
             arrivals: arrivals.map(|(at, keyframe)| Arrival { step: at.step, keyframe: keyframe.clone() }).collect(),
-        };
-        let scores = self.baseline_scores.map(|scores| scores.into_iter().map(|(of, db)| (id(of), db)).collect());
-        Ok((trial, scores))
+            baseline_db: self.baseline_scores.map(scores),
+            deferred: Vec::new(),
+        })
     }
 }
 
@@ -198,13 +200,13 @@ impl SplatTrainer {
             slots: cameras.slots(),
             remaining_trials: self.trials.remaining_trials(),
             finished_trials: self.trials.finished.clone(),
-            trial: self.trials.running_trial().map(|(trial, baseline_db)| TrialState::of(trial, baseline_db)),
+            trial: self.trials.running_trial().map(TrialState::of),
         };
         let state =
             serde_json::to_value(state).map_err(|error| Error::CheckpointState { reason: error.to_string() })?;
         let params = (&cameras.params, cameras.used_bytes());
         let mut halves = vec![PendingArrays::begin(gpu, "", splats, &scene.seeder, params)];
-        if let Some((RunningTrial { other, .. }, _)) = self.trials.running_trial() {
+        if let Some(RunningTrial { other, .. }) = self.trials.running_trial() {
             let params = (&other.cameras.1, other.cameras.1.bytes());
             halves.push(PendingArrays::begin(gpu, OTHER, &other.splats, &other.scene.seeder, params));
         }
@@ -263,9 +265,8 @@ impl SplatTrainer {
         trainer.model.cameras.restore(gpu, &state.slots, state.model.params, checkpoint)?;
         trainer.trials.restore(state.remaining_trials, state.finished_trials);
         if let Some(trial) = state.trial {
-            let (trial, baseline_db) =
-                trial.restored(gpu, checkpoint, trainer.options.common.n_planned_steps, &arrivals)?;
-            trainer.trials.restore_trial(trial, baseline_db);
+            let n_planned_steps = trainer.options.common.n_planned_steps;
+            trainer.trials.restore_trial(trial.restored(gpu, checkpoint, n_planned_steps, &arrivals)?);
         }
         trainer.views.replace(views);
         trainer.seeding.restore(state.model.scene(checkpoint, "")?, unseeded);

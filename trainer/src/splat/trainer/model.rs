@@ -12,7 +12,6 @@ use crate::splat::kernels::TrainPipelines;
 use crate::splat::options::SplatOptions;
 use crate::splat::params::Growth;
 use crate::splat::passes::{self, GrowthBuffers};
-use calibration::{CameraRefinement, ParamSet};
 
 /// Standard deviation of a child's position within its parent, in standard deviations of the parent.
 const CHILD_SPREAD: f32 = 0.5;
@@ -32,13 +31,9 @@ pub(super) struct TrainedModel {
 impl TrainedModel {
     /// A model without splats.
     pub(super) fn new(gpu: &Gpu, options: &ModelOptions<SplatOptions>) -> Result<Self, Error> {
-        let params = match &options.common.cameras {
-            CameraRefinement::Always(params) => *params,
-            CameraRefinement::Try(_) => ParamSet::default(),
-        };
         Ok(Self {
             splats: SplatBuffers::new(gpu, 1, options.specific.sh_degree)?,
-            cameras: CameraParams::new(gpu, params)?,
+            cameras: CameraParams::new(gpu, options.common.cameras.always())?,
             max_splats: options.cap(),
             is_full: false,
         })
